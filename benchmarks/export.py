@@ -1,0 +1,278 @@
+"""The export against LeRobot's own writers, its growth, its memory, and its speed against cp.
+
+    python benchmarks/export.py                          a small sample
+    python benchmarks/export.py --episodes 4 --frames 90 --rounds 3 --growth 10 100 1000
+
+Every round runs all candidates one after the other on the same frames; CPU time counts all processes and threads,
+so that the figures can be compared on a shared machine. What is compared is what a user waits for after recording:
+the pictures of our recordings are coded already, so the cost of recording them is told beside it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import shutil
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.episode import EpisodeInfo, Frame, Outcome
+from demorec.export import ExportOptions, export_lerobot
+from demorec.recording import EpisodeWriter
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
+
+CAMERAS = {"front": (640, 480), "wrist": (224, 224), "side": (224, 224)}
+"""Those of the comparison, with their sizes."""
+
+Pictures = dict[str, list[NDArray[np.uint8]]]
+
+
+@dataclass(kw_only=True)
+class Cost:
+    """CPU and wall seconds of every round."""
+
+    cpu: list[float] = field(default_factory=list)
+    wall: list[float] = field(default_factory=list)
+
+    def __str__(self) -> str:
+        return f"{1e3 * statistics.median(self.cpu):9.3f} {1e3 * statistics.median(self.wall):9.3f}"
+
+
+def cpu_seconds() -> float:
+    return sum(
+        usage.ru_utime + usage.ru_stime
+        for usage in (resource.getrusage(resource.RUSAGE_SELF), resource.getrusage(resource.RUSAGE_CHILDREN))
+    )
+
+
+@contextmanager
+def measured(cost: Cost, per: float) -> Iterator[None]:
+    cpu, wall = cpu_seconds(), time.perf_counter()
+    yield
+    cost.cpu.append((cpu_seconds() - cpu) / per)
+    cost.wall.append((time.perf_counter() - wall) / per)
+
+
+def scene_pictures(frames: int, width: int, height: int, seed: int) -> list[NDArray[np.uint8]]:
+    """Pictures that cost an encoder what rendered ones do: shaded surfaces, edges, a moving arm, a little noise."""
+    rng = np.random.default_rng(seed)
+    rows, columns = np.mgrid[0:height, 0:width].astype(np.float32) / np.float32(height)
+    table = np.stack([170 + 40 * columns, 140 + 30 * rows, 100 + 20 * columns], axis=-1)
+    grain = rng.normal(0, 1, (height, width, 1))
+    result = []
+    for t in range(frames):
+        picture = table + grain
+        x, y = 0.3 + 0.4 * t / frames, 0.5 + 0.2 * np.sin(t / 15)
+        for k in range(6):
+            near = (columns - x - 0.05 * k) ** 2 + (rows - y + 0.08 * k) ** 2 < (0.07 - 0.005 * k) ** 2
+            picture[near] = (60 + 25 * k, 70 + 10 * k, 200 - 20 * k)
+        result.append(np.clip(picture, 0, 255).astype(np.uint8))
+    return result
+
+
+def made_up(pictures: Pictures, episode: int) -> tuple[EpisodeInfo, list[Frame], Outcome]:
+    """An episode of made-up numbers and the given pictures."""
+    from helpers_recording import make_episode  # type: ignore[import-not-found]
+
+    length = len(next(iter(pictures.values())))
+    info, frames, outcome = make_episode(
+        num_frames=length, cameras=tuple(pictures), width=16, height=16, episode_index=episode
+    )
+    cameras = tuple(
+        replace(camera, height=pictures[camera.name][0].shape[0], width=pictures[camera.name][0].shape[1])
+        for camera in info.scene.cameras
+    )
+    frames = [
+        replace(frame, images={name: replace(frame.images[name], color=pictures[name][t]) for name in pictures})
+        for t, frame in enumerate(frames)
+    ]
+    return replace(info, scene=replace(info.scene, cameras=cameras)), frames, outcome
+
+
+def record(path: Path, episode: tuple[EpisodeInfo, list[Frame], Outcome]) -> None:
+    info, frames, outcome = episode
+    with EpisodeWriter(path, info) as writer:
+        for frame in frames:
+            writer.write(frame)
+        writer.finish(outcome)
+
+
+def compare(args: argparse.Namespace, work: Path) -> dict[str, Any]:
+    """CPU and wall ms a frame: this export, LeRobot's default writer, its streaming writers."""
+    from lerobot.configs.video import RGBEncoderConfig
+    from lerobot.datasets import LeRobotDataset
+
+    pictures: list[Pictures] = [
+        {name: scene_pictures(args.frames, *size, seed=7 * e + n) for n, (name, size) in enumerate(CAMERAS.items())}
+        for e in range(args.episodes)
+    ]
+    episodes = [made_up(found, e) for e, found in enumerate(pictures)]
+    costs = {
+        name: Cost() for name in ("record", "export", "lerobot", "lerobot_streaming_av1", "lerobot_streaming_h264")
+    }
+    total = args.episodes * args.frames
+    h264 = RGBEncoderConfig(vcodec="h264", crf=23, preset="veryfast")
+
+    def lerobot(name: str, folder: Path, **options: Any) -> None:
+        features: dict[str, Any] = {
+            "observation.state": {"dtype": "float32", "shape": (8,), "names": None},
+            "action": {"dtype": "float32", "shape": (8,), "names": None},
+        }
+        for key, (width, height) in CAMERAS.items():
+            features[f"observation.images.{key}"] = {
+                "dtype": "video", "shape": (height, width, 3), "names": ["height", "width", "channels"]
+            }  # fmt: skip
+        with measured(costs[name], total):
+            dataset = LeRobotDataset.create("local/bench", 30, features, root=folder, **options)
+            for episode in pictures:
+                for t in range(args.frames):
+                    vector = np.full(8, t, dtype=np.float32)
+                    frame: dict[str, Any] = {"observation.state": vector, "action": vector, "task": "task"}
+                    frame |= {f"observation.images.{key}": episode[key][t] for key in CAMERAS}
+                    dataset.add_frame(frame)
+                dataset.save_episode()
+            dataset.finalize()
+
+    for number in range(args.rounds):
+        folder = work / f"round{number}"
+        run = folder / "run"
+        run.mkdir(parents=True)
+        if number == 0:  # loads what is loaded at first use
+            record(folder / "warm.mcap", episodes[0])
+            export_lerobot([folder / "warm.mcap"], folder / "warm", ExportOptions(verify=False))
+        with measured(costs["record"], total):
+            for e, recorded in enumerate(episodes):
+                record(run / f"episode_{e:06d}.mcap", recorded)
+        for copy in range(1, args.repeat):
+            for e in range(args.episodes):
+                index = copy * args.episodes + e
+                shutil.copy(run / f"episode_{e:06d}.mcap", run / f"episode_{index:06d}.mcap")
+        with measured(costs["export"], total * args.repeat):
+            export_lerobot([run], folder / "ours", ExportOptions(verify=False, workers=1))
+        lerobot("lerobot", folder / "default")
+        lerobot("lerobot_streaming_av1", folder / "streaming", streaming_encoding=True, encoder_queue_maxsize=10_000)
+        lerobot(
+            "lerobot_streaming_h264", folder / "streaming264",
+            streaming_encoding=True, encoder_queue_maxsize=10_000, rgb_encoder=h264,
+        )  # fmt: skip
+        shutil.rmtree(folder)
+    ours = statistics.median(costs["export"].cpu)
+    print(f"\n{args.episodes} episodes of {args.frames} frames, cameras {CAMERAS}, {args.rounds} rounds")
+    print(f"(our export takes them {args.repeat} times over, since what it costs once would be in the way)")
+    print(f"{'ms a frame':28} {'CPU':>9} {'wall':>9}   CPU against ours")
+    for name, cost in costs.items():
+        print(f"{name:28} {cost} {statistics.median(cost.cpu) / ours:10.1f}x")
+    return {
+        name: {"cpu_ms": 1e3 * statistics.median(c.cpu), "wall_ms": 1e3 * statistics.median(c.wall)}
+        for name, c in costs.items()
+    }
+
+
+def growth(args: argparse.Namespace, work: Path) -> list[dict[str, float]]:
+    """Cost an episode and peak memory of exports of more and more episodes, each in a process of its own."""
+    from helpers_recording import write_episode
+
+    run = work / "growth" / "episodes"
+    run.mkdir(parents=True)
+    write_episode(run / "episode_000000.mcap", num_frames=args.growth_frames)
+    for index in range(1, max(args.growth)):
+        shutil.copy(run / "episode_000000.mcap", run / f"episode_{index:06d}.mcap")
+    program = (
+        "import resource, sys, time\n"
+        "from pathlib import Path\n"
+        "from demorec.export import ExportOptions, export_lerobot\n"
+        "files = sorted(Path(sys.argv[1]).glob('*.mcap'))[: int(sys.argv[2])]\n"
+        "export_lerobot(files[:1], Path(sys.argv[3] + '.warm'), ExportOptions(verify=False))\n"
+        "cpu = time.process_time()\n"
+        "export_lerobot(files, Path(sys.argv[3]), ExportOptions(verify=False, workers=1))\n"
+        "print(time.process_time() - cpu, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)\n"
+    )
+    print(f"\nGrowth, episodes of {args.growth_frames} frames, 2 cameras of 64x48")
+    print(f"{'episodes':>9} {'CPU ms an episode':>18} {'peak MiB':>9}")
+    rows = []
+    for count in args.growth:
+        out = work / f"growth{count}"
+        done = subprocess.run(
+            [sys.executable, "-c", program, str(run), str(count), str(out)], check=True, capture_output=True, text=True
+        )
+        cpu, memory = (float(text) for text in done.stdout.split())
+        shutil.rmtree(out)
+        rows.append({"episodes": count, "cpu_ms_an_episode": 1e3 * cpu / count, "peak_mib": memory})
+        print(f"{count:9d} {1e3 * cpu / count:18.2f} {memory:9.1f}")
+    return rows
+
+
+def against_copy(args: argparse.Namespace, work: Path) -> dict[str, float]:
+    """MB of recordings a second, exported and copied by cp, at 640x480."""
+    run = work / "copy" / "episodes"
+    run.mkdir(parents=True)
+    names = ("front", "wrist")
+    pictures = {name: scene_pictures(args.frames, 640, 480, seed=n) for n, name in enumerate(names)}
+    record(run / "episode_000000.mcap", made_up(pictures, 0))
+    for index in range(1, args.copy_episodes):
+        shutil.copy(run / "episode_000000.mcap", run / f"episode_{index:06d}.mcap")
+    size = sum(path.stat().st_size for path in run.iterdir()) / 1e6
+    ways: dict[str, Callable[[Path], object]] = {
+        "export": lambda out: export_lerobot([run], out, ExportOptions(verify=False)),
+        "cp": lambda out: subprocess.run(["cp", "-r", run, out], check=True),
+        "cp, then sync": lambda out: subprocess.run(["sh", "-c", f"cp -r {run} {out} && sync -f {out}/*"], check=True),
+    }
+    costs = {name: Cost() for name in ways}
+    for number in range(args.rounds + 1):
+        for name, way in ways.items():
+            out = work / "copied"
+            with measured(costs[name] if number else Cost(), 1):
+                way(out)
+            shutil.rmtree(out)
+    print(f"\nSpeed at 640x480, {size:.0f} MB in {args.copy_episodes} recordings")
+    print(f"{'':14} {'MB/s':>9} {'CPU s':>9}")
+    result = {}
+    for name, cost in costs.items():
+        result[name] = size / statistics.median(cost.wall)
+        print(f"{name:14} {result[name]:9.0f} {statistics.median(cost.cpu):9.3f}")
+    return result
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--episodes", type=int, default=2)
+    parser.add_argument("--frames", type=int, default=45)
+    parser.add_argument("--rounds", type=int, default=1)
+    parser.add_argument("--repeat", type=int, default=20, help="how often our export takes the same recordings")
+    parser.add_argument("--growth", type=int, nargs="*", default=[10, 100])
+    parser.add_argument("--growth-frames", type=int, default=12)
+    parser.add_argument("--copy-episodes", type=int, default=20)
+    parser.add_argument("--skip", nargs="*", default=[], choices=["compare", "growth", "copy"])
+    parser.add_argument("--json", type=Path)
+    args = parser.parse_args()
+    os.environ.setdefault("HF_HUB_OFFLINE", "1")
+    results: dict[str, Any] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        work = Path(folder)
+        os.environ["HF_DATASETS_CACHE"] = str(work / "hf")
+        if "growth" not in args.skip and args.growth:
+            results["growth"] = growth(args, work)
+        if "copy" not in args.skip:
+            results["copy"] = against_copy(args, work)
+        if "compare" not in args.skip:
+            results["compare"] = compare(args, work)
+    if args.json:
+        args.json.write_text(json.dumps(results, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,349 @@
+"""What teaches: the same policy trained on variants of the data and run over held-out scenes.
+
+    python benchmarks/learning.py --variants base clean plain_increments --out outputs/learning
+    python benchmarks/learning.py --episodes 1000 --steps 8000 --scenes 100 --seeds 3
+    python benchmarks/learning.py --variants pictures --episodes 300 --steps 20000 --scenes 50 --device cuda
+    python benchmarks/learning.py --variants base clean --plot outputs/learning/learning.png
+
+Every variant is made with the product's own commands (generate-dataset, demorec export lerobot, demorec evaluate).
+Training is LeRobot's ACT class with the numbers of a dataset held in memory: lerobot-train reads them row by row and
+spends five sixths of its CPU time there; the network, the loss and the optimizer are the same. One thread, no
+download. Each variant is one row: strict success in closed loop with its 95 % interval, and CPU seconds of training.
+What is there already (runs, datasets, policies, evaluations in --out) is used again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import subprocess
+import sys
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import numpy as np
+import pyarrow.parquet as pq
+import torch
+from numpy.typing import NDArray
+
+STATE, ENVIRONMENT, ACTION = "observation.state", "observation.environment_state", "action"
+SWITCHED_OFF = 1e9
+"""Standard deviation of a component that a policy shall not see: normalising with it leaves nothing of it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Variant:
+    """One way to make data or to learn from it.
+
+    Attributes:
+        about: What is different from the base.
+        generate: Flags of generate-dataset.
+        share: Of the episodes of the benchmark.
+        action: As of demorec export lerobot.
+        plain: Take the way back from noise out of the increments.
+        hide: Components of the environment state whose names contain one of these are hidden.
+        chunk, execute: Actions predicted at once, and executed before looking again.
+        pictures: From two 96 x 96 cameras in place of the environment state.
+    """
+
+    about: str
+    generate: tuple[str, ...] = ()
+    share: float = 1.0
+    action: str = "joint_increment"
+    plain: bool = False
+    hide: tuple[str, ...] = ()
+    chunk: int = 16
+    execute: int = 16
+    pictures: bool = False
+
+
+RELATIVE = ("from_", ".yaw.", "tcp.")
+NEAR_FIELD = (".near_",)
+VARIANTS = {
+    "base": Variant(about="noise 0.02 rad, clean labels, increments, all of the state, 16 of 16 executed"),
+    "clean": Variant(about="no action noise", generate=("--action-noise", "0", "0")),
+    "noise_0.04": Variant(about="noise 0.04 rad", generate=("--action-noise", "0.04", "0.04")),
+    "plain_increments": Variant(about="increments without the way back from noise", plain=True),
+    "joint": Variant(about="absolute joint targets", action="joint"),
+    "ee": Variant(about="absolute TCP poses", action="ee"),
+    "ee_delta": Variant(about="TCP deltas", action="ee_delta"),
+    "no_velocity": Variant(about="without velocities", hide=(".vel",)),
+    "raw_poses": Variant(about="raw poses only: no symmetric yaw, nothing relative", hide=RELATIVE),
+    "no_near_field": Variant(about="without the steep components of small offsets", hide=NEAR_FIELD),
+    "recovery": Variant(about="30 % deliberate misses with recovery", generate=("--miss-probability", "0.3")),
+    "a_third": Variant(about="a third of the episodes", share=1 / 3),
+    "a_tenth": Variant(about="a tenth of the episodes", share=0.1),
+    "execute_1": Variant(about="one action at a time", execute=1),
+    "execute_8": Variant(about="half of the chunk of 16", execute=8),
+    "chunk_32": Variant(about="chunk of 32, 16 executed", chunk=32, execute=16),
+    "pictures": Variant(about="two 96 x 96 cameras, no environment state", pictures=True),
+}
+
+
+@dataclass(eq=False, kw_only=True)
+class Data:
+    """All frames of a dataset, in memory, and its statistics."""
+
+    columns: dict[str, torch.Tensor]
+    end: torch.Tensor  # (N,) index after the last frame of each frame's episode
+    stats: dict[str, dict[str, torch.Tensor]]
+    pictures: dict[str, torch.Tensor] = field(default_factory=dict)  # (N, 3, H, W) uint8
+
+
+def command(*words: str | Path) -> None:
+    """Run one of demorec's commands; its output only if it fails."""
+    program = Path(sys.executable).with_name(str(words[0]))
+    result = subprocess.run([program, *map(str, words[1:])], capture_output=True, text=True, check=False)
+    if result.returncode:
+        raise SystemExit(f"{' '.join(map(str, words))}\n{result.stdout}{result.stderr}")
+
+
+def make_dataset(variant: Variant, args: argparse.Namespace) -> Path:
+    """Generate and export, where that was not done yet."""
+    cameras = ("front", "wrist", "--width", "96", "--height", "96") if variant.pictures else ("none",)
+    label = "_".join(word.strip("-").replace(".", "") for word in variant.generate) or "base"
+    run = args.out / f"run_{label}{'_pictures' if variant.pictures else ''}_{args.episodes}"
+    command(
+        *("generate-dataset", "--out", run, "--task", args.task, "--num-episodes", str(args.episodes)),
+        *("--split", "train", "--workers", str(args.workers), "--no-export", "--cameras", *cameras, *variant.generate),
+    )
+    count = max(1, round(args.episodes * variant.share))
+    dataset = run / f"dataset_{variant.action}_{count}"
+    if not dataset.exists():
+        command(
+            *("demorec", "export", "lerobot", run, "--out", dataset, "--action", variant.action),
+            *("--episodes", f"0:{count}", *(() if variant.pictures else ("--privileged",))),
+        )
+    return Path(dataset)
+
+
+def load(dataset: Path, variant: Variant) -> Data:
+    """Read a dataset's numbers (and its pictures, through LeRobot) and hide what the variant hides."""
+    info = json.loads((dataset / "meta" / "info.json").read_text())
+    tables = [pq.read_table(path) for path in sorted((dataset / "data").rglob("*.parquet"))]
+    names = [STATE, ACTION, *([] if variant.pictures else [ENVIRONMENT])]
+    columns = {
+        name: torch.from_numpy(np.concatenate([np.stack(t[name].to_numpy()) for t in tables]).astype(np.float32))
+        for name in names
+    }
+    episode = np.concatenate([t["episode_index"].to_numpy() for t in tables])
+    if variant.plain:
+        columns[ACTION] = torch.from_numpy(plain_increments(dataset))
+    stats = {name: statistics(values) for name, values in columns.items()}
+    if ENVIRONMENT in columns:
+        for i, component in enumerate(info["features"][ENVIRONMENT]["names"]):
+            if any(part in component for part in variant.hide):
+                stats[ENVIRONMENT]["std"][i] = SWITCHED_OFF
+    data = Data(columns=columns, end=torch.from_numpy(np.searchsorted(episode, episode, side="right")), stats=stats)
+    if variant.pictures:
+        add_pictures(data, dataset)
+    return data
+
+
+def statistics(values: torch.Tensor) -> dict[str, torch.Tensor]:
+    """Mean and standard deviation of every component."""
+    wide = values.double()
+    return {"mean": wide.mean(0).float(), "std": wide.std(0, unbiased=False).float()}
+
+
+def plain_increments(dataset: Path) -> NDArray[np.float32]:
+    """Increments of the clean targets alone, from the same recordings."""
+    from demorec.recording import Recording
+
+    rows = []
+    count = json.loads((dataset / "meta" / "info.json").read_text())["total_episodes"]
+    for path in sorted((dataset.parent / "episodes").glob("*.mcap"))[:count]:
+        with Recording(path) as recording:
+            columns, start = recording.columns(), recording.info.scene.robot.joint_position
+        increments = np.diff(columns.action_joint_target, axis=0, prepend=np.array([start]))
+        rows.append(np.concatenate([increments, columns.action_gripper[:, None]], axis=1))
+    return np.asarray(np.concatenate(rows), dtype=np.float32)
+
+
+def add_pictures(data: Data, dataset: Path) -> None:
+    """Decode every picture once."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    frames = LeRobotDataset("local/learning", root=dataset, return_uint8=True)
+    keys = frames.meta.camera_keys
+    items = [frames[i] for i in range(len(frames))]
+    for key in keys:
+        data.pictures[key] = torch.stack([item[key] for item in items])
+        scaled = data.pictures[key][:: max(1, len(items) // 500)].double() / 255
+        data.stats[key] = {
+            "mean": scaled.mean((0, 2, 3)).float()[:, None, None],
+            "std": scaled.std((0, 2, 3)).float()[:, None, None],
+        }
+
+
+def train(data: Data, variant: Variant, args: argparse.Namespace, *, seed: int, out: Path) -> float:
+    """Train LeRobot's ACT and save it as lerobot-train does; returns CPU seconds."""
+    from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature
+    from lerobot.policies.act.configuration_act import ACTConfig
+    from lerobot.policies.act.modeling_act import ACTPolicy
+    from lerobot.policies.act.processor_act import make_act_pre_post_processors
+
+    kinds = {STATE: FeatureType.STATE, ENVIRONMENT: FeatureType.ENV, ACTION: FeatureType.ACTION}
+    inputs = {
+        name: PolicyFeature(kinds[name], tuple(values.shape[1:]))
+        for name, values in data.columns.items()
+        if name != ACTION
+    }
+    inputs |= {key: PolicyFeature(FeatureType.VISUAL, tuple(p.shape[1:])) for key, p in data.pictures.items()}
+    torch.manual_seed(seed)
+    policy = ACTPolicy(
+        ACTConfig(
+            use_vae=False,
+            dropout=0.0,
+            dim_model=128,
+            n_heads=4,
+            dim_feedforward=512,
+            n_encoder_layers=2,
+            chunk_size=variant.chunk,
+            n_action_steps=variant.execute,
+            pretrained_backbone_weights=None,
+            device=args.device,
+            push_to_hub=False,
+            normalization_mapping=dict.fromkeys(("STATE", "ENV", "ACTION", "VISUAL"), NormalizationMode.MEAN_STD),
+            input_features=inputs,
+            output_features={ACTION: PolicyFeature(FeatureType.ACTION, tuple(data.columns[ACTION].shape[1:]))},
+        )
+    ).to(args.device)
+    before, after = make_act_pre_post_processors(policy.config, data.stats)
+    optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=args.learning_rate, weight_decay=1e-4)
+    schedule = torch.optim.lr_scheduler.LambdaLR(
+        optimizer, lambda step: min(1.0, (step + 1) / 100) * 0.5 * (1 + math.cos(math.pi * step / args.steps))
+    )
+    generator = torch.Generator().manual_seed(seed)
+    count = len(data.end)
+    policy.train()
+    started, smooth, curve = time.process_time(), 0.0, []
+    for step in range(args.steps):
+        rows = torch.randint(count, (args.batch_size,), generator=generator)
+        ahead = rows[:, None] + torch.arange(variant.chunk)
+        last = data.end[rows][:, None] - 1
+        batch = {name: values[rows] for name, values in data.columns.items()}
+        batch[ACTION] = data.columns[ACTION][torch.minimum(ahead, last)]
+        batch |= {key: pictures[rows].float() / 255 for key, pictures in data.pictures.items()}
+        batch = before(batch)
+        batch["action_is_pad"] = (ahead > last).to(args.device)
+        loss, _ = policy(batch)
+        optimizer.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(policy.parameters(), 10.0)
+        optimizer.step()
+        schedule.step()
+        smooth = loss.item() if step == 0 else 0.98 * smooth + 0.02 * loss.item()
+        if (step + 1) % 250 == 0:
+            curve.append({"step": step + 1, "loss": smooth, "cpu_seconds": time.process_time() - started})
+    seconds = time.process_time() - started
+    policy.save_pretrained(out)
+    before.save_pretrained(out)
+    after.save_pretrained(out)
+    (out / "training.json").write_text(json.dumps({"cpu_seconds": seconds, "curve": curve}, indent=1))
+    return seconds
+
+
+def measure(name: str, args: argparse.Namespace) -> dict[str, Any]:
+    """One row of the table."""
+    from demorec.config import GenerateConfig
+    from demorec.evaluate.rollouts import evaluate, settings_for
+    from demorec.evaluate.statistics import Rate
+
+    variant = VARIANTS[name]
+    dataset = make_dataset(variant, args)
+    data: Data | None = None
+    results = []
+    for seed in range(args.seeds):
+        out = args.out / "policies" / f"{name}_{args.episodes}_{args.steps}_{seed}"
+        if not (out / "training.json").exists():
+            data = data or load(dataset, variant)
+            train(data, variant, args, seed=seed, out=out)
+        config = GenerateConfig(task=args.task, split=args.split, seed=args.scene_seed, cameras=())
+        settings = settings_for(out, config, action=variant.action)  # type: ignore[arg-type]
+        where = args.out / "evaluations" / f"{out.name}_{args.split}_{args.scene_seed}"
+        where.parent.mkdir(parents=True, exist_ok=True)
+        results.append(evaluate(settings, where, num_episodes=args.scenes, workers=args.workers).rate)
+    total = Rate(successes=sum(r.successes for r in results), trials=sum(r.trials for r in results))
+    seconds = [
+        json.loads((args.out / "policies" / f"{name}_{args.episodes}_{args.steps}_{s}" / "training.json").read_text())
+        for s in range(args.seeds)
+    ]
+    low, high = total.interval
+    return {
+        "variant": name,
+        "about": variant.about,
+        "success": total.successes,
+        "trials": total.trials,
+        "low": low,
+        "high": high,
+        "by_seed": [r.successes for r in results],
+        "train_cpu_seconds": float(np.mean([s["cpu_seconds"] for s in seconds])),
+    }
+
+
+def plot(rows: list[dict[str, Any]], path: Path) -> None:
+    """Success of every variant with its interval, as a picture."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(7.5, 0.6 + 0.36 * len(rows)), layout="constrained")
+    for place, row in enumerate(reversed(rows)):
+        rate = 100 * row["success"] / row["trials"]
+        axes.barh(place, rate, color="#4c78a8", height=0.62)
+        axes.plot([100 * row["low"], 100 * row["high"]], [place, place], color="black", linewidth=1.2)
+        axes.text(1, place, row["about"], va="center", color="white" if rate > 55 else "black", fontsize=8)
+    axes.set_yticks(range(len(rows)), [f"{row['variant']}  n={row['trials']}" for row in reversed(rows)], fontsize=8)
+    axes.set_xlim(0, 100)
+    axes.set_xlabel("strict success in closed loop, % (line: 95 % interval)")
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    figure.savefig(path, dpi=110)
+
+
+def main() -> None:
+    """Measure the variants and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--variants", nargs="+", default=["base", "clean"], choices=list(VARIANTS))
+    parser.add_argument("--task", default="pick_place")
+    parser.add_argument("--episodes", type=int, default=300)
+    parser.add_argument("--steps", type=int, default=3000)
+    parser.add_argument("--batch-size", type=int, default=128)
+    parser.add_argument("--learning-rate", type=float, default=5e-4)
+    parser.add_argument("--seeds", type=int, default=1, help="trainings of each variant")
+    parser.add_argument("--scenes", type=int, default=50, help="held-out scenes of each training")
+    parser.add_argument("--split", default="eval", choices=("all", "train", "eval"))
+    parser.add_argument("--scene-seed", type=int, default=0)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--out", type=Path, default=Path("outputs/learning"))
+    parser.add_argument("--plot", type=Path, help="also draw the table into this PNG")
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    args.out.mkdir(parents=True, exist_ok=True)
+    rows = []
+    print(f"{'variant':<18} {'success':>9} {'95 % interval':>16} {'train CPU s':>12}  about", flush=True)
+    for name in args.variants:
+        row = measure(name, args)
+        rows.append(row)
+        interval = f"[{100 * row['low']:.0f}, {100 * row['high']:.0f}] %"
+        print(
+            f"{name:<18} {row['success']:>4}/{row['trials']:<4} {interval:>16} {row['train_cpu_seconds']:>12.0f}  "
+            f"{row['about']}",
+            flush=True,
+        )
+    (args.out / "learning.json").write_text(json.dumps(rows, indent=1))
+    if args.plot is not None:
+        plot(rows, args.plot)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,74 @@
+"""Sheets of pictures for the docs: every task at its grasp and at its end, and many looks of one task.
+
+python benchmarks/pictures.py --out docs/images
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from demorec.config import EpisodePlan, GenerateConfig
+from demorec.rollout import Rollout, make_renderer, make_world, prepare
+from demorec.tables import TASKS
+
+Picture = NDArray[np.uint8]
+WIDTH, HEIGHT = 320, 240
+CARRYING = {"lift", "transport", "hold"}
+
+
+def grasp_and_end(config: GenerateConfig, index: int) -> tuple[Picture, Picture, str]:
+    """The front camera's picture when something is first held and at the end of an episode, and its instruction."""
+    episode = prepare(EpisodePlan(config=config, episode_index=index))
+    with make_world(episode.info) as world, make_renderer(episode.info) as renderer:
+        frames = list(Rollout(world, episode, renderer))
+    held = next(frame for frame in frames if frame.phase in CARRYING)
+    return held.images["front"].color, frames[-1].images["front"].color, episode.info.instruction
+
+
+def sheet(rows: list[list[tuple[Picture, str]]]) -> Image.Image:
+    """Rows of captioned pictures."""
+    line = 18
+    columns = max(len(row) for row in rows)
+    canvas = Image.new("RGB", (columns * WIDTH, len(rows) * (HEIGHT + line)), "white")
+    draw, font = ImageDraw.Draw(canvas), ImageFont.load_default(size=12)
+    for y, row in enumerate(rows):
+        for x, (picture, caption) in enumerate(row):
+            canvas.paste(Image.fromarray(picture), (x * WIDTH, y * (HEIGHT + line)))
+            draw.text((x * WIDTH + 4, y * (HEIGHT + line) + HEIGHT + 2), caption, fill="black", font=font)
+    return canvas
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--out", type=Path, default=Path("docs/images"))
+    parser.add_argument("--seed", type=int, default=0)
+    args = parser.parse_args()
+    args.out.mkdir(parents=True, exist_ok=True)
+
+    def config(task: str, variation: str) -> GenerateConfig:
+        return GenerateConfig(
+            task=task,
+            seed=args.seed,
+            cameras=("front",),
+            width=WIDTH,
+            height=HEIGHT,
+            variation=variation,  # type: ignore[arg-type]
+        )
+
+    cells: list[list[tuple[Picture, str]]] = []
+    for task in TASKS.names():
+        held, end, instruction = grasp_and_end(config(task, "mild"), 0)
+        cells.append([(held, f"{task}: {instruction}"[:50]), (end, f"{task}, end")])
+    pairs = [left + right for left, right in zip(cells[0::2], cells[1::2], strict=True)]
+    sheet(pairs).save(args.out / "tasks.jpg", quality=88)
+    looks = [(grasp_and_end(config("pick_place", "full"), index)[0], f"look {index}") for index in range(16)]
+    sheet([looks[i : i + 4] for i in range(0, 16, 4)]).save(args.out / "looks.jpg", quality=88)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,215 @@
+"""CPU time of a picture by each renderer, on frames of a real episode, all measured in one interleaved run.
+
+    python benchmarks/render.py                        # a quick look
+    python benchmarks/render.py --rounds 11 --memory --rate-seconds 10
+
+Process CPU time, since machines are shared; medians over rounds; the ratio is against TinyRenderer in the same run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import multiprocessing
+import os
+import statistics
+import sys
+import time
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from typing import Any
+
+import psutil
+
+from demorec.config import EpisodePlan, GenerateConfig
+from demorec.errors import RenderError
+from demorec.geometry import Array, Pose
+from demorec.render import Renderer, RenderSetup
+from demorec.rollout import Episode, Rollout, make_world, prepare
+from demorec.scene import Camera
+from demorec.sim.world import World
+from demorec.tables import RENDERERS
+
+SIZES = ((96, 96), (224, 224), (640, 480))
+
+
+@dataclass(frozen=True)
+class State:
+    """What `World.set_state` needs to show one frame again."""
+
+    joint_position: Array
+    object_poses: dict[str, Pose]
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One way to draw: renderer, antialiasing, and whether depth and segmentation are drawn too."""
+
+    renderer: str
+    antialias: bool
+    everything: bool
+
+    @property
+    def label(self) -> str:
+        smooth = {True: " antialiased", False: " plain"}[self.antialias] if self.renderer == "raster" else ""
+        return f"{self.renderer}{smooth}, {'colour + depth + segmentation' if self.everything else 'colour'}"
+
+
+def plan(index: int = 0, **config: Any) -> Episode:
+    return prepare(EpisodePlan(config=GenerateConfig(**config), episode_index=index))
+
+
+def run_episode(world: World, episode: Episode) -> list[State]:
+    """Every frame of an episode, without pictures."""
+    return [
+        State(frame.observation.joint_position, dict(frame.observation.object_poses))
+        for frame in Rollout(world, episode)
+    ]
+
+
+def setup_for(world: World, cameras: tuple[Camera, ...], *, antialias: bool, everything: bool) -> RenderSetup:
+    return RenderSetup(
+        client=world.client,
+        cameras=cameras,
+        mounts=world.mounts(),
+        light=world.scene.light,
+        textures=world.textures,
+        depth=everything,
+        segmentation=everything,
+        antialias=antialias,
+    )
+
+
+def measure(renderer: Renderer, world: World, states: list[State]) -> float:
+    """CPU milliseconds a picture over the states; placing the robot is not counted."""
+    spent = 0.0
+    for state in states:
+        world.set_state(joint_position=state.joint_position, object_poses=state.object_poses)
+        start = time.process_time()
+        renderer.render()
+        spent += time.process_time() - start
+    return 1e3 * spent / len(states)
+
+
+def table(renderers: list[str], sizes: list[tuple[int, int]], rounds: int, frames: int) -> None:
+    episode = plan(width=96, height=96)
+    variants = [
+        Variant(name, antialias, everything)
+        for name in renderers
+        for antialias in ((True, False) if name == "raster" else (True,))
+        for everything in (False, True)
+    ]
+    with make_world(episode.info) as world:
+        states = run_episode(world, episode)
+        print(f"{len(states)} frames of an episode of {episode.info.task}; {rounds} rounds of {frames} frames each")
+        for width, height in sizes:
+            every = [replace(camera, width=width, height=height) for camera in episode.info.scene.cameras]
+            for cameras in [(camera,) for camera in every] + [tuple(every)]:
+                times: dict[Variant, list[float]] = {variant: [] for variant in variants}
+                for number in range(rounds):
+                    # Neighbouring frames, as in an episode; other ones in each round.
+                    first = number * max(1, (len(states) - frames) // max(1, rounds - 1)) if rounds > 1 else 0
+                    chosen = states[first : first + frames]
+                    for variant in variants:
+                        with RENDERERS.load(variant.renderer)() as renderer:
+                            renderer.setup(
+                                setup_for(world, cameras, antialias=variant.antialias, everything=variant.everything)
+                            )
+                            measure(renderer, world, chosen[:1])  # what is made once a scene
+                            few = chosen if variant.renderer == "raster" else chosen[:: max(1, frames // 4)]
+                            times[variant].append(measure(renderer, world, few) / len(cameras))
+                name = " + ".join(camera.name for camera in cameras)
+                print(f"\n{width}x{height} {name}: CPU ms a picture (times faster than tiny)")
+                for variant in variants:
+                    middle = statistics.median(times[variant])
+                    base = times.get(Variant("tiny", True, variant.everything))
+                    ratio = f"{statistics.median(base) / middle:6.1f}x" if base else ""
+                    print(f"  {variant.label:50s} {middle:8.2f} {ratio}", flush=True)
+
+
+def draw_for(renderer_name: str, size: tuple[int, int], seconds: float, ready: Any, counts: Any) -> None:
+    """A worker: pictures drawn within the time, both cameras."""
+    episode = plan(width=size[0], height=size[1])
+    with make_world(episode.info) as world, RENDERERS.load(renderer_name)() as renderer:
+        states = run_episode(world, episode)
+        renderer.setup(setup_for(world, episode.info.scene.cameras, antialias=True, everything=False))
+        renderer.render()
+        ready.wait()
+        count, end = 0, time.perf_counter() + seconds
+        while time.perf_counter() < end:
+            state = states[(count // 2) % len(states)]
+            world.set_state(joint_position=state.joint_position, object_poses=state.object_poses)
+            count += len(renderer.render())
+        counts.put(count / seconds)
+
+
+def rate(renderers: list[str], sizes: list[tuple[int, int]], seconds: float, workers: int) -> None:
+    """Pictures a second with one process a core (wall time: only meaningful on a quiet machine)."""
+    context = multiprocessing.get_context("spawn")
+    for size in sizes:
+        for name in renderers:
+            ready, counts = context.Barrier(workers), context.Queue()
+            processes = [
+                context.Process(target=draw_for, args=(name, size, seconds, ready, counts)) for _ in range(workers)
+            ]
+            for process in processes:
+                process.start()
+            total = sum(counts.get(timeout=300) for _ in processes)
+            for process in processes:
+                process.join()
+            print(f"  {size[0]}x{size[1]} {name:8s} {total:8.0f} pictures a second, {workers} processes", flush=True)
+
+
+def memory(pictures: int, resets: int) -> bool:
+    """Whether the process stays as large as it was over many pictures and scenes, after a first round of them."""
+    process = psutil.Process()
+    sizes = []
+    episode = plan(width=224, height=224)
+    with make_world(episode.info) as world, RENDERERS.load("raster")() as renderer:
+        states = run_episode(world, episode)
+        for number in range(resets):
+            world.reset(plan(number, width=224, height=224).info.scene)
+            renderer.setup(setup_for(world, episode.info.scene.cameras, antialias=True, everything=True))
+            for step in range(pictures // resets // len(episode.info.scene.cameras)):
+                world.set_state(joint_position=states[(number + step) % len(states)].joint_position)
+                renderer.render()
+            gc.collect()
+            sizes.append(process.memory_info().rss / 2**20)
+    settled, last = sizes[resets // 5], sizes[-1]
+    print(f"\nMemory over {pictures} pictures, {resets} scenes: {settled:.0f} MiB after a fifth, {last:.0f} after all")
+    return last - settled < 0.05 * settled
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--renderers", nargs="+", default=list(RENDERERS.names()), choices=RENDERERS.names())
+    parser.add_argument("--sizes", nargs="+", default=[f"{w}x{h}" for w, h in SIZES])
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--frames", type=int, default=16, help="frames a round; a quarter of them for slow renderers")
+    parser.add_argument("--rate-seconds", type=float, default=0.0, help="measure pictures a second for so long")
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--memory", action="store_true", help="2,000 pictures and 50 scenes; fails when memory grows")
+    options = parser.parse_args()
+    sizes = [(int(w), int(h)) for w, _, h in (size.partition("x") for size in options.sizes)]
+    renderers = []
+    for name in options.renderers:
+        with ExitStack() as stack:
+            try:
+                stack.enter_context(RENDERERS.load(name)())
+            except RenderError as error:
+                print(f"{name} is left out: {error}")
+                continue
+        renderers.append(name)
+    if options.rounds > 0:
+        table(renderers, sizes, options.rounds, options.frames)
+    if options.rate_seconds > 0:
+        print(f"\nPictures a second, both cameras, {options.rate_seconds:g} s each")
+        rate(renderers, sizes, options.rate_seconds, options.workers)
+    if options.memory and not memory(2000, 50):
+        print("Memory grew.", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

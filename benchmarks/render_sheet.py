@@ -1,0 +1,55 @@
+"""The sheet of pictures in docs/rendering.md: both cameras by every renderer that works here, at three sizes."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+from render import plan, run_episode, setup_for
+
+from demorec.errors import RenderError
+from demorec.rollout import make_world
+from demorec.tables import RENDERERS
+
+SIZES = ((96, 96), (224, 224), (640, 480))
+TILE_HEIGHT = 240
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, default=Path("docs/images/renderers.png"))
+    parser.add_argument("--frame", type=int, default=90)
+    options = parser.parse_args()
+    episode = plan(width=96, height=96)
+    rows = []
+    with make_world(episode.info) as world:
+        state = run_episode(world, episode)[options.frame]
+        world.set_state(joint_position=state.joint_position, object_poses=state.object_poses)
+        for name in RENDERERS.names():
+            row = []
+            try:
+                with RENDERERS.load(name)() as renderer:
+                    for width, height in SIZES:
+                        cameras = tuple(replace(c, width=width, height=height) for c in episode.info.scene.cameras)
+                        renderer.setup(setup_for(world, cameras, antialias=True, everything=False))
+                        for images in renderer.render().values():
+                            wide = round(TILE_HEIGHT * width / height)
+                            nearest = Image.Resampling.NEAREST if height < TILE_HEIGHT else Image.Resampling.LANCZOS
+                            row.append(np.asarray(Image.fromarray(images.color).resize((wide, TILE_HEIGHT), nearest)))
+            except RenderError as error:
+                print(f"{name} is left out: {error}")
+                continue
+            rows.append(np.hstack(row))
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    sheet = Image.fromarray(np.vstack(rows))
+    sheet.save(options.out, optimize=True)
+    print(f"{', '.join(RENDERERS.names())} from the top; {options.out.stat().st_size / 1e3:.0f} kB: {options.out}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

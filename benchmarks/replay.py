@@ -1,0 +1,107 @@
+"""How fast recordings are replayed, checked and drawn anew, and whether the replays are identical to the bit.
+
+    python benchmarks/replay.py --episodes 100 --pictures 2
+
+CPU seconds of this process. Ratios are taken within one interleaved run: each episode is generated, checked,
+replayed and (the first few) drawn anew, one after the other.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from collections import defaultdict
+from pathlib import Path
+
+from demorec.check.report import CheckOptions, Subject, check_subject
+from demorec.config import EpisodePlan, GenerateConfig
+from demorec.recording import EpisodeWriter, Recording
+from demorec.replay import ReplayOptions, open_file, replay_all
+from demorec.rerender import RerenderOptions, rerender
+from demorec.rollout import Rollout, make_renderer, make_world, prepare
+
+
+def generate(path: Path, config: GenerateConfig, index: int) -> None:
+    episode = prepare(EpisodePlan(config=config, episode_index=index))
+    with (
+        make_world(episode.info) as world,
+        make_renderer(episode.info) as renderer,
+        EpisodeWriter(path, episode.info, video=config.video) as writer,
+    ):
+        rollout = Rollout(world, episode, renderer)
+        for frame in rollout:
+            writer.write(frame)
+        assert rollout.outcome is not None
+        writer.finish(rollout.outcome)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--episodes", type=int, default=10, help="without pictures, replayed and checked")
+    parser.add_argument("--pictures", type=int, default=1, help="with two cameras, drawn anew and checked")
+    parser.add_argument("--size", type=int, default=224)
+    parser.add_argument("--task", default="pick_place")
+    arguments = parser.parse_args()
+    cpu: dict[str, float] = defaultdict(float)
+    identical = same_pictures = 0
+    simulated = filmed = 0.0
+
+    def timed(name: str, start: float) -> None:
+        cpu[name] += time.process_time() - start
+
+    with tempfile.TemporaryDirectory() as folder:
+        plain = GenerateConfig(task=arguments.task, cameras=())
+        generate(Path(folder) / "warm.mcap", plain, 10_000)  # compiles what is compiled once
+        for index in range(arguments.episodes):
+            path = Path(folder) / f"{index}.mcap"
+            start = time.process_time()
+            generate(path, plain, index)
+            timed("generate", start)
+            start = time.process_time()
+            report = check_subject(Subject(path=path, kind="recording"), CheckOptions(pictures=False))
+            timed("check", start)
+            assert report.level == "pass", report
+            start = time.process_time()
+            [(replayed, _)] = replay_all([open_file(path, ReplayOptions())], ReplayOptions())
+            timed("replay", start)
+            identical += replayed.is_identical
+            with Recording(path) as recording:
+                simulated += recording.num_frames / recording.info.fps
+        config = GenerateConfig(
+            task=arguments.task, cameras=("front", "wrist"), width=arguments.size, height=arguments.size
+        )
+        if arguments.pictures:
+            generate(Path(folder) / "warm_pictures.mcap", config, 10_000)
+        for index in range(arguments.pictures):
+            path = Path(folder) / f"filmed_{index}.mcap"
+            start = time.process_time()
+            generate(path, config, index)
+            timed("generate with pictures", start)
+            start = time.process_time()
+            drawn = rerender(path, Path(folder) / f"again_{index}.mcap", RerenderOptions())
+            timed("draw anew", start)
+            same_pictures += not drawn.differing
+            start = time.process_time()
+            rerender(
+                path, Path(folder) / f"small_{index}.mcap", RerenderOptions(cameras=("front",), width=96, height=96)
+            )
+            timed("draw one camera, 96x96", start)
+            for pictures in (False, True):
+                start = time.process_time()
+                check_subject(Subject(path=path, kind="recording"), CheckOptions(pictures=pictures))
+                timed("check with pictures" if pictures else "check, not decoding", start)
+            with Recording(path) as recording:
+                filmed += recording.num_frames / recording.info.fps
+    count = arguments.episodes
+    print(f"{identical} of {count} replays identical to the bit, {same_pictures} of {arguments.pictures} drawings")
+    for name, seconds in cpu.items():
+        of_pictures = name not in ("generate", "check", "replay")
+        number, length = (arguments.pictures, filmed) if of_pictures else (count, simulated)
+        print(f"{name:<24} {1e3 * seconds / number:8.1f} CPU ms an episode, {length / seconds:8.1f} times real time")
+    if arguments.pictures:
+        print(f"generate / draw anew: {cpu['generate with pictures'] / cpu['draw anew']:.2f}")
+
+
+if __name__ == "__main__":
+    main()

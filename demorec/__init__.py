@@ -1,0 +1,1 @@
+"""demorec: robot demonstrations people can trust."""

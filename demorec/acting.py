@@ -1,0 +1,107 @@
+"""From what a policy says to what the motors are told: the inverse of `demorec.features.action_vectors`."""
+
+from __future__ import annotations
+
+import math
+from typing import get_args
+
+import numpy as np
+
+from demorec import features
+from demorec.episode import Action, RobotSpec
+from demorec.errors import ConfigError
+from demorec.features import ActionKind
+from demorec.geometry import Array, Pose, wrap_angle
+from demorec.registry import nearest_match
+from demorec.sim.world import World
+
+ACTION_KINDS: tuple[ActionKind, ...] = get_args(ActionKind)
+
+NULL_GAIN = 0.05
+"""Pull of the elbow towards where the expert has it, when a policy commands poses."""
+
+
+def check_action_kind(name: str) -> ActionKind:
+    """Return `name`; ConfigError unless it is a kind of action."""
+    for kind in ACTION_KINDS:
+        if kind == name:
+            return kind
+    raise ConfigError(
+        f"Unknown action {name!r}.{nearest_match(name, ACTION_KINDS)} Allowed: {', '.join(ACTION_KINDS)}."
+    )
+
+
+def action_bounds(robot: RobotSpec, kind: ActionKind, *, fps: int) -> tuple[Array, Array]:
+    """Lowest and highest value (D,) of every component of an action; units as of `features.action_vectors`."""
+    if kind == "joint":
+        low, high = np.array(robot.position_lower), np.array(robot.position_upper)
+    elif kind == "joint_increment":
+        high = np.array(robot.velocity_limit) / fps
+        low = -high
+    elif kind == "ee":
+        high = np.array([2.0] * 3 + [1.0] * 4)
+        low = -high
+    else:
+        # 2 m/s and pi rad/s are more than the arm can follow.
+        high = np.array([2.0] * 3 + [math.pi] * 3) / fps
+        low = -high
+    return np.append(low, 0.0), np.append(high, robot.gripper_max_width)
+
+
+class ActionDecoder:
+    """Turns the actions of one episode into commands, from the world's present targets on.
+
+    Every command is held within the joint limits in position and velocity (from the last command), the gripper
+    within its opening; for a pose out of reach the last targets stay.
+    """
+
+    def __init__(self, world: World, kind: ActionKind) -> None:
+        self._robot, self._kinematics, self._kind = world.robot, world.arm.kinematics, kind
+        self._max_step = np.array(world.robot.velocity_limit) / world.fps
+        self._joint_target: Array = world.arm.target.copy()
+        self._tcp_target: Pose = world.observe().base_from_tcp
+
+    def command(self, values: Array) -> Action:
+        """The command for an action (D,), float64."""
+        wanted = self._wanted(values)
+        wanted = np.clip(wanted, self._kinematics.lower, self._kinematics.upper)
+        wanted = np.clip(wanted, self._joint_target - self._max_step, self._joint_target + self._max_step)
+        self._joint_target = wanted
+        return Action(
+            joint_target=wanted,
+            gripper_target=float(np.clip(values[-1], 0.0, self._robot.gripper_max_width)),
+            base_from_tcp_target=self._kinematics.forward(wanted),
+        )
+
+    def _wanted(self, values: Array) -> Array:
+        if self._kind == "joint":
+            return values[: len(self._joint_target)]
+        if self._kind == "joint_increment":
+            return features.joint_target_from_increment(self._joint_target, values)
+        if self._kind == "ee_delta":
+            self._tcp_target = features.pose_from_delta(self._tcp_target, values)
+        else:
+            self._tcp_target = _pose(values[:7], otherwise=self._tcp_target)
+        found = self._kinematics.inverse(
+            self._tcp_target, start=self._joint_target, rest=self._rest(), null_gain=NULL_GAIN
+        )
+        if found is None:
+            found = self._joint_target
+            self._tcp_target = self._kinematics.forward(found)
+        return found
+
+    def _rest(self) -> Array:
+        """The home configuration turned towards the TCP target, as the expert's."""
+        rest = np.array(self._robot.home_q)
+        home = self._kinematics.forward(rest).position
+        x, y, _ = self._tcp_target.position
+        rest[0] += wrap_angle(math.atan2(y, x) - math.atan2(home[1], home[0]))
+        return rest
+
+
+def _pose(values: Array, *, otherwise: Pose) -> Pose:
+    """Position and quaternion of any length; the given pose where the quaternion is (nearly) zero."""
+    length = math.sqrt(sum(float(v) ** 2 for v in values[3:7]))
+    if length < 1e-3:
+        return otherwise
+    return Pose(position=values[:3], quat_xyzw=values[3:7] / length)

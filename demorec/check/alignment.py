@@ -1,0 +1,126 @@
+"""Do actions and states belong together in time, as the contract says: action t is taken after observation t."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from demorec.check.base import Measurement, check
+from demorec.check.episode import RecordedEpisode
+from demorec.geometry import Array
+
+MAX_LAG = 5
+SERVO_GAIN = 0.2
+"""Of the simulated joints' position control: the share of the error that is gone after a physics step."""
+
+
+def measured_lag(before: Array, after: Array) -> tuple[float, float] | None:
+    """By how many frames `after` (T, n) runs behind `before` (T, n), and what share of its motion that leaves open.
+
+    Least squares over whole lags from -5 to 5, all columns together, each on the scale of its speed and up to a
+    constant, with a parabola through the best lag and its neighbours. None when nothing moves.
+    """
+    speed = np.sqrt((np.diff(before, axis=0) ** 2).mean(axis=0))
+    moving = speed > 1e-5
+    if len(before) < 4 * MAX_LAG or not moving.any():
+        return None
+    x, y = before[:, moving] / speed[moving], after[:, moving] / speed[moving]
+    core = slice(MAX_LAG, len(x) - MAX_LAG)
+    lags = list(range(-MAX_LAG, MAX_LAG + 1))
+    errors = [float((np.roll(y, -lag, axis=0)[core] - x[core]).var(axis=0).sum()) for lag in lags]
+    best = int(np.argmin(errors))
+    left_open = errors[best] / max(float(x[core].var(axis=0).sum()), 1e-12)
+    if best in (0, len(lags) - 1):
+        return float(lags[best]), left_open
+    low, middle, high = errors[best - 1 : best + 2]
+    bend = low - 2 * middle + high
+    return lags[best] + (0.5 * (low - high) / bend if bend > 0 else 0.0), left_open
+
+
+def servo_response(commands: Array, *, start: Array, substeps: int) -> Array:
+    """(T, n) where joints must be at each frame, if command t is sent after observation t.
+
+    The targets move linearly from one command to the next over `substeps` physics steps, and each step takes the
+    joint by the servo's gain towards them: what `demorec.sim` does, without forces.
+    """
+    keep = 1.0 - SERVO_GAIN
+    powers = SERVO_GAIN * keep ** np.arange(substeps - 1, -1, -1)
+    share = np.arange(1, substeps + 1) / substeps
+    from_new, from_old = float((powers * share).sum()), float((powers * (1 - share)).sum())
+    out = np.empty_like(commands)
+    position, previous = start, start
+    for t, command in enumerate(commands):
+        out[t] = position
+        position = keep**substeps * position + from_old * previous + from_new * command
+        previous = command
+    return out
+
+
+def lag_error(before: Array, after: Array, *, what: str) -> Measurement | None:
+    """How far the lag between two motions, which ought to be 0 frames, is off; infinite for unrelated motions."""
+    found = measured_lag(before, after)
+    if found is None:
+        return None
+    lag, left_open = found
+    if left_open > 0.5:
+        return Measurement(value=math.inf, detail=f"{what}: the two do not follow each other at any lag")
+    return Measurement(value=abs(lag), detail=f"{what}: {lag:+.2f} frames off")
+
+
+@check(group="alignment", measures="lag between states and what the commands ask for, frames", warn=0.3, fail=0.6)
+def command_lag(episode: RecordedEpisode) -> Measurement | None:
+    """Command t is sent after observation t and reached, but for the servo's lag, at observation t + 1."""
+    c, info = episode.columns, episode.info
+    expected = servo_response(
+        c.command_joint_target,
+        start=np.array(info.scene.robot.joint_position),
+        substeps=max(info.physics_hz // info.fps, 1),
+    )
+    return lag_error(expected, c.joint_position[:, : episode.num_arm], what="states")
+
+
+@check(group="alignment", measures="lag between action and executed command, frames", warn=0)
+def action_lag(episode: RecordedEpisode) -> Measurement | None:
+    """The action of a frame is the wish behind that frame's command.
+
+    Exploration noise hides this from least squares, but a good part of every episode has none: what counts is the
+    third of the moving frames in which the two are nearest, in units of the way to the next frame.
+    """
+    action, command = episode.columns.action_joint_target, episode.columns.command_joint_target
+    if len(action) < 4 * MAX_LAG:
+        return None
+    core = np.arange(MAX_LAG, len(action) - MAX_LAG)
+    step = np.linalg.norm(action[core + 1] - action[core - 1], axis=1) / 2
+    moving = step > 0.3 * np.sqrt((step**2).mean())
+    if not moving.any() or step.max() < 1e-4:
+        return None
+    core, step = core[moving], step[moving]
+    lags = range(-MAX_LAG, MAX_LAG + 1)
+    off = [float(np.quantile(np.linalg.norm(action[core] - command[core + lag], axis=1) / step, 0.33)) for lag in lags]
+    best = int(np.argmin(off))
+    if off[best] > 3.0:
+        return Measurement(value=math.inf, detail="commands do not follow the actions at any lag")
+    return Measurement(value=abs(lags[best]), detail=f"commands run {lags[best]:+d} frames behind the actions")
+
+
+@check(group="alignment", measures="lag between gripper command and opening, frames beyond the motor's", warn=2, fail=4)
+def gripper_lag(episode: RecordedEpisode) -> Measurement | None:
+    """The opening starts to follow within a few frames of each command to close or open, and never before it."""
+    c, fps = episode.columns, episode.info.fps
+    jumps = np.flatnonzero(np.abs(np.diff(c.command_gripper)) > 0.01) + 1
+    found = None
+    for frame in jumps.tolist():
+        direction = math.copysign(1.0, float(c.command_gripper[frame] - c.command_gripper[frame - 1]))
+        window = slice(max(frame - round(0.4 * fps), 0), frame + round(0.5 * fps) + 1)
+        moved = direction * np.diff(c.gripper_width[window]) > 5e-4 * 30 / fps
+        if not moved.any():
+            continue
+        start = window.start + int(np.argmax(moved))  # the last frame before the opening changes
+        # The command is sent after this observation: the opening may change from this frame to the next at the
+        # earliest; closing fingers need a frame or two to speed up.
+        late = start - frame
+        off = float(-late if late < 0 else max(late - 0.1 * fps, 0.0))
+        if off < 0 or found is None or off > found.value:
+            found = Measurement(value=off, frame=frame, detail=f"starts {late} frames after the command")
+    return found

@@ -1,0 +1,156 @@
+"""What a check is: one function that measures one thing, with the limits that judge it.
+
+A check never judges by itself: it returns the worst value found and where, and the limits in its row turn the value
+into pass, warn or fail. So a report can always say what was found and what is allowed, and `demorec list checks`
+says it beforehand. Larger values are worse, everywhere.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from demorec.errors import DemorecError
+
+Level = Literal["pass", "warn", "fail", "skip"]
+Scope = Literal["recording", "run", "dataset"]
+Group = Literal["file", "time", "physics", "alignment", "calibration", "pictures", "outcome", "run", "dataset"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measurement:
+    """What a check found.
+
+    Attributes:
+        value: The worst value, in the check's unit.
+        frame: Where it was found; None when it belongs to no frame.
+        detail: What exactly (which joint, topic, camera, file), for people.
+    """
+
+    value: float
+    frame: int | None = None
+    detail: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Check:
+    """One check.
+
+    Attributes:
+        name: Its row in `demorec.tables.CHECKS`.
+        group: What it is about.
+        scope: What it looks at: a recording, a run (its folder) or a dataset.
+        measures: What the value is, in words.
+        unit: Of the value and the limits; "" for counts and ratios.
+        warn, fail: The value passes up to `warn`, is a warning up to `fail`, and a failure above.
+        needs_pictures: Whether pictures have to be decoded.
+        measure: The function: a measurement, or None where the thing does not exist (no cameras, no depth).
+    """
+
+    name: str
+    group: Group
+    scope: Scope
+    measures: str
+    unit: str
+    warn: float
+    fail: float
+    needs_pictures: bool
+    measure: Callable[[Any], Measurement | None]
+
+    @property
+    def summary(self) -> str:
+        """One line for `demorec list checks`."""
+        unit = f" {self.unit}" if self.unit else ""
+        warn = "" if self.warn == self.fail else f"warns above {self.warn:g}{unit}, "
+        return f"{self.scope}, {self.group}: {self.measures}; {warn}fails above {self.fail:g}{unit}"
+
+    def run(self, subject: object) -> Result:
+        """Measure and judge; an error of ours while reading is a failure of this check."""
+        try:
+            found = self.measure(subject)
+        except DemorecError as error:
+            return self._result("fail", Measurement(value=math.nan, detail=str(error)))
+        if found is None:
+            return self._result("skip", Measurement(value=math.nan, detail="nothing to measure"))
+        return self._result(self.judge(found.value), found)
+
+    def skipped(self, why: str) -> Result:
+        """The result of a check that could not be run."""
+        return self._result("skip", Measurement(value=math.nan, detail=why))
+
+    def judge(self, value: float) -> Level:
+        """The level of a value; what is no number fails."""
+        if value <= self.warn:
+            return "pass"
+        return "warn" if value <= self.fail else "fail"
+
+    def _result(self, level: Level, found: Measurement) -> Result:
+        return Result(
+            check=self.name,
+            group=self.group,
+            level=level,
+            value=None if math.isnan(found.value) else float(found.value),
+            unit=self.unit,
+            warn=self.warn,
+            fail=self.fail,
+            frame=found.frame,
+            detail=found.detail,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Result:
+    """A check's judgement of one subject.
+
+    Attributes:
+        check, group, unit, warn, fail: As in `Check`.
+        level: "skip" where there was nothing to measure.
+        value: What was found; None when nothing could be measured.
+        frame, detail: As in `Measurement`.
+    """
+
+    check: str
+    group: str
+    level: Level
+    value: float | None
+    unit: str
+    warn: float
+    fail: float
+    frame: int | None
+    detail: str
+
+
+def check(
+    *,
+    group: Group,
+    measures: str,
+    warn: float,
+    fail: float | None = None,
+    unit: str = "",
+    scope: Scope = "recording",
+    needs_pictures: bool = False,
+) -> Callable[[Callable[[Any], Measurement | None]], Check]:
+    """Make a `Check` of a function; its name is the function's. Without `fail` there is no range for warnings."""
+
+    def wrap(function: Callable[[Any], Measurement | None]) -> Check:
+        return Check(
+            name=function.__name__,
+            group=group,
+            scope=scope,
+            measures=measures,
+            unit=unit,
+            warn=warn,
+            fail=warn if fail is None else fail,
+            needs_pictures=needs_pictures,
+            measure=function,
+        )
+
+    return wrap
+
+
+def worst(*found: Measurement | None) -> Measurement | None:
+    """The measurement of the largest value (a NaN counts as largest); None when there is none."""
+    known = [measurement for measurement in found if measurement is not None]
+    return max(known, key=lambda m: math.inf if math.isnan(m.value) else m.value, default=None)

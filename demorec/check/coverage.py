@@ -1,0 +1,183 @@
+"""How well the episodes cover what was randomised: the largest gaps, and a picture to look at."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageDraw
+
+from demorec.check.base import Measurement
+from demorec.episode import EpisodeInfo
+from demorec.geometry import Array
+from demorec.scene import Goal, Scene, yaw_of
+
+MIN_EPISODES = 30
+"""With fewer, gaps are chance."""
+_MIN_VALUES = 10
+"""A quantity with fewer distinct values was not drawn from a range."""
+_SIZE, _MARGIN, _PLOT = 360, 24, 84
+
+
+def randomised(infos: Sequence[EpisodeInfo]) -> dict[str, Array]:
+    """Name -> one value per episode, of the start places, yaws and sizes of objects and the places of goals.
+
+    Quantities that not all episodes have, or that take only a few values, are left out. Lengths in metres, yaws in
+    rad within the body's symmetry.
+    """
+    rows = [_values(info.scene) for info in infos]
+    if not rows:
+        return {}
+    names = [name for name in rows[0] if all(name in row for row in rows)]
+    columns = {name: np.array([row[name] for row in rows]) for name in names}
+    return {name: values for name, values in columns.items() if len(np.unique(values)) >= _MIN_VALUES}
+
+
+def _values(scene: Scene) -> dict[str, float]:
+    values: dict[str, float] = {}
+    for number, goal in enumerate(scene.goals):
+        body = scene.body(goal.object)
+        label = "object" if len(scene.goals) == 1 else f"object {number + 1}"
+        position = body.world_from_body.position
+        values[f"{label} x"], values[f"{label} y"] = float(position[0]), float(position[1])
+        if body.yaw_symmetry > 0:
+            values[f"{label} yaw"] = yaw_of(body.world_from_body) % (2 * math.pi / body.yaw_symmetry)
+        values[f"{label} size"] = max(body.shape.extents)
+        if body.mass > 0:
+            values[f"{label} mass"] = body.mass
+        goal_position = world_from_goal(scene, goal)
+        goal_label = "goal" if len(scene.goals) == 1 else f"goal {number + 1}"
+        values[f"{goal_label} x"], values[f"{goal_label} y"] = float(goal_position[0]), float(goal_position[1])
+    return values
+
+
+def world_from_goal(scene: Scene, goal: Goal) -> Array:
+    """(3,) where the object shall end, as things stand at the start."""
+    pose = scene.body(goal.onto).world_from_body @ goal.onto_from_goal if goal.onto else goal.onto_from_goal
+    return pose.position
+
+
+def largest_gap(infos: Sequence[EpisodeInfo]) -> Measurement | None:
+    """The largest stretch of any randomised quantity in which no episode lies, as a share of its range."""
+    if len(infos) < MIN_EPISODES:
+        return None
+    columns = randomised(infos)
+    if not columns:
+        return Measurement(value=1.0, detail="no start place, yaw or size differs between the episodes")
+    gaps = {}
+    for name, values in columns.items():
+        ordered = np.sort(values)
+        gaps[name] = float(np.diff(ordered).max() / max(ordered[-1] - ordered[0], 1e-12))
+    name = max(gaps, key=lambda key: gaps[key])
+    return Measurement(value=gaps[name], detail=f"{name}, {len(infos)} episodes, {len(columns)} quantities")
+
+
+def start_vector(scene: Scene) -> Array:
+    """All that is random about a start, in one row: poses and sizes of the bodies, joints; for finding twins."""
+    parts: list[Array] = [np.array(scene.robot.joint_position)]
+    for body in scene.bodies:
+        if body.role in ("object", "target", "distractor"):
+            parts += [body.world_from_body.vector(), np.array(body.shape.extents)]
+    return np.concatenate(parts)
+
+
+def twins(rows: Sequence[Array], names: Sequence[str], *, tolerance: float) -> tuple[int, str]:
+    """How many rows are within `tolerance` (root mean square) of an earlier one, and the first such pair."""
+    count, first = 0, ""
+    by_length: dict[int, list[int]] = {}
+    for index, row in enumerate(rows):
+        by_length.setdefault(len(row), []).append(index)
+    for group in by_length.values():
+        table = np.array([rows[index] for index in group])
+        # Sorted along the widest column, only neighbours within the tolerance have to be compared.
+        axis = int(np.argmax(np.ptp(table, axis=0))) if len(table) > 1 else 0
+        order = np.argsort(table[:, axis], kind="stable")
+        reach = tolerance * math.sqrt(table.shape[1]) if table.size else 0.0
+        is_twin = np.zeros(len(group), dtype=bool)
+        for place, i in enumerate(order):
+            for j in order[place + 1 :]:
+                if table[j, axis] - table[i, axis] > reach:
+                    break
+                if math.sqrt(float(((table[i] - table[j]) ** 2).mean())) <= tolerance:
+                    later, earlier = max(i, j), min(i, j)
+                    is_twin[later] = True
+                    first = first or f"{names[group[later]]} is like {names[group[earlier]]}"
+        count += int(is_twin.sum())
+    return count, first
+
+
+@dataclass(frozen=True, kw_only=True)
+class CoveragePicture:
+    """What was drawn: the file and how many episodes are in it."""
+
+    path: Path
+    num_episodes: int
+
+
+def draw_coverage(infos: Sequence[EpisodeInfo], path: Path) -> CoveragePicture:
+    """A picture: starts (dots, in the object's colour) and goals (rings) from above, and a histogram per quantity."""
+    columns = randomised(infos)
+    rows = -(-max(len(columns), 1) // 3)
+    height = max(_SIZE + 2 * _MARGIN, rows * (_PLOT + 2 * _MARGIN) + _MARGIN)
+    image = Image.new("RGB", (_SIZE + 2 * _MARGIN + 3 * (140 + _MARGIN) + _MARGIN, height), "white")
+    draw = ImageDraw.Draw(image)
+    _draw_map(draw, infos)
+    for number, (name, values) in enumerate(columns.items()):
+        left = _SIZE + 3 * _MARGIN + (number % 3) * (140 + _MARGIN)
+        top = _MARGIN + (number // 3) * (_PLOT + 2 * _MARGIN)
+        _draw_histogram(draw, name, values, left, top)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    image.save(path)
+    return CoveragePicture(path=path, num_episodes=len(infos))
+
+
+def _draw_map(draw: ImageDraw.ImageDraw, infos: Sequence[EpisodeInfo]) -> None:
+    starts = [(info.scene.body(g.object), world_from_goal(info.scene, g)) for info in infos for g in info.scene.goals]
+    draw.rectangle((_MARGIN, _MARGIN, _MARGIN + _SIZE, _MARGIN + _SIZE), outline="grey")
+    if not starts:
+        return
+    points = np.array(
+        [[*body.world_from_body.position[:2]] for body, _ in starts] + [[*goal[:2]] for _, goal in starts]
+    )
+    low, high = points.min(axis=0), points.max(axis=0)
+    side = max(float((high - low).max()), 1e-6) * 1.1
+    middle = (low + high) / 2
+
+    def place(x: float, y: float) -> tuple[float, float]:
+        # From above, the robot at the bottom looking up: x up, y to the left.
+        return (
+            _MARGIN + _SIZE / 2 - (y - middle[1]) / side * _SIZE,
+            _MARGIN + _SIZE / 2 - (x - middle[0]) / side * _SIZE,
+        )
+
+    for body, goal in starts:
+        u, v = place(float(goal[0]), float(goal[1]))
+        draw.ellipse((u - 4, v - 4, u + 4, v + 4), outline="grey")
+        u, v = place(float(body.world_from_body.position[0]), float(body.world_from_body.position[1]))
+        color = tuple(int(255 * channel) for channel in body.rgba[:3])
+        draw.ellipse((u - 3, v - 3, u + 3, v + 3), fill=color)
+    draw.text(
+        (_MARGIN, 6), f"{len(infos)} episodes from above, {side:.2f} m wide: starts and (grey) goals", fill="black"
+    )
+
+
+def _draw_histogram(draw: ImageDraw.ImageDraw, name: str, values: Array, left: int, top: int) -> None:
+    counts, edges = np.histogram(values, bins=14)
+    draw.text((left, top - 14), f"{name}: {edges[0]:.3g} .. {edges[-1]:.3g}", fill="black")
+    draw.rectangle((left, top, left + 140, top + _PLOT), outline="grey")
+    for number, count in enumerate(counts.tolist()):
+        bar = _PLOT * count / max(int(counts.max()), 1)
+        draw.rectangle(
+            (left + 10 * number + 1, top + _PLOT - bar, left + 10 * number + 8, top + _PLOT), fill=(70, 110, 180)
+        )
+
+
+def infos_by_task(infos: Sequence[EpisodeInfo]) -> Mapping[str, list[EpisodeInfo]]:
+    """Episodes of the same task and scene layout."""
+    groups: dict[str, list[EpisodeInfo]] = {}
+    for info in infos:
+        groups.setdefault(info.task, []).append(info)
+    return groups

@@ -1,0 +1,215 @@
+"""A recording as the checks see it: everything is read once, when the first check asks for it."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.check.pictures_summary import PictureSummary, summarise
+from demorec.check.rows import inverse, link_matrices, matrices
+from demorec.episode import EpisodeColumns, EpisodeInfo, frame_time_ns
+from demorec.errors import RecordingError
+from demorec.geometry import Array
+from demorec.recording import Recording, channels, messages
+from demorec.recording.container import Container
+from demorec.scene import Camera
+from demorec.urdf import Urdf
+
+ROBOT_DESCRIPTION = "/robot_description"
+
+_STAMP_FIRST = {
+    "sensor_msgs/msg/JointState",
+    "geometry_msgs/msg/PoseStamped",
+    "sensor_msgs/msg/CompressedImage",
+    "sensor_msgs/msg/Image",
+    "foxglove_msgs/msg/CompressedVideo",
+    "rcl_interfaces/msg/Log",
+}
+"""Types whose first field is a time stamp, alone or in a header."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TopicScan:
+    """What was found on one topic, in the order of the file.
+
+    Attributes:
+        schema: Its type.
+        time_ns: (N,) time of each message.
+        stamp_ns: (N,) time stamp inside each message; None for types without one.
+        first: Bytes of the first message.
+    """
+
+    schema: str
+    time_ns: NDArray[np.int64]
+    stamp_ns: NDArray[np.int64] | None
+    first: bytes
+
+
+class RecordedEpisode:
+    """One recording; a context manager. Properties raise RecordingError where the file does not give them.
+
+    Args:
+        path: The recording.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._recording: Recording | None = None
+        self._pictures: dict[str, PictureSummary] = {}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file; harmless when called twice."""
+        if self._recording is not None:
+            self._recording.close()
+
+    @property
+    def recording(self) -> Recording:
+        """The open recording."""
+        if self._recording is None:
+            self._recording = Recording(self.path)
+        return self._recording
+
+    @property
+    def info(self) -> EpisodeInfo:
+        """What was known before the first frame."""
+        return self.recording.info
+
+    @cached_property
+    def columns(self) -> EpisodeColumns:
+        """All numbers."""
+        return self.recording.columns()
+
+    @property
+    def num_frames(self) -> int:
+        """T."""
+        return self.recording.num_frames
+
+    @cached_property
+    def frame_times(self) -> NDArray[np.int64]:
+        """(T,) ns: when each frame ought to be."""
+        return np.array([frame_time_ns(t, self.info.fps) for t in range(self.num_frames)], dtype=np.int64)
+
+    @cached_property
+    def scan(self) -> dict[str, TopicScan]:
+        """Every message of every topic, read once: every chunk's checksum is verified on the way."""
+        container = Container(self.path)
+        try:
+            schemas = {name: container.schemas[c.schema_id].name for name, c in container.channels.items()}
+            times: dict[str, list[int]] = {topic: [] for topic in schemas}
+            stamps: dict[str, list[int]] = {topic: [] for topic in schemas}
+            first: dict[str, bytes] = {}
+            stamped = {topic for topic, schema in schemas.items() if schema in _STAMP_FIRST}
+            for topic, time_ns, data in container.messages(list(schemas)):
+                times[topic].append(time_ns)
+                if topic in stamped:
+                    stamps[topic].append(_stamp(data))
+                first.setdefault(topic, data)
+            for name in container.attachment_names:
+                container.attachment(name)
+        finally:
+            container.close()
+        return {
+            topic: TopicScan(
+                schema=schema,
+                time_ns=np.array(times[topic], dtype=np.int64),
+                stamp_ns=np.array(stamps[topic], dtype=np.int64) if topic in stamped else None,
+                first=first.get(topic, b""),
+            )
+            for topic, schema in schemas.items()
+        }
+
+    @cached_property
+    def index_counts(self) -> dict[str, int]:
+        """topic -> number of messages according to the file's index."""
+        return {topic: count for topic, (_, count) in self.recording.topics.items()}
+
+    # ------------------------------------------------------------------------------------------- the robot
+
+    @property
+    def num_arm(self) -> int:
+        """How many arm joints the robot has."""
+        return len(self.info.robot.arm_joints)
+
+    @cached_property
+    def urdf(self) -> Urdf:
+        """The robot's joint tree, from the URDF that the recording itself contains (already scaled)."""
+        found = self.scan.get(ROBOT_DESCRIPTION)
+        if found is None or not found.first:
+            raise RecordingError(f"The recording has no URDF of its robot on {ROBOT_DESCRIPTION}: {self.path}")
+        try:
+            return Urdf.parse(messages.read_string(found.first))
+        except (ValueError, KeyError, AttributeError) as error:
+            raise RecordingError(f"The URDF on {ROBOT_DESCRIPTION} cannot be used ({error}): {self.path}") from error
+
+    def base_from_link(self, link: str, joint_position: Array) -> Array:
+        """(T, 4, 4) by forward kinematics of (T, n_arm) or (T, n_joints) positions; KeyError for an unknown link."""
+        by_name = dict(zip(self.info.robot.joint_names, joint_position.T, strict=False))
+        return link_matrices(self.urdf, link, by_name, len(joint_position))
+
+    @cached_property
+    def world_from_base(self) -> Array:
+        """(1, 4, 4)."""
+        return self.info.scene.robot.world_from_base.matrix()[None]
+
+    @cached_property
+    def world_from_tcp(self) -> Array:
+        """(T, 4, 4) by forward kinematics of the recorded joints."""
+        fk = self.base_from_link(self.info.robot.tcp_link, self.columns.joint_position)
+        return np.asarray(self.world_from_base @ fk)
+
+    def world_from_object(self, name: str) -> Array:
+        """(T, 4, 4) of a movable body as recorded."""
+        return matrices(self.columns.object_poses[name])
+
+    # ------------------------------------------------------------------------------------------- the cameras
+
+    @property
+    def cameras(self) -> tuple[Camera, ...]:
+        """Of the scene."""
+        return self.info.scene.cameras
+
+    def camera_from_world(self, camera: str) -> Array:
+        """(T, 4, 4) as recorded."""
+        return inverse(matrices(self.columns.world_from_camera[camera]))
+
+    def recorded_intrinsics(self, camera: str) -> Array:
+        """(3, 3) K as the camera's own calibration message has it, which is what other programs read."""
+        found = self.scan.get(channels.camera_topic(camera, "camera_info"))
+        if found is None or not found.first:
+            raise RecordingError(f"The recording has no calibration of the camera {camera!r}: {self.path}")
+        return messages.read_camera_info(found.first).intrinsics
+
+    def pictures(self, camera: Camera) -> PictureSummary:
+        """What the checks need of a camera's decoded pictures; decoded once."""
+        if camera.name not in self._pictures:
+            self._pictures[camera.name] = summarise(self, camera)
+        return self._pictures[camera.name]
+
+
+def _stamp(data: bytes) -> int:
+    with suppress(struct.error):
+        seconds, nanoseconds = struct.unpack_from("<iI", data, 4)
+        return int(seconds) * 1_000_000_000 + int(nanoseconds)
+    return -1
+
+
+def goal_objects(info: EpisodeInfo) -> Iterator[str]:
+    """Names of the objects that have a goal, in order."""
+    yield from dict.fromkeys(goal.object for goal in info.scene.goals)

@@ -1,0 +1,85 @@
+"""Is the file whole: index, checksums, topics, readable to the last message."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from demorec.check.base import Measurement, check
+from demorec.check.episode import RecordedEpisode
+from demorec.episode import FORMAT_VERSION
+from demorec.recording import channels, messages
+
+
+@check(group="file", measures="recordings that cannot be opened (index, metadata, format version)", warn=0)
+def opens(episode: RecordedEpisode) -> Measurement:
+    """The index and the metadata pass their checksums and are of a known format version."""
+    version = episode.recording.info.format_version
+    return Measurement(value=0, detail=f"format version {version} of {FORMAT_VERSION}")
+
+
+@check(group="file", measures="topics whose message count differs from the index; every chunk passes its CRC", warn=0)
+def checksums(episode: RecordedEpisode) -> Measurement:
+    """Every byte that holds a message or an attachment passes its checksum, and the index counts them right."""
+    counts = {topic: len(scan.time_ns) for topic, scan in episode.scan.items()}
+    wrong = [
+        f"{topic}: {counts[topic]}, index says {count}"
+        for topic, count in episode.index_counts.items()
+        if counts[topic] != count
+    ]
+    return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{sum(counts.values())} messages")
+
+
+@check(group="file", measures="topics that are missing, of another type or not one message a frame", warn=0)
+def topics(episode: RecordedEpisode) -> Measurement:
+    """Every stream that the metadata promises is there, of its type, with one message for each frame."""
+    expected: dict[str, tuple[str, int | None]] = {}
+    for stream in channels.state_streams(episode.info):
+        expected[stream.topic] = (stream.schema, episode.num_frames)
+    for camera in episode.cameras:
+        expected |= {topic: (schema, episode.num_frames) for topic, schema in _picture_streams(episode, camera.name)}
+        expected[channels.camera_topic(camera.name, "camera_info")] = (messages.CAMERA_INFO, None)
+    wrong = []
+    for topic, (schema, count) in expected.items():
+        found = episode.scan.get(topic)
+        if found is None:
+            wrong.append(f"{topic} is missing")
+        elif found.schema != schema:
+            wrong.append(f"{topic} is {found.schema}, expected {schema}")
+        elif topic == channels.JOINT_STATES:
+            # There may be more joint states than frames, but one at each frame.
+            missing = episode.num_frames - len(set(found.time_ns.tolist()) & set(episode.frame_times.tolist()))
+            if missing:
+                wrong.append(f"{topic} lacks {missing} frames")
+        elif count is not None and len(found.time_ns) != count:
+            wrong.append(f"{topic} has {len(found.time_ns)} messages, expected {count}")
+        elif len(found.time_ns) == 0:
+            wrong.append(f"{topic} is empty")
+    return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{len(expected)} topics")
+
+
+def _picture_streams(episode: RecordedEpisode, camera: str) -> Iterator[tuple[str, str]]:
+    recording = episode.recording
+    codec = recording.video_settings(camera).codec
+    schema = messages.PROTOBUF_VIDEO if codec == "av1" else messages.COMPRESSED_IMAGE
+    yield channels.video_topic(camera, codec), schema
+    if codec == "h264":
+        yield channels.camera_topic(camera, "video"), messages.COMPRESSED_VIDEO
+    if recording.has_depth(camera):
+        yield channels.camera_topic(camera, "depth"), messages.COMPRESSED_IMAGE
+    if recording.has_segmentation(camera):
+        yield channels.camera_topic(camera, "segmentation"), messages.COMPRESSED_IMAGE
+
+
+@check(group="file", measures="streams that do not decode into numbers", warn=0)
+def readable(episode: RecordedEpisode) -> Measurement:
+    """Every message has the layout that the metadata promises."""
+    num_frames = episode.columns.num_frames
+    num_events = sum(1 for _ in episode.recording.events())
+    return Measurement(value=0, detail=f"{num_frames} frames, {num_events} events")
+
+
+@check(group="file", measures="recordings that a crash cut off (recovered, without an outcome)", warn=0, fail=1)
+def complete(episode: RecordedEpisode) -> Measurement:
+    """The episode was recorded to its end."""
+    cut = episode.recording.outcome is None
+    return Measurement(value=int(cut), detail="recovered from a crash, no outcome" if cut else "")

@@ -1,0 +1,231 @@
+"""Do objects behave like things: still unless touched, never through each other, carried only by a closed hand."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.check.base import Measurement, check, worst
+from demorec.check.episode import RecordedEpisode
+from demorec.check.rows import displacement, inverse, matrices
+from demorec.geometry import Array
+from demorec.scene import Body, Shape
+
+COAST_SECONDS = 0.7
+"""How long a thing may go on moving by itself after it was last touched."""
+SOLID = ("box", "sphere", "cylinder", "capsule")
+"""Shapes that fill what their size says; a mesh's or URDF's bounding box may be hollow."""
+
+
+def _speeds(episode: RecordedEpisode, name: str) -> Array:
+    """(T - 1, 3) m/s between frames."""
+    return np.asarray(np.diff(episode.columns.object_poses[name][:, :3], axis=0) * episode.info.fps)
+
+
+def _near_hand(episode: RecordedEpisode, body: Body) -> NDArray[np.bool_]:
+    """(T,) whether hand or fingers may touch a body: its bounding sphere and a hand's breadth overlap."""
+    radius = math.hypot(*body.shape.extents) / 2
+    hand = episode.base_from_link(episode.info.robot.hand_link, episode.columns.joint_position)
+    hand = episode.world_from_base @ hand
+    centre = episode.columns.object_poses[body.name][:, :3]
+    near_tcp = np.linalg.norm(episode.world_from_tcp[:, :3, 3] - centre, axis=1) < radius + 0.06
+    near_hand = np.linalg.norm(hand[:, :3, 3] - centre, axis=1) < radius + 0.12
+    return np.asarray(near_tcp | near_hand)
+
+
+def _touched(episode: RecordedEpisode) -> dict[str, NDArray[np.bool_]]:
+    """name -> (T - 1,) whether a movable body may have been pushed between frames t and t + 1.
+
+    By the hand, or by another movable body that is near it and was itself pushed less than a moment ago.
+    """
+    bodies = [body for body in episode.info.scene.movable if body.name in episode.columns.object_poses]
+    coast = round(COAST_SECONDS * episode.info.fps)
+    active = {}
+    for body in bodies:
+        near = _near_hand(episode, body)
+        velocity = _speeds(episode, body.name)
+        # What starts in the air falls straight down, and comes to rest after that.
+        falling = velocity[:, 2] < -0.05 - 3.0 * np.linalg.norm(velocity[:, :2], axis=1)
+        active[body.name] = _held_for(near[:-1] | near[1:] | falling, coast)
+    for _ in range(len(bodies) - 1):  # a push travels from body to body
+        for body in bodies:
+            for other in bodies:
+                if other.name == body.name:
+                    continue
+                reach = (math.hypot(*body.shape.extents) + math.hypot(*other.shape.extents)) / 2 + 0.01
+                gap = np.linalg.norm(
+                    episode.columns.object_poses[body.name][:, :3] - episode.columns.object_poses[other.name][:, :3],
+                    axis=1,
+                )
+                close = (gap < reach)[:-1] & active[other.name]
+                active[body.name] = active[body.name] | _held_for(close, coast)
+    return active
+
+
+def _held_for(flags: NDArray[np.bool_], count: int) -> NDArray[np.bool_]:
+    """Each True lasts for `count` more entries."""
+    if not len(flags):
+        return flags
+    last = np.where(flags, np.arange(len(flags)), -(10**9))
+    return np.asarray(np.arange(len(flags)) - np.maximum.accumulate(last) <= count)
+
+
+@check(group="physics", measures="fastest motion of an object that nothing touches", unit="m/s", warn=0.03, fail=0.1)
+def object_motion(episode: RecordedEpisode) -> Measurement | None:
+    """An object moves only when touched, or for a moment after it (falling, rolling, tipping)."""
+    found = []
+    for name, touched in _touched(episode).items():
+        speed = np.linalg.norm(_speeds(episode, name), axis=1)
+        speed = np.where(touched, 0.0, speed)
+        if len(speed):
+            frame = int(np.argmax(speed))
+            found.append(Measurement(value=float(speed[frame]), frame=frame + 1, detail=name))
+    return worst(*found)
+
+
+@check(group="physics", measures="object speed beyond that of the hand and of falling", unit="m/s", warn=0.8, fail=1.5)
+def teleports(episode: RecordedEpisode) -> Measurement | None:
+    """No object jumps."""
+    c, fps = episode.columns, episode.info.fps
+    if c.num_frames < 2:
+        return None
+    hand = displacement(episode.world_from_tcp[1:], episode.world_from_tcp[:-1]) * fps
+    found = []
+    for name in c.object_poses:
+        velocity = _speeds(episode, name)
+        falling = np.minimum(np.maximum(-velocity[:, 2], 0.0), 3.5)
+        beyond = np.linalg.norm(velocity, axis=1) - hand - falling
+        frame = int(np.argmax(beyond))
+        found.append(Measurement(value=max(float(beyond[frame]), 0.0), frame=frame + 1, detail=name))
+    return worst(*found)
+
+
+@check(group="physics", measures="distance of the first frame from the scene's start", unit="m", warn=0.01, fail=0.03)
+def starts_as_scene_says(episode: RecordedEpisode) -> Measurement | None:
+    """Objects and joints begin where the scene put them (0.1 m per rad of rotation; 0.1 m per rad of a joint).
+
+    Physics settles for 0.1 s before the first frame, in which an object may fall, by 5.5 cm at most.
+    """
+    c, scene = episode.columns, episode.info.scene
+    if not c.num_frames:
+        return None
+    joints = np.abs(c.joint_position[0, : episode.num_arm] - np.array(scene.robot.joint_position))
+    worst_joint = int(np.argmax(joints))
+    found = [
+        Measurement(value=0.1 * float(joints[worst_joint]), frame=0, detail=episode.info.robot.arm_joints[worst_joint]),
+        Measurement(value=abs(float(c.gripper_width[0]) - scene.robot.gripper_width), frame=0, detail="gripper"),
+    ]
+    for body in scene.movable:
+        placed = matrices(body.world_from_body.vector()[None])
+        placed[0, 2, 3] -= min(max(float(placed[0, 2, 3] - c.object_poses[body.name][0, 2]), 0.0), 0.055)
+        off = displacement(matrices(c.object_poses[body.name][:1]), placed, lever=0.1)
+        found.append(Measurement(value=float(off[0]), frame=0, detail=body.name))
+    return worst(*found)
+
+
+@check(group="physics", measures="depth to which a body is inside another", unit="m", warn=0.003, fail=0.008)
+def penetration(episode: RecordedEpisode) -> Measurement | None:
+    """Nothing solid is inside anything solid (boxes, spheres, cylinders, capsules)."""
+    scene = episode.info.scene
+    movable = [body for body in scene.movable if body.shape.kind in SOLID]
+    still = [b for b in scene.bodies if b.collides and not b.movable and b.shape.kind in SOLID]
+    found = []
+    for number, body in enumerate(movable):
+        pose = episode.world_from_object(body.name)
+        for other in (*still, *movable[number + 1 :]):
+            other_pose = (
+                episode.world_from_object(other.name) if other.movable else other.world_from_body.matrix()[None]
+            )
+            reach = (math.hypot(*body.shape.extents) + math.hypot(*other.shape.extents)) / 2
+            near = np.flatnonzero(np.linalg.norm(pose[:, :3, 3] - other_pose[:, :3, 3], axis=1) < reach)
+            if not len(near):
+                continue
+            depth = np.maximum(
+                _depth_inside(body.shape, pose[near], other.shape, _rows(other_pose, near)),
+                _depth_inside(other.shape, _rows(other_pose, near), body.shape, pose[near]),
+            )
+            row = int(np.argmax(depth))
+            detail = f"{body.name} in {other.name}"
+            found.append(Measurement(value=float(depth[row]), frame=int(near[row]), detail=detail))
+    if not found and movable:
+        return Measurement(value=0.0, detail="nothing comes near anything")
+    return worst(*found)
+
+
+def _rows(transforms: Array, rows: NDArray[np.intp]) -> Array:
+    return transforms if len(transforms) == 1 else transforms[rows]
+
+
+def _depth_inside(shape: Shape, pose: Array, other: Shape, other_pose: Array) -> Array:
+    """(T,) how deep the deepest surface point of one shape lies inside another, metres, 0 outside."""
+    points = _surface_points(shape)
+    relative = inverse(other_pose) @ pose
+    local = np.einsum("tij,pj->tpi", relative[:, :3, :3], points) + relative[:, None, :3, 3]
+    half = np.array(other.extents) / 2
+    if other.kind == "box":
+        depth = (half - np.abs(local)).min(axis=2)
+    elif other.kind == "sphere":
+        depth = half[0] - np.linalg.norm(local, axis=2)
+    elif other.kind == "cylinder":
+        depth = np.minimum(half[0] - np.hypot(local[..., 0], local[..., 1]), half[2] - np.abs(local[..., 2]))
+    else:
+        axis_end = np.clip(local[..., 2], -other.size[1] / 2, other.size[1] / 2)
+        depth = half[0] - np.sqrt(local[..., 0] ** 2 + local[..., 1] ** 2 + (local[..., 2] - axis_end) ** 2)
+    return np.asarray(np.maximum(depth.max(axis=1), 0.0))
+
+
+def _surface_points(shape: Shape) -> Array:
+    """(P, 3) points of a solid's surface: corners and face centres of a box, rings of a round body."""
+    half = np.array(shape.extents) / 2
+    if shape.kind == "box":
+        grid = np.array(np.meshgrid([-1, 0, 1], [-1, 0, 1], [-1, 0, 1])).reshape(3, -1).T
+        return np.asarray(grid[np.abs(grid).max(axis=1) == 1] * half)
+    angles = np.arange(16) * (2 * math.pi / 16)
+    ring = np.stack([np.cos(angles), np.sin(angles), np.zeros(16)], axis=1)
+    poles = np.array([[0, 0, -half[2]], [0, 0, half[2]]])
+    if shape.kind == "cylinder":
+        ends = [ring * half[0] + [0, 0, z] for z in (-half[2], 0.0, half[2])]
+        return np.concatenate([*ends, poles])
+    middle = 0.0 if shape.kind == "sphere" else shape.size[1] / 2
+    rows = [
+        ring * [half[0] * math.cos(a), half[0] * math.cos(a), 0]
+        + [0, 0, math.copysign(middle, a) + half[0] * math.sin(a)]
+        for a in np.linspace(-1.2, 1.2, 7)
+    ]
+    return np.concatenate([*rows, poles])
+
+
+@check(group="physics", measures="frames in which an object moves through the air unheld", warn=2, fail=5)
+def carried_by_gripper(episode: RecordedEpisode) -> Measurement | None:
+    """While an object travels above where it rests, fingers press on it and stand as far apart as it is wide."""
+    c, fps = episode.columns, episode.info.fps
+    if c.num_frames < 3 or not episode.info.scene.movable:
+        return None
+    found = []
+    # A contact that a frame happens to miss is none that was lost: the strongest of three neighbours counts.
+    force = np.max([c.contact_force[:-2], c.contact_force[1:-1], c.contact_force[2:]], axis=0)
+    width = c.gripper_width[1:-1]
+    for body in episode.info.scene.movable:
+        pose = c.object_poses[body.name]
+        velocity = (pose[2:, :3] - pose[:-2, :3]) * (fps / 2)
+        fall = (pose[2:, 2] - 2 * pose[1:-1, 2] + pose[:-2, 2]) * fps**2 < -4.0
+        # A fall, and what follows it for a moment, needs no hand.
+        falling = _held_for(fall | (velocity[:, 2] < -0.5), round(COAST_SECONDS * fps))
+        travelling = (np.linalg.norm(velocity, axis=1) > 0.08) & (pose[1:-1, 2] > pose[0, 2] + 0.03) & ~falling
+        reach = math.hypot(*body.shape.extents) / 2 + 0.03
+        distance = np.linalg.norm(pose[1:-1, :3] - episode.world_from_tcp[1:-1, :3, 3], axis=1)
+        thinnest = min(body.shape.extents) - 0.004 if body.shape.kind in SOLID else 0.002
+        held = (force > 0.3) & (distance < reach) & (width > thinnest)
+        wrong = travelling & ~held
+        if wrong.any():
+            frame = int(np.argmax(wrong))
+            detail = (
+                f"{body.name}: {force[frame]:.2f} N, {distance[frame] * 1e3:.0f} mm from the TCP, "
+                f"opening {width[frame] * 1e3:.0f} mm"
+            )
+            found.append(Measurement(value=int(wrong.sum()), frame=frame + 1, detail=detail))
+        else:
+            found.append(Measurement(value=0, detail=f"{body.name} travels {int(travelling.sum())} frames"))
+    return worst(*found)

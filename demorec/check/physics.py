@@ -1,0 +1,191 @@
+"""Can a robot have moved like this: limits, kinematics, and the commands that are said to have caused it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from demorec.check.base import Measurement, check, worst
+from demorec.check.episode import RecordedEpisode
+from demorec.check.rows import displacement, matrices
+from demorec.geometry import Array
+
+
+def _worst_joint(episode: RecordedEpisode, table: Array, *, frame_offset: int = 0) -> Measurement | None:
+    """The largest entry of (T, n_arm), with its frame and joint."""
+    if not table.size:
+        return None
+    frame, joint = (int(i) for i in np.unravel_index(int(np.argmax(table)), table.shape))
+    return Measurement(
+        value=float(table[frame, joint]), frame=frame + frame_offset, detail=episode.info.robot.arm_joints[joint]
+    )
+
+
+@check(group="physics", measures="numbers that are NaN or infinite", warn=0)
+def finite_numbers(episode: RecordedEpisode) -> Measurement:
+    """Every recorded number is one."""
+    c = episode.columns
+    tables = {
+        "joint_position": c.joint_position,
+        "joint_velocity": c.joint_velocity,
+        "joint_effort": c.joint_effort,
+        "gripper_width": c.gripper_width,
+        "contact_force": c.contact_force,
+        "base_from_tcp": c.base_from_tcp,
+        "action": np.column_stack([c.action_joint_target, c.action_gripper, c.action_base_from_tcp]),
+        "command": np.column_stack([c.command_joint_target, c.command_gripper, c.command_base_from_tcp]),
+        **{f"object {name}": poses for name, poses in c.object_poses.items()},
+        **{f"camera {name}": poses for name, poses in c.world_from_camera.items()},
+    }
+    wrong = {name: ~np.isfinite(table).reshape(len(table), -1).all(axis=1) for name, table in tables.items()}
+    total = int(sum(rows.sum() for rows in wrong.values()))
+    first = next(((name, int(np.argmax(rows))) for name, rows in wrong.items() if rows.any()), ("", None))
+    return Measurement(value=total, frame=first[1], detail=first[0])
+
+
+@check(group="physics", measures="joint positions beyond the robot's limits", unit="rad", warn=0.005, fail=0.05)
+def joint_position(episode: RecordedEpisode) -> Measurement | None:
+    """Measured and commanded arm joints stay within the limits."""
+    robot, c = episode.info.robot, episode.columns
+    low, high = np.array(robot.position_lower), np.array(robot.position_upper)
+    found = []
+    for table in (c.joint_position[:, : episode.num_arm], c.command_joint_target, c.action_joint_target):
+        found.append(_worst_joint(episode, np.maximum(np.maximum(low - table, table - high), 0.0)))
+    return worst(*found)
+
+
+@check(group="physics", measures="largest joint velocity in units of its limit", warn=1.1, fail=1.5)
+def joint_velocity(episode: RecordedEpisode) -> Measurement | None:
+    """Velocities, as recorded and as differences of measured and commanded positions."""
+    n, fps, c = episode.num_arm, episode.info.fps, episode.columns
+    limit = np.array(episode.info.robot.velocity_limit)
+    found = [_worst_joint(episode, np.abs(c.joint_velocity[:, :n]) / limit)]
+    for table in (c.joint_position[:, :n], c.command_joint_target, c.action_joint_target):
+        found.append(_worst_joint(episode, np.abs(np.diff(table, axis=0)) * fps / limit, frame_offset=1))
+    return worst(*found)
+
+
+@check(group="physics", measures="largest acceleration of the wanted motion in units of its limit", warn=1.5, fail=3.0)
+def action_acceleration(episode: RecordedEpisode) -> Measurement | None:
+    """The expert's joint targets (the labels) ask for no more than the motors give."""
+    targets, fps = episode.columns.action_joint_target, episode.info.fps
+    limit = np.array(episode.info.robot.acceleration_limit)
+    return _worst_joint(episode, np.abs(np.diff(targets, 2, axis=0)) * fps**2 / limit, frame_offset=1)
+
+
+@check(
+    group="physics", measures="largest acceleration of the measured motion in units of its limit", warn=12.0, fail=20.0
+)
+def joint_acceleration(episode: RecordedEpisode) -> Measurement | None:
+    """Steps of the recorded velocities.
+
+    Looser than the limits of a real arm: exploration noise on the commands asks for several times as much.
+    """
+    velocity, fps = episode.columns.joint_velocity[:, : episode.num_arm], episode.info.fps
+    limit = np.array(episode.info.robot.acceleration_limit)
+    return _worst_joint(episode, np.abs(np.diff(velocity, axis=0)) * fps / limit, frame_offset=1)
+
+
+@check(group="physics", measures="ratio of position differences to recorded velocities, off 1", warn=0.1, fail=0.16)
+def velocity_matches_position(episode: RecordedEpisode) -> Measurement | None:
+    """Differences of joint positions over the frame's time equal the mean of the velocities at both ends.
+
+    Catches a wrong frame rate, degrees for radians, and velocities of other joints. The ratio is that of least
+    squares, per joint; 0 where the two have nothing to do with each other.
+    """
+    n, fps, c = episode.num_arm, episode.info.fps, episode.columns
+    difference = np.diff(c.joint_position[:, :n], axis=0) * fps
+    mean = (c.joint_velocity[1:, :n] + c.joint_velocity[:-1, :n]) / 2
+    moving = np.sqrt((difference**2).mean(axis=0)) > 0.05 if len(difference) else np.zeros(n, dtype=bool)
+    if not moving.any():
+        return None
+    ratio = (difference * mean).sum(axis=0) / np.maximum((mean * mean).sum(axis=0), 1e-12)
+    # At few frames a second the mean of two velocities says less about the way between them.
+    off = np.where(moving, np.abs(ratio - 1.0), 0.0) * min(1.0, fps / 20)
+    joint = int(np.argmax(off))
+    return Measurement(value=float(off[joint]), detail=f"{episode.info.robot.arm_joints[joint]}: {ratio[joint]:.3f}")
+
+
+@check(group="physics", measures="EE pose against forward kinematics of the joints", unit="m", warn=1e-6, fail=1e-4)
+def forward_kinematics(episode: RecordedEpisode) -> Measurement | None:
+    """Observed, wanted and commanded TCP poses are those of their joints (0.1 m per rad of rotation added)."""
+    c, link = episode.columns, episode.info.robot.tcp_link
+    rows = (
+        ("observed", c.base_from_tcp, c.joint_position),
+        ("action", c.action_base_from_tcp, c.action_joint_target),
+        ("command", c.command_base_from_tcp, c.command_joint_target),
+    )
+    found = []
+    for name, poses, joints in rows:
+        off = displacement(matrices(poses), episode.base_from_link(link, joints))
+        if len(off):
+            frame = int(np.argmax(off))
+            found.append(Measurement(value=float(off[frame]), frame=frame, detail=name))
+    return worst(*found)
+
+
+@check(group="physics", measures="deviation of a quaternion's length from 1", warn=1e-6, fail=1e-3)
+def unit_quaternions(episode: RecordedEpisode) -> Measurement | None:
+    """Every rotation is one."""
+    c = episode.columns
+    poses = {"EE": c.base_from_tcp, "action EE": c.action_base_from_tcp, "command EE": c.command_base_from_tcp}
+    poses |= {f"object {name}": table for name, table in c.object_poses.items()}
+    poses |= {f"camera {name}": table for name, table in c.world_from_camera.items()}
+    found = []
+    for name, table in poses.items():
+        off = np.abs(np.linalg.norm(table[:, 3:], axis=1) - 1.0)
+        if len(off):
+            frame = int(np.argmax(off))
+            found.append(Measurement(value=float(off[frame]), frame=frame, detail=name))
+    return worst(*found)
+
+
+@check(group="physics", measures="gripper opening against its fingers and its range", unit="m", warn=1e-6, fail=2e-3)
+def gripper_width(episode: RecordedEpisode) -> Measurement | None:
+    """The opening is the sum of the finger joints and lies, as its target does, within 0 and the full opening.
+
+    A millimetre of overshoot is allowed: the fingers have mass.
+    """
+    c, robot = episode.columns, episode.info.robot
+    found = []
+    fingers = c.joint_position[:, episode.num_arm :].sum(axis=1)
+    beyond = [np.maximum(np.maximum(-w, w - robot.gripper_max_width) - 1e-3, 0.0) for w in _widths(episode)]
+    rows = ("against the fingers", "range", "range of the action", "range of the command")
+    for detail, off in zip(rows, (np.abs(c.gripper_width - fingers), *beyond), strict=True):
+        if len(off):
+            frame = int(np.argmax(off))
+            found.append(Measurement(value=float(off[frame]), frame=frame, detail=detail))
+    return worst(*found)
+
+
+def _widths(episode: RecordedEpisode) -> tuple[Array, Array, Array]:
+    c = episode.columns
+    return c.gripper_width, c.action_gripper, c.command_gripper
+
+
+@check(group="physics", measures="distance of the joints from the command before", unit="rad", warn=0.15, fail=0.3)
+def command_tracking(episode: RecordedEpisode) -> Measurement | None:
+    """The arm goes where it is sent, rad: catches commands of another episode, of another joint, or made up."""
+    c = episode.columns
+    off = np.abs(c.joint_position[1:, : episode.num_arm] - c.command_joint_target[:-1])
+    return _worst_joint(episode, off, frame_offset=1)
+
+
+@check(group="physics", measures="distance between action and executed command", unit="rad", warn=0.25, fail=0.4)
+def action_matches_command(episode: RecordedEpisode) -> Measurement | None:
+    """The label differs from what was executed by exploration noise at most, rad."""
+    c = episode.columns
+    return _worst_joint(episode, np.abs(c.action_joint_target - c.command_joint_target))
+
+
+@check(group="physics", measures="share of frames in which nothing moves and nothing is asked", warn=0.2, fail=0.5)
+def idle_frames(episode: RecordedEpisode) -> Measurement | None:
+    """A policy that learns from idle frames learns to stand still."""
+    c, n = episode.columns, episode.num_arm
+    if c.num_frames < 2:
+        return None
+    still = np.abs(np.diff(c.action_joint_target, axis=0)).max(axis=1) < 1e-4
+    still &= np.abs(np.diff(c.action_gripper)) < 1e-4
+    still &= np.abs(c.joint_velocity[1:, :n]).max(axis=1) < 0.02
+    still &= np.abs(c.joint_velocity[1:, n:]).max(axis=1, initial=0.0) < 2e-3
+    frame = int(np.argmax(still)) + 1 if still.any() else None
+    return Measurement(value=float(still.mean()), frame=frame, detail=f"{int(still.sum())} of {len(still)} frames")

@@ -1,0 +1,89 @@
+"""Rigid transforms over all frames at once: forward kinematics, distances and angles of (T, ...) arrays.
+
+Written apart from `demorec.kinematics` on purpose: that code made the recorded poses, this one judges them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.geometry import Array
+from demorec.urdf import Urdf
+
+
+def matrices(poses: Array) -> Array:
+    """(T, 4, 4) of poses (T, 7): position, quaternion xyzw (need not be of unit length)."""
+    quat = poses[:, 3:] / np.maximum(np.linalg.norm(poses[:, 3:], axis=1, keepdims=True), 1e-12)
+    x, y, z, w = quat.T
+    out = np.zeros((len(poses), 4, 4))
+    out[:, 0, 0], out[:, 0, 1], out[:, 0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)
+    out[:, 1, 0], out[:, 1, 1], out[:, 1, 2] = 2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)
+    out[:, 2, 0], out[:, 2, 1], out[:, 2, 2] = 2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)
+    out[:, :3, 3] = poses[:, :3]
+    out[:, 3, 3] = 1.0
+    return out
+
+
+def inverse(transforms: Array) -> Array:
+    """(T, 4, 4) of the inverse rigid transforms."""
+    out = np.zeros_like(transforms)
+    rotation = np.swapaxes(transforms[:, :3, :3], 1, 2)
+    out[:, :3, :3] = rotation
+    out[:, :3, 3] = -np.einsum("tij,tj->ti", rotation, transforms[:, :3, 3])
+    out[:, 3, 3] = 1.0
+    return out
+
+
+def link_matrices(urdf: Urdf, link: str, joint_position: Mapping[str, Array], count: int) -> Array:
+    """(T, 4, 4) base_from_link, given joint name -> (T,) positions (rad, m); KeyError when there is no such link."""
+    total = np.broadcast_to(np.eye(4), (count, 4, 4)).copy()
+    for joint in urdf.path_to(link):
+        total = total @ joint.parent_from_joint.matrix()
+        position = joint_position.get(joint.name)
+        if position is None or joint.kind == "fixed":
+            continue
+        motion = np.broadcast_to(np.eye(4), (count, 4, 4)).copy()
+        axis = np.array(joint.axis)
+        if joint.kind == "prismatic":
+            motion[:, :3, 3] = position[:, None] * axis
+        else:
+            motion[:, :3, :3] = _axis_rotations(axis, position)
+        total = total @ motion
+    return total
+
+
+def _axis_rotations(axis: Array, angle: Array) -> Array:
+    """(T, 3, 3) by Rodrigues' formula."""
+    x, y, z = axis
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    sine, cosine = np.sin(angle)[:, None, None], np.cos(angle)[:, None, None]
+    return np.asarray(np.eye(3) + sine * cross + (1 - cosine) * (cross @ cross))
+
+
+def displacement(a: Array, b: Array, *, lever: float = 0.1) -> Array:
+    """(T,) metres: how far apart two transforms (T, 4, 4) are: of the origins, plus what the rotation does at `lever`.
+
+    One number for position and rotation: a turn by an angle moves a point at the lever's end by lever times angle.
+    """
+    return np.asarray(np.linalg.norm(a[:, :3, 3] - b[:, :3, 3], axis=1) + lever * angle_between(a, b))
+
+
+def angle_between(a: Array, b: Array) -> Array:
+    """(T,) rad between the rotations of transforms (T, 4, 4)."""
+    # |R - S| (Frobenius) = 2 sqrt(2) sin(angle / 2): exact for small angles, unlike the arc cosine of the trace.
+    chord = np.sqrt(((a[:, :3, :3] - b[:, :3, :3]) ** 2).sum(axis=(1, 2)))
+    return np.asarray(2 * np.arcsin(np.minimum(chord / (2 * np.sqrt(2)), 1.0)))
+
+
+def longest_run(flags: NDArray[np.bool_]) -> tuple[int, int]:
+    """(length, start) of the longest run of True; (0, 0) when there is none."""
+    padded = np.concatenate([[False], np.asarray(flags, dtype=bool), [False]])
+    edges = np.flatnonzero(padded[1:] != padded[:-1])
+    if not len(edges):
+        return 0, 0
+    starts, lengths = edges[::2], edges[1::2] - edges[::2]
+    best = int(np.argmax(lengths))
+    return int(lengths[best]), int(starts[best])

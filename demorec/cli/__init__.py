@@ -1,0 +1,137 @@
+"""The command line: one file per command, exit codes, errors as one sentence.
+
+Exit codes: 0 done; 1 it did not work (or a check failed); 2 the request was wrong; 130 interrupted.
+Modules of this package import heavy libraries inside `run` only, so that `--help` is quick.
+"""
+
+from __future__ import annotations
+
+import inspect
+import logging
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from types import NoneType
+from typing import Any, Protocol, cast, get_args
+
+import tyro
+
+from demorec.errors import DemorecError
+from demorec.registry import Registry, nearest_match
+
+
+class Command(Protocol):
+    """A dataclass whose fields are the flags and whose docstring is the help.
+
+    A classmethod `defaults(args)`, where there is one, returns the instance whose values are the flags' defaults.
+    """
+
+    def run(self) -> int:
+        """Do it and return the exit code."""
+
+
+COMMANDS: Registry[type[Command]] = Registry(
+    kind="command",
+    rows={
+        "generate": "demorec.cli.generate:Generate",
+        "info": "demorec.cli.info:Info",
+        "view": "demorec.cli.view:View",
+        "export": "demorec.cli.export:Export",
+        "check": "demorec.cli.check:Check",
+        "replay": "demorec.cli.replay:Replay",
+        "render": "demorec.cli.render:Render",
+        "evaluate": "demorec.cli.evaluate:Evaluate",
+        "reproduce": "demorec.cli.reproduce:Reproduce",
+        "recover": "demorec.cli.recover:Recover",
+        "list": "demorec.cli.list_rows:ListRows",
+    },
+)
+
+
+_flag_types = tyro.constructors.ConstructorRegistry()
+
+
+@_flag_types.primitive_rule
+def _optional_value(
+    info: tyro.constructors.PrimitiveTypeInfo,
+) -> tyro.constructors.PrimitiveConstructorSpec[Any] | None:
+    """`--workers INT` with auto for None, where tyro would show `--workers {None}|INT`."""
+    kinds = [kind for kind in get_args(info.type) if kind is not NoneType]
+    if NoneType not in get_args(info.type) or len(kinds) != 1 or kinds[0] not in (int, float, str, Path):
+        return None
+    kind = kinds[0]
+    return tyro.constructors.PrimitiveConstructorSpec(
+        nargs=1,
+        metavar=kind.__name__.upper(),
+        instance_from_str=lambda words: None if words[0] == "auto" else kind(words[0]),
+        is_instance=lambda value: value is None or isinstance(value, kind),
+        str_from_instance=lambda value: ["auto" if value is None else str(value)],
+    )
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Entry point of `demorec`."""
+    args = list(sys.argv[1:] if argv is None else argv)
+    name = args[0] if args else ""
+    if name and not name.startswith("-"):
+        if name not in COMMANDS.rows:
+            _fail(f"Unknown command {name!r}.{nearest_match(name, COMMANDS.rows)} See demorec --help.", 2)
+        sys.exit(run_command(COMMANDS.load(name), args[1:], prog=f"demorec {name}"))
+    if name == "--version":
+        from importlib.metadata import version
+
+        print(f"demorec {version('demorec')}")
+        return
+    print(_overview())
+    sys.exit(0 if name in ("-h", "--help") else 2)
+
+
+def generate_dataset_main(argv: Sequence[str] | None = None) -> None:
+    """Entry point of `generate-dataset`: the same as `demorec generate`."""
+    args = list(sys.argv[1:] if argv is None else argv)
+    sys.exit(run_command(COMMANDS.load("generate"), args, prog="generate-dataset"))
+
+
+def run_command(command: type[Command], args: Sequence[str], *, prog: str) -> int:
+    """Parse the flags, run the command, turn its errors into one sentence and an exit code."""
+    logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
+    try:
+        find_defaults = getattr(command, "defaults", None)
+        with _flag_types:
+            parsed = tyro.cli(
+                cast(Any, command),
+                args=args,
+                prog=prog,
+                description=inspect.cleandoc(command.__doc__ or ""),
+                default=tyro.MISSING_NONPROP if find_defaults is None else find_defaults(args),
+                config=(tyro.conf.OmitArgPrefixes,),
+            )
+        return cast(Command, parsed).run()
+    except DemorecError as error:
+        print(f"{prog}: {error}", file=sys.stderr)
+        return error.exit_code
+    except KeyboardInterrupt:
+        print(f"{prog}: interrupted.", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        sys.stderr.close()
+        return 1
+
+
+def _overview() -> str:
+    lines = [
+        "demorec: robot demonstrations you can trust",
+        "",
+        "usage: demorec COMMAND ... (COMMAND --help for more)",
+        "",
+    ]
+    for name in COMMANDS.names():
+        summary = (COMMANDS.load(name).__doc__ or "").strip().splitlines()[0]
+        lines.append(f"  {name:<10} {summary}")
+    lines += ["", "generate-dataset ... is demorec generate ..."]
+    return "\n".join(lines)
+
+
+def _fail(message: str, code: int) -> None:
+    print(f"demorec: {message}", file=sys.stderr)
+    sys.exit(code)

@@ -1,0 +1,182 @@
+"""`demorec check`: every check over recordings, runs and datasets."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tyro.conf import Positional
+
+from demorec.errors import ConfigError
+
+if TYPE_CHECKING:
+    from demorec.check.base import Level, Result
+    from demorec.check.report import SubjectReport
+    from demorec.episode import EpisodeInfo
+    from demorec.replay import ReplayReport
+
+
+@dataclass(frozen=True, kw_only=True)
+class Check:
+    """Check recordings, runs and datasets: files, time, physics, alignment, calibration, pictures.
+
+    Exit code 0: everything passed (warnings allowed); 1: a check failed. `demorec list checks` says what is measured
+    and with which limits.
+
+    Examples:
+      demorec check recordings/cubes
+      demorec check recordings/cubes --no-pictures --strict
+      demorec check datasets/cubes --json
+      demorec check recordings/cubes --replay 5
+    """
+
+    paths: Positional[tuple[Path, ...]]
+    """Recordings, runs, datasets, or folders of recordings."""
+    pictures: bool = True
+    """Decode all pictures; without, a recording is checked at over 100 times real time."""
+    only: tuple[str, ...] = ()
+    """Names of the checks to run; default: all."""
+    strict: bool = False
+    """Warnings count as failures."""
+    replay: int = 0
+    """Also replay this many episodes of each run or dataset, spread evenly, and every recording given by itself."""
+    coverage_picture: Path | None = None
+    """Draw start places, goals and ranges of all episodes into this PNG file."""
+    workers: int = 1
+    """Processes."""
+    verbose: bool = False
+    """Print the checks that pass, too."""
+    json: bool = False
+    """Print JSON: a list with one object for each recording, run and dataset."""
+
+    def run(self) -> int:
+        """Check and report."""
+        if not self.paths:
+            raise ConfigError("No path is given: name a recording, a run or a dataset, e.g. demorec check recordings.")
+        if self.replay < 0:
+            raise ConfigError(f"replay is {self.replay}, it must be 0 or more.")
+        from tqdm import tqdm
+
+        from demorec.check.report import CheckOptions, check_subjects, find_subjects
+
+        options = CheckOptions(pictures=self.pictures, only=self.only, workers=self.workers)
+        options.validate()
+        subjects = find_subjects(self.paths)
+        reports, replays = [], []
+        with tqdm(total=len(subjects), unit="item", desc="checking", disable=not sys.stderr.isatty()) as bar:
+            for report in check_subjects(subjects, options):
+                reports.append(report)
+                bar.update()
+                if not self.json:
+                    bar.write("\n".join(_lines(report, verbose=self.verbose)), file=sys.stdout)
+        if self.replay:
+            for replayed in _replays(self.paths, self.replay):
+                replays.append(replayed)
+                if not self.json:
+                    from demorec.cli.replay import told
+
+                    print(told(replayed))
+        if self.coverage_picture is not None:
+            self._draw(self.coverage_picture)
+        bad = {"fail", "warn"} if self.strict else {"fail"}
+        failed = [report for report in reports if report.level in bad]
+        diverged = [replayed for replayed in replays if not _as_recorded(replayed)]
+        if self.json:
+            print(json.dumps([_plain(report) for report in reports] + [_plain_replay(r) for r in replays], indent=2))
+        else:
+            print(_summary(reports, len(failed), len(replays), len(diverged)))
+        return 1 if failed or diverged else 0
+
+    def _draw(self, path: Path) -> None:
+        from demorec.check.coverage import draw_coverage
+
+        drawn = draw_coverage(list(_infos(self.paths)), path)
+        if not self.json:
+            print(f"Coverage of {drawn.num_episodes} episodes: {drawn.path}")
+
+
+def _infos(paths: Sequence[Path]) -> Iterator[EpisodeInfo]:
+    """Of every successful episode of runs, every recording, and every episode of datasets."""
+    from demorec.check.dataset import Dataset
+    from demorec.check.report import find_subjects
+    from demorec.recording import Recording
+
+    # The dataset of a run holds the same episodes once more.
+    subjects = find_subjects(paths)
+    runs = {subject.path for subject in subjects if subject.kind == "run"}
+    for subject in subjects:
+        if subject.kind == "recording" and subject.path.parent.name != "failed":
+            with Recording(subject.path) as recording:
+                yield recording.info
+        elif subject.kind == "dataset" and subject.path.parent not in runs:
+            yield from Dataset(subject.path).infos
+
+
+def _replays(paths: Sequence[Path], count: int) -> Iterator[ReplayReport]:
+    from demorec.cli.replay import demonstrations
+    from demorec.replay import ReplayOptions, replay_all
+
+    for path in paths:
+        found = demonstrations([path], ReplayOptions(), limit=count)
+        yield from (report for report, _ in replay_all(found, ReplayOptions()))
+
+
+def _as_recorded(report: ReplayReport) -> bool:
+    """Bit for bit, or for float32 actions of a dataset: with the same outcome."""
+    from demorec.replay import is_as_recorded
+
+    return is_as_recorded(report)
+
+
+def _lines(report: SubjectReport, *, verbose: bool) -> list[str]:
+    words: tuple[tuple[Level, str], ...] = (
+        ("pass", "passed"),
+        ("warn", "warnings"),
+        ("fail", "failed"),
+        ("skip", "not applicable"),
+    )
+    counts = ", ".join(f"{report.count(level)} {word}" for level, word in words if report.count(level))
+    lines = [f"{report.level:<4}  {report.kind} {report.path}: {counts}"]
+    shown = [result for result in report.results if verbose or result.level in ("warn", "fail")]
+    return lines + [f"      {_result(result)}" for result in shown]
+
+
+def _result(result: Result) -> str:
+    where = "" if result.frame is None else f" at frame {result.frame}"
+    unit = f" {result.unit}" if result.unit else ""
+    value = "" if result.value is None else f" {result.value:.4g}{unit}{where}"
+    limit = f" (allowed {result.warn:g}{unit})" if result.level in ("warn", "fail") and result.value is not None else ""
+    detail = f": {result.detail}" if result.detail else ""
+    return f"{result.level:<4}  {result.check}{value}{limit}{detail}"
+
+
+def _summary(reports: Sequence[SubjectReport], failed: int, replays: int, diverged: int) -> str:
+    warned = sum(report.level == "warn" for report in reports)
+    text = f"{len(reports)} checked, {failed} failed, {warned} with warnings."
+    return text + (f" {replays} replayed, {diverged} not as recorded." if replays else "")
+
+
+def _plain(report: SubjectReport) -> dict[str, Any]:
+    from demorec.plain import to_plain
+
+    results = [to_plain(result) for result in report.results]
+    for result in results:
+        if result["value"] is not None and abs(result["value"]) == float("inf"):
+            result["value"] = None  # JSON has no infinity; the level and the detail tell
+    return {"path": str(report.path), "kind": report.kind, "level": report.level, "results": results}
+
+
+def _plain_replay(report: ReplayReport) -> dict[str, Any]:
+    from demorec.plain import to_plain
+
+    plain = to_plain(report)
+    return {
+        "path": plain.pop("name"),
+        "kind": "replay",
+        "level": "pass" if _as_recorded(report) else "fail",
+        "results": [plain],
+    }

@@ -1,0 +1,119 @@
+"""`demorec generate`, also called `generate-dataset`: the main job."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import arg
+
+from demorec.cli.config_file import config_path, with_file_values
+from demorec.config import GenerateConfig
+from demorec.generate.options import RunOptions, default_out, default_repo_id
+
+if TYPE_CHECKING:
+    from demorec.generate.run import RunResult
+    from demorec.generate.run_file import Attempt
+
+
+@dataclass(frozen=True, kw_only=True)
+class Generate:
+    """Generate scripted demonstrations: simulate, record (MCAP), export (LeRobot), check.
+
+    The same command again goes on where it stopped; a larger --num-episodes extends the run. Episodes are a pure
+    function of the options below and the seed: the same for any number of workers, any executor and any order.
+
+    Examples:
+      generate-dataset --num-episodes 50 --out recordings/cubes
+      generate-dataset --config run.toml --seed 7          (a flag wins over the file)
+      generate-dataset --cameras front wrist --width 320 --height 240 --codec av1
+      generate-dataset --num-episodes 1000 --dry-run       (how long, how large, how often does it succeed)
+      generate-dataset --executor ray --address auto --out /shared/cubes --num-episodes 100000
+    """
+
+    config: Annotated[Path | None, arg(help_behavior_hint="")] = None
+    """TOML file with any of the options below, without the dashes: num_episodes = 50."""
+    options: Annotated[RunOptions, arg(name="run")] = field(default_factory=RunOptions)
+    """How it is carried out; leaves the data alone."""
+    check: bool = True
+    """Check run, recordings and dataset at the end, without decoding pictures (demorec check decodes them)."""
+    dry_run: bool = False
+    """Make one pilot episode in a temporary folder and tell what the whole run would take."""
+    view: bool = False
+    """Show the episodes in Rerun while they are made."""
+    episodes: Annotated[GenerateConfig, arg(name="episode")] = field(default_factory=GenerateConfig)
+    """What decides the data."""
+
+    @classmethod
+    def defaults(cls, args: Sequence[str]) -> Generate:
+        """The values of --config, if there is one, are the defaults of the flags."""
+        path = config_path(args)
+        return cls() if path is None else replace(with_file_values(cls(), path), config=path)
+
+    def run(self) -> int:
+        """Generate, export, check, report."""
+        self.episodes.validate()
+        self.options.validate()
+        options = replace(
+            self.options,
+            out=self.options.out or default_out(self.episodes.task),
+            repo_id=self.options.repo_id or default_repo_id(self.episodes.task),
+        )
+        if self.dry_run:
+            from demorec.cli.generate_report import print_estimate
+            from demorec.generate.estimate import estimate
+
+            print_estimate(estimate(self.episodes, options), options)
+            return 0
+
+        from demorec.cli.generate_report import TerminalProgress, check_run, print_result
+        from demorec.generate.interrupts import terminate_as_interrupt
+        from demorec.generate.run import generate
+
+        with self._watching(options) as watch, TerminalProgress(watch=watch) as progress:
+            result = generate(self.episodes, options, progress=progress)
+        if result.interrupted:
+            return self._interrupted(result)
+        export, checked = None, None
+        with TerminalProgress() as progress, terminate_as_interrupt():
+            if options.export and result.run.successes:
+                from demorec.generate.export_step import export_run
+
+                assert options.repo_id is not None
+                export, _ = export_run(result.folder, repo_id=options.repo_id, progress=progress.exporting)
+            if self.check and result.run.successes:
+                checked = check_run(result.folder, progress=progress.checking)
+        print_result(result, export, checked)
+        return 1 if result.run.given_up or (checked is not None and checked.failures) else 0
+
+    @contextmanager
+    def _watching(self, options: RunOptions) -> Iterator[Callable[[Attempt], None] | None]:
+        """With --view: hands finished attempts to the viewer."""
+        if not self.view:
+            yield None
+            return
+        from demorec.playback.live import LiveViewer
+
+        folder = options.out
+        assert folder is not None
+        with LiveViewer() as viewer:
+
+            def watch(attempt: Attempt) -> None:
+                if attempt.file:
+                    viewer.add(folder / attempt.file)
+
+            yield watch
+
+    @staticmethod
+    def _interrupted(result: RunResult) -> int:
+        done = len(result.run.successes)
+        print(
+            f"Interrupted: {done} of {result.run.num_episodes} episodes are complete; the same command goes on: "
+            f"{result.folder}",
+            file=sys.stderr,
+        )
+        return 130

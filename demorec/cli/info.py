@@ -1,0 +1,243 @@
+"""`demorec info`: what a recording, a run or a dataset holds."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tyro.conf import Positional
+
+from demorec.errors import ConfigError, ExportError, RecordingError
+
+if TYPE_CHECKING:
+    from demorec.generate.run_file import RunFile
+    from demorec.recording.summary import RecordingSummary
+
+
+@dataclass(frozen=True, kw_only=True)
+class Info:
+    """Say what recordings, runs and datasets hold.
+
+    Examples:
+      demorec info recordings/cubes
+      demorec info recordings/cubes/episodes/episode_000000.mcap
+      demorec info datasets/cubes --json
+    """
+
+    paths: Positional[tuple[Path, ...]]
+    """Recordings, runs, datasets, or folders of recordings."""
+    json: bool = False
+    """Print JSON: one object, or a list for several paths."""
+
+    def run(self) -> int:
+        """Read and print; 1 when something among several paths cannot be read."""
+        if not self.paths:
+            raise ConfigError("No path is given: name a recording, a run or a dataset, e.g. demorec info recordings.")
+        found = [_describe(path) for path in self.paths]
+        if self.json:
+            plain = [item for item, _ in found]
+            print(json.dumps(plain[0] if len(plain) == 1 else plain, indent=2))
+        else:
+            print("\n\n".join("\n".join(lines) for _, lines in found))
+        return 0
+
+
+def _describe(path: Path) -> tuple[dict[str, Any], list[str]]:
+    """Plain data for --json, and the lines for people."""
+    if not path.exists():
+        raise ConfigError(f"There is no such file or folder: {path}")
+    if path.is_file():
+        return _recording(path)
+    if (path / "run.json").is_file():
+        return _run(path)
+    if (path / "meta" / "info.json").is_file():
+        return _dataset(path)
+    recordings = sorted(path.glob("*.mcap"))
+    if recordings:
+        return _folder(path, recordings)
+    parts = sorted(path.glob("*.mcap.part"))
+    hint = f" It has unfinished recordings; demorec recover {parts[0].name} reads one." if parts else ""
+    raise ConfigError(
+        f"The folder holds no run (run.json), dataset (meta/info.json) or recording (*.mcap).{hint} {path}"
+    )
+
+
+def _recording(path: Path) -> tuple[dict[str, Any], list[str]]:
+    from demorec.plain import to_plain
+    from demorec.recording.summary import summarize
+
+    if path.suffix == ".part":
+        raise RecordingError(f"The recording is unfinished; demorec recover makes a readable one of it: {path}")
+    summary = summarize(path)
+    return {"kind": "recording", **to_plain(summary)}, _recording_lines(summary)
+
+
+def _recording_lines(summary: RecordingSummary) -> list[str]:
+    attempt = f", attempt {summary.attempt}" if summary.attempt else ""
+    rates = f"{summary.fps} Hz (physics {summary.physics_hz} Hz)"
+    facts = [
+        ("recording", f"{summary.path} ({_size(summary.bytes)}, format {summary.format_version})"),
+        ("instruction", summary.instruction),
+        ("episode", f"{summary.task}, seed {summary.root_seed}, episode {summary.episode_index}{attempt}"),
+        ("outcome", _outcome(summary)),
+        ("length", f"{summary.frames} frames, {summary.seconds:.2f} s at {rates}"),
+        ("robot", summary.robot),
+        ("objects", ", ".join(summary.objects) or "none"),
+    ]
+    if summary.origin:
+        facts.append(("origin", summary.origin))
+    for camera in summary.cameras:
+        video = camera.video
+        quality = f"quality {video.jpeg_quality}" if video.codec == "jpeg" else f"GOP {video.gop}, crf {video.crf}"
+        more = [name for name, there in (("depth", camera.depth), ("segmentation", camera.segmentation)) if there]
+        facts.append(
+            (f"camera {camera.name}", ", ".join([f"{video.width}x{video.height} {video.codec}", quality, *more]))
+        )
+    for check in summary.checks:
+        verdict = "passed" if check.passed else "FAILED"
+        facts.append((f"check {check.name}", f"{verdict}: {check.value:.4g} {check.unit} (limit {check.limit:.4g})"))
+    facts.append(("digest", summary.digest[:16]))
+    facts.append(("made with", ", ".join(f"{name} {version}" for name, version in summary.versions.items())))
+    streams = [(stream.topic, str(stream.messages), stream.type) for stream in summary.streams]
+    return [*_aligned(facts), "", *_aligned([("topic", "messages", "type"), *streams])]
+
+
+def _outcome(summary: RecordingSummary) -> str:
+    if summary.success is None:
+        return "unknown: recovered after a crash"
+    retries = f" after {summary.retries} retries" if summary.retries else ""
+    if summary.success:
+        return f"success{retries}"
+    return f"failure in phase {summary.failure_phase or 'unknown'}: {summary.failure_reason or 'unknown'}{retries}"
+
+
+def _run(path: Path) -> tuple[dict[str, Any], list[str]]:
+    from demorec.generate.run_file import load_run_file
+    from demorec.plain import to_plain
+
+    run = load_run_file(path)
+    plain = {
+        "kind": "run",
+        "path": str(path),
+        "complete": run.is_complete,
+        "digest": run.digest,
+        "config_digest": run.config_digest,
+        **to_plain(run),
+    }
+    return plain, _run_lines(path, run)
+
+
+def _run_lines(path: Path, run: RunFile) -> list[str]:
+    config = run.config
+    frames = sum(attempt.num_frames for attempt in run.attempts)
+    facts = [
+        ("run", f"{path} ({'complete' if run.is_complete else 'unfinished'})"),
+        ("task", f"{config.task} with {config.robot}, seed {config.seed}"),
+        ("episodes", f"{len(run.successes)} of {run.num_episodes}, {len(run.failures)} failed attempts"),
+        ("frames", f"{frames} ({frames / config.fps:.1f} s at {config.fps} Hz)"),
+        ("size", _size(sum(attempt.num_bytes for attempt in run.attempts))),
+        ("cameras", f"{', '.join(config.cameras) or 'none'} at {config.width}x{config.height}, {config.video.codec}"),
+        ("digest", run.digest),
+    ]
+    if run.export is not None:
+        facts.append(("dataset", f"{path / 'dataset'} ({run.export.repo_id})"))
+    rows = [("episode", "attempt", "outcome", "frames", "size", "file")]
+    rows += [
+        (
+            str(attempt.episode_index),
+            str(attempt.attempt),
+            "success" if attempt.success else f"{attempt.phase}: {attempt.reason}",
+            str(attempt.num_frames),
+            _size(attempt.num_bytes),
+            attempt.file or "(no scene)",
+        )
+        for attempt in run.attempts
+    ]
+    return [*_aligned(facts), "", *_aligned(rows)]
+
+
+def _dataset(path: Path) -> tuple[dict[str, Any], list[str]]:
+    file = path / "meta" / "info.json"
+    try:
+        info: dict[str, Any] = json.loads(file.read_text())
+        facts = [
+            ("dataset", f"{path} (LeRobot {info['codebase_version']})"),
+            ("episodes", str(info["total_episodes"])),
+            ("frames", f"{info['total_frames']} ({info['total_frames'] / info['fps']:.1f} s at {info['fps']} Hz)"),
+            ("tasks", str(info["total_tasks"])),
+            ("robot", str(info["robot_type"])),
+            ("size", _size(sum(part.stat().st_size for part in path.rglob("*") if part.is_file()))),
+        ]
+        facts += _dataset_content(path)
+        rows = [("feature", "dtype", "shape", "names")]
+        for name, feature in info["features"].items():
+            shape = "x".join(map(str, feature["shape"]))
+            rows.append((name, feature["dtype"], shape, _names(feature.get("names"))))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, ZeroDivisionError) as error:
+        raise ConfigError(f"The dataset's info.json is damaged ({type(error).__name__}: {error}): {file}") from error
+    return {"kind": "dataset", "path": str(path), "info": info}, [*_aligned(facts), "", *_aligned(rows)]
+
+
+def _dataset_content(path: Path) -> list[tuple[str, str]]:
+    """What the tables say beyond info.json, where demorec understands them."""
+    from demorec.export import dataset_digest, dataset_info
+
+    facts: list[tuple[str, str]] = []
+    # Incomplete datasets and kinds of features that demorec does not write: demorec check says what is wrong.
+    with contextlib.suppress(ExportError):
+        summary = dataset_info(path)
+        if summary.num_attempts is not None:
+            facts.append(("successes", f"{summary.num_successes}, of {summary.num_attempts} attempts"))
+        for name, width, height, codec in summary.cameras:
+            facts.append(("camera", f"{name.removeprefix('observation.images.')} {width}x{height} {codec}"))
+        facts.append(("digest", dataset_digest(path)))
+    return facts
+
+
+def _names(names: object) -> str:
+    if not isinstance(names, list):
+        return ""
+    return ", ".join(map(str, names)) if len(names) <= 4 else f"{names[0]} .. {names[-1]}"
+
+
+def _folder(path: Path, recordings: Sequence[Path]) -> tuple[dict[str, Any], list[str]]:
+    from demorec.recording import Recording
+
+    rows = [("file", "task", "seed", "episode", "outcome", "frames", "size")]
+    items = []
+    for file in recordings:
+        with Recording(file) as recording:
+            info, outcome = recording.info, recording.outcome
+            success = None if outcome is None else outcome.success
+        items.append({"path": str(file), "task": info.task, "success": success, "frames": recording.num_frames})
+        word = {None: "recovered", True: "success", False: "failure"}[success]
+        rows.append(
+            (
+                file.name,
+                info.task,
+                str(info.root_seed),
+                str(info.episode_index),
+                word,
+                str(recording.num_frames),
+                _size(file.stat().st_size),
+            )
+        )
+    plain = {"kind": "folder", "path": str(path), "recordings": items}
+    return plain, [f"{len(recordings)} recordings in {path}", "", *_aligned(rows)]
+
+
+def _aligned(rows: Iterable[Sequence[str]]) -> list[str]:
+    """Columns of equal width, two spaces between them."""
+    table = [list(row) for row in rows]
+    widths = [max(len(row[column]) for row in table) for column in range(len(table[0]))]
+    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in table]
+
+
+def _size(num_bytes: int) -> str:
+    if num_bytes < 1_000_000:
+        return f"{num_bytes / 1000:.0f} kB"
+    return f"{num_bytes / 1e6:.1f} MB"

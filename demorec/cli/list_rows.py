@@ -1,0 +1,69 @@
+"""`demorec list`: what there is to choose from."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+from tyro.conf import Positional
+
+if TYPE_CHECKING:
+    from demorec.registry import Registry
+
+
+@dataclass(frozen=True, kw_only=True)
+class ListRows:
+    """List the tasks, cameras, robots, renderers or checks that there are.
+
+    Examples:
+      demorec list tasks
+      demorec list cameras --json
+    """
+
+    what: Positional[Literal["tasks", "cameras", "robots", "renderers", "checks"]]
+    """Which table."""
+    json: bool = False
+    """Print JSON: a list of names and what they are."""
+
+    def run(self) -> int:
+        """Print one line each."""
+        registry, describe = _tables()[self.what]
+        rows = [(name, describe(registry, name)) for name in registry.names()]
+        if self.json:
+            import json
+
+            print(json.dumps([{"name": name, "summary": summary} for name, summary in rows], indent=2))
+            return 0
+        width = max(len(name) for name, _ in rows)
+        for name, summary in rows:
+            print(f"{name:<{width}}  {summary}")
+        return 0
+
+
+def _tables() -> Mapping[str, tuple[Registry[Any], Callable[[Registry[Any], str], str]]]:
+    """What to list -> its table, and how a row is told in one line."""
+    from demorec.tables import CAMERAS, CHECKS, RENDERERS, ROBOTS, TASKS
+
+    return {
+        "tasks": (TASKS, _own_summary),
+        "cameras": (CAMERAS, _own_summary),
+        "robots": (ROBOTS, _robot),
+        "renderers": (RENDERERS, _first_line_of_module),
+        "checks": (CHECKS, _own_summary),
+    }
+
+
+def _own_summary(registry: Registry[Any], name: str) -> str:
+    return str(registry.load(name).summary)
+
+
+def _robot(registry: Registry[Any], name: str) -> str:
+    robot = registry.load(name)
+    return f"{len(robot.arm_joints)} joints, gripper opening {1000 * robot.gripper_max_width:.0f} mm, from {robot.urdf}"
+
+
+def _first_line_of_module(registry: Registry[Any], name: str) -> str:
+    module = importlib.import_module(registry.rows[name].partition(":")[0])
+    return (module.__doc__ or "").strip().splitlines()[0]

@@ -1,0 +1,171 @@
+"""`demorec render`: recorded states seen by other cameras."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from multiprocessing import get_context
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+from demorec.config import VideoConfig
+from demorec.errors import ConfigError
+
+if TYPE_CHECKING:
+    from demorec.rerender import RerenderOptions, RerenderReport
+
+
+@dataclass(frozen=True, kw_only=True)
+class Render:
+    """Draw recordings anew: other cameras, sizes, renderers, looks; every number stays.
+
+    Writes new recordings that name their origin. With the recording's own cameras and looks the pictures come out
+    again to the bit, which is checked (exit code 1 when they do not). Cameras may be described in a TOML file, one
+    table each:
+
+      [side]
+      position = [0.5, 0.9, 0.5]
+      look_at = [0.5, 0.0, 0.1]
+      fov_y_degrees = 45
+
+    Examples:
+      demorec render recordings/cubes --out large --width 640 --height 480
+      demorec render episode.mcap --out side --cameras front side --camera-file cameras.toml
+      demorec render recordings/cubes --out looks_1 --looks 1 --depth --segmentation
+    """
+
+    paths: Positional[tuple[Path, ...]]
+    """Recordings, runs, or folders of recordings."""
+    out: Annotated[Path, arg(help_behavior_hint="(required)")]
+    """Folder for the new recordings, or the name of one (.mcap)."""
+    cameras: tuple[str, ...] = ()
+    """Names: of the recording, of the camera file, or of `demorec list cameras`; default: the
+    recorded ones and all of the file."""
+    camera_file: Path | None = None
+    """Cameras by pose and field of view (TOML)."""
+    width: int | None = None
+    """Of the pictures, pixels; default: as recorded."""
+    height: int | None = None
+    """Of the pictures, pixels; default: as recorded."""
+    renderer: str | None = None
+    """A name of `demorec list renderers`; default: as recorded."""
+    antialias: bool = True
+    """Smooth edges where the recording's were (raster only)."""
+    depth: bool = False
+    """Record depth pictures, too, where the recording has none."""
+    segmentation: bool = False
+    """Record segmentation pictures, too, where the recording has none."""
+    looks: int | None = None
+    """Seed of random light, colours and textures; default: the recorded looks."""
+    codec: Literal["h264", "av1", "jpeg"] | None = None
+    """Of the new pictures; default: as recorded, as are the next four."""
+    gop: int | None = None
+    """Pictures from one keyframe to the next."""
+    crf: int | None = None
+    """Constant rate factor, smaller is better."""
+    preset: str | None = None
+    """Encoder preset."""
+    jpeg_quality: int | None = None
+    """1..100."""
+    workers: int | None = None
+    """Processes; default: one for each core."""
+    overwrite: bool = False
+    """Replace recordings that are there already."""
+
+    def run(self) -> int:
+        """Draw and report."""
+        if not self.paths:
+            raise ConfigError("No path is given: name a recording or a run, e.g. demorec render recordings --out new.")
+        options = self._options()
+        jobs = _jobs(self.paths, self.out)
+        from tqdm import tqdm
+
+        from demorec.generate.options import available_cores
+
+        if self.workers is not None and not 1 <= self.workers <= 1024:
+            raise ConfigError(f"workers is {self.workers}, allowed are 1 to 1024.")
+        workers = min(self.workers or available_cores(), len(jobs))
+        differing = compared = pictures = 0
+        with tqdm(total=len(jobs), unit="episode", desc="rendering", disable=not sys.stderr.isatty()) as bar:
+            for report in _rendered(jobs, options, self.overwrite, workers):
+                bar.update()
+                pictures += report.num_pictures
+                compared += len(report.compared)
+                differing += len(report.differing)
+                for camera, frame in report.differing.items():
+                    bar.write(f"{report.source.name}: camera {camera} differs from the recording at frame {frame}")
+        print(f"{len(jobs)} recordings, {pictures} pictures: {self.out}")
+        if compared:
+            print(f"{compared - differing} of {compared} unchanged cameras give the recorded pictures to the bit.")
+        return 1 if differing else 0
+
+    def _options(self) -> RerenderOptions:
+        from demorec.rerender import RerenderOptions, read_cameras
+        from demorec.tables import RENDERERS
+
+        if self.renderer is not None:
+            RENDERERS.check_name(self.renderer)
+        if self.looks is not None and not 0 <= self.looks < 2**63:
+            raise ConfigError(f"looks is {self.looks}, allowed are 0 to {2**63 - 1}.")
+        changes = {
+            name: getattr(self, name)
+            for name in ("codec", "gop", "crf", "preset", "jpeg_quality")
+            if getattr(self, name) is not None
+        }
+        replace(VideoConfig(), **changes).validate()
+        free = {} if self.camera_file is None else read_cameras(self.camera_file)
+        return RerenderOptions(
+            cameras=self.cameras or None,
+            free_cameras=free,
+            width=self.width,
+            height=self.height,
+            renderer=self.renderer,
+            antialias=None if self.antialias else False,
+            depth=self.depth or None,
+            segmentation=self.segmentation or None,
+            looks=self.looks,
+            video=changes,
+        )
+
+
+def _jobs(paths: Sequence[Path], out: Path) -> list[tuple[Path, Path]]:
+    """(source, new recording) of everything; a run's folders episodes/ and failed/ are kept."""
+    jobs: list[tuple[Path, Path]] = []
+    for path in paths:
+        if path.is_file():
+            jobs.append((path, out if out.suffix == ".mcap" else out / path.name))
+            continue
+        files = [*path.glob("*.mcap"), *path.glob("episodes/*.mcap"), *path.glob("failed/*.mcap")]
+        if not files:
+            raise ConfigError(f"There is no recording or run here: {path}")
+        jobs += [(file, out / file.relative_to(path)) for file in sorted(files)]
+    if out.suffix == ".mcap" and len(jobs) > 1:
+        raise ConfigError(f"{len(jobs)} recordings cannot become one file: name a folder with --out.")
+    targets = [target for _, target in jobs]
+    if len(set(targets)) != len(targets):
+        raise ConfigError("Two recordings have the same name and would get into each other's way: render them apart.")
+    return jobs
+
+
+def _rendered(
+    jobs: Sequence[tuple[Path, Path]], options: RerenderOptions, overwrite: bool, workers: int
+) -> Iterator[RerenderReport]:
+    from demorec.rerender import rerender
+
+    if workers <= 1:
+        for source, target in jobs:
+            yield rerender(source, target, options, overwrite=overwrite)
+        return
+    # Spawned, as renderers and decoders do not survive a fork.
+    with ProcessPoolExecutor(max_workers=workers, mp_context=get_context("spawn")) as pool:
+        futures = [pool.submit(rerender, source, target, options, overwrite=overwrite) for source, target in jobs]
+        try:
+            for future in futures:
+                yield future.result()
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise

@@ -1,0 +1,175 @@
+"""`demorec replay`: recorded actions or states back into the simulator."""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tyro.conf import Positional
+
+from demorec.errors import ConfigError
+
+if TYPE_CHECKING:
+    from demorec.replay import Demonstration, ReplayOptions, ReplayReport
+
+
+@dataclass(frozen=True, kw_only=True)
+class Replay:
+    """Send recorded actions back into the simulator and compare every state with the recorded one.
+
+    Recordings must come out the same to the bit (on the same type of machine). Datasets hold float32 actions without
+    the exploration noise that was executed: for them the report tells success and deviations. Exit code 0: as
+    recorded (bit for bit; for a dataset, --noise, --delay or --export-hz: with the recorded outcome); 1: not.
+
+    Examples:
+      demorec replay recordings/cubes/episodes/episode_000000.mcap
+      demorec replay recordings/cubes --episodes 0:10
+      demorec replay datasets/cubes
+      demorec replay recordings/cubes --noise 0.01 --delay 2 --export-hz 10
+      demorec replay episode.mcap --out replayed --view
+    """
+
+    paths: Positional[tuple[Path, ...]]
+    """Recordings, runs, folders of recordings, or exported datasets."""
+    episodes: str = ""
+    """Which, by their number: 0:100, ::2, 3,5,8:10; all by default."""
+    states: bool = False
+    """Place the recorded states one after the other instead of sending the actions."""
+    export_hz: int | None = None
+    """Send a command only so many times a second; divides the recorded rate."""
+    noise: float = 0.0
+    """Standard deviation of noise on every joint target, rad."""
+    delay: int = 0
+    """Steps by which every command comes late."""
+    seed: int = 0
+    """Of the noise."""
+    tolerance: float = 0.0
+    """Largest difference, m and rad, that still counts as recorded, for another type of machine."""
+    out: Path | None = None
+    """Folder for recordings of the replays, pictures included."""
+    view: bool = False
+    """Show recording and replay over each other in Rerun."""
+    overwrite: bool = False
+    """Replace recordings in the output folder."""
+    json: bool = False
+    """Print JSON: a list with one object for each episode."""
+
+    def run(self) -> int:
+        """Replay and report."""
+        if not self.paths:
+            raise ConfigError("No path is given: name a recording, a run or a dataset, e.g. demorec replay recordings.")
+        if self.tolerance < 0:
+            raise ConfigError(f"tolerance is {self.tolerance}, it must be 0 or more.")
+        from tqdm import tqdm
+
+        from demorec.replay import ReplayOptions, is_as_recorded, replay_all
+
+        options = ReplayOptions(
+            states=self.states, export_hz=self.export_hz, noise=self.noise, delay=self.delay, seed=self.seed
+        )
+        options.validate()
+        with ExitStack() as stack:
+            out = self.out
+            if out is None and self.view:
+                out = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="demorec-replay-")))
+            found = demonstrations(self.paths, options, episodes=self.episodes)
+            reports: list[ReplayReport] = []
+            pairs: list[tuple[Path, Path]] = []
+            with tqdm(unit="episode", desc="replaying", disable=not sys.stderr.isatty()) as bar:
+                for report, written in replay_all(found, options, out=out, overwrite=self.overwrite):
+                    reports.append(report)
+                    bar.update()
+                    if not self.json:
+                        bar.write(told(report), file=sys.stdout)
+                    if written is not None:
+                        pairs.append(written)
+            if not reports:
+                raise ConfigError(f"No episode has a number within {self.episodes!r}.")
+            good = [is_as_recorded(r, tolerance=self.tolerance, bitwise=options.is_plain) for r in reports]
+            if self.json:
+                from demorec.plain import to_plain
+
+                print(json.dumps([to_plain(report) for report in reports], indent=2))
+            else:
+                print(_summary(reports, sum(good)))
+                if self.out is not None:
+                    print(f"Recordings of the replays: {self.out}")
+            if self.view:
+                _show(pairs)
+        return 0 if all(good) else 1
+
+
+def demonstrations(
+    paths: Sequence[Path], options: ReplayOptions, *, episodes: str = "", limit: int | None = None
+) -> Iterator[Demonstration]:
+    """What there is to replay in some paths, in order; with a limit: so many of each path, spread evenly."""
+    from demorec.export.options import parse_episodes
+    from demorec.replay import dataset_demonstrations, open_file
+
+    wanted = parse_episodes(episodes)
+    for path in paths:
+        if (path / "meta" / "info.json").is_file():
+            yield from dataset_demonstrations(path, wanted, options, limit=limit)
+            continue
+        files = _recordings(path)
+        if limit is not None and len(files) > limit:
+            files = [files[number * len(files) // limit] for number in range(limit)]
+        for file in files:
+            demonstration = open_file(file, options)
+            if wanted(demonstration.info.episode_index):
+                yield demonstration
+
+
+def _recordings(path: Path) -> list[Path]:
+    if path.is_file():
+        return [path]
+    files = [*sorted(path.glob("*.mcap")), *sorted((path / "episodes").glob("*.mcap"))]
+    if not files:
+        raise ConfigError(f"There is no recording, run or dataset here: {path}")
+    return files
+
+
+def told(report: ReplayReport) -> str:
+    """One line about a replay."""
+    if report.is_identical:
+        how = "identical"
+    else:
+        assert report.first_difference is not None
+        step, what = report.first_difference
+        how = (
+            f"differs from step {step} on ({what}); at most {report.joint_error:.2g} rad at step "
+            f"{report.joint_error_step}, gripper {report.gripper_error * 1e3:.2g} mm"
+        )
+        if report.object_error_name:
+            how += f", {report.object_error_name} {report.object_error * 1e3:.3g} mm at step {report.object_error_step}"
+    outcome = {None: "", True: ", succeeds", False: f", fails ({', '.join(report.failed_checks)})"}[report.success]
+    if report.success is not None and report.recorded_success is not None and report.success != report.recorded_success:
+        outcome += f" where the recording {'succeeded' if report.recorded_success else 'failed'}"
+    lost = f", {report.unreachable} poses out of reach" if report.unreachable else ""
+    return f"{report.name}: {how}{outcome}{lost}"
+
+
+def _summary(reports: Sequence[ReplayReport], good: int) -> str:
+    judged = [report for report in reports if report.success is not None]
+    parts = [f"{len(reports)} replayed, {sum(r.is_identical for r in reports)} identical, {good} as recorded"]
+    if judged:
+        parts.append(f"success {sum(bool(r.success) for r in judged)} of {len(judged)}")
+    worst = max(report.joint_error for report in reports)
+    objects = max(report.object_error for report in reports)
+    parts.append(f"largest difference {worst:.2g} rad, {objects * 1e3:.2g} mm")
+    return "; ".join(parts) + "."
+
+
+def _show(pairs: Sequence[tuple[Path, Path]]) -> None:
+    from demorec.cli import COMMANDS, run_command
+
+    if not pairs:
+        raise ConfigError("There is nothing to show: --view needs recordings, since a dataset holds no scene to draw.")
+    recorded, replayed = pairs[0]
+    run_command(COMMANDS.load("view"), [str(recorded), str(replayed), "--compare"], prog="demorec view")

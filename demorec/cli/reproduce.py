@@ -1,0 +1,59 @@
+"""`demorec reproduce`: the same data again, from what a run or a dataset says about itself."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reproduce:
+    """Make a run or a dataset again and compare every episode to the bit.
+
+    Everything that is needed is read from run.json, or from what a dataset says about itself. Exit code 1 when an
+    episode differs. The same command again goes on where it stopped.
+
+    Examples:
+      demorec reproduce recordings/cubes --out /tmp/cubes
+      demorec reproduce datasets/cubes --out /tmp/cubes --workers 8
+    """
+
+    source: Positional[Path]
+    """A run, or a dataset that was exported from one."""
+    out: Annotated[Path, arg(help_behavior_hint="(required)")]
+    """Folder of the new run."""
+    workers: int | None = None
+    """Processes that simulate (auto: one for each core)."""
+    executor: Literal["local", "ray"] = "local"
+    """Processes of this machine, or tasks of a Ray cluster."""
+    address: str = "local"
+    """Ray: the cluster, for example auto or HOST:6379; local: this machine alone."""
+
+    def run(self) -> int:
+        """Generate again, compare, report."""
+        from demorec.cli.generate_report import TerminalProgress
+        from demorec.generate.options import RunOptions
+        from demorec.generate.reproduce import Comparison, reproduce
+
+        options = RunOptions(
+            out=self.out, workers=self.workers, executor=self.executor, address=self.address, export=False
+        )
+        options.validate()
+        with TerminalProgress() as progress:
+            found = reproduce(self.source, options, progress=progress)
+        if not isinstance(found, Comparison):
+            print(f"Interrupted; the same command goes on: {self.out}", file=sys.stderr)
+            return 130
+        for difference in found.versions:
+            print(f"Note: {difference}.", file=sys.stderr)
+        total = len(found.same) + len(found.different)
+        print(f"{len(found.same)} of {total} episodes are the same to the bit: {self.source} and {found.result.folder}")
+        if found.different:
+            shown = ", ".join(f"{episode} (attempt {attempt})" for episode, attempt in found.different[:10])
+            print(f"Different: {shown}{', ...' if len(found.different) > 10 else ''}", file=sys.stderr)
+            return 1
+        return 0

@@ -1,0 +1,144 @@
+"""`demorec view`: episodes in Rerun."""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tyro.conf import Positional
+
+from demorec.errors import ConfigError
+
+if TYPE_CHECKING:
+    from demorec.playback.sources import Source
+
+_MOST = 50
+"""How many episodes are shown unless --episodes asks for more."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class View:
+    """Watch episodes in Rerun: recordings, runs, exported datasets.
+
+    Opens a window. With --save, --screenshot or --web no screen is needed.
+
+    Examples:
+      demorec view recordings/cubes
+      demorec view recordings/cubes/episodes/episode_000003.mcap --screenshot cube.png --at 2.5
+      demorec view datasets/cubes --episodes 0:10 --web
+      demorec view recordings/cubes --save cubes.rrd
+      demorec view original.mcap replayed.mcap --compare
+    """
+
+    paths: Positional[tuple[Path, ...]]
+    """Recordings, runs, datasets, or folders of recordings."""
+    compare: bool = False
+    """Lay two episodes over each other: the same streams in the same views, and the distance between them."""
+    episodes: str = ""
+    """Which of them, numbered from 0: 7, or 0:20, or 3,5,8:10; default: the first 50."""
+    include_failures: bool = False
+    """Show a run's failed attempts too."""
+    save: Path | None = None
+    """Write an .rrd file with the layout inside instead of opening a window; several episodes: NAME-0000.rrd and on."""
+    screenshot: Path | None = None
+    """Write a picture (.png) of the viewer instead of opening a window."""
+    at: float | None = None
+    """Second of the episode that the screenshot shows; default: the middle of the first episode."""
+    size: tuple[int, int] = (1600, 950)
+    """Of the screenshot, pixels."""
+    web: bool = False
+    """Serve Rerun's web viewer to this machine and print its address; Ctrl-C ends it."""
+    port: int | None = None
+    """Of the web viewer; default: a free one."""
+    overwrite: bool = False
+    """Replace the file of --save or --screenshot, if it is there."""
+
+    def run(self) -> int:
+        """Convert, then show, save, photograph or serve."""
+        self._validate()
+        from demorec.playback.save import numbered, save, save_comparison, save_each
+        from demorec.playback.sources import find_episodes, select
+
+        sources = select(find_episodes(self.paths, include_failures=self.include_failures), self.episodes)
+        if self.compare:
+            if len(sources) != 2:
+                raise ConfigError(f"--compare takes two episodes, found {len(sources)}: name two recordings.")
+        elif len(sources) > _MOST and not self.episodes:
+            print(f"Showing the first {_MOST} of {len(sources)} episodes; --episodes chooses others.", file=sys.stderr)
+            sources = sources[:_MOST]
+
+        if self.save is not None:
+            if self.compare:
+                save_comparison(sources[0], sources[1], self.save)
+                print(f"{_size(self.save)}: {self.save}")
+            else:
+                for source, target in zip(sources, numbered(self.save, len(sources)), strict=True):
+                    if target.exists() and not self.overwrite:
+                        raise ConfigError(_already("--save", target))
+                    save(source, target)
+                    print(f"{_size(target)}: {target}")
+            if self.screenshot is None:
+                return 0
+        with tempfile.TemporaryDirectory(prefix="demorec-view-") as folder:
+            if self.compare:
+                files = [Path(folder) / "comparison.rrd"]
+                save_comparison(sources[0], sources[1], files[0])
+            else:
+                files = save_each(sources, Path(folder))
+            return self._show(files, sources)
+
+    def _validate(self) -> None:
+        if self.web and (self.save is not None or self.screenshot is not None):
+            raise ConfigError("--web serves until Ctrl-C: give --save or --screenshot in a call of its own.")
+        if self.port is not None and not 0 < self.port < 65536:
+            raise ConfigError(f"--port is {self.port}, allowed are 1 to 65535.")
+        if self.port is not None and not self.web:
+            raise ConfigError("--port belongs to --web.")
+        if min(self.size) < 200 or max(self.size) > 8192:
+            raise ConfigError(f"--size is {self.size[0]} {self.size[1]}, allowed are 200 to 8192 pixels.")
+        for flag, target, suffix in (("--save", self.save, ".rrd"), ("--screenshot", self.screenshot, ".png")):
+            if target is None:
+                continue
+            if target.suffix != suffix:
+                raise ConfigError(f"{flag} writes a {suffix} file, found the name {target.name!r}.")
+            if not target.absolute().parent.is_dir():
+                raise ConfigError(f"{flag}: there is no folder {target.parent}.")
+            if target.exists() and not self.overwrite:
+                raise ConfigError(_already(flag, target))
+
+    def _show(self, files: Sequence[Path], sources: Sequence[Source]) -> int:
+        if self.screenshot is not None:
+            self._photograph(files, sources)
+            return 0
+        if self.web:
+            from demorec.playback.viewer import serve_web
+
+            with serve_web(files, web_port=self.port or 0) as (address, wait):
+                print(f"Open this in a browser on this machine (Ctrl-C ends it): {address}", flush=True)
+                return 1 if wait() else 0
+        from demorec.playback.viewer import show
+
+        show(files)
+        return 0
+
+    def _photograph(self, files: Sequence[Path], sources: Sequence[Source]) -> None:
+        from demorec.playback.viewer import screenshot
+
+        assert self.screenshot is not None
+        with sources[0].open() as episode:
+            middle = episode.duration / 2
+        width, height = self.size
+        screenshot(files, self.screenshot, seconds=middle if self.at is None else self.at, width=width, height=height)
+        print(f"{width}x{height}: {self.screenshot}")
+
+
+def _already(flag: str, target: Path) -> str:
+    return f"{flag}: the file is there already, give another name or --overwrite: {target}"
+
+
+def _size(path: Path) -> str:
+    return f"{path.stat().st_size / 1e6:.1f} MB"

@@ -1,0 +1,194 @@
+"""What the user chooses: the part that decides the data (`GenerateConfig`), read from TOML and flags.
+
+Two equal configs and seeds give the same episodes, whatever the machine's load, the workers or the order; how a
+run is carried out (workers, executor, output folder) is not in here.
+"""
+
+from __future__ import annotations
+
+import functools
+import tomllib
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Literal
+
+from demorec.errors import ConfigError
+from demorec.plain import from_plain
+from demorec.variation import PRESET_NAMES, Preset, Ranges
+
+MAX_PIXELS = 16_000_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class VideoConfig:
+    """How pictures are coded, once, while recording."""
+
+    codec: Literal["h264", "av1", "jpeg"] = "h264"
+    """h264: plays everywhere, little CPU; av1: LeRobot's default, a third smaller; jpeg: single pictures."""
+    gop: int = 2
+    """Pictures from one keyframe to the next: 2 is LeRobot's convention for fast random access."""
+    crf: int | None = None
+    """Constant rate factor, smaller is better; default 23 for h264, 30 for av1."""
+    preset: str | None = None
+    """Encoder preset; default veryfast for h264, 12 for av1."""
+    jpeg_quality: int = 90
+    """1..100."""
+
+    def validate(self) -> None:
+        """Raise ConfigError for impossible values."""
+        _check("video.gop", self.gop, 1, 600)
+        if self.crf is not None:
+            _check("video.crf", self.crf, 0, 51 if self.codec == "h264" else 63)
+        _check("video.jpeg_quality", self.jpeg_quality, 1, 100)
+
+
+@dataclass(frozen=True, kw_only=True)
+class GenerateConfig:
+    """Everything that decides what an episode contains."""
+
+    task: str = "pick_place"
+    """What the robot does: a name of `demorec list tasks`, or my_package.my_module:MyTask."""
+    fixed: bool = False
+    """The task's one exact layout instead of random ones, where it has one (tutorial)."""
+    robot: str = "panda"
+    """Which arm: a name of `demorec list robots`."""
+    seed: int = 0
+    """Root of all randomness."""
+    fps: int = 30
+    """Frames (control steps) per second; divides the physics rate."""
+    physics_hz: int = 240
+    """Physics steps per second."""
+    cameras: tuple[str, ...] = ("front", "wrist")
+    """Names of `demorec list cameras`, or "none"."""
+    width: int = 224
+    """Of the pictures, pixels; even."""
+    height: int = 224
+    """Of the pictures, pixels; even."""
+    renderer: str = "raster"
+    """A name of `demorec list renderers`."""
+    antialias: bool = True
+    """Smooth edges (raster only)."""
+    depth: bool = False
+    """Record depth pictures too."""
+    segmentation: bool = False
+    """Record segmentation pictures too."""
+    video: VideoConfig = field(default_factory=VideoConfig)
+    """Video coding."""
+    variation: Preset = "mild"
+    """How much episodes differ beside their layout: none; mild adds action noise with clean labels; full all."""
+    ranges: Ranges = field(default_factory=Ranges)
+    """Single ranges in place of the preset's."""
+    sampling: Literal["random", "sobol", "lhs"] = "random"
+    """How layouts cover the table: independently, or evenly by a Sobol sequence or Latin hypercubes."""
+    sampling_block: int = 50
+    """Episodes in one Latin hypercube."""
+    split: Literal["all", "train", "eval"] = "all"
+    """train leaves a region and all seeds of eval out; eval starts in that region."""
+    joint_rate: Literal["control", "physics"] = "control"
+    """Joint states once a frame, or at every physics step."""
+    max_attempts: int = 3
+    """How many scenes are tried for an episode before it is given up."""
+    max_episode_seconds: float = 60.0
+    """Simulated seconds after which an episode ends as a failure."""
+
+    def __post_init__(self) -> None:
+        if self.cameras == ("none",):
+            object.__setattr__(self, "cameras", ())
+
+    def validate(self) -> None:
+        """Check all values that can be judged without loading anything heavy.
+
+        Raises:
+            ConfigError: The first impossible value, with what is allowed.
+        """
+        from demorec.registry import nearest_match
+        from demorec.tables import CAMERAS, RENDERERS, ROBOTS, TASKS
+
+        TASKS.check_name(self.task)
+        ROBOTS.check_name(self.robot)
+        RENDERERS.check_name(self.renderer)
+        for name in self.cameras:
+            if name == "none":
+                raise ConfigError(f"--cameras none stands alone, found {' '.join(self.cameras)}.")
+            CAMERAS.check_name(name)
+        if len(set(self.cameras)) != len(self.cameras):
+            raise ConfigError(f"A camera is named twice: {' '.join(self.cameras)}.")
+        _check("seed", self.seed, 0, 2**63 - 1)
+        _check("physics-hz", self.physics_hz, 60, 10_000)
+        _check("fps", self.fps, 1, self.physics_hz)
+        if self.physics_hz % self.fps:
+            divisors = [str(n) for n in range(5, self.physics_hz + 1) if self.physics_hz % n == 0]
+            raise ConfigError(
+                f"fps is {self.fps}, which does not divide the physics rate of {self.physics_hz} Hz."
+                f"{nearest_match(str(self.fps), divisors)} Allowed: {', '.join(divisors)}."
+            )
+        for name, value in (("width", self.width), ("height", self.height)):
+            _check(name, value, 16, 8192)
+            if value % 2:
+                raise ConfigError(
+                    f"{name} is {value}, but yuv420p video needs even sizes: use {value - 1} or {value + 1}."
+                )
+        if self.width * self.height > MAX_PIXELS:
+            raise ConfigError(f"{self.width}x{self.height} is over {MAX_PIXELS} pixels a picture.")
+        if self.variation not in PRESET_NAMES:
+            raise ConfigError(
+                f"Unknown variation {self.variation!r}.{nearest_match(self.variation, PRESET_NAMES)} "
+                f"Allowed: {', '.join(PRESET_NAMES)}."
+            )
+        self.ranges.validate()
+        _check("sampling-block", self.sampling_block, 2, 100_000)
+        _check("max-attempts", self.max_attempts, 1, 100)
+        _check("max-episode-seconds", self.max_episode_seconds, 1.0, 3600.0)
+        self.video.validate()
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodePlan:
+    """One attempt at one episode: all that a worker needs, as plain data that crosses processes."""
+
+    config: GenerateConfig
+    episode_index: int
+    attempt: int = 0
+
+
+def deciding_versions() -> dict[str, str]:
+    """package -> version, of everything that decides the bits of an episode (numba draws, av codes the pictures)."""
+    return dict(_deciding_versions())
+
+
+@functools.cache
+def _deciding_versions() -> tuple[tuple[str, str], ...]:
+    return tuple((name, version(name)) for name in ("demorec", "pybullet", "numpy", "numba", "av"))
+
+
+def load_toml[T](path: Path, cls: type[T]) -> T:
+    """Read a config file.
+
+    Raises:
+        ConfigError: No such file, no TOML, or unknown, missing or mistyped keys (all of them in one message).
+    """
+    return parse_config(read_toml(path), cls, source=str(path))
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """The plain tables of a TOML file; ConfigError when it cannot be read."""
+    try:
+        return tomllib.loads(path.read_text())
+    except OSError as error:
+        raise ConfigError(f"The config file cannot be read ({error.strerror}): {path}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"The config file is no valid TOML ({error}): {path}") from error
+
+
+def parse_config[T](data: dict[str, Any], cls: type[T], *, source: str) -> T:
+    """Plain data to a config; ConfigError names every bad key and the nearest match of an unknown one."""
+    try:
+        return from_plain(data, cls)
+    except ValueError as error:
+        raise ConfigError(f"{source}: {error}.") from error
+
+
+def _check(name: str, value: float, low: float, high: float) -> None:
+    if not low <= value <= high:
+        raise ConfigError(f"{name} is {value}, allowed are {low:g} to {high:g}.")

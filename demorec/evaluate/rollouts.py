@@ -1,0 +1,320 @@
+"""A policy over many held-out scenes, in parallel workers, every rollout recorded.
+
+    OUT/evaluation.json              settings, one line per rollout
+    OUT/episodes/episode_000000.mcap    successes
+    OUT/failed/episode_000003.mcap      failures
+
+The recordings are ordinary ones (view, check, replay and export work on them); `action` is what the policy commanded.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import os
+import shutil
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from demorec.config import EpisodePlan, GenerateConfig
+from demorec.episode import Frame, Outcome, frame_time_ns
+from demorec.errors import ConfigError, DemorecError
+from demorec.evaluate.policy import Policy, find_checkpoint, policy_summary, trained_action
+from demorec.evaluate.progress import Progress, factors_of
+from demorec.evaluate.statistics import Rate
+from demorec.features import ENVIRONMENT_STATE, ActionKind
+from demorec.generate.executor import Lost, Raised
+from demorec.generate.local import LocalExecutor
+from demorec.generate.plan import plain_differences
+from demorec.generate.run_file import EPISODES, FAILED, Attempt
+from demorec.gym_env import DemorecEnv, Situation
+from demorec.plain import from_plain, to_plain
+from demorec.recording import EpisodeWriter
+from demorec.rollout import prepare
+
+EVALUATION_NAME = "evaluation.json"
+POLICY_PHASE = "policy"
+MAKE_ROLLOUT = "demorec.evaluate.rollouts:make_rollout"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """What decides the result of an evaluation.
+
+    Attributes:
+        policy: Folder of the policy; where it lies does not matter, `policy_digest` does.
+        policy_type: LeRobot's name of its kind ("act").
+        policy_digest: SHA-256 of its config and weights, 16 hex digits.
+        config: Task, split, root seed, cameras: which scenes, seen how.
+        action: What the policy's actions mean.
+        action_steps: Actions executed before it looks again; None: as trained.
+        privileged: Whether it sees observation.environment_state.
+        episode_length: Time limit; None: the environment's.
+    """
+
+    policy: str
+    policy_type: str
+    policy_digest: str
+    config: GenerateConfig
+    action: ActionKind
+    action_steps: int | None = None
+    privileged: bool = False
+    episode_length: int | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluation:
+    """An evaluation, finished or not.
+
+    Attributes:
+        settings: What decides the result.
+        rollouts: One line each, in the order of the episodes.
+        factors: For each of these, what was randomised in its scene.
+    """
+
+    settings: Settings
+    rollouts: tuple[Attempt, ...] = ()
+    factors: tuple[Mapping[str, float], ...] = field(default=())
+
+    @property
+    def rate(self) -> Rate:
+        """Of strict successes."""
+        return Rate(successes=sum(r.success for r in self.rollouts), trials=len(self.rollouts))
+
+    @property
+    def successes(self) -> dict[int, bool]:
+        """Scene (episode index) -> success."""
+        return {r.episode_index: r.success for r in self.rollouts}
+
+
+def settings_for(
+    policy: Path,
+    config: GenerateConfig,
+    *,
+    action: ActionKind | None = None,
+    action_steps: int | None = None,
+    episode_length: int | None = None,
+) -> Settings:
+    """Fill in what the policy itself tells: its kind, its actions, its inputs, its cameras' sizes.
+
+    Raises:
+        ConfigError: No policy, cameras that it needs and did not get, or actions of an unknown meaning.
+    """
+    checkpoint = find_checkpoint(policy)
+    plain, digest = policy_summary(checkpoint)
+    inputs: Mapping[str, Any] = plain.get("input_features") or {}
+    pictures = {name.removeprefix("observation.images."): value["shape"] for name, value in inputs.items()
+                if name.startswith("observation.images.")}  # fmt: skip
+    if pictures:
+        (_, height, width), *_ = pictures.values()
+        config = replace(config, cameras=tuple(pictures), width=width, height=height)
+    action = action or trained_action(checkpoint)
+    if action is None:
+        raise ConfigError(
+            "What the policy's actions mean is unknown, since the dataset it was trained on is gone: give --action "
+            "joint, joint_increment, ee or ee_delta."
+        )
+    config.validate()
+    return Settings(
+        policy=str(policy),
+        policy_type=str(plain.get("type", "")),
+        policy_digest=digest,
+        config=config,
+        action=action,
+        action_steps=action_steps,
+        privileged=ENVIRONMENT_STATE in inputs,
+        episode_length=episode_length,
+    )
+
+
+def evaluate(
+    settings: Settings,
+    out: Path,
+    *,
+    num_episodes: int,
+    workers: int,
+    overwrite: bool = False,
+    progress: Callable[[Evaluation], None] = lambda evaluation: None,
+) -> Evaluation:
+    """Run the policy in episodes 0 .. num_episodes - 1; goes on where an evaluation in `out` stopped.
+
+    Raises:
+        ConfigError: Another evaluation, or something else, is in the folder.
+        DemorecError: A rollout could not be carried out.
+    """
+    evaluation = _open(settings, out, overwrite=overwrite)
+    done = evaluation.successes
+    due = [
+        EpisodePlan(config=settings.config, episode_index=index) for index in range(num_episodes) if index not in done
+    ]
+    rollouts = list(evaluation.rollouts)
+    with LocalExecutor(MAKE_ROLLOUT, out, workers=workers, recycle_after=1000) as executor:
+        waiting = list(reversed(due))
+        while waiting or executor.pending:
+            while waiting and executor.has_room:
+                executor.submit(waiting.pop())
+            for report in executor.wait(1.0):
+                if isinstance(report, Raised):
+                    raise DemorecError(f"Episode {report.plan.episode_index}: {report.kind}: {report.message}")
+                if isinstance(report, Lost):
+                    raise DemorecError(f"Episode {report.plan.episode_index} was lost: {report.reason}.")
+                rollouts.append(report.attempt)
+                evaluation = _with(settings, rollouts)
+                _save(evaluation, out)
+                progress(evaluation)
+    return _with(settings, [r for r in evaluation.rollouts if r.episode_index < num_episodes])
+
+
+def load_evaluation(folder: Path) -> Evaluation:
+    """Read evaluation.json; ConfigError where there is none."""
+    path = folder / EVALUATION_NAME
+    try:
+        plain = json.loads(path.read_text())
+        return from_plain(plain, Evaluation)
+    except FileNotFoundError as error:
+        raise ConfigError(f"No {EVALUATION_NAME}, so this is no output of demorec evaluate: {folder}") from error
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{EVALUATION_NAME} is damaged ({error}): {path}") from error
+
+
+def make_rollout(plan: EpisodePlan, folder: Path) -> Attempt:
+    """Run the policy once and record it; the work of a worker (see `demorec.generate.executor.Maker`)."""
+    env, policy = _stage.set(folder)
+    settings = _stage.settings
+    observation, _ = env.reset(seed=plan.episode_index)
+    policy.reset(plan.episode_index)
+    info = replace(env.info, origin=f"rollout of {settings.policy_type} {settings.policy_digest}")
+    progress = Progress(info.scene)
+    name = f"episode_{plan.episode_index:06d}.mcap"
+    path = folder / name
+    with EpisodeWriter(path, info, video=plan.config.video, overwrite=True) as recording:
+        terminated = truncated = False
+        after = env.situation
+        while not (terminated or truncated):
+            before = after
+            observation, _, terminated, truncated, _ = env.step(policy.act(observation, info.instruction))
+            after = env.situation
+            recording.write(_frame(before, after, fps=info.fps))
+            progress.watch(env.world)
+        phase, reason = ("", "") if terminated else progress.failure(after)
+        outcome = Outcome(
+            success=terminated,
+            checks=after.checks,
+            failure_phase=phase,
+            failure_reason=reason,
+            num_frames=after.frame_index,
+            final_state_digest=env.world.state_digest(),
+        )
+        stats = recording.finish(outcome)
+    file = f"{EPISODES if terminated else FAILED}/{name}"
+    path.replace(folder / file)
+    return Attempt(
+        episode_index=plan.episode_index,
+        attempt=info.attempt,
+        seed=plan.config.seed,
+        success=terminated,
+        file=file,
+        sha256="",
+        digest=outcome.final_state_digest[:16],
+        num_frames=stats.num_frames,
+        num_bytes=stats.num_bytes,
+        phase=phase,
+        reason=reason,
+    )
+
+
+def _frame(before: Situation, after: Situation, *, fps: int) -> Frame:
+    """Frame t: what was seen at t, and the command that then led to t + 1."""
+    assert after.command is not None  # since it is no situation after a reset
+    return Frame(
+        frame_index=before.frame_index,
+        time_ns=frame_time_ns(before.frame_index, fps),
+        observation=before.observation,
+        action=after.command,
+        command=after.command,
+        phase=POLICY_PHASE,
+        images=before.images,
+    )
+
+
+class _Stage:
+    """The environment and the policy of this process, kept from one rollout to the next."""
+
+    def __init__(self) -> None:
+        self._folder: Path | None = None
+        self._made: tuple[DemorecEnv, Policy] | None = None
+        self.settings: Settings
+
+    def set(self, folder: Path) -> tuple[DemorecEnv, Policy]:
+        """Those of the evaluation in `folder`."""
+        if self._made is None or self._folder != folder:
+            if self._made is not None:
+                self._made[0].close()
+            self.settings = load_evaluation(folder).settings
+            env = DemorecEnv(
+                config=self.settings.config,
+                action=self.settings.action,
+                privileged=self.settings.privileged,
+                episode_length=self.settings.episode_length,
+            )
+            policy = Policy(find_checkpoint(Path(self.settings.policy)), action_steps=self.settings.action_steps)
+            self._folder, self._made = folder, (env, policy)
+        return self._made
+
+
+_stage = _Stage()
+
+
+def _open(settings: Settings, out: Path, *, overwrite: bool) -> Evaluation:
+    """The evaluation that is in the folder already, or a new one."""
+    ours = out / EVALUATION_NAME
+    if out.exists() and (not out.is_dir() or any(out.iterdir())) and not ours.is_file():
+        raise ConfigError(f"The folder holds something that is no evaluation, choose another --out: {out}")
+    if ours.is_file() and overwrite:
+        for place in (EPISODES, FAILED):
+            shutil.rmtree(out / place, ignore_errors=True)
+        ours.unlink()
+    evaluation = Evaluation(settings=settings)
+    if ours.is_file():
+        evaluation = load_evaluation(out)
+        lines = plain_differences(_deciding(evaluation.settings), _deciding(settings))
+        if lines:
+            raise ConfigError(
+                f"Another evaluation is in this folder ({'; '.join(lines)}): choose another --out or --overwrite: {out}"
+            )
+        kept = [r for r in evaluation.rollouts if (out / r.file).is_file()]
+        evaluation = _with(settings, kept)
+    for place in (EPISODES, FAILED):
+        (out / place).mkdir(parents=True, exist_ok=True)
+    _save(evaluation, out)
+    return evaluation
+
+
+def _deciding(settings: Settings) -> dict[str, Any]:
+    return {key: value for key, value in to_plain(settings).items() if key != "policy"}
+
+
+def _with(settings: Settings, rollouts: list[Attempt]) -> Evaluation:
+    ordered = sorted(rollouts, key=lambda r: r.episode_index)
+    return Evaluation(
+        settings=settings,
+        rollouts=tuple(ordered),
+        factors=tuple(_factors(settings.config, r.episode_index, r.attempt) for r in ordered),
+    )
+
+
+@functools.lru_cache(maxsize=100_000)
+def _factors(config: GenerateConfig, episode_index: int, attempt: int) -> dict[str, float]:
+    plan = EpisodePlan(config=config, episode_index=episode_index, attempt=attempt)
+    return factors_of(prepare(plan).info.scene)
+
+
+def _save(evaluation: Evaluation, folder: Path) -> None:
+    part = folder / f"{EVALUATION_NAME}.part"
+    with part.open("w") as file:
+        json.dump(to_plain(evaluation), file, indent=1, allow_nan=False)
+        file.flush()
+        os.fsync(file.fileno())
+    part.replace(folder / EVALUATION_NAME)

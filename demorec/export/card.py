@@ -1,0 +1,265 @@
+"""The dataset card: README.md, as the Hugging Face Hub shows it, and the sheet of thumbnails that it contains.
+
+Everything in it is read back from the finished dataset, so it is right after an append too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+from PIL import Image
+
+from demorec.errors import ExportError
+from demorec.export.layout import IMAGE_PREFIX, SIDECAR_DIR, DatasetInfo, Feature
+from demorec.export.options import ExportOptions
+from demorec.export.reader import EpisodePlace, episode_places, read_tasks
+from demorec.export.staging import sync_file
+from demorec.export.writer import write_text
+from demorec.features import ACTION, EE_POSE, ENVIRONMENT_STATE, STATE, VELOCITY, ActionKind
+
+CARD_PATH = "README.md"
+SECOND_CARD_PATH = f"{SIDECAR_DIR}/README.md"
+"""Where the card goes if the dataset has a README.md that demorec did not write."""
+THUMBNAILS_PATH = f"{SIDECAR_DIR}/thumbnails.jpg"
+
+
+@dataclass(frozen=True, kw_only=True)
+class CardFacts:
+    """What the card tells that is not in the dataset's tables.
+
+    Attributes:
+        options: Of the export.
+        configs: Config digest -> configuration of the runs.
+        is_transcoded: Whether any pictures were coded anew.
+    """
+
+    options: ExportOptions
+    configs: Mapping[str, Any]
+    is_transcoded: bool
+
+
+_MARK = "<!-- written by demorec, renewed at every export -->"
+_CELLS = 4
+_SHEET_EPISODES, _SHEET_MOMENTS, _SHEET_SIDE = 4, 5, 160
+
+_MEANING = {
+    STATE: "joint positions (rad), gripper opening (m)",
+    VELOCITY: "joint velocities (rad/s), speed of the gripper's opening (m/s)",
+    EE_POSE: "tool centre point in the base frame: position (m), quaternion xyzw with x >= 0",
+    ENVIRONMENT_STATE: "privileged: TCP, objects and goals, symmetric and relative quantities first, raw poses last "
+    "(m, rad; base frame)",
+    "next.reward": "1 at the last frame of a success, else 0",
+    "next.done": "true at the last frame",
+    "next.success": "true at the last frame of a success",
+    "timestamp": "seconds since the episode's start",
+}
+_ACTION_MEANING: Mapping[ActionKind, str] = {
+    "joint": "absolute joint targets (rad), gripper opening (m)",
+    "joint_increment": "joint target minus that of the frame before (rad), the first minus the initial positions, plus "
+    "the way back from exploration noise (demorec.features); gripper opening (m), absolute",
+    "ee": "absolute pose of the tool centre point in the base frame: position (m), quaternion xyzw with x >= 0; "
+    "gripper opening (m)",
+    "ee_delta": "change of the tool centre point's pose since the frame before, the first since the observed one: "
+    "translation (m) and rotation vector (rad) in base axes, applied from the left; gripper opening (m), absolute",
+}
+
+
+def write_card(root: Path, info: DatasetInfo, about: CardFacts) -> None:
+    """Write the card and the thumbnails of a finished dataset folder."""
+    has_sheet = _write_thumbnails(root, info)
+    there = root / CARD_PATH
+    is_ours = not there.exists() or _MARK in there.read_text(errors="replace")
+    path = there if is_ours else root / SECOND_CARD_PATH
+    path.unlink(missing_ok=True)
+    write_text(path, "\n".join(_card(root, info, about, has_sheet)))
+
+
+def _card(root: Path, info: DatasetInfo, about: CardFacts, has_sheet: bool) -> Iterable[str]:
+    options = about.options
+    tasks = read_tasks(root)
+    minutes = info.total_frames / info.fps / 60
+    pictures = (
+        "some pictures were coded anew" if about.is_transcoded else "every video packet is the one that was recorded"
+    )
+    yield from ("---", f"license: {options.license}", "task_categories:", "- robotics")
+    yield from ("tags:", "- LeRobot", "- demorec", "- simulation")
+    yield from ("configs:", "- config_name: default", "  data_files: data/*/*.parquet", "---", _MARK)
+    yield from (f"# {options.repo_id}", "")
+    yield (
+        f"{info.total_episodes} scripted demonstrations by a simulated {info.robot_type} arm in PyBullet, "
+        f"{info.total_frames} frames at {info.fps} Hz ({minutes:.1f} minutes), in the LeRobot v3.0 format. Recorded "
+        f"and exported by demorec; {pictures}."
+    )
+    yield from ("", "## Task", "", *(f"- {task}" for task in tasks[:20]))
+    if len(tasks) > 20:
+        yield f"- and {len(tasks) - 20} more"
+    if has_sheet:
+        yield from ("", f"![First to last picture of some episodes]({THUMBNAILS_PATH})")
+    yield from ("", "## Use", "", "```python", "from lerobot.datasets import LeRobotDataset", "")
+    yield from (f'dataset = LeRobotDataset("{options.repo_id}")  # or with root="path/of/this/folder"', "```", "")
+    yield from ("## Features", "", "| feature | type | shape | meaning |", "|---|---|---|---|")
+    for key, item in info.features.items():
+        yield f"| `{key}` | {item.dtype} | {list(item.shape)} | {_meaning(key, item, options)} |"
+    yield from ("", "Names of all components are in `meta/info.json`.", "", "## Contract", "")
+    yield (
+        "Row t holds the observation at time t, taken before the action of row t is applied; the action is what the "
+        "expert wanted to be reached at the next frame. Where exploration noise was added to what the motors got, the "
+        "action is derived from the clean target. Frame times are multiples of the simulation's frame period, not of a "
+        "wall clock."
+    )
+    yield ""
+    yield from _success_section(_read_attempts(root))
+    yield from ("## What stands beside", "")
+    yield (
+        f"`{SIDECAR_DIR}/` holds what LeRobot has no column for: `episodes/` (seed, outcome with every check, phases, "
+        "camera intrinsics and extrinsics, poses, the complete scene of every episode), `camera_poses/` (of moving "
+        "cameras, per frame, world_from_camera, OpenCV axes), `attempts/` (failed ones too), `configs.json`."
+    )
+    yield ""
+    yield from _origin_section(about.configs)
+
+
+def _meaning(key: str, item: Feature, options: ExportOptions) -> str:
+    if key == ACTION:
+        return _ACTION_MEANING[options.action]
+    if item.is_depth:
+        return "distance along the optical axis, 12-bit logarithmic codes of 0.01 to 10 m; 0.01 m: nothing was hit"
+    if key.startswith(IMAGE_PREFIX):
+        return f"camera {key.removeprefix(IMAGE_PREFIX)}, RGB"
+    return _MEANING.get(key, "filled in by LeRobot's rules")
+
+
+def _origin_section(configs: Mapping[str, Any]) -> Iterable[str]:
+    yield "## Origin"
+    yield ""
+    for digest, config in configs.items():
+        chosen = ", ".join(f"{key} {config[key]}" for key in ("task", "robot", "renderer", "seed") if key in config)
+        yield f"- configuration `{digest or 'unknown'}`: {chosen or 'not recorded'}"
+    yield ""
+
+
+# ------------------------------------------------------------------------------------------------------ success rates
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Attempts:
+    success: NDArray[np.bool_]  # (N,)
+    reasons: list[str]
+    positions: Mapping[str, NDArray[np.float64]]  # what -> (N, 2), nan where unknown
+
+
+def _read_attempts(root: Path) -> _Attempts:
+    columns = ["success", "failure_phase", "failure_reason", "object_x", "object_y", "goal_x", "goal_y"]
+    files = sorted((root / SIDECAR_DIR / "attempts").glob("*/*.parquet"))
+    table = pa.concat_tables([pq.read_table(file, columns=columns) for file in files])
+    coordinates = {name: table.column(name).to_numpy().astype(np.float64) for name in columns[3:]}
+    reasons = [
+        f"{reason} in phase {phase}" if phase else reason
+        for phase, reason in zip(
+            table.column("failure_phase").to_pylist(), table.column("failure_reason").to_pylist(), strict=True
+        )
+    ]
+    return _Attempts(
+        success=table.column("success").to_numpy().astype(np.bool_),
+        reasons=reasons,
+        positions={
+            "object": np.stack([coordinates["object_x"], coordinates["object_y"]], axis=1),
+            "goal": np.stack([coordinates["goal_x"], coordinates["goal_y"]], axis=1),
+        },
+    )
+
+
+def _success_section(attempts: _Attempts) -> Iterable[str]:
+    total, good = len(attempts.success), int(attempts.success.sum())
+    yield "## Success"
+    yield ""
+    yield f"{good} of {total} attempts that were made for this dataset succeeded ({100 * good / total:.1f} %)."
+    counts: dict[str, int] = {}
+    for reason, success in zip(attempts.reasons, attempts.success, strict=True):
+        if not success:
+            counts[reason] = counts.get(reason, 0) + 1
+    for reason, count in sorted(counts.items(), key=lambda item: (-item[1], item[0])):
+        yield f"- {count} failed: {reason or 'no reason recorded'}"
+    yield ""
+    for what, positions in attempts.positions.items():
+        if total >= 2 and np.isfinite(positions).all():
+            yield f"By the start position of the {what} (successes / attempts, world frame):"
+            yield ""
+            yield from success_table(positions, attempts.success)
+            yield ""
+
+
+def success_table(positions: NDArray[np.float64], success: NDArray[np.bool_]) -> Iterable[str]:
+    """Markdown table of successes / attempts over a grid of positions (N, 2), x downwards and y to the right."""
+    low, high = positions.min(axis=0), positions.max(axis=0)
+    cells = np.where(high - low > 1e-6, _CELLS, 1)
+    width = np.where(high > low, high - low, 1.0)
+    index = np.clip(((positions - low) / width * cells).astype(np.int64), 0, cells - 1)
+
+    def span(axis: int, cell: int) -> str:
+        step = (high[axis] - low[axis]) / cells[axis]
+        return f"{low[axis] + cell * step:.3f} to {low[axis] + (cell + 1) * step:.3f} m"
+
+    yield "| x \\ y | " + " | ".join(span(1, column) for column in range(cells[1])) + " |"
+    yield "|---" * (cells[1] + 1) + "|"
+    for row in range(cells[0]):
+        texts = []
+        for column in range(cells[1]):
+            here = (index[:, 0] == row) & (index[:, 1] == column)
+            texts.append(f"{int(success[here].sum())} / {int(here.sum())}" if here.any() else "")
+        yield f"| {span(0, row)} | " + " | ".join(texts) + " |"
+
+
+# --------------------------------------------------------------------------------------------------------- thumbnails
+
+
+def _write_thumbnails(root: Path, info: DatasetInfo) -> bool:
+    """A row per episode, from its first to its last picture; False for a dataset without cameras."""
+    key = next((name for name, item in info.features.items() if item.is_video and not item.is_depth), None)
+    if key is None:
+        return False
+    wanted = set(np.linspace(0, info.total_episodes - 1, _SHEET_EPISODES).round().astype(int).tolist())
+    places = [place for place in episode_places(root, info) if place.episode_index in wanted]
+    height, width, _ = info.features[key].shape
+    scale = _SHEET_SIDE / max(height, width)
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    sheet = Image.new("RGB", (size[0] * _SHEET_MOMENTS, size[1] * len(places)))
+    for row, place in enumerate(places):
+        moments = np.linspace(0, place.length - 1, _SHEET_MOMENTS).round().astype(int).tolist()
+        for column, picture in enumerate(_pictures(root, info, key, place, moments)):
+            sheet.paste(Image.fromarray(picture).resize(size, reducing_gap=1.0), (column * size[0], row * size[1]))
+    path = root / THUMBNAILS_PATH
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.unlink(missing_ok=True)
+    sheet.save(path, quality=85)
+    sync_file(path)
+    return True
+
+
+def _pictures(
+    root: Path, info: DatasetInfo, key: str, place: EpisodePlace, moments: Sequence[int]
+) -> Iterable[NDArray[np.uint8]]:
+    position, first = place.videos[key]
+    path = root / position.path(info.video_path or "", key)
+    try:
+        with av.open(str(path)) as container:
+            stream = container.streams.video[0]
+            stream.thread_type = "NONE"  # starting threads costs more than a few pictures
+            for moment in moments:
+                time = (first + moment) / info.fps
+                assert stream.time_base is not None
+                container.seek(round(time / stream.time_base), stream=stream)
+                for frame in container.decode(stream):
+                    if frame.time is not None and frame.time > time - 0.5 / info.fps:
+                        yield np.asarray(frame.to_ndarray(format="rgb24"), dtype=np.uint8)
+                        break
+    except (OSError, av.FFmpegError) as error:
+        raise ExportError(f"The finished video cannot be read back ({error}): {path}") from error

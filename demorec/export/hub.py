@@ -1,0 +1,44 @@
+"""Uploads a finished dataset to the Hugging Face Hub."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from demorec.errors import ExportError
+from demorec.export.layout import CODEBASE_VERSION
+
+
+def push_to_hub(folder: Path, repo_id: str, *, private: bool) -> str:
+    """Upload the folder as a dataset repository, tagged with the format's version as LeRobot expects it.
+
+    Returns:
+        Its address.
+
+    Raises:
+        ExportError: No token, no network, no right to write there; the folder stays as it is.
+    """
+    from huggingface_hub import HfApi, get_token
+
+    if "/" not in repo_id:
+        raise ExportError(f"--repo-id is {repo_id!r}, the Hub needs OWNER/NAME; the dataset is kept: {folder}")
+    if get_token() is None:
+        raise ExportError(
+            "The dataset was not uploaded, there is no Hugging Face token: type hf auth login, or set HF_TOKEN, and "
+            f"then: hf upload {repo_id} {folder} --repo-type dataset"
+        )
+    hub = HfApi()
+    try:
+        url = hub.create_repo(repo_id, repo_type="dataset", private=private, exist_ok=True)
+        hub.upload_folder(
+            repo_id=repo_id,
+            folder_path=folder,
+            repo_type="dataset",
+            commit_message="Upload dataset",
+        )
+        hub.create_tag(repo_id, tag=CODEBASE_VERSION, repo_type="dataset", exist_ok=True)
+    except Exception as error:  # the hub's client raises errors of several HTTP libraries
+        raise ExportError(
+            f"The dataset was not uploaded to {repo_id} ({type(error).__name__}: {str(error).splitlines()[0]}); "
+            f"it is kept: {folder}"
+        ) from error
+    return str(url)

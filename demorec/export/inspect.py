@@ -1,0 +1,119 @@
+"""What a dataset holds: a summary, and the digest of its content recomputed from its files."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import pyarrow.parquet as pq
+
+from demorec.errors import ExportError
+from demorec.export.digest import combined_digest, episode_digest
+from demorec.export.layout import INFO_PATH, SIDECAR_DIR, DatasetInfo
+from demorec.export.reader import PacketReader, RowReader, episode_places, read_tasks
+
+
+@dataclass(frozen=True, kw_only=True)
+class DatasetSummary:
+    """What `demorec info` tells about a dataset.
+
+    Attributes:
+        path: Folder.
+        fps, robot_type, num_episodes, num_frames: As info.json says.
+        tasks: Instructions.
+        features: (name, dtype, shape, component names or None).
+        cameras: (name, width, height, codec).
+        num_files, num_bytes: On disk.
+        num_successes: Episodes that succeeded, None in a dataset that does not tell.
+        num_attempts: Attempts that were made for it, None where unknown.
+    """
+
+    path: Path
+    fps: int
+    robot_type: str | None
+    num_episodes: int
+    num_frames: int
+    tasks: tuple[str, ...]
+    features: tuple[tuple[str, str, tuple[int, ...], tuple[str, ...] | None], ...]
+    cameras: tuple[tuple[str, int, int, str], ...]
+    num_files: int
+    num_bytes: int
+    num_successes: int | None
+    num_attempts: int | None
+
+
+def is_dataset(path: Path) -> bool:
+    """Whether a folder looks like a LeRobot dataset."""
+    return (path / INFO_PATH).is_file()
+
+
+def dataset_info(path: Path) -> DatasetSummary:
+    """Read the summary of a LeRobot v3.0 dataset, whoever wrote it.
+
+    Raises:
+        ExportError: None there, or damaged.
+    """
+    info = DatasetInfo.load(path)
+    files = [file for file in path.rglob("*") if file.is_file()]
+    attempts = sorted((path / SIDECAR_DIR / "attempts").glob("*/*.parquet"))
+    successes = sorted((path / SIDECAR_DIR / "episodes").glob("*/*.parquet"))
+    try:
+        num_attempts = sum(pq.read_metadata(file).num_rows for file in attempts) if attempts else None
+        columns = [pq.read_table(file, columns=["success"]).column("success") for file in successes]
+    except (OSError, ValueError) as error:
+        raise ExportError(f"The sidecar of the dataset cannot be read ({error}): {path}") from error
+    return DatasetSummary(
+        path=path,
+        fps=info.fps,
+        robot_type=info.robot_type,
+        num_episodes=info.total_episodes,
+        num_frames=info.total_frames,
+        tasks=tuple(read_tasks(path)) if info.total_tasks else (),
+        features=tuple((name, item.dtype, item.shape, item.names) for name, item in info.features.items()),
+        cameras=tuple(
+            (name, item.shape[1], item.shape[0], str((item.info or {}).get("video.codec", "")))
+            for name, item in info.features.items()
+            if item.is_video
+        ),
+        num_files=len(files),
+        num_bytes=sum(file.stat().st_size for file in files),
+        num_successes=sum(sum(column.to_pylist()) for column in columns) if columns else None,
+        num_attempts=num_attempts,
+    )
+
+
+def dataset_digest(path: Path) -> str:
+    """SHA-256 (hex) of the content, read back from all files; `ExportReport.digest` of a new dataset is the same.
+
+    Raises:
+        ExportError: The dataset is damaged.
+    """
+    info = DatasetInfo.load(path)
+    return combined_digest(info, list(episode_digests(path, info)))
+
+
+def episode_digests(path: Path, info: DatasetInfo) -> list[str]:
+    """The digest of every episode, in order, read back from all files."""
+    unknown = [name for name, feature in info.features.items() if feature.dtype in ("image", "language")]
+    if unknown:
+        raise ExportError(f"The content of {', '.join(unknown)} has no digest, it is neither video nor numbers: {path}")
+    tasks = read_tasks(path)
+    rows = RowReader(path, info)
+    cameras = {key: PacketReader(path, info, key) for key in info.video_keys}
+    result = []
+    try:
+        for place in episode_places(path, info):
+            columns = rows.read(place)
+            videos = {}
+            for key, packets in cameras.items():
+                pictures = hashlib.sha256()
+                for sample in packets.read(place):
+                    pictures.update(sample)
+                videos[key] = pictures.hexdigest()
+            task = tasks[int(columns["task_index"][0, 0])]
+            result.append(episode_digest(task, columns, videos))
+    finally:
+        for packets in cameras.values():
+            packets.close()
+    return result

@@ -1,0 +1,172 @@
+"""Recordings to a LeRobot v3.0 dataset: `export_lerobot`, from the first recording to the finished folder."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import nullcontext
+from dataclasses import replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from demorec.errors import ExportError
+from demorec.export.card import CardFacts, write_card
+from demorec.export.digest import combined_digest
+from demorec.export.existing import Existing, features_to_append, link_files, open_existing
+from demorec.export.hub import push_to_hub
+from demorec.export.inspect import episode_digests
+from demorec.export.layout import DatasetInfo
+from demorec.export.options import ExportOptions, ExportReport, Progress
+from demorec.export.readings import Reading, readings
+from demorec.export.sidecar import AttemptRecord, SidecarStart, SidecarWriter
+from demorec.export.sources import Source, find_recordings, refuse_differences
+from demorec.export.staging import staged_folder
+from demorec.export.verify import MAX_EPISODES, Sample, Verifier
+from demorec.export.writer import DatasetWriter, WriterStart
+
+
+def export_lerobot(
+    sources: Sequence[Path], out: Path, options: ExportOptions, progress: Progress | None = None
+) -> ExportReport:
+    """Write the recordings into the dataset folder `out`: whole, or not at all.
+
+    Args:
+        sources: Recordings, runs, or folders of recordings.
+        out: Folder of the dataset.
+        options: How.
+        progress: Called after every recording.
+
+    Raises:
+        ConfigError: Options that contradict each other.
+        ExportError: Nothing to export, recordings that differ, a dataset in the way, a full disk, a failed
+            verification. What was at `out` is still there then.
+        RecordingError: A recording is damaged.
+    """
+    options.validate()
+    found = find_recordings(sources, include_failures=options.include_failures)
+    existing = open_existing(out) if options.append and out.exists() else None
+    with (
+        staged_folder(out, replace=options.overwrite or existing is not None) as folder,
+        Verifier() if options.verify else nullcontext() as verifier,
+    ):
+        if existing is not None:
+            link_files(existing.root, folder)
+        export = _Export(folder, found, options, existing)
+        report = export.run(progress)
+        if verifier is not None:
+            report = replace(report, verified_frames=verifier.verify(folder, export.samples(), options))
+    report = replace(report, path=out)
+    if options.push_to_hub:
+        report = replace(report, url=push_to_hub(out, options.repo_id, private=not options.public))
+    return report
+
+
+class _Export:
+    """One export into an empty (or linked) folder."""
+
+    def __init__(self, folder: Path, found: list[Source], options: ExportOptions, existing: Existing | None) -> None:
+        self._folder = folder
+        self._found = found
+        self._options = options
+        self._existing = existing
+        self._left_out: tuple[str, ...] = ()
+        self._transcoded: dict[str, None] = {}
+        self._digests: list[str] = []
+        self._recordings: list[Path] = []
+        self._skipped_failures = 0
+
+    def run(self, progress: Progress | None) -> ExportReport:
+        found = readings(self._found, self._options, progress)
+        waiting: list[AttemptRecord] = []  # failed attempts before the first episode
+        first = None
+        for first in found:
+            if first.prepared is not None:
+                break
+            waiting.append(first.attempt)
+        if first is None or first.prepared is None:
+            raise ExportError(
+                f"Nothing to export: of {len(self._found)} recordings, {len(waiting)} are failed attempts and the "
+                "others are not among the wanted episodes (--include-failures, --episodes)."
+            )
+        info = self._dataset_info(first)
+        start = self._existing.writer if self._existing else WriterStart()
+        sidecar_start = self._existing.sidecar if self._existing else SidecarStart()
+        limits: dict[str, Any] = {"limit_mb": info.data_files_size_in_mb, "chunks_size": info.chunks_size}
+        with (
+            DatasetWriter(self._folder, info, start) as writer,
+            SidecarWriter(self._folder, sidecar_start, **limits) as sidecar,
+        ):
+            for attempt in waiting:
+                self._add_failure(sidecar, attempt)
+            self._add(writer, sidecar, first)
+            for reading in found:
+                if reading.prepared is None:
+                    self._add_failure(sidecar, reading.attempt)
+                    continue
+                if reading.profile != first.profile:
+                    refuse_differences(
+                        first.profile, first.path, (source.path for source in self._found), self._options
+                    )
+                self._add(writer, sidecar, reading)
+            finished = writer.finish()
+            configs = sidecar.finish(self._about_this_export())
+        facts = CardFacts(options=self._options, configs=configs, is_transcoded=bool(self._transcoded))
+        write_card(self._folder, finished, facts)
+        before = episode_digests(self._existing.root, self._existing.info) if self._existing else []
+        return ExportReport(
+            path=self._folder,
+            num_episodes=finished.total_episodes,
+            num_frames=finished.total_frames,
+            new_episodes=finished.total_episodes - start.num_episodes,
+            new_frames=finished.total_frames - start.num_frames,
+            skipped_failures=self._skipped_failures,
+            transcoded=tuple(self._transcoded),
+            left_out=self._left_out,
+            digest=combined_digest(finished, [*before, *self._digests]),
+        )
+
+    def samples(self) -> list[Sample]:
+        """What shall be verified: the new episodes, or some of them, spread evenly, if there are very many."""
+        first = self._existing.writer.num_episodes if self._existing else 0
+        count = len(self._recordings)
+        chosen = np.unique(np.linspace(0, count - 1, min(count, MAX_EPISODES)).round().astype(int)).tolist()
+        return [Sample(episode_index=first + index, recording=self._recordings[index]) for index in chosen]
+
+    def _dataset_info(self, first: Reading) -> DatasetInfo:
+        if self._existing is not None:
+            self._left_out = features_to_append(self._existing, first.features, fps=first.fps, robot=first.robot)
+            return self._existing.info
+        return DatasetInfo(
+            fps=first.fps,
+            features=first.features,
+            robot_type=first.robot,
+            chunks_size=self._options.files_per_chunk,
+            data_files_size_in_mb=self._options.data_files_mb,
+            video_files_size_in_mb=self._options.video_files_mb,
+        )
+
+    def _add(self, writer: DatasetWriter, sidecar: SidecarWriter, reading: Reading) -> None:
+        assert reading.prepared is not None
+        written = writer.add(reading.prepared.data)
+        sidecar.add(written, reading.prepared.record)
+        self._digests.append(written.digest)
+        self._recordings.append(reading.path)
+        self._transcoded.update(dict.fromkeys(reading.transcoded))
+
+    def _add_failure(self, sidecar: SidecarWriter, attempt: AttemptRecord) -> None:
+        sidecar.add_attempt(attempt, in_dataset=False)
+        self._skipped_failures += 1
+
+    def _about_this_export(self) -> dict[str, Any]:
+        options = self._options
+        return {
+            "demorec": version("demorec"),
+            "action": options.action,
+            "privileged": options.privileged,
+            "include_failures": options.include_failures,
+            "episodes": options.episodes,
+            "fps": options.fps,
+            "depth": options.depth,
+        }

@@ -1,0 +1,107 @@
+"""Recordings read and prepared, in order, by this process or by several."""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+
+from demorec.export.layout import Feature
+from demorec.export.options import ExportOptions, Progress, parse_episodes
+from demorec.export.prepare import PreparedEpisode, dataset_features, frame_stride, prepare_episode
+from demorec.export.sidecar import AttemptRecord
+from demorec.export.sources import Profile, Source
+from demorec.export.transcode import reason_to_transcode
+from demorec.recording import Recording
+
+_BYTES_THAT_PAY = 1 << 30
+"""Reading is so quick that starting processes pays from about a gigabyte of recordings on (benchmarks/export.py)."""
+_AHEAD = 3
+"""Recordings that each process may be ahead of the writer: bounds the memory."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Reading:
+    """What came of one recording.
+
+    Attributes:
+        path: The recording.
+        attempt: For the success rates.
+        profile: What must agree with all the others.
+        features, fps, robot: Of a dataset made from it.
+        transcoded: Cameras whose pictures had to be coded anew, with the reason.
+        prepared: The episode; None for a failed attempt that is left out.
+    """
+
+    path: Path
+    attempt: AttemptRecord
+    profile: Profile
+    features: dict[str, Feature]
+    fps: int
+    robot: str
+    transcoded: tuple[str, ...]
+    prepared: PreparedEpisode | None
+
+
+def read(source: Source, options: ExportOptions) -> Reading | None:
+    """Read one recording; None if its episode is not wanted (`--episodes`).
+
+    Raises:
+        RecordingError: It is damaged.
+        ExportError: It has no frames, or its fps is no multiple of the wanted one.
+    """
+    with Recording(source.path) as recording:
+        info = recording.info
+        if not parse_episodes(options.episodes)(info.episode_index):
+            return None
+        attempt = AttemptRecord.of(recording)
+        stride = frame_stride(info.fps, options.fps)
+        is_wanted = source.is_chosen and (attempt.success or options.include_failures)
+        reasons = {name: reason_to_transcode(recording.video_settings(name), stride) for name in recording.cameras}
+        return Reading(
+            path=source.path,
+            attempt=attempt,
+            profile=Profile.of(recording, options),
+            features=dataset_features(recording, options),
+            fps=info.fps // stride,
+            robot=info.robot.name,
+            transcoded=tuple(f"{camera}, {reason}" for camera, reason in reasons.items() if reason),
+            prepared=prepare_episode(recording, options) if is_wanted else None,
+        )
+
+
+def readings(sources: Sequence[Source], options: ExportOptions, progress: Progress | None) -> Iterator[Reading]:
+    """Every wanted recording in order; several processes read ahead where that pays."""
+    workers = options.workers or _workers_that_pay(sources, options)
+    found = _in_processes(sources, options, workers) if workers > 1 else (read(source, options) for source in sources)
+    for done, reading in enumerate(found, start=1):
+        if reading is not None:
+            yield reading
+        if progress is not None:
+            progress(done, len(sources))
+
+
+def _workers_that_pay(sources: Sequence[Source], options: ExportOptions) -> int:
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    transcodes = options.depth or options.fps is not None
+    size = sum(source.path.stat().st_size for source in sources) * (20 if transcodes else 1)
+    return min(cores - 1, 8) if size >= _BYTES_THAT_PAY else 1
+
+
+def _in_processes(sources: Sequence[Source], options: ExportOptions, workers: int) -> Iterator[Reading | None]:
+    waiting: deque[Future[Reading | None]] = deque()
+    with ProcessPoolExecutor(max_workers=workers, mp_context=get_context("spawn")) as pool:
+        try:
+            for source in sources:
+                waiting.append(pool.submit(read, source, options))
+                if len(waiting) >= workers * _AHEAD:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            for future in waiting:
+                future.cancel()

@@ -1,0 +1,115 @@
+"""Which recordings go into a dataset, and whether they go together."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from demorec.errors import ExportError
+from demorec.export.options import ExportOptions
+from demorec.features import observation_names
+from demorec.plain import digest
+from demorec.recording import Recording
+
+
+@dataclass(frozen=True, kw_only=True)
+class Source:
+    """One recording.
+
+    Attributes:
+        path: The file.
+        is_chosen: False for a failed attempt that only counts for the success rate.
+    """
+
+    path: Path
+    is_chosen: bool = True
+
+
+def find_recordings(paths: Sequence[Path], *, include_failures: bool) -> list[Source]:
+    """The recordings in the given files, runs (folders with episodes/) and folders of recordings, in order.
+
+    Raises:
+        ExportError: A path is missing, holds no recording, or the same recording is given twice.
+    """
+    found: list[Source] = []
+    for path in paths:
+        if path.is_file():
+            found.append(Source(path=path))
+            continue
+        if not path.is_dir():
+            raise ExportError(f"No such recording or run: {path}")
+        episodes = path / "episodes" if (path / "episodes").is_dir() else path
+        failed = sorted((path / "failed").glob("*.mcap")) if (path / "failed").is_dir() else []
+        of_path = [Source(path=file) for file in sorted(episodes.glob("*.mcap"))]
+        of_path += [Source(path=file, is_chosen=include_failures) for file in failed]
+        if not of_path:
+            raise ExportError(f"No finished recordings (*.mcap) in episodes/ of the folder: {path}")
+        found += sorted(of_path, key=_attempt_order)
+    seen: set[Path] = set()
+    for source in found:
+        resolved = source.path.resolve()
+        if resolved in seen:
+            raise ExportError(f"The same recording is given twice: {source.path}")
+        seen.add(resolved)
+    return found
+
+
+def _attempt_order(source: Source) -> tuple[str, bool, str]:
+    """Failed attempts at an episode before the one that succeeded."""
+    episode, _, attempt = source.path.stem.partition(".")
+    return episode, not attempt, attempt
+
+
+@dataclass(frozen=True, kw_only=True)
+class Profile:
+    """What all recordings of a dataset must have in common, as (what, value) in words."""
+
+    traits: tuple[tuple[str, str], ...]
+
+    @classmethod
+    def of(cls, recording: Recording, options: ExportOptions) -> Profile:
+        """That of a recording, as far as it matters for these options."""
+        info = recording.info
+        traits = [("fps", str(info.fps)), ("robot", f"{info.robot.name} ({digest(info.robot)})")]
+        traits.append(("cameras", " ".join(recording.cameras) or "none"))
+        for camera in info.scene.cameras:
+            settings = recording.video_settings(camera.name)
+            traits.append((f"size of camera {camera.name}", f"{settings.width}x{settings.height}"))
+            traits.append((f"codec of camera {camera.name}", settings.codec))
+        if options.privileged:
+            names = observation_names(info.robot, info.scene, privileged=True)["observation.environment_state"]
+            traits.append(("objects and goals", " ".join(dict.fromkeys(name.partition(".")[0] for name in names))))
+            traits.append(("components of the environment state", f"{len(names)} ({digest(list(names))})"))
+        return cls(traits=tuple(traits))
+
+    def differences(self, other: Profile) -> tuple[str, ...]:
+        """How `other` differs, in words."""
+        mine, theirs = dict(self.traits), dict(other.traits)
+        return tuple(
+            f"{what} is {theirs[what]} instead of {mine[what]}"
+            for what in mine
+            if what in theirs and theirs[what] != mine[what]
+        )
+
+
+def refuse_differences(profile: Profile, reference: Path, paths: Iterable[Path], options: ExportOptions) -> None:
+    """Raise ExportError with every difference between the reference and any of the recordings.
+
+    Called only when one is known to differ: then all headers are read, so that the user hears of everything at once.
+    """
+    files_by_difference: dict[str, list[str]] = {}
+    for path in paths:
+        with Recording(path) as recording:
+            for difference in profile.differences(Profile.of(recording, options)):
+                files_by_difference.setdefault(difference, []).append(path.name)
+    if files_by_difference:
+        told = "; ".join(f"{difference} ({_some(files)})" for difference, files in files_by_difference.items())
+        raise ExportError(
+            f"These recordings do not go into one dataset with {reference.name}: {told}. Export them separately."
+        )
+
+
+def _some(names: list[str]) -> str:
+    shown = ", ".join(names[:3])
+    return shown if len(names) <= 3 else f"{shown} and {len(names) - 3} more"

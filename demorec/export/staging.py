@@ -1,0 +1,135 @@
+"""A folder that is made beside its place and takes it in one step: whole or not at all.
+
+Everything is written below `.NAME.demorec-export/new`. At the end the two folders change places by one system call
+(renameat2 with RENAME_EXCHANGE on Linux, renamex_np on macOS): at no moment is the dataset missing or half written.
+Leftovers of a crash lie in that one folder and are removed by the next export to the same place.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import fcntl
+import os
+import shutil
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from demorec.errors import ExportError
+
+_RENAME_EXCHANGE = 2
+_AT_FDCWD = -100
+_RENAME_SWAP_MACOS = 2
+
+
+@contextmanager
+def staged_folder(target: Path, *, replace: bool) -> Iterator[Path]:
+    """Give an empty folder that becomes `target` when the block ends without an error.
+
+    Args:
+        target: Where the folder shall be; its parent is made if it is missing.
+        replace: Whether a folder that is there is replaced (and then deleted).
+
+    Raises:
+        ExportError: The target is there and not to be replaced, another export is writing to it, or the disk is full.
+    """
+    target = Path.cwd() / target
+    if not replace and (target.is_symlink() or target.exists()) and not _is_empty_folder(target):
+        raise ExportError(f"The dataset is there already, choose --append, --overwrite or another --out: {target}")
+    if target.is_symlink():
+        target = target.resolve()
+    workshop = target.parent / f".{target.name}.demorec-export"
+    try:
+        workshop.mkdir(parents=True, exist_ok=True)
+        with _locked(workshop, target):
+            new = workshop / "new"
+            if (workshop / "old").exists() and not target.exists():  # a crash between the two renames
+                (workshop / "old").rename(target)
+                if not replace:
+                    raise ExportError(f"The dataset is there already, restored after a crash: {target}")
+            try:
+                if new.exists():
+                    shutil.rmtree(new)
+                new.mkdir()
+                yield new
+                _sync_folders(new)
+                _take_place(new, target)
+                sync_file(target.parent)
+            finally:
+                shutil.rmtree(workshop, ignore_errors=True)
+    except OSError as error:
+        raise ExportError(f"The dataset cannot be written ({error.strerror or error}): {target}") from error
+
+
+def _is_empty_folder(path: Path) -> bool:
+    return path.is_dir() and not any(path.iterdir())
+
+
+@contextmanager
+def _locked(workshop: Path, target: Path) -> Iterator[None]:
+    """Hold the workshop; the lock dies with the process, so a crash leaves none."""
+    while True:
+        handle = os.open(workshop / "lock", os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            os.close(handle)
+            raise ExportError(f"Another export is writing this dataset, wait until it is done: {target}") from error
+        # The holder before us may have removed the folder, and its lock file with it, between the two calls.
+        if (workshop / "lock").exists() and os.path.samestat(os.fstat(handle), (workshop / "lock").stat()):
+            break
+        os.close(handle)
+        workshop.mkdir(parents=True, exist_ok=True)
+    try:
+        yield
+    finally:
+        os.close(handle)
+
+
+def _take_place(new: Path, target: Path) -> None:
+    if not target.exists():
+        new.rename(target)
+        return
+    try:
+        _exchange(new, target)
+    except OSError as error:
+        if error.errno not in (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP):
+            raise
+        # A file system without the exchange: two renames, the second one undone if it fails.
+        aside = new.with_name("old")
+        target.rename(aside)
+        try:
+            new.rename(target)
+        except BaseException:
+            aside.rename(target)
+            raise
+
+
+def _exchange(a: Path, b: Path) -> None:
+    library = ctypes.CDLL(None, use_errno=True)
+    try:
+        if sys.platform == "darwin":
+            result = library.renamex_np(os.fsencode(a), os.fsencode(b), _RENAME_SWAP_MACOS)
+        else:
+            result = library.renameat2(_AT_FDCWD, os.fsencode(a), _AT_FDCWD, os.fsencode(b), _RENAME_EXCHANGE)
+    except AttributeError:
+        raise OSError(errno.ENOSYS, "no exchange of folders in this C library") from None
+    if result != 0:
+        code = ctypes.get_errno()
+        raise OSError(code, os.strerror(code), str(b))
+
+
+def sync_file(path: Path) -> None:
+    """Make a file or a folder's entries durable."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _sync_folders(root: Path) -> None:
+    for folder, _, _ in os.walk(root, topdown=False):
+        sync_file(Path(folder))

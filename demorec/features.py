@@ -1,0 +1,393 @@
+"""The vectors that a policy sees and gives: one computation for the export and for the environments.
+
+A policy trained on an exported dataset meets the same numbers in closed loop only if both come from the same
+arithmetic. So everything here works on rows (T frames, or one) with additions, multiplications, divisions and
+square roots alone: IEEE 754 rounds these the same on every CPU and for every array length, unlike the
+vectorised sines of NumPy. The result is rounded to float32 once, at the end.
+
+Frames: everything is expressed in the robot's base frame (the world's, where the robot stands at its origin).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.episode import EpisodeColumns, Observation, RobotSpec
+from demorec.geometry import Array, Pose, quat_multiply
+from demorec.scene import Goal, Scene
+
+Vectors = NDArray[np.float32]
+
+STATE = "observation.state"
+VELOCITY = "observation.velocity"
+EE_POSE = "observation.ee_pose"
+ENVIRONMENT_STATE = "observation.environment_state"
+ACTION = "action"
+
+ActionKind = Literal["joint", "joint_increment", "ee", "ee_delta"]
+"""What the action column holds; `action_vectors` defines each."""
+
+NOISE_LETS_GO = 0.3
+"""Share of the exploration noise on the executed commands that goes away within 1/30 s, when none is added.
+
+Known to both sides: `demorec.rollout.ActionNoise` makes the noise so, and the increments below contain this return.
+"""
+
+NEAR = 0.02
+"""Offset, metres, at which a near-field component is a half. A centimetre decides whether an object is where it shall
+be, but is a twentieth of a standard deviation of the plain offset, which a policy learns last."""
+
+_POSITION = ("x", "y", "z")
+_POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ObservationRows:
+    """The numbers of T observations; shapes and units as in `demorec.episode.Observation`."""
+
+    joint_position: Array  # (T, n_joints)
+    joint_velocity: Array  # (T, n_joints)
+    gripper_width: Array  # (T,)
+    base_from_tcp: Array  # (T, 7)
+    object_poses: Mapping[str, Array]  # name -> (T, 7), world_from_object
+
+    @classmethod
+    def of_columns(cls, columns: EpisodeColumns, rows: NDArray[np.intp] | slice = slice(None)) -> ObservationRows:
+        """Those of a recorded episode, or of some of its frames."""
+        return cls(
+            joint_position=columns.joint_position[rows],
+            joint_velocity=columns.joint_velocity[rows],
+            gripper_width=columns.gripper_width[rows],
+            base_from_tcp=columns.base_from_tcp[rows],
+            object_poses={name: poses[rows] for name, poses in columns.object_poses.items()},
+        )
+
+    @classmethod
+    def of_observation(cls, observation: Observation) -> ObservationRows:
+        """One observation, as T = 1."""
+        return cls(
+            joint_position=observation.joint_position[np.newaxis],
+            joint_velocity=observation.joint_velocity[np.newaxis],
+            gripper_width=np.array([observation.gripper_width]),
+            base_from_tcp=observation.base_from_tcp.vector()[np.newaxis],
+            object_poses={name: pose.vector()[np.newaxis] for name, pose in observation.object_poses.items()},
+        )
+
+
+def observation_names(robot: RobotSpec, scene: Scene, *, privileged: bool = False) -> dict[str, tuple[str, ...]]:
+    """Feature name -> name of every component, in the order of `observation_vectors`."""
+    arm = robot.arm_joints
+    names = {
+        STATE: (*(f"{joint}.pos" for joint in arm), "gripper.width"),
+        VELOCITY: (*(f"{joint}.vel" for joint in arm), "gripper.vel"),
+        EE_POSE: tuple(f"tcp.{axis}" for axis in _POSE),
+    }
+    if privileged:
+        names[ENVIRONMENT_STATE] = tuple(_environment_names(robot, scene))
+    return names
+
+
+def observation_vectors(
+    rows: ObservationRows, robot: RobotSpec, scene: Scene, *, privileged: bool = False
+) -> dict[str, Vectors]:
+    """Feature name -> (T, D) float32.
+
+    - `observation.state`: arm joint positions (rad), gripper opening (m).
+    - `observation.velocity`: arm joint velocities (rad/s), speed of the gripper's opening (m/s).
+    - `observation.ee_pose`: base_from_tcp, xyz (m) and quaternion xyzw. Of the two signs of the quaternion the one
+      with x >= 0: it does not jump for a hand that points down within 180 degrees of yaw.
+    - `observation.environment_state` (only if `privileged`): see `_environment_columns`.
+    """
+    arm = len(robot.arm_joints)
+    velocity = rows.joint_velocity
+    features = {
+        STATE: _float32([rows.joint_position[:, :arm], rows.gripper_width]),
+        VELOCITY: _float32([velocity[:, :arm], _gripper_velocity(velocity, arm)]),
+        EE_POSE: _float32([_continuous(rows.base_from_tcp)]),
+    }
+    if privileged:
+        features[ENVIRONMENT_STATE] = _float32(_environment_columns(rows, robot, scene))
+    return features
+
+
+# ---------------------------------------------------------------------------------------------- environment state
+
+
+def _environment_names(robot: RobotSpec, scene: Scene) -> Iterable[str]:
+    yield from (f"tcp.{axis}" for axis in _POSITION)
+    yield from ("tcp.yaw.sin", "tcp.yaw.cos")
+    for label, goal in _labelled_goals(scene):
+        n = scene.body(goal.object).yaw_symmetry
+        yield from (f"{label}.{axis}" for axis in _POSITION)
+        yield from (f"{label}.size.{axis}" for axis in _POSITION)
+        yield from (f"{label}.from_tcp.{axis}" for axis in _POSITION)
+        yield from (f"{label}.from_tcp.hand_{axis}" for axis in _POSITION)
+        if n:
+            yield from _yaw_names(f"{label}.yaw", n)
+            yield from _yaw_names(f"{label}.from_tcp.yaw", n)
+        yield from (f"{label}.goal.{axis}" for axis in _POSITION)
+        yield from (f"{label}.goal.size.{axis}" for axis in _POSITION)
+        yield from (f"{label}.goal.from_tcp.{axis}" for axis in _POSITION)
+        yield from (f"{label}.goal.from_tcp.hand_{axis}" for axis in _POSITION)
+        yield from (f"{label}.from_tcp.near_{axis}" for axis in _POSITION)
+        yield from (f"{label}.goal.from_tcp.near_{axis}" for axis in _POSITION)
+        yield from (f"{label}.goal.from_{goal.object}.near_{axis}" for axis in _POSITION)
+        if goal.yaw_symmetry:
+            yield from _yaw_names(f"{label}.goal.yaw", goal.yaw_symmetry)
+            yield from _yaw_names(f"{label}.goal.from_{goal.object}.yaw", goal.yaw_symmetry)
+    yield from (f"{joint}.vel" for joint in robot.arm_joints)
+    yield "gripper.vel"
+    for body in scene.movable:
+        yield from (f"{body.name}.pose.{axis}" for axis in _POSE)
+
+
+def _yaw_names(prefix: str, n: int) -> tuple[str, str]:
+    times = "" if n == 1 else str(n)
+    return f"{prefix}.sin{times}", f"{prefix}.cos{times}"
+
+
+def _environment_columns(rows: ObservationRows, robot: RobotSpec, scene: Scene) -> list[Array]:
+    """What a policy learns best from, then what is as it is (metres, rad; base frame).
+
+    First the TCP: position, yaw of the hand as sine and cosine. Per goal, the object: position, full extents,
+    position relative to the TCP in base axes and in hand axes, and, for a body that looks the same every 2 pi / n,
+    its yaw as sine and cosine of n times the angle, absolute and relative to the hand. The same of the wanted pose
+    (the extents are those of the body that is placed onto, 0 for a place in the world; the relative yaw is that
+    to the object), and the offsets object - TCP, goal - TCP and goal - object once more as near-field components
+    (`_near`). Then the velocities of `observation.velocity`, because LeRobot's ACT takes no second state
+    vector, and last the raw poses of all movable bodies.
+    """
+    count = len(rows.gripper_width)
+    base_from_world = scene.robot.world_from_base.inverse().vector()[np.newaxis]
+    tcp = rows.base_from_tcp
+    poses = {name: _compose(base_from_world, pose) for name, pose in rows.object_poses.items()}
+    hand_yaw = _yaw(tcp, 1)
+    columns = [tcp[:, :3], *hand_yaw]
+    for _, goal in _labelled_goals(scene):
+        body = scene.body(goal.object)
+        onto_pose, onto_size = _onto(scene, goal, poses, base_from_world)
+        wanted = _compose(onto_pose, goal.onto_from_goal.vector()[np.newaxis])
+        wanted = np.broadcast_to(wanted, (count, 7))
+        object_ = poses[goal.object]
+        columns += [object_[:, :3], _repeat(body.shape.extents, count), *_seen_from(tcp, object_)]
+        if body.yaw_symmetry:
+            object_yaw = _yaw(object_, body.yaw_symmetry)
+            columns += [*object_yaw, *_difference(object_yaw, _yaw(tcp, body.yaw_symmetry))]
+        columns += [wanted[:, :3], _repeat(onto_size, count), *_seen_from(tcp, wanted)]
+        columns += [_near(object_, tcp), _near(wanted, tcp), _near(wanted, object_)]
+        if goal.yaw_symmetry:
+            wanted_yaw = _yaw(wanted, goal.yaw_symmetry)
+            columns += [*wanted_yaw, *_difference(wanted_yaw, _yaw(object_, goal.yaw_symmetry))]
+    arm = len(robot.arm_joints)
+    columns += [rows.joint_velocity[:, :arm], _gripper_velocity(rows.joint_velocity, arm)]
+    columns += [poses[body.name] for body in scene.movable]
+    return columns
+
+
+def _labelled_goals(scene: Scene) -> list[tuple[str, Goal]]:
+    """Each goal with a unique label: its object's name, numbered from the second goal for the same object on."""
+    seen: dict[str, int] = {}
+    labelled = []
+    for goal in scene.goals:
+        seen[goal.object] = seen.get(goal.object, 0) + 1
+        labelled.append((goal.object if seen[goal.object] == 1 else f"{goal.object}#{seen[goal.object]}", goal))
+    return labelled
+
+
+def _onto(
+    scene: Scene, goal: Goal, poses: Mapping[str, Array], base_from_world: Array
+) -> tuple[Array, tuple[float, float, float]]:
+    if not goal.onto:
+        return base_from_world, (0.0, 0.0, 0.0)
+    body = scene.body(goal.onto)
+    if goal.onto in poses:
+        return poses[goal.onto], body.shape.extents
+    return _compose(base_from_world, body.world_from_body.vector()[np.newaxis]), body.shape.extents
+
+
+def _seen_from(tcp: Array, pose: Array) -> tuple[Array, Array]:
+    offset = pose[:, :3] - tcp[:, :3]
+    conjugate = tcp[:, 3:] * np.array([-1.0, -1.0, -1.0, 1.0])
+    return offset, _rotate(conjugate, offset)
+
+
+def _near(pose: Array, origin: Array) -> Array:
+    """(T, 3) offset d from another pose, base axes, each as d / (|d| + 2 cm): -1 .. 1, steep where it matters."""
+    offset = pose[:, :3] - origin[:, :3]
+    return np.asarray(offset / (np.abs(offset) + NEAR), dtype=np.float64)
+
+
+def _yaw(pose: Array, n: int) -> tuple[Array, Array]:
+    """Sine and cosine (T,) of n times the yaw of the body axis that `demorec.scene.yaw_of` takes."""
+    rotation = _rotation(pose[:, 3:])
+    vertical = np.argmax(np.abs(rotation[:, 2]), axis=1)
+    horizontal = (vertical + 1) % 3
+    frame = np.arange(len(pose))
+    x, y = rotation[frame, 0, horizontal], rotation[frame, 1, horizontal]
+    length = np.sqrt(x * x + y * y)
+    sin1, cos1 = y / length, x / length
+    sin, cos = sin1, cos1
+    for _ in range(n - 1):
+        sin, cos = sin * cos1 + cos * sin1, cos * cos1 - sin * sin1
+    return sin, cos
+
+
+def _difference(a: tuple[Array, Array], b: tuple[Array, Array]) -> tuple[Array, Array]:
+    (sin_a, cos_a), (sin_b, cos_b) = a, b
+    return sin_a * cos_b - cos_a * sin_b, cos_a * cos_b + sin_a * sin_b
+
+
+# --------------------------------------------------------------------------------------------------------- actions
+
+
+def action_names(robot: RobotSpec, kind: ActionKind) -> tuple[str, ...]:
+    """Name of every component of `action_vectors`."""
+    if kind == "joint":
+        return (*(f"{joint}.pos" for joint in robot.arm_joints), "gripper.width")
+    if kind == "joint_increment":
+        return (*(f"{joint}.delta" for joint in robot.arm_joints), "gripper.width")
+    if kind == "ee":
+        return (*(f"tcp.{axis}" for axis in _POSE), "gripper.width")
+    return ("tcp.dx", "tcp.dy", "tcp.dz", "tcp.rx", "tcp.ry", "tcp.rz", "gripper.width")
+
+
+def action_vectors(
+    columns: EpisodeColumns, scene: Scene, kind: ActionKind, rows: NDArray[np.intp] | slice = slice(None)
+) -> Vectors:
+    """(T, D) float32, the expert's wanted commands; the last component is always the absolute gripper opening (m).
+
+    - `joint`: absolute joint targets, rad.
+    - `joint_increment`: joint target minus the one of the frame before; the first minus the scene's initial joint
+      positions. Sum them up to execute them (`joint_target_from_increment`). Where the executed command of the frame
+      before had noise on it, the increment also takes back the share that lets go within a frame (`NOISE_LETS_GO`):
+      it is then what the robot is expected to do next from where the noise has brought it. Without this, noise would
+      teach a policy to stay off the path: increments of the clean targets alone do not know that it left it.
+    - `ee`: absolute base_from_tcp target, xyz (m) and quaternion xyzw with x >= 0.
+    - `ee_delta`: change of that pose since the frame before, the first since the TCP pose observed at frame 0:
+      translation in base axes (m), then rotation vector in base axes (rad, |r| <= pi), to be applied from the left
+      (`pose_from_delta`); noise is taken back as in `joint_increment`, the rotation vectors being added.
+
+    Args:
+        columns: Of the whole episode.
+        scene: Of the episode.
+        kind: Which form.
+        rows: Frames whose actions are wanted; increments are taken between these.
+    """
+    gripper = columns.action_gripper[rows]
+    if kind == "joint":
+        return _float32([columns.action_joint_target[rows], gripper])
+    if kind == "joint_increment":
+        targets, commands = columns.action_joint_target[rows], columns.command_joint_target[rows]
+        increments = targets - np.concatenate([np.array([scene.robot.joint_position]), targets[:-1]])
+        increments[1:] += _noise_share(columns.time_ns[rows]) * (targets[:-1] - commands[:-1])
+        return _float32([increments, gripper])
+    poses, executed = columns.action_base_from_tcp[rows], columns.command_base_from_tcp[rows]
+    if kind == "ee":
+        return _float32([_continuous(poses), gripper])
+    before = np.concatenate([columns.base_from_tcp[:1], poses[:-1]])
+    shifts, turns = poses[:, :3] - before[:, :3], _rotation_vectors(before[:, 3:], poses[:, 3:])
+    share = _noise_share(columns.time_ns[rows])
+    shifts[1:] += share * (poses[:-1, :3] - executed[:-1, :3])
+    turns[1:] += share * _rotation_vectors(executed[:-1, 3:], poses[:-1, 3:])
+    return _float32([shifts, turns, gripper])
+
+
+def _noise_share(time_ns: NDArray[np.int64]) -> float:
+    """`NOISE_LETS_GO` for the interval between these frames."""
+    if len(time_ns) < 2:
+        return 0.0
+    return float(1.0 - (1.0 - NOISE_LETS_GO) ** (30.0 * 1e-9 * int(time_ns[1] - time_ns[0])))
+
+
+def joint_target_from_increment(previous: Array, action: NDArray[np.floating]) -> Array:
+    """(n_arm,) joint target after one action of kind `joint_increment`; start from the initial joint positions."""
+    return np.asarray(previous + np.asarray(action, dtype=np.float64)[: len(previous)], dtype=np.float64)
+
+
+def pose_from_delta(previous: Pose, action: NDArray[np.floating]) -> Pose:
+    """base_from_tcp target after one action of kind `ee_delta`; start from the observed TCP pose."""
+    delta = np.asarray(action, dtype=np.float64)
+    angle = math.sqrt(float(delta[3]) ** 2 + float(delta[4]) ** 2 + float(delta[5]) ** 2)
+    scale = math.sin(angle / 2) / angle if angle > 0 else 0.5
+    turn = np.array([delta[3] * scale, delta[4] * scale, delta[5] * scale, math.cos(angle / 2)])
+    return Pose(position=previous.position + delta[:3], quat_xyzw=quat_multiply(turn, previous.quat_xyzw))
+
+
+def _rotation_vectors(before: Array, after: Array) -> Array:
+    """(T, 3) rotation vector that turns `before` into `after`, applied from the left.
+
+    Python's scalar functions, since those of NumPy round differently from one CPU to the next.
+    """
+    vectors = np.empty((len(after), 3))
+    for t, (a, b) in enumerate(zip(after, before, strict=True)):
+        x, y, z, w = quat_multiply(a, [-b[0], -b[1], -b[2], b[3]]).tolist()
+        if w < 0:
+            x, y, z, w = -x, -y, -z, -w
+        sine = math.sqrt(x * x + y * y + z * z)
+        scale = 2 * math.atan2(sine, w) / sine if sine > 0 else 2.0
+        vectors[t] = x * scale, y * scale, z * scale
+    return vectors
+
+
+# ---------------------------------------------------------------------------------------------- arithmetic on rows
+
+
+def _float32(columns: Iterable[Array]) -> Vectors:
+    parts = [part[:, np.newaxis] if part.ndim == 1 else part for part in columns]
+    return np.concatenate(parts, axis=1).astype(np.float32)
+
+
+def _repeat(values: tuple[float, ...], count: int) -> Array:
+    return np.broadcast_to(np.array(values, dtype=np.float64), (count, len(values)))
+
+
+def _gripper_velocity(joint_velocity: Array, arm: int) -> Array:
+    total: Array = np.zeros(len(joint_velocity))
+    for finger in range(arm, joint_velocity.shape[1]):
+        total = total + joint_velocity[:, finger]
+    return total
+
+
+def _continuous(pose: Array) -> Array:
+    """The same poses, quaternions with x >= 0."""
+    sign = np.where(pose[:, 3:4] < 0, -1.0, 1.0)
+    return np.concatenate([pose[:, :3], pose[:, 3:] * sign], axis=1)
+
+
+def _compose(a: Array, b: Array) -> Array:
+    """(T, 7) of a @ b; either may have one row."""
+    ax, ay, az, aw = a[:, 3], a[:, 4], a[:, 5], a[:, 6]
+    bx, by, bz, bw = b[:, 3], b[:, 4], b[:, 5], b[:, 6]
+    position = a[:, :3] + _rotate(a[:, 3:], b[:, :3])
+    quat = np.stack(
+        [
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+            aw * bw - ax * bx - ay * by - az * bz,
+        ],
+        axis=1,
+    )
+    return np.concatenate([position, quat], axis=1)
+
+
+def _rotation(quat: Array) -> Array:
+    """(T, 3, 3) of unit quaternions (T, 4) xyzw."""
+    x, y, z, w = quat[:, 0], quat[:, 1], quat[:, 2], quat[:, 3]
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=1) for row in rows], axis=1)
+
+
+def _rotate(quat: Array, vector: Array) -> Array:
+    r = _rotation(quat)
+    return np.asarray(r[:, :, 0] * vector[:, 0:1] + r[:, :, 1] * vector[:, 1:2] + r[:, :, 2] * vector[:, 2:3])

@@ -1,0 +1,126 @@
+"""What an executor is, and what it reports: the driver is the same for one process, one machine and a cluster."""
+
+from __future__ import annotations
+
+import importlib
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import psutil
+
+from demorec.config import EpisodePlan
+from demorec.errors import DemorecError
+from demorec.generate.run_file import Attempt
+
+Maker = Callable[[EpisodePlan, Path], Attempt]
+"""Makes one attempt in the run's folder: writes the recording to its place, then returns its line."""
+
+MAKE_EPISODE = "demorec.generate.worker:make_episode"
+"""Makers are given by name and imported in the worker, so that the driver never loads a simulator."""
+
+_THREAD_SETTINGS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+SINGLE_THREADED = dict.fromkeys(_THREAD_SETTINGS, "1")
+"""Environment of a worker: a worker is one core, so that N workers take N cores and not N times N threads."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Made:
+    """An attempt has come to its end, with a recording."""
+
+    plan: EpisodePlan
+    attempt: Attempt
+    peak_bytes: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Raised:
+    """An attempt raised an exception. Told in words: an exception of somebody's task may not survive pickling.
+
+    `errno` is that of the operating system's error in the chain, if any; `exit_code` that of a DemorecError, else 0.
+    """
+
+    plan: EpisodePlan
+    kind: str
+    message: str
+    traceback: str
+    errno: int | None
+    exit_code: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lost:
+    """The worker ended without a word (killed, out of memory, its machine gone)."""
+
+    plan: EpisodePlan
+    reason: str
+
+
+Report = Made | Raised | Lost
+
+
+class Executor(Protocol):
+    """Carries out plans in other processes."""
+
+    @property
+    def workers(self) -> int:
+        """How many processes work at the same time."""
+
+    @property
+    def has_room(self) -> bool:
+        """Whether `submit` may be called; bounds what is in flight."""
+
+    @property
+    def pending(self) -> int:
+        """Plans submitted and not yet reported."""
+
+    def submit(self, plan: EpisodePlan) -> None:
+        """Start an attempt; returns at once."""
+
+    def wait(self, timeout_s: float) -> list[Report]:
+        """What has ended; waits up to `timeout_s` for the first."""
+
+    def interrupt(self) -> None:
+        """Ask every worker to leave its attempt where it is and end."""
+
+    def close(self) -> None:
+        """End every worker, whatever it does; harmless when called twice."""
+
+    def __enter__(self) -> Executor: ...
+
+    def __exit__(self, *exc: object) -> None: ...
+
+
+def attempt_episode(maker: str, plan: EpisodePlan, folder: Path) -> Made | Raised:
+    """Run the maker of that name and turn what happens into a report; the same in every executor."""
+    try:
+        module, _, name = maker.partition(":")
+        make: Maker = getattr(importlib.import_module(module), name)
+        attempt = make(plan, folder)
+    except Exception as error:
+        # A library may wrap the operating system's error; the first one in the chain tells what to do.
+        cause: BaseException | None = error
+        while cause is not None and not isinstance(cause, OSError):
+            cause = cause.__cause__ or cause.__context__
+        return Raised(
+            plan=plan,
+            kind=type(error).__name__,
+            message=str(error),
+            traceback=traceback.format_exc(),
+            errno=cause.errno if isinstance(cause, OSError) else None,
+            exit_code=error.exit_code if isinstance(error, DemorecError) else 0,
+        )
+    return Made(plan=plan, attempt=attempt, peak_bytes=peak_memory())
+
+
+def peak_memory() -> int:
+    """Largest resident size of this process so far, bytes (the present one where the system does not keep it)."""
+    try:
+        for line in Path("/proc/self/status").read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) * 1024
+    except OSError:
+        pass
+    return int(psutil.Process().memory_info().rss)

@@ -1,0 +1,210 @@
+"""Workers on this machine: spawned processes, one pipe each, so that killing one cannot harm the others.
+
+A shared queue (multiprocessing.Queue, ProcessPoolExecutor) has locks that a killed worker takes with it; with a
+pipe of its own a worker's death is an end-of-file and nothing else.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from multiprocessing import connection
+from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnProcess
+from pathlib import Path
+from types import FrameType
+
+from demorec.config import EpisodePlan
+from demorec.generate.executor import SINGLE_THREADED, Lost, Report, attempt_episode
+
+_spawn = multiprocessing.get_context("spawn")
+
+
+class _Interrupted(BaseException):
+    """Raised in a worker by SIGTERM; passes every `except Exception`, so that the writer leaves its part file."""
+
+
+@dataclass(eq=False)
+class _Worker:
+    process: SpawnProcess
+    pipe: Connection[EpisodePlan | None, Report]
+    plan: EpisodePlan | None = None
+    given: int = 0
+
+
+class LocalExecutor:
+    """A fixed number of worker processes, started when they are needed, replaced when they die or have grown old.
+
+    Args:
+        maker: What a worker does with a plan, as "module:function".
+        folder: Of the run.
+        workers: Number of processes.
+        recycle_after: Attempts after which a worker is replaced.
+    """
+
+    def __init__(self, maker: str, folder: Path, *, workers: int, recycle_after: int) -> None:
+        self._maker = maker
+        self._folder = folder
+        self._num_workers = workers
+        self._recycle_after = recycle_after
+        self._live: list[_Worker] = []
+        self._retired: list[_Worker] = []
+
+    @property
+    def workers(self) -> int:
+        """Number of processes."""
+        return self._num_workers
+
+    @property
+    def has_room(self) -> bool:
+        """Whether a worker is idle or yet to be started."""
+        return self.pending < self._num_workers
+
+    @property
+    def pending(self) -> int:
+        """Busy workers."""
+        return sum(worker.plan is not None for worker in self._live)
+
+    def submit(self, plan: EpisodePlan) -> None:
+        """Give the plan to an idle worker, or to a new one."""
+        worker = next((w for w in self._live if w.plan is None), None)
+        if worker is None:
+            worker = self._start()
+        worker.plan = plan
+        worker.given += 1
+        # A worker that died while idle shows at the next wait: the plan is then reported as lost.
+        with suppress(OSError):
+            worker.pipe.send(plan)
+
+    def wait(self, timeout_s: float) -> list[Report]:
+        """What has ended; waits up to `timeout_s` for the first."""
+        reports: list[Report] = []
+        by_pipe = {worker.pipe: worker for worker in self._live}
+        for pipe in connection.wait(list(by_pipe), timeout_s):
+            worker = by_pipe[pipe]  # type: ignore[index]
+            plan, worker.plan = worker.plan, None
+            try:
+                reports.append(worker.pipe.recv())
+                if worker.given >= self._recycle_after:
+                    self._retire(worker)
+            except (EOFError, OSError):
+                self._live.remove(worker)
+                worker.process.join()
+                worker.pipe.close()
+                if plan is not None:
+                    reports.append(Lost(plan=plan, reason=_death(worker.process.exitcode)))
+        return reports
+
+    def interrupt(self) -> None:
+        """Ask every worker to leave its attempt where it is and end."""
+        for worker in self._live:
+            worker.process.terminate()
+
+    def close(self) -> None:
+        """End every worker: idle ones by word, busy ones by SIGKILL (their part files stay)."""
+        for worker in list(self._live):
+            if worker.plan is None:
+                self._retire(worker)
+            else:
+                worker.process.kill()
+        for worker in self._live + self._retired:
+            worker.process.join(timeout=5.0)
+            if worker.process.exitcode is None:
+                worker.process.kill()
+                worker.process.join()
+            worker.pipe.close()
+        self._live.clear()
+        self._retired.clear()
+
+    def __enter__(self) -> LocalExecutor:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def _start(self) -> _Worker:
+        ours, theirs = _spawn.Pipe()
+        process = _spawn.Process(
+            target=_worker_main, args=(theirs, self._maker, self._folder), name="demorec-worker", daemon=True
+        )
+        with _environment(SINGLE_THREADED), _blocked(signal.SIGINT):
+            process.start()
+        theirs.close()  # else the pipe would never report that the worker is gone
+        worker = _Worker(process=process, pipe=ours)
+        self._live.append(worker)
+        return worker
+
+    def _retire(self, worker: _Worker) -> None:
+        self._live.remove(worker)
+        self._retired = [w for w in self._retired if w.process.exitcode is None]
+        self._retired.append(worker)
+        with suppress(OSError):
+            worker.pipe.send(None)
+
+
+def _worker_main(pipe: Connection[Report, EpisodePlan | None], maker: str, folder: Path) -> None:
+    """Life of a worker: plans in, reports out, until None, SIGTERM or the driver's death."""
+    # Ctrl-C reaches the whole process group; it is the driver who decides what it means.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    signal.signal(signal.SIGTERM, _raise_interrupted)
+    threading.Thread(target=_end_with_driver, daemon=True).start()
+    try:
+        while (plan := pipe.recv()) is not None:
+            pipe.send(attempt_episode(maker, plan, folder))
+    except (EOFError, OSError, _Interrupted):
+        pass
+    # Nothing is left to be flushed, and native libraries may crash or dawdle while they are torn down.
+    sys.stderr.flush()
+    os._exit(0)
+
+
+def _raise_interrupted(number: int, frame: FrameType | None) -> None:
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    raise _Interrupted
+
+
+def _end_with_driver() -> None:
+    """Leave no orphan behind when the driver is killed: its end of a pipe closes, whatever it died of."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        connection.wait([parent.sentinel])
+        os._exit(1)
+
+
+def _death(exitcode: int | None) -> str:
+    if exitcode is not None and exitcode < 0:
+        name = signal.Signals(-exitcode).name
+        return f"its worker was ended by {name}" + (" (out of memory?)" if exitcode == -signal.SIGKILL else "")
+    return f"its worker ended with exit code {exitcode}"
+
+
+@contextmanager
+def _environment(variables: dict[str, str]) -> Iterator[None]:
+    """Set environment variables for a child that starts inside; libraries read them when they are imported."""
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+@contextmanager
+def _blocked(number: signal.Signals) -> Iterator[None]:
+    """Hold a signal back, here and in a child that starts inside, until each is ready for it."""
+    signal.pthread_sigmask(signal.SIG_BLOCK, {number})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {number})

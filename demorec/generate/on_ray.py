@@ -1,0 +1,179 @@
+"""Workers on a Ray cluster: the same worker function, one Ray task an attempt, over a folder that all nodes share.
+
+Tasks, not actors: Ray places them wherever a CPU is free, also on nodes that join later, and keeps its worker
+processes warm between tasks of one function. Lost tasks come back to the driver, which gives them out again; so
+the bound and the words are those of the local executor.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from pathlib import Path
+from typing import Any
+
+from demorec.config import EpisodePlan
+from demorec.errors import ConfigError, GenerationError, MissingDependencyError
+from demorec.generate.executor import SINGLE_THREADED, Lost, Report, attempt_episode
+from demorec.generate.options import available_cores
+from demorec.generate.run_file import RUN_NAME
+
+try:
+    import ray
+except ImportError as error:
+    raise MissingDependencyError("The Ray executor", "ray", "pip install 'demorec[ray]'") from error
+
+_QUEUED_PER_WORKER = 0.25
+"""Attempts submitted beyond those that can run: Ray hands a freed CPU the next one without asking the driver."""
+_STORE_BYTES = 100 << 20
+"""Object store of a cluster of our own: only lines of run.json pass through it."""
+_RECOUNT_S = 5.0
+"""How often the cluster is asked for its size."""
+
+
+class RayExecutor:
+    """Attempts as Ray tasks; bounded in flight by the size of the cluster, which may change while the run works.
+
+    Args:
+        maker: What a worker does with a plan, as "module:function".
+        folder: Of the run; the workers must see it under the same path.
+        workers: Attempts at the same time; None: as many as the cluster has room for.
+        address: Of the cluster; "local" starts one on this machine. A connection that exists already is used.
+        cpus_per_worker, gpus_per_worker: That each attempt reserves.
+        recycle_after: Attempts after which Ray replaces a worker process.
+
+    Raises:
+        ConfigError: The cluster cannot be reached or has no room for a worker.
+    """
+
+    def __init__(
+        self,
+        maker: str,
+        folder: Path,
+        *,
+        workers: int | None,
+        address: str,
+        cpus_per_worker: float,
+        gpus_per_worker: float,
+        recycle_after: int,
+    ) -> None:
+        self._maker = maker
+        self._folder = str(folder)
+        self._asked = workers
+        self._needs = {"CPU": cpus_per_worker, "GPU": gpus_per_worker}
+        self._pending: dict[Any, EpisodePlan] = {}
+        self._counted_at = -1e9
+        self._size = 0
+        self._owns_connection = not ray.is_initialized()
+        if self._owns_connection:
+            _connect(address, workers or available_cores())
+        self._task = ray.remote(
+            num_cpus=cpus_per_worker,
+            num_gpus=gpus_per_worker,
+            max_calls=recycle_after,
+            max_retries=0,
+            runtime_env={"env_vars": SINGLE_THREADED},
+        )(_attempt)
+        if self.workers < 1:
+            have = ray.cluster_resources()
+            self.close()
+            raise ConfigError(
+                f"The Ray cluster has {have.get('CPU', 0):g} CPUs and {have.get('GPU', 0):g} GPUs, too few for one "
+                f"worker with {cpus_per_worker:g} CPUs and {gpus_per_worker:g} GPUs: lower --cpus-per-worker or "
+                "--gpus-per-worker."
+            )
+
+    @property
+    def workers(self) -> int:
+        """Attempts that the cluster has room for now, or as many as were asked for."""
+        if time.monotonic() - self._counted_at > _RECOUNT_S:
+            self._counted_at = time.monotonic()
+            have = ray.cluster_resources()
+            self._size = min(int(have.get(name, 0) / need) for name, need in self._needs.items() if need > 0)
+        return self._size if self._asked is None else min(self._asked, self._size)
+
+    @property
+    def has_room(self) -> bool:
+        """Whether less is in flight than the cluster can take."""
+        return self.pending < self.workers + int(self.workers * _QUEUED_PER_WORKER * (self._asked is None))
+
+    @property
+    def pending(self) -> int:
+        """Attempts in flight."""
+        return len(self._pending)
+
+    def submit(self, plan: EpisodePlan) -> None:
+        """Hand an attempt to Ray."""
+        self._pending[self._task.remote(self._maker, plan, self._folder)] = plan
+
+    def wait(self, timeout_s: float) -> list[Report]:
+        """What has ended; waits up to `timeout_s` for the first."""
+        waiting = list(self._pending)
+        done, _ = ray.wait(waiting, num_returns=1, timeout=timeout_s)
+        if done:
+            done, _ = ray.wait(waiting, num_returns=len(waiting), timeout=0)
+        reports: list[Report] = []
+        for reference in done:
+            plan = self._pending.pop(reference)
+            try:
+                reports.append(ray.get(reference))
+            except ray.exceptions.TaskCancelledError:
+                reports.append(Lost(plan=plan, reason="it was cancelled"))
+            except ray.exceptions.RayTaskError as error:
+                # What the maker raises comes back as a report; this is the worker that cannot even begin.
+                raise GenerationError(f"A Ray worker cannot work: {_last_line(error)}") from error
+            except ray.exceptions.RuntimeEnvSetupError as error:
+                raise GenerationError(f"A Ray worker cannot be set up: {_last_line(error)}") from error
+            except ray.exceptions.RayError as error:
+                reports.append(Lost(plan=plan, reason=f"its Ray worker was lost ({type(error).__name__})"))
+        return reports
+
+    def interrupt(self) -> None:
+        """Ask every worker to leave its attempt where it is."""
+        for reference in self._pending:
+            ray.cancel(reference, force=False)
+
+    def close(self) -> None:
+        """Cancel what is in flight and leave the cluster (which ends it if it was started here)."""
+        if not ray.is_initialized():
+            return
+        for reference in self._pending:
+            ray.cancel(reference, force=True)
+        self._pending.clear()
+        if self._owns_connection:
+            ray.shutdown()
+
+    def __enter__(self) -> RayExecutor:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+
+def _attempt(maker: str, plan: EpisodePlan, folder: str) -> Report:
+    """What runs on a node."""
+    path = Path(folder)
+    if not (path / RUN_NAME).exists():
+        raise FileNotFoundError(
+            f"the node {ray.util.get_node_ip_address()} does not see the output folder: put it on storage that all "
+            f"nodes share under one path: {folder}"
+        )
+    return attempt_episode(maker, plan, path)
+
+
+def _connect(address: str, cores: int) -> None:
+    options: dict[str, Any] = {"logging_level": logging.ERROR, "log_to_driver": False}
+    try:
+        if address == "local":
+            ray.init(
+                address="local", num_cpus=cores, object_store_memory=_STORE_BYTES, include_dashboard=False, **options
+            )
+        else:
+            ray.init(address=address, **options)
+    except (ConnectionError, ValueError, RuntimeError) as error:
+        raise ConfigError(f"The Ray cluster at {address!r} cannot be reached: {_last_line(error)}") from error
+
+
+def _last_line(error: BaseException) -> str:
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return lines[-1] if lines else type(error).__name__

@@ -1,0 +1,95 @@
+"""How a run is carried out: where, how many, by whom. None of it decides what an episode contains."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from demorec.errors import ConfigError
+
+MAX_EPISODES = 10_000_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions:
+    """Everything about a run that leaves the data alone."""
+
+    out: Path | None = None
+    """Folder of the run (auto: recordings/TASK). The same command again goes on where it stopped."""
+    num_episodes: int = 50
+    """How many successful episodes to make; a larger number extends the run."""
+    workers: int | None = None
+    """Processes that simulate (auto: one for each core; with Ray: as many as the cluster has room for)."""
+    executor: Literal["local", "ray"] = "local"
+    """Processes of this machine, or tasks of a Ray cluster."""
+    address: str = "local"
+    """Ray: the cluster, for example auto (the one that this machine belongs to) or HOST:6379; local: this machine
+    alone."""
+    cpus_per_worker: float = 1.0
+    """Ray: CPUs that each worker reserves."""
+    gpus_per_worker: float = 0.0
+    """Ray: GPUs that each worker reserves (for --renderer egl)."""
+    recycle_after: int = 500
+    """Episodes after which a worker process is replaced by a fresh one."""
+    export: bool = True
+    """Export the successful episodes to a LeRobot dataset in OUT/dataset."""
+    repo_id: str | None = None
+    """Name of the dataset, OWNER/NAME (auto: local/TASK)."""
+    overwrite: bool = False
+    """Delete the run that the output folder holds, and begin anew."""
+
+    def validate(self) -> None:
+        """Raise ConfigError for impossible values."""
+        _check("num-episodes", self.num_episodes, 1, MAX_EPISODES)
+        if self.workers is not None:
+            _check("workers", self.workers, 1, 100_000)
+        _check("recycle-after", self.recycle_after, 1, 1_000_000)
+        _check("cpus-per-worker", self.cpus_per_worker, 0.01, 1024)
+        _check("gpus-per-worker", self.gpus_per_worker, 0, 64)
+        if self.executor == "local":
+            given = [
+                name
+                for name, value, default in (
+                    ("--address", self.address, "local"),
+                    ("--cpus-per-worker", self.cpus_per_worker, 1.0),
+                    ("--gpus-per-worker", self.gpus_per_worker, 0.0),
+                )
+                if value != default
+            ]
+            if given:
+                raise ConfigError(f"{given[0]} is for Ray: add --executor ray, or leave it out.")
+        if self.repo_id is not None:
+            owner, _, name = self.repo_id.partition("/")
+            if not owner or not name or "/" in name or any(c.isspace() for c in self.repo_id):
+                raise ConfigError(f"repo-id is {self.repo_id!r}, but must be OWNER/NAME, for example me/cubes.")
+            if not self.export:
+                raise ConfigError("--repo-id names the exported dataset, but --no-export leaves it out: drop one.")
+
+
+def default_out(task: str) -> Path:
+    """recordings/TASK; for somebody else's "package.module:Name", its name."""
+    return Path("recordings") / task.rpartition(":")[2]
+
+
+def default_repo_id(task: str) -> str:
+    """local/TASK."""
+    return f"local/{task.rpartition(':')[2]}"
+
+
+def available_cores() -> int:
+    """Cores that this process may use: its affinity mask, and the quota of its control group where there is one."""
+    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
+    try:
+        quota, period = Path("/sys/fs/cgroup/cpu.max").read_text().split()
+        if quota != "max":
+            count = min(count, max(1, round(int(quota) / int(period))))
+    except (OSError, ValueError):
+        pass  # no control groups of version 2: the affinity mask is all there is
+    return count
+
+
+def _check(name: str, value: float, low: float, high: float) -> None:
+    if not low <= value <= high:
+        raise ConfigError(f"{name} is {value}, allowed are {low:,} to {high:,}.")

@@ -1,0 +1,154 @@
+"""The same data again, from what a run or a dataset says about itself, and whether it is the same.
+
+A run is compared recording by recording (content digest); a dataset is exported again with its own options and
+compared episode by episode, since all that is left of its recordings is in it.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+
+from demorec.config import GenerateConfig, deciding_versions, parse_config
+from demorec.errors import ConfigError
+from demorec.export import ExportOptions, export_lerobot
+from demorec.export.layout import SIDECAR_DIR
+from demorec.export.sidecar import CONFIGS_PATH, EXPORT_PATH
+from demorec.generate.options import RunOptions
+from demorec.generate.plan import plain_differences
+from demorec.generate.run import Progress, RunResult, generate
+from demorec.generate.run_file import DATASET, RUN_NAME, load_run_file
+
+Key = tuple[int, int]
+"""(episode of the run, attempt)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Original:
+    """What is to be made again.
+
+    Attributes:
+        config: That decided the data.
+        num_episodes: Of the run, as many as are needed to have all that is compared.
+        versions: package -> version that it was made with; empty where a dataset does not say.
+        digests: (episode, attempt) -> content digest.
+        export: Options of the dataset; None for a run.
+    """
+
+    config: GenerateConfig
+    num_episodes: int
+    versions: Mapping[str, str]
+    digests: Mapping[Key, str]
+    export: ExportOptions | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """How the copy compares.
+
+    Attributes:
+        result: The run that was made.
+        same: Episodes and attempts whose content is the same to the bit.
+        different: Those whose content is not, or that the copy does not have.
+        versions: Package versions in which the two differ, in words.
+    """
+
+    result: RunResult
+    same: tuple[Key, ...]
+    different: tuple[Key, ...]
+    versions: tuple[str, ...]
+
+
+def reproduce(source: Path, options: RunOptions, *, progress: Progress) -> Comparison | RunResult:
+    """Make the source's run again in `options.out` and compare; the run's result alone when it was interrupted.
+
+    Raises:
+        ConfigError: The source is no run and no dataset, or was made from several runs.
+    """
+    original = read_original(source)
+    result = generate(original.config, replace(options, num_episodes=original.num_episodes), progress=progress)
+    if result.interrupted:
+        return result
+    if original.export is None:
+        made = {(a.episode_index, a.attempt): a.digest for a in result.run.attempts}
+    else:
+        target = result.folder / DATASET
+        export_lerobot([result.folder], target, replace(original.export, overwrite=target.exists()))
+        made = _dataset_digests(target)
+    same = tuple(key for key, value in original.digests.items() if made.get(key) == value)
+    return Comparison(
+        result=result,
+        same=same,
+        different=tuple(key for key in original.digests if key not in same),
+        versions=plain_differences(original.versions, deciding_versions()) if original.versions else (),
+    )
+
+
+def read_original(source: Path) -> Original:
+    """What a run or a dataset says about itself; ConfigError when that is not enough to make it again."""
+    if (source / RUN_NAME).is_file():
+        run = load_run_file(source)
+        if not run.attempts:
+            raise ConfigError(f"The run has no episodes yet: {source}")
+        return Original(
+            config=run.config,
+            num_episodes=run.num_episodes,
+            versions=run.versions,
+            digests={(a.episode_index, a.attempt): a.digest for a in run.attempts},
+            export=None,
+        )
+    if (source / CONFIGS_PATH).is_file():
+        return _read_dataset(source)
+    raise ConfigError(f"No run (run.json) and no dataset of demorec (demorec/configs.json): {source}")
+
+
+def _read_dataset(source: Path) -> Original:
+    try:
+        configs = json.loads((source / CONFIGS_PATH).read_text())
+        made_with = json.loads((source / EXPORT_PATH).read_text())
+        rows = _rows(source)
+        if len(configs) != 1:
+            raise ConfigError(
+                f"The dataset was made from {len(configs)} different runs: reproduce each of them from its own folder: "
+                f"{source}"
+            )
+        if any(row["origin"] for row in rows):
+            raise ConfigError(f"The dataset holds replayed or rendered episodes, which no run makes: {source}")
+        (config,) = configs.values()
+        return Original(
+            config=parse_config(config, GenerateConfig, source=str(source / CONFIGS_PATH)),
+            num_episodes=1 + max(row["run_episode_index"] for row in rows),
+            versions=json.loads(rows[0]["episode_info"])["versions"],
+            digests=_digests(rows),
+            export=ExportOptions(
+                action=made_with["action"],
+                privileged=made_with["privileged"],
+                include_failures=made_with["include_failures"],
+                episodes=made_with["episodes"],
+                fps=made_with["fps"],
+                depth=made_with["depth"],
+                verify=False,
+            ),
+        )
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ConfigError(f"The dataset does not say enough about itself ({error}): {source}") from error
+
+
+def _dataset_digests(dataset: Path) -> dict[Key, str]:
+    return _digests(_rows(dataset))
+
+
+def _digests(rows: list[dict[str, Any]]) -> dict[Key, str]:
+    return {(row["run_episode_index"], row["attempt"]): row["content_digest"] for row in rows}
+
+
+def _rows(dataset: Path) -> list[dict[str, Any]]:
+    """The sidecar's table of episodes."""
+    files = sorted((dataset / SIDECAR_DIR / "episodes").rglob("*.parquet"))
+    columns = ["run_episode_index", "attempt", "origin", "content_digest", "episode_info"]
+    return [row for file in files for row in pq.read_table(file, columns=columns).to_pylist()]

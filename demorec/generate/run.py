@@ -1,0 +1,237 @@
+"""Carries a run out: plans to an executor, lines into run.json, until the asked successes are there.
+
+The driver holds one line per episode and never a picture. Everything that can go wrong ends in one sentence with
+all finished episodes kept; the same command goes on from there.
+"""
+
+from __future__ import annotations
+
+import errno
+import time
+from collections.abc import Iterable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from demorec.config import EpisodePlan, GenerateConfig
+from demorec.errors import ConfigError, GenerationError
+from demorec.generate.executor import MAKE_EPISODE, Executor, Lost, Made, Raised
+from demorec.generate.folder import RunFolder, open_run
+from demorec.generate.interrupts import catch_interrupts
+from demorec.generate.local import LocalExecutor
+from demorec.generate.options import RunOptions, available_cores
+from demorec.generate.plan import Schedule
+from demorec.generate.recordings import inspect_recording
+from demorec.generate.run_file import UNFINISHED, Attempt, RunFile, Session
+from demorec.generate.survey import Inspector
+from demorec.render import prepare
+
+MAX_LOSSES = 5
+"""How often one attempt may lose its worker before the run stops: chance takes few, too little memory takes all."""
+GRACE_S = 3.0
+"""How long current episodes may go on after the first Ctrl-C."""
+_POLL_S = 0.2
+_FULL = {errno.ENOSPC: "the disk is full", errno.EDQUOT: "the quota is used up", errno.EROFS: "it is read-only"}
+
+
+class Progress(Protocol):
+    """Told how a run goes; every method does nothing by default in `NoProgress`."""
+
+    def verifying(self, done: int, total: int) -> None:
+        """Recordings of an earlier session are being verified."""
+
+    def started(self, run: RunFile, workers: int) -> None:
+        """The work begins; `run` knows what is there already."""
+
+    def ended(self, attempt: Attempt) -> None:
+        """An attempt has come to its end."""
+
+    def says(self, message: str) -> None:
+        """Something that a person should know."""
+
+
+class NoProgress:
+    """Says nothing."""
+
+    def verifying(self, done: int, total: int) -> None:
+        """Nothing."""
+
+    def started(self, run: RunFile, workers: int) -> None:
+        """Nothing."""
+
+    def ended(self, attempt: Attempt) -> None:
+        """Nothing."""
+
+    def says(self, message: str) -> None:
+        """Nothing."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunResult:
+    """What a session has come to.
+
+    Attributes:
+        folder: Of the run.
+        run: All that is known now, earlier sessions included.
+        session: This one.
+        made: The attempts of this session.
+        interrupted: Whether Ctrl-C or SIGTERM ended it.
+    """
+
+    folder: Path
+    run: RunFile
+    session: Session
+    made: tuple[Attempt, ...]
+    interrupted: bool
+
+
+def generate(
+    config: GenerateConfig,
+    options: RunOptions,
+    *,
+    progress: Progress | None = None,
+    maker: str = MAKE_EPISODE,
+    inspect: Inspector = inspect_recording,
+    episodes: Iterable[int] | None = None,
+) -> RunResult:
+    """Make the episodes that the run still lacks.
+
+    Args:
+        config: What decides the data.
+        options: How it is carried out; `out` must be set.
+        progress: Is told how it goes.
+        maker: "module:function" that makes an attempt, imported in the workers.
+        inspect: Reads a recording that run.json does not know.
+        episodes: Order in which episodes are begun (default: ascending); the result does not depend on it.
+
+    Raises:
+        ConfigError: The folder is in use, holds another run or cannot be written to.
+        GenerationError: The run cannot go on; everything finished is kept.
+        KeyboardInterrupt: At the second Ctrl-C.
+    """
+    progress = progress or NoProgress()
+    with ExitStack() as stack:
+        folder = stack.enter_context(open_run(config, options, progress=progress, inspect=inspect))
+        schedule = Schedule(folder.run, episodes=episodes)
+        first = schedule.take()
+        if first is None:
+            return folder.result(interrupted=False)
+        schedule.give_back(first)
+        if config.cameras and options.executor != "ray":
+            prepare(config.renderer)
+        executor = stack.enter_context(make_executor(options, folder.path, folder.run, maker))
+        folder.begin_session(executor=options.executor, workers=executor.workers)
+        progress.started(folder.run, executor.workers)
+        driver = _Driver(folder, schedule, executor, progress)
+        try:
+            interrupted = driver.work()
+        except BaseException:
+            folder.end_session("stopped")
+            raise
+        folder.end_session("interrupted" if interrupted else "ended")
+        return folder.result(interrupted=interrupted)
+
+
+def make_executor(options: RunOptions, folder: Path, run: RunFile, maker: str) -> Executor:
+    """The executor that the options name; a context manager."""
+    if options.executor == "ray":
+        from demorec.generate.on_ray import RayExecutor
+
+        return RayExecutor(
+            maker,
+            folder,
+            workers=options.workers,
+            address=options.address,
+            cpus_per_worker=options.cpus_per_worker,
+            gpus_per_worker=options.gpus_per_worker,
+            recycle_after=options.recycle_after,
+        )
+    missing = run.num_episodes - len(run.successes)
+    return LocalExecutor(
+        maker,
+        folder,
+        workers=max(1, min(options.workers or available_cores(), missing)),
+        recycle_after=options.recycle_after,
+    )
+
+
+class _Driver:
+    """The loop between schedule, executor and run.json."""
+
+    def __init__(self, folder: RunFolder, schedule: Schedule, executor: Executor, progress: Progress) -> None:
+        self._folder = folder
+        self._schedule = schedule
+        self._executor = executor
+        self._progress = progress
+        self._losses: dict[tuple[int, int], int] = {}
+
+    def work(self) -> bool:
+        """Until nothing is due any more; returns whether the user has interrupted it."""
+        with catch_interrupts() as interrupts:
+            while not interrupts.count:
+                while self._executor.has_room and (plan := self._schedule.take()) is not None:
+                    self._executor.submit(plan)
+                if not self._executor.pending:
+                    return False
+                self._handle_next(_POLL_S)
+            self._progress.says(
+                f"Interrupted: the current episodes may end within {GRACE_S:.0f} s (Ctrl-C again ends at once)."
+            )
+            self._drain(GRACE_S)
+            self._executor.interrupt()
+            self._drain(GRACE_S)
+            return True
+
+    def _drain(self, seconds: float) -> None:
+        deadline = time.monotonic() + seconds
+        while self._executor.pending and time.monotonic() < deadline:
+            for report in self._executor.wait(_POLL_S):
+                if isinstance(report, Made):
+                    self._made(report)
+
+    def _handle_next(self, timeout_s: float) -> None:
+        for report in self._executor.wait(timeout_s):
+            if isinstance(report, Made):
+                self._made(report)
+            elif isinstance(report, Lost):
+                self._again(report.plan, report.reason)
+            else:
+                self._raised(report)
+
+    def _made(self, report: Made) -> None:
+        self._schedule.report(report.attempt)
+        self._folder.add(report.attempt, peak_worker_bytes=report.peak_bytes)
+        self._progress.ended(report.attempt)
+
+    def _again(self, plan: EpisodePlan, reason: str) -> None:
+        key = (plan.episode_index, plan.attempt)
+        self._losses[key] = self._losses.get(key, 0) + 1
+        self._folder.lost_workers += 1
+        if self._losses[key] >= MAX_LOSSES:
+            raise GenerationError(
+                f"Episode {plan.episode_index} failed to be made {MAX_LOSSES} times, the last time because {reason}: "
+                f"try fewer --workers or a machine with more memory. {self._folder.kept}"
+            )
+        self._progress.says(f"Episode {plan.episode_index} is made again: {reason}.")
+        self._schedule.give_back(plan)
+
+    def _raised(self, report: Raised) -> None:
+        self._folder.check_alive()
+        if report.errno in _FULL:
+            raise GenerationError(
+                f"The output folder cannot take another episode: {_FULL[report.errno]}; mend that and run the same "
+                f"command again. {self._folder.kept}"
+            )
+        if report.errno is not None and not report.exit_code:
+            self._again(report.plan, report.message)
+            return
+        if report.exit_code:
+            wrong = ConfigError if report.exit_code == ConfigError.exit_code else GenerationError
+            raise wrong(f"Episode {report.plan.episode_index} cannot be made: {report.message} {self._folder.kept}")
+        place = self._folder.path / UNFINISHED / f"error_episode_{report.plan.episode_index:06d}.txt"
+        place.write_text(report.traceback)
+        raise GenerationError(
+            f"Episode {report.plan.episode_index} raised {report.kind}: {report.message or 'no message'} "
+            f"(the traceback is in {place}). {self._folder.kept}"
+        )

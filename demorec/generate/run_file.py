@@ -1,0 +1,229 @@
+"""run.json: what a run is, what it is made with, and how far it is; one line per episode, replaced atomically.
+
+The recordings are the truth and this file their table of contents: a line that a crash lost is read back from its
+recording. What decides the data (config, versions) is kept apart from what does not (machine, times).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from demorec.config import GenerateConfig
+from demorec.errors import ConfigError
+from demorec.plain import digest, from_plain, to_plain
+
+RUN_NAME = "run.json"
+RUN_FORMAT = 1
+EPISODES, FAILED, UNFINISHED, DATASET = "episodes", "failed", "unfinished", "dataset"
+
+
+class DamagedRunFileError(ConfigError):
+    """run.json is there but cannot be read; the recordings tell what it held."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Attempt:
+    """One attempt at one episode that has come to its end: a line of run.json.
+
+    Attributes:
+        episode_index, attempt: Which.
+        seed: Root seed; with index and attempt it gives every random number (demorec.seeding).
+        success: Whether every check of the task passed.
+        file: Recording, relative to the run's folder; "" when no scene could be laid out, so that nothing was
+            recorded.
+        sha256: Of the file.
+        digest: Of its content (states, actions, packets, metadata that matter).
+        num_frames, num_bytes: Of the recording.
+        phase, reason: Of the failure; "" on success.
+        seconds: stage -> CPU seconds: "simulation", "rendering", "recording". Not part of any digest.
+    """
+
+    episode_index: int
+    attempt: int
+    seed: int
+    success: bool
+    file: str
+    sha256: str
+    digest: str
+    num_frames: int
+    num_bytes: int
+    phase: str = ""
+    reason: str = ""
+    seconds: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Session:
+    """One start of the command that worked on this run. Wall-clock times in UTC, ISO 8601."""
+
+    started: str
+    ended: str = ""
+    state: str = "running"
+    machine: Mapping[str, str] = field(default_factory=dict)
+    executor: str = "local"
+    workers: int = 0
+    wall_seconds: float = 0.0
+    lost_workers: int = 0
+    peak_worker_bytes: int = 0
+    peak_driver_bytes: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportRecord:
+    """The dataset that was made from this run: of which content, with which options, as what."""
+
+    run_digest: str
+    repo_id: str
+    dataset_digest: str = ""
+    seconds: float = 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunFile:
+    """The content of run.json.
+
+    Attributes:
+        config: What decides the data.
+        versions: package -> version, of what decides the bits.
+        num_episodes: How many successes are wanted.
+        attempts: Every finished attempt, ordered by episode and attempt.
+        sessions: Every start of the command.
+        export: The dataset made from it, if any.
+    """
+
+    config: GenerateConfig
+    versions: Mapping[str, str]
+    num_episodes: int
+    attempts: tuple[Attempt, ...] = ()
+    sessions: tuple[Session, ...] = ()
+    export: ExportRecord | None = None
+
+    @property
+    def config_digest(self) -> str:
+        """Of the config: equal digests and versions, equal episodes."""
+        return digest(self.config)
+
+    @property
+    def successes(self) -> tuple[Attempt, ...]:
+        """The attempts that made an episode."""
+        return tuple(a for a in self.attempts if a.success)
+
+    @property
+    def failures(self) -> tuple[Attempt, ...]:
+        """The attempts that did not."""
+        return tuple(a for a in self.attempts if not a.success)
+
+    @property
+    def given_up(self) -> tuple[int, ...]:
+        """Episodes for which every allowed attempt failed."""
+        succeeded = {a.episode_index for a in self.successes}
+        last = self.config.max_attempts - 1
+        return tuple(a.episode_index for a in self.failures if a.attempt == last and a.episode_index not in succeeded)
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether every episode has succeeded or been given up."""
+        return len(self.successes) + len(self.given_up) >= self.num_episodes
+
+    @property
+    def digest(self) -> str:
+        """Content digest of the run: of config and attempts, in order; not of times, machines or versions."""
+        lines = [self.config_digest]
+        lines += [f"{a.episode_index} {a.attempt} {int(a.success)} {a.digest}" for a in self.attempts]
+        return hashlib.sha256("\n".join(lines).encode()).hexdigest()[:16]
+
+    def with_attempts(self, attempts: Iterable[Attempt]) -> RunFile:
+        """This run with these attempts, in order."""
+        return replace(self, attempts=tuple(sorted(attempts, key=lambda a: (a.episode_index, a.attempt))))
+
+
+def save_run_file(run: RunFile, folder: Path) -> None:
+    """Replace run.json in one step: a reader or a crash sees the old or the new one, never a mixture."""
+    plain = to_plain(run)
+    attempts = plain.pop("attempts")
+    head = {
+        "format": RUN_FORMAT,
+        "config_digest": run.config_digest,
+        "digest": run.digest,
+        "complete": run.is_complete,
+        **plain,
+    }
+    text = json.dumps(head, indent=2, allow_nan=False)[:-2]
+    lines = ",\n".join("    " + json.dumps(line, allow_nan=False) for line in _episode_lines(run, attempts))
+    text += ',\n  "episodes": [\n' + lines + "\n  ]\n}\n"
+    part = folder / f"{RUN_NAME}.part"
+    with part.open("w") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+    part.replace(folder / RUN_NAME)
+    sync_folder(folder)
+
+
+def load_run_file(folder: Path) -> RunFile:
+    """Read run.json.
+
+    Raises:
+        ConfigError: There is none, or it is of a newer format.
+        DamagedRunFileError: It is no run file.
+    """
+    path = folder / RUN_NAME
+    try:
+        plain = json.loads(path.read_text())
+        if not isinstance(plain, dict):
+            raise ValueError("no JSON object")
+        if plain.get("format", 0) > RUN_FORMAT:
+            raise ConfigError(f"run.json has format {plain['format']}, this demorec knows up to {RUN_FORMAT}: {path}")
+        attempts = [_attempt_line(line) for line in plain.pop("episodes") if line["state"] != "planned"]
+        for derived in ("format", "config_digest", "digest", "complete"):
+            plain.pop(derived)
+        return from_plain({**plain, "attempts": attempts}, RunFile)
+    except FileNotFoundError as error:
+        raise ConfigError(f"No run.json, so this is no run of generate-dataset: {folder}") from error
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise DamagedRunFileError(f"run.json is damaged ({error}): {path}") from error
+
+
+def recording_name(episode_index: int, attempt: int, *, success: bool) -> str:
+    """episode_000003.mcap, or episode_000003.attempt_0.mcap for a failed attempt."""
+    middle = "" if success else f".attempt_{attempt}"
+    return f"episode_{episode_index:06d}{middle}.mcap"
+
+
+def sha256_of(path: Path) -> str:
+    """SHA-256 (hex) of a file's bytes."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def sync_folder(folder: Path) -> None:
+    """Make renames in `folder` last through a power cut."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _episode_lines(run: RunFile, attempts: list[dict[str, Any]]) -> Iterable[dict[str, Any]]:
+    """One line an attempt, and one for each episode that has not been tried yet."""
+    tried: set[int] = set()
+    given_up = set(run.given_up)
+    for line in attempts:
+        index = line["episode_index"]
+        tried.add(index)
+        state = "done" if line["success"] else ("given up" if index in given_up else "failed")
+        yield {"state": state, **line}
+    for index in range(run.num_episodes):
+        if index not in tried:
+            yield {"state": "planned", "episode_index": index, "seed": run.config.seed}
+
+
+def _attempt_line(line: dict[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in line.items() if key != "state"}

@@ -1,0 +1,104 @@
+"""What of a folder can be kept: every recording is verified before a run builds on it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from demorec.errors import DemorecError
+from demorec.generate.plan import plain_differences
+from demorec.generate.recordings import Inspected, inspect_recording
+from demorec.generate.run_file import (
+    EPISODES,
+    FAILED,
+    UNFINISHED,
+    Attempt,
+    RunFile,
+    recording_name,
+    sha256_of,
+    sync_folder,
+)
+from demorec.plain import to_plain
+
+Inspector = Callable[[Path], Inspected]
+"""Reads all of a recording; DemorecError or OSError when it is none."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Survey:
+    """What a folder holds of a run.
+
+    Attributes:
+        attempts: Those whose recordings are there and sound, and those that failed without one.
+        set_aside: file -> why it was moved to unfinished/.
+        num_adopted: Recordings that run.json did not know yet.
+    """
+
+    attempts: tuple[Attempt, ...]
+    set_aside: Mapping[str, str]
+    num_adopted: int
+
+
+def recordings_of(folder: Path) -> list[Path]:
+    """Every file in episodes/ and failed/."""
+    return sorted(path for place in (EPISODES, FAILED) for path in (folder / place).glob("*") if path.is_file())
+
+
+def survey(
+    folder: Path,
+    run: RunFile,
+    *,
+    inspect: Inspector = inspect_recording,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Survey:
+    """Verify every recording of a folder against run.json, or read it in full where run.json does not know it.
+
+    What is damaged, unfinished or of another run is moved to unfinished/; nothing is deleted.
+    """
+    known = {a.file: a for a in run.attempts if a.file}
+    kept = [a for a in run.attempts if not a.file]
+    set_aside: dict[str, str] = {}
+    num_adopted = 0
+    files = recordings_of(folder)
+    for number, path in enumerate(files):
+        file = path.relative_to(folder).as_posix()
+        line = known.get(file)
+        try:
+            if line is None:
+                line = _adopt(path, run, inspect)
+                num_adopted += 1
+            elif path.stat().st_size != line.num_bytes or sha256_of(path) != line.sha256:
+                raise DemorecError("its bytes are not those that run.json knows")
+            kept.append(line)
+        except (DemorecError, OSError) as error:
+            set_aside[file] = str(error)
+            _set_aside(path, folder)
+        progress(number + 1, len(files))
+    return Survey(attempts=tuple(kept), set_aside=set_aside, num_adopted=num_adopted)
+
+
+def _adopt(path: Path, run: RunFile, inspect: Inspector) -> Attempt:
+    found = inspect(path)
+    line = found.attempt
+    place = EPISODES if line.success else FAILED
+    name = recording_name(line.episode_index, line.attempt, success=line.success)
+    if (path.parent.name, path.name) != (place, name):
+        raise DemorecError(f"it holds episode {line.episode_index}, attempt {line.attempt}")
+    different = plain_differences(
+        {**found.config, "version of": dict(found.versions)},
+        {**to_plain(run.config), "version of": dict(run.versions)},
+    )
+    if different:
+        raise DemorecError(f"it is of another run ({'; '.join(different)})")
+    return replace(line, file=f"{place}/{name}")
+
+
+def _set_aside(path: Path, folder: Path) -> None:
+    target = folder / UNFINISHED / path.name
+    number = 0
+    while target.exists():
+        number += 1
+        target = folder / UNFINISHED / f"{path.name}.{number}"
+    path.rename(target)
+    sync_folder(path.parent)

@@ -1,0 +1,397 @@
+"""The tasks as gymnasium environments, for policies that were trained on exported recordings.
+
+    import demorec.gym_env
+    env = gymnasium.make("demorec/PickPlace-v0", cameras=("front", "wrist"), split="eval")
+
+World, cameras, renderer and feature vectors are those of the recordings: stepping a recording's commands through the
+environment gives the recorded observations to the bit. Every task of `demorec list tasks` is registered when this
+module is imported; `env_id` registers somebody else's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from demorec import features
+from demorec.acting import ActionDecoder, action_bounds, check_action_kind
+from demorec.config import EpisodePlan, GenerateConfig
+from demorec.episode import Action, CameraImages, Check, EpisodeInfo, Observation
+from demorec.errors import ConfigError, SceneError
+from demorec.features import ActionKind, ObservationRows
+from demorec.geometry import Array
+from demorec.render import Renderer, RenderSetup
+from demorec.rollout import Episode, make_world, prepare
+from demorec.scene import Camera, Scene
+from demorec.sim.world import World
+from demorec.tables import CAMERAS, RENDERERS, TASKS
+from demorec.variation import Preset
+
+SUCCESS_FRAMES = 5
+"""For how many frames in a row every check of the task must hold."""
+SECONDS_PER_GOAL = 15.0
+"""Time limit for each object to be moved, about twice what the expert takes."""
+
+PROBED_SCENES = 16
+"""How many scenes are looked at to tell whether the number of objects varies."""
+
+_KEYS = {
+    features.STATE: "agent_pos",
+    features.VELOCITY: "velocity",
+    features.EE_POSE: "ee_pose",
+    features.ENVIRONMENT_STATE: "environment_state",
+}
+"""Dataset feature -> key of the observation, as LeRobot's `preprocess_observation` maps them back."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Situation:
+    """What the simulation is at after a reset or a step, unrounded: what a recorder or an analysis needs.
+
+    Attributes:
+        frame_index: Control steps since the reset.
+        observation: Now.
+        images: camera name -> images now.
+        command: What was sent in the step that led here; None after a reset.
+        checks: The task's conditions with the values found now.
+        is_success: Whether all of them have held for `SUCCESS_FRAMES` frames.
+    """
+
+    frame_index: int
+    observation: Observation
+    images: Mapping[str, CameraImages]
+    command: Action | None
+    checks: tuple[Check, ...]
+    is_success: bool
+
+
+class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
+    """One task: the robot acts until the task's strict conditions have held for 5 frames, or time is up.
+
+    Observation (a dict): `agent_pos` (observation.state), `velocity`, `ee_pose`, with `privileged`
+    `environment_state`, with cameras `pixels` (camera name -> (H, W, 3) uint8): see `demorec.features`.
+    Action: float32 of one of the kinds of `demorec.features.action_vectors`; float64 is taken as it is. Targets are
+    held within the joint limits in position and velocity; a pose out of reach keeps the last target.
+    Reward: 1 at the step that completes a success, else 0, as `next.reward` of the datasets.
+    `info["is_success"]` is `next.success`; `info["episode_index"]` names the scene.
+
+    `reset(seed=N)` gives the scene of episode N of the split, the same whatever was done before; without a seed, a
+    random one. `reset(options={"scene": scene})` gives a scene of a recording.
+
+    Args:
+        task: A name of `demorec list tasks`, or package.module:Name.
+        split: "eval": scenes and seeds that `generate-dataset --split train` leaves out; "train", "all": those that it
+            makes.
+        seed: Root of all scenes, as of `generate-dataset`.
+        variation: How much the scenes differ.
+        robot, fps, physics_hz, width, height, renderer: As of `generate-dataset`.
+        cameras: Names of `demorec list cameras`.
+        privileged: Whether to give `environment_state`; None: only without cameras, and only for a task whose scenes
+            all have as many numbers to tell, since a space has one length.
+        action: What an action means.
+        episode_length: Time limit in frames; None: 15 s for each object to be moved.
+        render_mode: None or "rgb_array".
+        render_camera: Whose pictures `render` returns.
+        render_width, render_height: Their size, pixels.
+        config: Everything that decides scenes and pictures at once; replaces the arguments above that it holds.
+
+    Raises:
+        ConfigError: An unknown name or an impossible value.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 30}  # noqa: RUF012  (each instance has its own)
+
+    def __init__(
+        self,
+        task: str = "pick_place",
+        *,
+        split: Literal["all", "train", "eval"] = "eval",
+        seed: int = 0,
+        variation: Preset = "mild",
+        robot: str = "panda",
+        fps: int = 30,
+        physics_hz: int = 240,
+        cameras: tuple[str, ...] = (),
+        width: int = 224,
+        height: int = 224,
+        renderer: str | None = None,
+        privileged: bool | None = None,
+        action: ActionKind = "joint",
+        episode_length: int | None = None,
+        render_mode: str | None = None,
+        render_camera: str = "front",
+        render_width: int = 320,
+        render_height: int = 240,
+        config: GenerateConfig | None = None,
+    ) -> None:
+        if config is None:
+            config = GenerateConfig(
+                task=task,
+                split=split,
+                seed=seed,
+                variation=variation,
+                robot=robot,
+                fps=fps,
+                physics_hz=physics_hz,
+                cameras=tuple(cameras),
+                width=width,
+                height=height,
+            )
+            if renderer is not None:
+                config = replace(config, renderer=renderer)
+        config.validate()
+        check_action_kind(action)
+        if render_mode not in (None, "rgb_array"):
+            raise ConfigError(f"render_mode is {render_mode!r}, allowed are None and 'rgb_array'.")
+        self.config = config
+        self.render_mode = render_mode
+        self.metadata = {**type(self).metadata, "render_fps": config.fps}
+        self._action_kind: ActionKind = action
+        self._render_size = (render_width, render_height)
+        self._render_camera = render_camera
+        self.episode = prepare(EpisodePlan(config=config, episode_index=0))
+        info = self.episode.info
+        self._max_episode_steps = episode_length or round(SECONDS_PER_GOAL * config.fps * max(1, len(info.scene.goals)))
+        self.privileged = self._is_privileged() if privileged is None else privileged
+        self._vector_lengths = _lengths(info, privileged=self.privileged)
+        self.observation_space = spaces.Dict(
+            {
+                _KEYS[name]: spaces.Box(-np.inf, np.inf, shape=(length,), dtype=np.float32)
+                for name, length in self._vector_lengths.items()
+            }
+            | (
+                {
+                    "pixels": spaces.Dict(
+                        {
+                            camera.name: spaces.Box(0, 255, shape=(camera.height, camera.width, 3), dtype=np.uint8)
+                            for camera in info.scene.cameras
+                        }
+                    )
+                }
+                if info.scene.cameras
+                else {}
+            )
+        )
+        self.action_space = _box(action_bounds(info.robot, action, fps=config.fps))
+        self._resources = ExitStack()
+        self._world: World | None = None
+        self._renderer: Renderer | None = None
+        self._viewer: Renderer | None = None
+        self._viewer_is_set_up = False
+        self._situation: Situation | None = None
+
+    # ------------------------------------------------------------------------------------------------ what it is at
+
+    @property
+    def keys(self) -> dict[str, str]:
+        """Dataset feature -> key of the observation, pictures aside."""
+        return {name: _KEYS[name] for name in self._vector_lengths}
+
+    @property
+    def info(self) -> EpisodeInfo:
+        """Of the present episode."""
+        return self.episode.info
+
+    @property
+    def world(self) -> World:
+        """The simulated world, after a reset."""
+        if self._world is None:
+            raise RuntimeError("the environment has no world yet: call reset first")
+        return self._world
+
+    @property
+    def situation(self) -> Situation:
+        """What the simulation is at, after a reset or a step."""
+        if self._situation is None:
+            raise RuntimeError("the environment has no episode yet: call reset first")
+        return self._situation
+
+    @property
+    def task(self) -> str:
+        """Name of the task."""
+        return self.config.task
+
+    @property
+    def task_description(self) -> str:
+        """The present episode's instruction, LeRobot's task text."""
+        return self.info.instruction
+
+    # ------------------------------------------------------------------------------------------------ gymnasium's
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Begin an episode; see the class for `seed` and for the option "scene".
+
+        Raises:
+            SceneError: No layout was found, the scene cannot be built, or it has other features than the space says.
+        """
+        super().reset(seed=seed)
+        scene = (options or {}).get("scene")
+        index = int(self.np_random.integers(2**31)) if seed is None else seed
+        self.episode = self._prepare(index, scene)
+        info = self.info
+        if _lengths(info, privileged=self.privileged) != self._vector_lengths:
+            raise SceneError(
+                f"Episode {index} of {self.config.task!r} has other objects than episode 0, and an environment has one "
+                "observation space: leave privileged out and use cameras."
+            )
+        if self._world is None:
+            self._world = self._resources.enter_context(make_world(info))
+        self.world.reset(info.scene)
+        if info.scene.cameras:
+            if self._renderer is None:
+                self._renderer = self._resources.enter_context(RENDERERS.load(self.config.renderer)())
+            self._renderer.setup(self._render_setup(self.episode.cameras))
+        self._viewer_is_set_up = False
+        self._held = 0
+        self._steps = 0
+        self._decoder = ActionDecoder(self.world, self._action_kind)
+        self._situation = self._look(None)
+        return self._observation(self._situation), {"is_success": False, "episode_index": index}
+
+    def step(self, action: NDArray[np.floating]) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        """One control step; ValueError for an action of a wrong shape or with a value that is no number."""
+        if self._situation is None:
+            raise RuntimeError("the environment has no episode yet: call reset first")
+        values = np.asarray(action, dtype=np.float64)
+        if values.shape != self.action_space.shape or not np.isfinite(values).all():
+            raise ValueError(f"An action has shape {self.action_space.shape} and finite values, found {values!r}.")
+        command = self._decoder.command(values)
+        self.world.apply(command)
+        self._steps += 1
+        self._situation = self._look(command)
+        success = self._situation.is_success
+        truncated = not success and self._steps >= self._max_episode_steps
+        reward = 1.0 if success else 0.0
+        information = {"is_success": success, "episode_index": self.episode.plan.episode_index}
+        return self._observation(self._situation), reward, success, truncated, information
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """(H, W, 3) uint8 picture of the present state from `render_camera`; None without a render mode."""
+        if self.render_mode is None:
+            return None
+        if self._situation is None:
+            raise RuntimeError("the environment has no episode yet: call reset first")
+        if self._viewer is None:
+            self._viewer = self._resources.enter_context(RENDERERS.load(self.config.renderer)())
+        if not self._viewer_is_set_up:
+            width, height = self._render_size
+            camera = CAMERAS.load(self._render_camera).camera(
+                self._render_camera, self.info.robot, width=width, height=height
+            )
+            self._viewer.setup(self._render_setup((camera,)))
+            self._viewer_is_set_up = True
+        return self._viewer.render()[self._render_camera].color
+
+    def close(self) -> None:
+        """Free the simulator and the renderers; harmless when called twice."""
+        self._resources.close()
+        self._world = self._renderer = self._viewer = self._situation = None
+
+    # ------------------------------------------------------------------------------------------------ parts
+
+    def _prepare(self, index: int, scene: Scene | None) -> Episode:
+        """The first attempt at this episode for which a layout is found, as the generator does it."""
+        for attempt in range(self.config.max_attempts):
+            try:
+                episode = prepare(EpisodePlan(config=self.config, episode_index=index, attempt=attempt))
+            except SceneError:
+                if attempt == self.config.max_attempts - 1:
+                    raise
+                continue
+            break
+        if scene is None:
+            return episode
+        scene = replace(scene, cameras=episode.info.scene.cameras)
+        info = replace(episode.info, scene=scene)
+        return replace(episode, info=info)
+
+    def _is_privileged(self) -> bool:
+        """The default: without cameras, and with as many objects in each of the first scenes."""
+        if self.config.cameras:
+            return False
+        infos = [self._prepare(index, None).info for index in range(PROBED_SCENES)]
+        # A round object has no yaw, so that its vector is shorter.
+        return len({tuple(_lengths(info, privileged=True).values()) for info in infos}) == 1
+
+    def _render_setup(self, cameras: tuple[Camera, ...]) -> RenderSetup:
+        return RenderSetup(
+            client=self.world.client,
+            cameras=cameras,
+            mounts=self.world.mounts(),
+            light=self.info.scene.light,
+            antialias=self.config.antialias,
+            textures=self.world.textures,
+        )
+
+    def _look(self, command: Action | None) -> Situation:
+        checks = self.episode.task.evaluate(self.world)
+        self._held = self._held + 1 if all(check.passed for check in checks) else 0
+        return Situation(
+            frame_index=self._steps,
+            observation=self.world.observe(),
+            images=self._images(),
+            command=command,
+            checks=checks,
+            is_success=self._held >= SUCCESS_FRAMES,
+        )
+
+    def _images(self) -> dict[str, CameraImages]:
+        if self._renderer is None:
+            return {}
+        images = self._renderer.render()
+        for name, error in self.episode.true_from_recorded.items():
+            images[name] = replace(images[name], world_from_camera=images[name].world_from_camera @ error)
+        return images
+
+    def _observation(self, situation: Situation) -> dict[str, Any]:
+        vectors = features.observation_vectors(
+            ObservationRows.of_observation(situation.observation),
+            self.info.robot,
+            self.info.scene,
+            privileged=self.privileged,
+        )
+        observation: dict[str, Any] = {_KEYS[name]: rows[0] for name, rows in vectors.items()}
+        if situation.images:
+            observation["pixels"] = {name: images.color for name, images in situation.images.items()}
+        return observation
+
+
+def _lengths(info: EpisodeInfo, *, privileged: bool) -> dict[str, int]:
+    names = features.observation_names(info.robot, info.scene, privileged=privileged)
+    return {name: len(components) for name, components in names.items()}
+
+
+def _box(bounds: tuple[Array, Array]) -> spaces.Box:
+    low, high = bounds
+    return spaces.Box(low.astype(np.float32), high.astype(np.float32))
+
+
+def env_id(task: str) -> str:
+    """Gymnasium's name of a task's environment ("demorec/PickPlace-v0"); registers it where that was not done yet.
+
+    Raises:
+        ConfigError: An unknown task.
+    """
+    TASKS.check_name(task)
+    name = "".join(word.capitalize() for word in task.split("_")) if task in TASKS.rows else task.rpartition(":")[2]
+    full = f"demorec/{name}-v0"
+    if full not in gymnasium.registry:
+        gymnasium.register(full, entry_point="demorec.gym_env:DemorecEnv", kwargs={"task": task})
+    elif gymnasium.registry[full].kwargs["task"] != task:
+        raise ConfigError(
+            f"Two tasks are called {name!r}: {gymnasium.registry[full].kwargs['task']} and {task}; rename one class."
+        )
+    return full
+
+
+for _task in TASKS.names():
+    env_id(_task)

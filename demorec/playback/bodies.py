@@ -1,0 +1,124 @@
+"""The things of the scene: what they look like, how they move, where they shall end."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+import rerun as rr
+import trimesh
+from numpy.typing import NDArray
+
+from demorec.assets import asset_path
+from demorec.episode import EpisodeInfo
+from demorec.geometry import Array, Pose
+from demorec.playback.episode import Episode
+from demorec.playback.meshes import Mesh, joined, mesh_file, of_trimesh, sphere_mesh, urdf_meshes
+from demorec.playback.paths import Paths
+from demorec.playback.robot import as_mesh3d
+from demorec.playback.style import GOAL
+from demorec.playback.times import indexes
+from demorec.scene import Body, Goal, Rgba, Texture
+from demorec.textures import texture_pixels
+from demorec.urdf import Urdf
+
+
+def log_bodies(recording: rr.RecordingStream, paths: Paths, episode: Episode, tint: Rgba | None = None) -> None:
+    """Every body at its place or along its way, and the goals as wire frames.
+
+    An object whose way the source does not know is drawn at its start and, as a wire frame, at its end.
+
+    Raises:
+        RecordingError, SceneError: The model of a body cannot be read.
+    """
+    scene = episode.info.scene
+    times = indexes(episode.time_ns, episode.time_ns)
+    for body in scene.bodies:
+        entity = paths.body(body.name)
+        if tint is not None and body.role in ("support", "fixture"):
+            continue  # the other episode's table, which would lie in the same place
+        recording.log(entity, _visible(body, tint), static=True)
+        poses = episode.object_poses.get(body.name)
+        if poses is not None:
+            columns = rr.Transform3D.columns(translation=poses[:, :3], quaternion=poses[:, 3:])
+            recording.send_columns(entity, times, columns)
+        else:
+            recording.log(entity, _transform(body.world_from_body.vector()), static=True)
+    for name, pose in episode.end_poses.items():
+        wire = rr.Boxes3D(sizes=[scene.body(name).shape.extents], colors=[(200, 200, 200)], radii=[-1.0])
+        recording.log(f"{paths.goal(name)}/end", _transform(pose), wire, static=True)
+    for goal in scene.goals:
+        wire = rr.Boxes3D(sizes=[scene.body(goal.object).shape.extents], colors=[GOAL], radii=[-1.5])
+        recording.log(
+            paths.goal(goal.object), _transform(world_from_goal(episode.info, goal).vector()), wire, static=True
+        )
+
+
+def world_from_goal(info: EpisodeInfo, goal: Goal) -> Pose:
+    """Where the object shall end, as things stand at the start."""
+    if not goal.onto:
+        return goal.onto_from_goal
+    return info.scene.body(goal.onto).world_from_body @ goal.onto_from_goal
+
+
+def _transform(pose: Array) -> rr.Transform3D:
+    return rr.Transform3D(translation=pose[:3], quaternion=pose[3:])
+
+
+def _visible(body: Body, tint: Rgba | None) -> rr.Mesh3D:
+    if body.shape.kind == "box" and body.texture is not None:
+        return _textured_box(np.array(body.shape.size), body.texture)
+    color = body.rgba
+    if body.texture is not None:
+        first, second = body.texture.colors
+        color = (*((a + b) / 2 for a, b in zip(first, second, strict=True)), 1.0)  # type: ignore[assignment]
+    return as_mesh3d(_body_mesh(body).placed(Pose(), np.ones(3), color), tint)
+
+
+def _body_mesh(body: Body) -> Mesh:
+    shape = body.shape
+    match shape.kind:
+        case "box" | "sphere" | "cylinder":
+            return _unit_mesh(shape.kind).placed(Pose(), np.array(shape.extents), (1.0, 1.0, 1.0, 1.0))
+        case "capsule":
+            capsule = trimesh.creation.capsule(radius=shape.size[0], height=shape.size[1], count=[32, 32])
+            capsule.apply_translation((0.0, 0.0, -capsule.bounds.mean(axis=0)[2]))
+            return of_trimesh(capsule)
+        case "mesh":
+            return mesh_file(asset_path(shape.file)).placed(Pose(), np.full(3, shape.scale), (1.0, 1.0, 1.0, 1.0))
+        case "urdf":
+            path = asset_path(shape.file)
+            text = path.read_text()
+            poses = Urdf.parse(text, scale=shape.scale).link_poses({})
+            links = urdf_meshes(text, path.parent, shape.scale)
+            return joined([mesh.placed(poses[link], np.ones(3), (1.0, 1.0, 1.0, 1.0)) for link, mesh in links.items()])
+
+
+@functools.cache
+def _unit_mesh(kind: str) -> Mesh:
+    """A box, ball or cylinder with extents of 1: scaled for each body, since shading a mesh anew takes longer."""
+    if kind == "box":
+        return of_trimesh(trimesh.creation.box(extents=(1.0, 1.0, 1.0)))
+    if kind == "sphere":
+        return sphere_mesh(0.5)
+    return of_trimesh(trimesh.creation.cylinder(radius=0.5, height=1.0, sections=48))
+
+
+def _textured_box(size: Array, texture: Texture) -> rr.Mesh3D:
+    """A box each face of which shows the texture once."""
+    corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
+    vertices, normals = np.zeros((24, 3)), np.zeros((24, 3))
+    for face in range(6):
+        axis, sign = divmod(face, 2)
+        rows = slice(4 * face, 4 * face + 4)
+        normals[rows, axis] = vertices[rows, axis] = 2 * sign - 1
+        vertices[rows, (axis + 1) % 3], vertices[rows, (axis + 2) % 3] = corners.T
+    quads = np.arange(0, 24, 4)[:, None]
+    triangles: NDArray[np.int64] = np.concatenate([quads + np.array([0, 1, 2]), quads + np.array([0, 2, 3])])
+    return rr.Mesh3D(
+        vertex_positions=vertices * size / 2,
+        vertex_normals=normals,
+        vertex_texcoords=np.tile((corners + 1) / 2, (6, 1)),
+        triangle_indices=triangles,
+        albedo_texture=texture_pixels(texture, 512),
+    )

@@ -1,0 +1,108 @@
+"""Cameras: poses, pinholes (frusta in the 3D view) and pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from itertools import batched
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from demorec.playback.episode import Episode, Video
+from demorec.playback.paths import Paths
+from demorec.playback.style import FRUSTUM
+from demorec.playback.times import indexes
+from demorec.scene import Camera
+
+_CODECS = {"h264": rr.VideoCodec.H264, "av1": rr.VideoCodec.AV1}
+_PICTURES_AT_ONCE = 64
+_FRUSTUM_METRES = {"world": 0.22}
+_FRUSTUM_ON_ROBOT = 0.08
+
+
+def log_cameras(recording: rr.RecordingStream, paths: Paths, episode: Episode) -> None:
+    """Every camera with what it saw; the coded pictures are passed on as they are."""
+    for camera in episode.info.scene.cameras:
+        _log_pinhole(recording, paths, episode, camera)
+        if camera.name in episode.videos:
+            _send_video(recording, paths.camera(camera.name), episode, episode.videos[camera.name])
+        if camera.name in episode.depth:
+            _send_depth(recording, paths.depth(camera.name), episode, episode.depth[camera.name])
+        if camera.name in episode.segmentation:
+            _send_segmentation(recording, paths.segmentation(camera.name), episode, episode.segmentation[camera.name])
+    if episode.segmentation:
+        numbers = _compact(episode)
+        names = [(number, episode.segment_names[value]) for value, number in numbers.items() if number > 0]
+        recording.log(paths.world, rr.AnnotationContext(names), static=True)
+
+
+def _log_pinhole(recording: rr.RecordingStream, paths: Paths, episode: Episode, camera: Camera) -> None:
+    entity = paths.camera(camera.name)
+    pinhole = rr.Pinhole(
+        image_from_camera=camera.intrinsics,
+        resolution=(camera.width, camera.height),
+        camera_xyz=rr.ViewCoordinates.RDF,
+        image_plane_distance=_FRUSTUM_METRES.get(camera.mount, _FRUSTUM_ON_ROBOT),
+        color=FRUSTUM,
+        line_width=-1.0,
+    )
+    recording.log(entity, pinhole, static=True)
+    poses = episode.world_from_camera.get(camera.name)
+    if camera.mount == "world":
+        pose = camera.mount_from_camera.vector()
+        recording.log(entity, rr.Transform3D(translation=pose[:3], quaternion=pose[3:]), static=True)
+    elif poses is not None:
+        columns = rr.Transform3D.columns(translation=poses[:, :3], quaternion=poses[:, 3:])
+        recording.send_columns(entity, indexes(episode.time_ns, episode.time_ns), columns)
+
+
+def _send_video(recording: rr.RecordingStream, entity: str, episode: Episode, video: Video) -> None:
+    if video.codec in _CODECS:
+        recording.log(entity, rr.VideoStream(codec=_CODECS[video.codec]), static=True)
+    for batch in video.batches():
+        if video.codec in _CODECS:
+            columns = rr.VideoStream.columns(sample=batch.samples, is_keyframe=batch.is_keyframe)
+        else:
+            columns = rr.EncodedImage.columns(blob=batch.samples, media_type=["image/jpeg"] * len(batch.samples))
+        recording.send_columns(entity, indexes(batch.time_ns, episode.time_ns), columns)
+
+
+def _send_depth(
+    recording: rr.RecordingStream, entity: str, episode: Episode, read: Callable[[], Iterator[NDArray[np.float32]]]
+) -> None:
+    for frames in batched(enumerate(read()), _PICTURES_AT_ONCE):
+        pictures = [np.rint(metres * 1000).astype(np.uint16) for _, metres in frames]
+        height, width = pictures[0].shape
+        columns = rr.DepthImage.columns(
+            buffer=[picture.tobytes() for picture in pictures],
+            format=[_format(width, height)] * len(pictures),
+            meter=[1000.0] * len(pictures),
+        )
+        times = episode.time_ns[[index for index, _ in frames]]
+        recording.send_columns(entity, indexes(times, episode.time_ns), columns)
+
+
+def _format(width: int, height: int) -> rr.components.ImageFormat:
+    return rr.components.ImageFormat(width=width, height=height, channel_datatype=rr.ChannelDatatype.U16)
+
+
+def _compact(episode: Episode) -> dict[int, int]:
+    """Segment number -> small number, the background 0."""
+    values = sorted(episode.segment_names)
+    return {value: number for number, value in enumerate(values)}
+
+
+def _send_segmentation(
+    recording: rr.RecordingStream, entity: str, episode: Episode, read: Callable[[], Iterator[NDArray[np.int32]]]
+) -> None:
+    known = np.array(sorted(episode.segment_names))
+    for frames in batched(enumerate(read()), _PICTURES_AT_ONCE):
+        pictures = [np.searchsorted(known, values).astype(np.uint16) for _, values in frames]
+        height, width = pictures[0].shape
+        columns = rr.SegmentationImage.columns(
+            buffer=[picture.tobytes() for picture in pictures],
+            format=[_format(width, height)] * len(pictures),
+        )
+        times = episode.time_ns[[index for index, _ in frames]]
+        recording.send_columns(entity, indexes(times, episode.time_ns), columns)

@@ -1,0 +1,116 @@
+"""An episode as playback sees it, whether it comes from a recording or from an exported dataset."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.episode import EpisodeInfo, Event, Outcome
+from demorec.geometry import Array
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Curves:
+    """Several numbers over time: one row per time, one column per name.
+
+    Attributes:
+        time_ns: (T,) since the episode's start.
+        values: (T, n).
+        names: n.
+    """
+
+    time_ns: NDArray[np.int64]
+    values: Array
+    names: tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class VideoBatch:
+    """Consecutive coded pictures of a camera: a codec's access units, or whole JPEG files."""
+
+    time_ns: NDArray[np.int64]
+    samples: list[bytes]
+    is_keyframe: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Video:
+    """Coded pictures of a camera.
+
+    Attributes:
+        codec: "h264", "av1" or "jpeg".
+        batches: Reads them anew, some hundred pictures at a time.
+    """
+
+    codec: str
+    batches: Callable[[], Iterator[VideoBatch]]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Episode:
+    """What is shown of one episode. What a source does not have is None or empty.
+
+    Attributes:
+        name: In the list of recordings.
+        group: Run or dataset that it belongs to.
+        identity: Distinguishes it from all others.
+        source: Where it was read from, for people.
+        info: Scene, robot, cameras, seed.
+        outcome: How it ended, None when nobody knows.
+        robot_description: URDF of primitives, for where the original model is not installed.
+        time_ns: (T,) of the frames, since the start.
+        joint_position: (T, n_joints) rad, fingers m.
+        base_from_tcp: (T, 7).
+        object_poses: name -> (T, 7), world_from_object.
+        end_poses: name -> (7,) where an object ended, for sources without `object_poses`.
+        world_from_camera: name -> (T, 7).
+        phase: T names.
+        events: (time_ns, event).
+        curves: Name -> measured values: "position", "velocity", "effort" of the joints, "gripper" (m), "force" (N),
+            "ee" (m); "target" and "gripper target" are what was asked for.
+        videos: Camera -> coded pictures.
+        depth: Camera -> reads (H, W) metres of every frame.
+        segmentation: Camera -> reads (H, W) segment numbers of every frame.
+        segment_names: Segment number -> name.
+    """
+
+    name: str
+    group: str
+    identity: str
+    source: str
+    info: EpisodeInfo
+    outcome: Outcome | None
+    robot_description: str | None
+    time_ns: NDArray[np.int64]
+    joint_position: Array
+    base_from_tcp: Array
+    object_poses: Mapping[str, Array]
+    end_poses: Mapping[str, Array] = field(default_factory=dict)
+    world_from_camera: Mapping[str, Array]
+    phase: tuple[str, ...]
+    events: tuple[tuple[int, Event], ...] = ()
+    curves: Mapping[str, Curves]
+    videos: Mapping[str, Video]
+    depth: Mapping[str, Callable[[], Iterator[NDArray[np.float32]]]] = field(default_factory=dict)
+    segmentation: Mapping[str, Callable[[], Iterator[NDArray[np.int32]]]] = field(default_factory=dict)
+    segment_names: Mapping[int, str] = field(default_factory=dict)
+
+    @property
+    def num_frames(self) -> int:
+        """Length."""
+        return len(self.time_ns)
+
+    @property
+    def verdict(self) -> str:
+        """The outcome in a word or two."""
+        if self.outcome is None:
+            return "outcome unknown"
+        return "success" if self.outcome.success else f"failure: {self.outcome.failure_reason}"
+
+    @property
+    def duration(self) -> float:
+        """Seconds from the first frame to the end of the last."""
+        return self.num_frames / self.info.fps

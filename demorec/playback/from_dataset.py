@@ -1,0 +1,194 @@
+"""Episodes out of exported datasets: numbers from the data files, the scene from demorec's own tables beside them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+from rerun.experimental import LeRobotReader
+
+from demorec.episode import Check, EpisodeInfo, Outcome, frame_time_ns
+from demorec.errors import RecordingError
+from demorec.geometry import Array
+from demorec.plain import from_json
+from demorec.playback.episode import Curves, Episode, Video, VideoBatch
+
+_SIDECAR = "demorec"
+_IMAGES = "observation.images."
+_PICTURES_AT_ONCE = 256
+_CODECS = {"h264": "h264", "av1": "av1"}
+
+
+def dataset_episodes(root: Path) -> list[int]:
+    """Numbers of the episodes in a dataset.
+
+    Raises:
+        RecordingError: It was not exported by demorec, or is damaged.
+    """
+    return [int(row["episode_index"]) for row in _rows(root, f"{_SIDECAR}/episodes", ["episode_index"])]
+
+
+@contextmanager
+def open_dataset_episode(root: Path, episode_index: int) -> Iterator[Episode]:
+    """One episode of a dataset.
+
+    Raises:
+        RecordingError: It cannot be read.
+    """
+    row = _episode_row(root, episode_index)
+    try:
+        features = json.loads((root / "meta" / "info.json").read_text())
+        export = json.loads((root / _SIDECAR / "export.json").read_text())
+        info = from_json(row["episode_info"], EpisodeInfo)
+    except (OSError, ValueError, KeyError) as error:
+        raise RecordingError(f"The dataset cannot be read ({error}): {root}") from error
+    columns = [name for name, entry in features["features"].items() if entry["dtype"] not in ("video", "string")]
+    data = _data(root, episode_index, columns)
+    num_frames = len(data["frame_index"])
+    fps = int(features["fps"])
+    time_ns = np.array([frame_time_ns(index, fps) for index in range(num_frames)], dtype=np.int64)
+    num_arm, num_fingers = len(info.robot.arm_joints), len(info.robot.gripper_joints)
+    state = data["observation.state"]
+    fingers = np.repeat(state[:, num_arm:] / num_fingers, num_fingers, axis=1)
+    yield Episode(
+        name=f"episode_{episode_index:06d}",
+        group=root.resolve().name,
+        identity=f"dataset-{root.resolve().name}-{episode_index}",
+        source=str(row["source"]),
+        info=info,
+        outcome=_outcome(row, num_frames),
+        robot_description=None,
+        time_ns=time_ns,
+        joint_position=np.concatenate([state[:, :num_arm], fingers], axis=1),
+        base_from_tcp=data["observation.ee_pose"],
+        object_poses={},
+        end_poses={item["name"]: np.array(item["world_from_object_end"]) for item in row["objects"]},
+        world_from_camera=_camera_poses(root, episode_index),
+        phase=_phases(row, num_frames),
+        curves=_curves(info, data, time_ns, with_targets=export.get("action") == "joint"),
+        videos=_videos(root, episode_index, time_ns, features["features"]),
+    )
+
+
+def _rows(root: Path, table: str, columns: list[str] | None, episode_index: int | None = None) -> list[dict[str, Any]]:
+    files = sorted((root / table).glob("*/*.parquet"))
+    if not files:
+        raise RecordingError(
+            f"The dataset has no {table}: only datasets of demorec can be shown; rerun shows others: {root}"
+        )
+    filters = None if episode_index is None else [("episode_index", "=", episode_index)]
+    try:
+        return [row for file in files for row in pq.read_table(file, columns=columns, filters=filters).to_pylist()]
+    except (OSError, ValueError) as error:
+        raise RecordingError(f"The dataset's table {table} cannot be read ({error}): {root}") from error
+
+
+def _episode_row(root: Path, episode_index: int) -> dict[str, Any]:
+    for row in _rows(root, f"{_SIDECAR}/episodes", None, episode_index):
+        return row
+    raise RecordingError(f"The dataset has no episode {episode_index}: {root}")
+
+
+def _data(root: Path, episode_index: int, columns: list[str]) -> dict[str, Array]:
+    rows = _rows(root, "data", columns, episode_index)
+    result = {}
+    for name in columns:
+        values = np.array([row[name] for row in rows], dtype=np.float64)
+        result[name] = values if values.ndim == 2 else values[:, None]
+    return result
+
+
+def _outcome(row: dict[str, Any], num_frames: int) -> Outcome:
+    return Outcome(
+        success=row["success"],
+        checks=tuple(Check(**check) for check in row["checks"]),
+        failure_phase=row["failure_phase"],
+        failure_reason=row["failure_reason"],
+        num_frames=num_frames,
+        num_retries=row["num_retries"],
+        final_state_digest=row["final_state_digest"],
+    )
+
+
+def _phases(row: dict[str, Any], num_frames: int) -> tuple[str, ...]:
+    names = [""] * num_frames
+    for phase in row["phases"]:
+        names[phase["from"] : phase["to"]] = [phase["name"]] * (phase["to"] - phase["from"])
+    return tuple(names)
+
+
+def _camera_poses(root: Path, episode_index: int) -> dict[str, Array]:
+    """Camera -> (T, 7) of the cameras that move."""
+    if not (root / _SIDECAR / "camera_poses").is_dir():
+        return {}
+    rows = _rows(root, f"{_SIDECAR}/camera_poses", None, episode_index)
+    names = [name for name in (rows[0] if rows else {}) if name not in ("episode_index", "frame_index")]
+    return {name: np.array([row[name] for row in rows]) for name in names}
+
+
+def _curves(
+    info: EpisodeInfo, data: dict[str, Array], time_ns: NDArray[np.int64], *, with_targets: bool
+) -> dict[str, Curves]:
+    joints = info.robot.arm_joints
+    state, velocity, action = data["observation.state"], data["observation.velocity"], data["action"]
+    number = len(joints)
+
+    def curves(values: Array, names: tuple[str, ...]) -> Curves:
+        return Curves(time_ns=time_ns, values=values, names=names)
+
+    result = {
+        "position": curves(state[:, :number], joints),
+        "velocity": curves(velocity[:, :number], joints),
+        "gripper": curves(state[:, number:], ("opening",)),
+        "gripper target": curves(action[:, -1:], ("target",)),
+        "ee": curves(data["observation.ee_pose"][:, :3], ("x", "y", "z")),
+    }
+    if with_targets:
+        result["target"] = curves(action[:, :number], joints)
+    return result
+
+
+def _videos(
+    root: Path, episode_index: int, time_ns: NDArray[np.int64], features: dict[str, dict[str, Any]]
+) -> dict[str, Video]:
+    result = {}
+    for key, feature in features.items():
+        described = feature.get("info") or {}
+        codec = _CODECS.get(str(described.get("video.codec")))
+        if feature["dtype"] == "video" and codec is not None and not described.get("is_depth_map"):
+            batches = partial(_video_batches, root, episode_index, key, time_ns)
+            result[key.removeprefix(_IMAGES)] = Video(codec=codec, batches=batches)
+    return result
+
+
+def _video_batches(root: Path, episode_index: int, key: str, time_ns: NDArray[np.int64]) -> Iterator[VideoBatch]:
+    """Coded pictures as Rerun's own reader of LeRobot datasets cuts them out of the mp4 files."""
+    samples: list[tuple[int, bytes]] = []
+    keyframes: set[int] = set()
+    for chunk in LeRobotReader(root).stream(episode_index):
+        if chunk.entity_path.strip("/") != key or chunk.is_static:
+            continue
+        batch = chunk.to_record_batch()
+        frames = batch.column("frame_index").to_pylist()
+        if "VideoStream:is_keyframe" in batch.schema.names:
+            flags = batch.column("VideoStream:is_keyframe").to_pylist()
+            keyframes.update(frame for frame, flag in zip(frames, flags, strict=True) if flag and flag[0])
+        if "VideoStream:sample" in batch.schema.names:
+            blobs = batch.column("VideoStream:sample")
+            samples += [(frame, bytes(blobs[row].values[0].values)) for row, frame in enumerate(frames)]
+    samples.sort()
+    first = samples[0][0] if samples else 0
+    for start in range(0, len(samples), _PICTURES_AT_ONCE):
+        part = samples[start : start + _PICTURES_AT_ONCE]
+        yield VideoBatch(
+            time_ns=time_ns[[frame - first for frame, _ in part]],
+            samples=[data for _, data in part],
+            is_keyframe=np.array([frame in keyframes for frame, _ in part]),
+        )

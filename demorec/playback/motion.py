@@ -1,0 +1,118 @@
+"""What happens over time: the gripper's path, curves, phases and events."""
+
+from __future__ import annotations
+
+import numpy as np
+import rerun as rr
+
+from demorec.episode import Event
+from demorec.geometry import Array
+from demorec.playback.episode import Curves, Episode
+from demorec.playback.paths import Paths
+from demorec.playback.style import FORCE, MEASURED, SECOND, TARGET, Color, dimmed, phase_colors, series_colors
+from demorec.playback.times import indexes, seconds_only
+
+_WIDTHS = {"target": 1.2, "gripper target": 1.2}
+
+
+def log_ee_path(recording: rr.RecordingStream, paths: Paths, episode: Episode) -> None:
+    """The gripper's path: one piece a frame, so that a view can show what lies behind; coloured by phase."""
+    if episode.num_frames < 2:
+        return
+    world_from_base = episode.info.scene.robot.world_from_base
+    points = world_from_base.apply(episode.base_from_tcp[:, :3])
+    colors = phase_colors(episode.phase)
+    recording.log(paths.ee_path, rr.LineStrips3D.from_fields(radii=[-2.0]), static=True)
+    columns = rr.LineStrips3D.columns(
+        strips=np.stack([points[:-1], points[1:]], axis=1), colors=[colors[name] for name in episode.phase[1:]]
+    )
+    recording.send_columns(paths.ee_path, indexes(episode.time_ns[1:], episode.time_ns), columns)
+
+
+def log_curves(
+    recording: rr.RecordingStream, paths: Paths, episode: Episode, label: str = "", *, is_second: bool = False
+) -> None:
+    """All plots; `label` goes before the names of the curves, a second episode's have other colours."""
+    for name, curves in episode.curves.items():
+        entity = paths.curves(name)
+        recording.log(
+            entity,
+            rr.SeriesLines(
+                names=[f"{label}{curve}" for curve in _curve_names(name, curves)],
+                colors=_curve_colors(name, curves, is_second=is_second),
+                widths=[_WIDTHS.get(name, 2.0)] * len(curves.names),
+            ),
+            static=True,
+        )
+        on_frame = np.isin(curves.time_ns, episode.time_ns)
+        for chosen, is_frame in ((on_frame, True), (~on_frame, False)):
+            times, values = curves.time_ns[chosen], curves.values[chosen]
+            if len(times):
+                index = indexes(times, episode.time_ns) if is_frame else seconds_only(times)
+                recording.send_columns(entity, index, _scalars(values))
+
+
+def _scalars(values: Array) -> rr.ComponentColumnList:
+    return rr.Scalars.columns(scalars=values)
+
+
+def _curve_names(name: str, curves: Curves) -> list[str]:
+    short = [curve.removeprefix("panda_") for curve in curves.names]
+    return [f"{curve} target" for curve in short] if name == "target" else short
+
+
+def _curve_colors(name: str, curves: Curves, *, is_second: bool) -> list[Color]:
+    if is_second:
+        return [SECOND] if len(curves.names) == 1 else dimmed(series_colors(len(curves.names)))
+    if name == "gripper":
+        return [MEASURED]
+    if name == "gripper target":
+        return [TARGET]
+    if name == "force":
+        return [FORCE]
+    colors = series_colors(len(curves.names))
+    return dimmed(colors) if name == "target" else colors
+
+
+def log_phases(recording: rr.RecordingStream, paths: Paths, episode: Episode) -> None:
+    """The phases of the motion as states over time."""
+    colors = phase_colors(episode.phase)
+    if not colors or set(colors) == {""}:
+        return
+    recording.log(paths.phase, rr.StateConfiguration(values=list(colors), colors=list(colors.values())), static=True)
+    starts = [i for i, name in enumerate(episode.phase) if i == 0 or name != episode.phase[i - 1]]
+    recording.send_columns(
+        paths.phase,
+        indexes(episode.time_ns[starts], episode.time_ns),
+        rr.StateChange.columns(state=[episode.phase[i] for i in starts]),
+    )
+
+
+def log_events(recording: rr.RecordingStream, paths: Paths, episode: Episode) -> None:
+    """Changes of phase and what happened, in order."""
+    colors = phase_colors(episode.phase)
+    rows: list[tuple[int, str, str, Color]] = [
+        (int(episode.time_ns[i]), "INFO", name, colors[name])
+        for i, name in enumerate(episode.phase)
+        if name and (i == 0 or name != episode.phase[i - 1])
+    ]
+    rows += [(time, _LEVELS[event.level], _text(event), _LEVEL_COLORS[event.level]) for time, event in episode.events]
+    if episode.outcome is not None and episode.num_frames:
+        end = int(episode.time_ns[-1])
+        level, color = ("INFO", (60, 230, 120)) if episode.outcome.success else ("ERROR", (255, 80, 80))
+        rows.append((end, level, episode.verdict, color))
+    if not rows:
+        return
+    rows.sort(key=lambda row: row[0])
+    columns = rr.TextLog.columns(
+        text=[row[2] for row in rows], level=[row[1] for row in rows], color=[row[3] for row in rows]
+    )
+    recording.send_columns(paths.events, indexes(np.array([row[0] for row in rows]), episode.time_ns), columns)
+
+
+_LEVELS = {"info": "INFO", "warning": "WARN", "error": "ERROR"}
+_LEVEL_COLORS: dict[str, Color] = {"info": (200, 200, 200), "warning": (255, 200, 60), "error": (255, 80, 80)}
+
+
+def _text(event: Event) -> str:
+    return event.message or event.name

@@ -1,0 +1,66 @@
+"""Entity paths in the Rerun recording, shared by what logs and what lays out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Paths:
+    """Paths below a root, "" for an episode alone or "/a" and "/b" for two that are compared."""
+
+    root: str = ""
+
+    @property
+    def world(self) -> str:
+        """The scene, z up."""
+        return f"{self.root}/world"
+
+    @property
+    def robot(self) -> str:
+        """The robot's base; its links are nested below."""
+        return f"{self.world}/robot"
+
+    @property
+    def ee_path(self) -> str:
+        """One piece of the gripper's path per frame."""
+        return f"{self.world}/ee_path"
+
+    def body(self, name: str) -> str:
+        """A body of the scene."""
+        return f"{self.world}/bodies/{name}"
+
+    def goal(self, name: str) -> str:
+        """Where an object shall end."""
+        return f"{self.world}/goals/{name}"
+
+    def camera(self, name: str) -> str:
+        """A camera: its pose, its pinhole and its pictures."""
+        return f"{self.world}/cameras/{name}"
+
+    def depth(self, name: str) -> str:
+        """Depth pictures of a camera."""
+        return f"{self.camera(name)}/depth"
+
+    def segmentation(self, name: str) -> str:
+        """Segmentation pictures of a camera."""
+        return f"{self.camera(name)}/segmentation"
+
+    def curves(self, name: str) -> str:
+        """Numbers over time."""
+        return f"{self.root}/plots/{name.replace(' ', '_')}"
+
+    @property
+    def phase(self) -> str:
+        """Phases of the motion as states."""
+        return f"{self.root}/phase"
+
+    @property
+    def events(self) -> str:
+        """What happened, as a log."""
+        return f"{self.root}/events"
+
+    @property
+    def summary(self) -> str:
+        """The episode in words."""
+        return f"{self.root}/summary"

@@ -1,0 +1,116 @@
+"""The moving robot: its links' meshes once, its joints' transforms as columns."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+
+import numpy as np
+import rerun as rr
+
+from demorec.assets import asset_path
+from demorec.errors import MissingDependencyError, SceneError
+from demorec.geometry import Array, quat_multiply
+from demorec.playback.episode import Episode
+from demorec.playback.meshes import Mesh, urdf_meshes
+from demorec.playback.paths import Paths
+from demorec.playback.times import indexes
+from demorec.scene import Rgba
+from demorec.urdf import Urdf, UrdfJoint
+
+_SAME_PLACE = 1e-3
+"""How far joints of the installed model may be from those of the recorded description, metres."""
+
+
+def log_robot(recording: rr.RecordingStream, paths: Paths, episode: Episode, tint: Rgba | None = None) -> None:
+    """Meshes of all links below `paths.robot`, nested as the links are, and how the joints move them.
+
+    Raises:
+        RecordingError: A mesh of the robot's model cannot be read.
+    """
+    placement = episode.info.scene.robot
+    urdf, meshes = robot_model(episode.info.robot.urdf, placement.scale, episode.robot_description)
+    entities = {urdf.root: f"{paths.robot}/{urdf.root}"}
+    waiting = list(urdf.joints)
+    while waiting:
+        for joint in [joint for joint in waiting if joint.parent in entities]:
+            entities[joint.child] = f"{entities[joint.parent]}/{joint.child}"
+            waiting.remove(joint)
+    base = placement.world_from_base
+    _log_pose(recording, entities[urdf.root], base.position, base.quat_xyzw)
+    positions = dict(zip(episode.info.robot.joint_names, episode.joint_position.T, strict=True))
+    times = indexes(episode.time_ns, episode.time_ns)
+    for joint in urdf.joints:
+        entity = entities[joint.child]
+        if joint.kind == "fixed" or joint.name not in positions:
+            fixed = joint.parent_from_joint
+            _log_pose(recording, entity, fixed.position, fixed.quat_xyzw)
+        else:
+            translation, quaternion = joint_columns(joint, positions[joint.name])
+            recording.send_columns(
+                entity, times, rr.Transform3D.columns(translation=translation, quaternion=quaternion)
+            )
+    for link, mesh in meshes.items():
+        recording.log(entities[link], as_mesh3d(mesh, tint), static=True)
+
+
+def _log_pose(recording: rr.RecordingStream, entity: str, position: Array, quat_xyzw: Array) -> None:
+    recording.log(entity, rr.Transform3D(translation=position, quaternion=quat_xyzw), static=True)
+
+
+def as_mesh3d(mesh: Mesh, tint: Rgba | None = None) -> rr.Mesh3D:
+    """For Rerun; `tint` multiplies the colours."""
+    colors = mesh.colors if tint is None else np.rint(mesh.colors * np.array(tint)).astype(np.uint8)
+    return rr.Mesh3D(
+        vertex_positions=mesh.vertices,
+        vertex_normals=mesh.normals,
+        triangle_indices=mesh.triangles,
+        vertex_colors=colors,
+    )
+
+
+def joint_columns(joint: UrdfJoint, position: Array) -> tuple[Array, Array]:
+    """(T, 3) and (T, 4): parent_from_child of a joint at each position (rad or m)."""
+    fixed, axis = joint.parent_from_joint, np.array(joint.axis)
+    origin = np.tile(fixed.position, (len(position), 1))
+    if joint.kind == "prismatic":
+        direction = fixed.apply(axis) - fixed.position
+        return origin + position[:, None] * direction, np.tile(fixed.quat_xyzw, (len(position), 1))
+    half = position / 2
+    turned = quat_multiply(fixed.quat_xyzw, (*joint.axis, 0.0))
+    return origin, np.sin(half)[:, None] * turned + np.cos(half)[:, None] * fixed.quat_xyzw
+
+
+@functools.lru_cache(maxsize=4)
+def robot_model(urdf: str, scale: float, description: str | None) -> tuple[Urdf, Mapping[str, Mesh]]:
+    """The joint tree and the links' meshes: the installed model, or else the recorded description.
+
+    The installed model is used when its joints are where the recording has them.
+
+    Raises:
+        SceneError, MissingDependencyError: The model is not installed and there is no description.
+    """
+    recorded = None if description is None else Urdf.parse(description)
+    try:
+        path = asset_path(urdf)
+        text = path.read_text()
+        installed = Urdf.parse(text, scale=scale)
+    except (SceneError, MissingDependencyError, OSError, ValueError):
+        if recorded is None:
+            raise
+    else:
+        if recorded is None or _same_joints(installed, recorded):
+            return installed, urdf_meshes(text, path.parent, scale)
+    assert description is not None
+    assert recorded is not None
+    return recorded, urdf_meshes(description, None)
+
+
+def _same_joints(a: Urdf, b: Urdf) -> bool:
+    if [joint.name for joint in a.joints] != [joint.name for joint in b.joints]:
+        return False
+    distances = [
+        np.abs(first.parent_from_joint.position - second.parent_from_joint.position).max()
+        for first, second in zip(a.joints, b.joints, strict=True)
+    ]
+    return max(distances, default=0.0) < _SAME_PLACE

@@ -1,0 +1,88 @@
+"""Episodes to .rrd files, with the layout inside."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import rerun as rr
+
+from demorec.errors import RecordingError
+from demorec.playback.compare import log_comparison, new_comparison
+from demorec.playback.layout import comparison_layout, episode_layout
+from demorec.playback.scene import log_episode, new_recording
+from demorec.playback.sources import Source
+
+
+def save(source: Source, target: Path) -> None:
+    """An episode into an .rrd file, which appears when it is complete.
+
+    Raises:
+        DemorecError: The episode cannot be read, or the file cannot be written.
+    """
+    with _partial(target) as part:
+        _save_episode(source, part)
+
+
+def numbered(target: Path, count: int) -> list[Path]:
+    """The names of `count` files: the target itself for one, NAME-0000.rrd and so on for several.
+
+    Rerun's viewer shows one recording of a file (it takes the last), so several episodes are several files.
+    """
+    if count == 1:
+        return [target]
+    return [target.with_name(f"{target.stem}-{index:04d}{target.suffix}") for index in range(count)]
+
+
+def save_each(sources: Sequence[Source], folder: Path) -> list[Path]:
+    """Each episode into an .rrd file of its own.
+
+    Raises:
+        DemorecError: An episode cannot be read.
+    """
+    files = [folder / f"{index:06d}.rrd" for index in range(len(sources))]
+    for source, file in zip(sources, files, strict=True):
+        _save_episode(source, file)
+    return files
+
+
+def save_comparison(a: Source, b: Source, target: Path) -> None:
+    """Two episodes over each other into one .rrd file.
+
+    Raises:
+        DemorecError: As `save`; ConfigError when they cannot be compared.
+    """
+    with _partial(target) as part, a.open() as first, b.open() as second:
+        recording = new_comparison(first, second)
+        with _saving(recording, part, comparison_layout(first, second)):
+            log_comparison(recording, first, second)
+
+
+def _save_episode(source: Source, target: Path) -> None:
+    with source.open() as episode:
+        recording = new_recording(episode)
+        with _saving(recording, target, episode_layout(episode)):
+            log_episode(recording, episode)
+
+
+@contextmanager
+def _saving(recording: rr.RecordingStream, target: Path, layout: rr.blueprint.Blueprint) -> Iterator[None]:
+    recording.save(target, default_blueprint=layout)
+    try:
+        yield
+    finally:
+        recording.disconnect()
+
+
+@contextmanager
+def _partial(target: Path) -> Iterator[Path]:
+    """A name beside the target, renamed when the block ends well and removed when not."""
+    part = target.with_name(f".{target.name}.part.rrd")
+    try:
+        yield part
+        part.replace(target)
+    except OSError as error:
+        raise RecordingError(f"The file cannot be written ({error.strerror}): {target}") from error
+    finally:
+        part.unlink(missing_ok=True)

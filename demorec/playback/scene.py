@@ -1,0 +1,51 @@
+"""One episode into one Rerun recording: everything that can be seen of it, as columns."""
+
+from __future__ import annotations
+
+import re
+
+import rerun as rr
+
+from demorec.playback.bodies import log_bodies
+from demorec.playback.cameras import log_cameras
+from demorec.playback.episode import Episode
+from demorec.playback.motion import log_curves, log_ee_path, log_events, log_phases
+from demorec.playback.paths import Paths
+from demorec.playback.robot import log_robot
+from demorec.playback.summary import properties, summary
+from demorec.scene import Rgba
+
+
+def log_episode(
+    recording: rr.RecordingStream, episode: Episode, *, root: str = "", label: str = "", tint: Rgba | None = None
+) -> None:
+    """Send all of an episode below `root`; `label` goes before the names of its curves, `tint` colours its robot.
+
+    Raises:
+        DemorecError: The source is damaged, or a model is neither installed nor recorded.
+    """
+    paths = Paths(root)
+    recording.log(paths.world, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    log_robot(recording, paths, episode, tint)
+    log_bodies(recording, paths, episode, tint)
+    log_cameras(recording, paths, episode)
+    log_ee_path(recording, paths, episode)
+    log_curves(recording, paths, episode, label, is_second=tint is not None)
+    log_phases(recording, paths, episode)
+    log_events(recording, paths, episode)
+    recording.log(paths.summary, rr.TextDocument(summary(episode), media_type="text/markdown"), static=True)
+
+
+def new_recording(episode: Episode) -> rr.RecordingStream:
+    """An empty Rerun recording with the episode's name and properties."""
+    recording = rr.RecordingStream(application_id(episode), recording_id=f"{episode.name}-{episode.identity}")
+    recording.send_recording_name(f"{episode.name}: {episode.verdict}")
+    recording.send_property("episode", rr.AnyValues(**properties(episode)))
+    return recording
+
+
+def application_id(episode: Episode) -> str:
+    """The group in the viewer's list: episodes of one group, task and set of cameras share a layout."""
+    cameras = "-".join(camera.name for camera in episode.info.scene.cameras)
+    words = (episode.group, episode.info.task, cameras)
+    return "-".join(re.sub(r"[^A-Za-z0-9_]+", "-", word).strip("-") for word in words if word)

@@ -1,0 +1,93 @@
+"""What a path holds: one recording, the episodes of a run, or those of an exported dataset."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from demorec.errors import ConfigError
+from demorec.playback.episode import Episode
+from demorec.playback.from_dataset import dataset_episodes, open_dataset_episode
+from demorec.playback.from_recording import open_recording
+
+
+@dataclass(frozen=True, kw_only=True)
+class Source:
+    """An episode that can be opened.
+
+    Attributes:
+        name: For people.
+        open: A context manager that gives the episode; RecordingError when it cannot be read.
+    """
+
+    name: str
+    open: Callable[[], AbstractContextManager[Episode]]
+
+
+def find_episodes(paths: Sequence[Path], *, include_failures: bool = False) -> list[Source]:
+    """Every episode below the paths, in their order; a run's failures only when asked for.
+
+    Raises:
+        ConfigError: A path is not there, or holds nothing that can be shown.
+        RecordingError: A dataset cannot be read.
+    """
+    if not paths:
+        raise ConfigError("No path is given: name a recording, a run or a dataset, e.g. demorec view recordings.")
+    return [source for path in paths for source in _sources(path, include_failures)]
+
+
+def _sources(path: Path, include_failures: bool) -> list[Source]:
+    if not path.exists():
+        raise ConfigError(f"There is no such file or folder: {path}")
+    if path.is_file():
+        return [_recording(path)]
+    if (path / "meta" / "info.json").is_file():
+        return [
+            Source(name=f"{path}: episode {index}", open=partial(open_dataset_episode, path, index))
+            for index in dataset_episodes(path)
+        ]
+    files = sorted(path.glob("*.mcap")) + sorted((path / "episodes").glob("*.mcap"))
+    if include_failures:
+        files += sorted((path / "failed").glob("*.mcap"))
+    if files:
+        return [_recording(file) for file in files]
+    hint = " Its failures are shown with --include-failures." if any((path / "failed").glob("*.mcap")) else ""
+    raise ConfigError(
+        f"The folder holds no recording (*.mcap), run (episodes/) or dataset (meta/info.json).{hint} {path}"
+    )
+
+
+def _recording(path: Path) -> Source:
+    return Source(name=str(path), open=partial(open_recording, path, group=_group(path)))
+
+
+def _group(path: Path) -> str:
+    """The run's name, or that of the folder."""
+    folder = path.resolve().parent
+    return folder.parent.name if folder.name in ("episodes", "failed") else folder.name
+
+
+def select(sources: Sequence[Source], episodes: str) -> list[Source]:
+    """Those of "7", "0:20" or "3,5,8:10", numbered from 0; all for "".
+
+    Raises:
+        ConfigError: No such numbers.
+    """
+    if not episodes:
+        return list(sources)
+    chosen: list[Source] = []
+    for word in episodes.split(","):
+        first, colon, last = word.partition(":")
+        try:
+            low = int(first or 0)
+            high = (int(last) if last else len(sources)) if colon else low + 1
+        except ValueError as error:
+            raise ConfigError(f"--episodes is {episodes!r}, expected numbers and ranges like 7 or 0:20.") from error
+        part = list(sources[low:high]) if 0 <= low < high else []
+        if not part:
+            raise ConfigError(f"--episodes {word}: there are {len(sources)} episodes, numbered from 0.")
+        chosen += part
+    return chosen

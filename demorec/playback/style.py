@@ -1,0 +1,54 @@
+"""Colours: one palette for joints, one for the phases of a motion, the same in plots, paths and time lines."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+Color = tuple[int, int, int]
+
+SERIES: tuple[Color, ...] = (
+    (86, 180, 233),
+    (230, 159, 0),
+    (0, 190, 140),
+    (240, 228, 66),
+    (204, 121, 167),
+    (213, 94, 0),
+    (120, 140, 255),
+    (150, 210, 80),
+    (200, 200, 200),
+)
+"""Of the joints, base to fingers; after Okabe and Ito, who chose colours that colour-blind people tell apart."""
+
+PHASES: tuple[Color, ...] = (
+    (70, 130, 255),
+    (0, 200, 200),
+    (255, 200, 40),
+    (60, 200, 90),
+    (190, 110, 255),
+    (255, 130, 50),
+    (240, 80, 110),
+    (150, 160, 180),
+)
+"""Of the phases, in the order in which they come up."""
+
+MEASURED: Color = (86, 180, 233)
+TARGET: Color = (255, 170, 60)
+SECOND: Color = (255, 140, 60)
+FORCE: Color = (240, 90, 90)
+GOAL: Color = (60, 230, 120)
+FRUSTUM: Color = (255, 200, 60)
+
+
+def series_colors(count: int) -> list[Color]:
+    """One colour a curve."""
+    return [SERIES[index % len(SERIES)] for index in range(count)]
+
+
+def dimmed(colors: Iterable[Color]) -> list[Color]:
+    """The same colours, nearer to grey: of targets beside the measured values."""
+    return [(r // 2 + 60, g // 2 + 60, b // 2 + 60) for r, g, b in colors]
+
+
+def phase_colors(phases: Iterable[str]) -> dict[str, Color]:
+    """Phase -> colour."""
+    return {name: PHASES[index % len(PHASES)] for index, name in enumerate(dict.fromkeys(phases))}

@@ -1,0 +1,236 @@
+"""Rerun's viewer: in a window, without a screen (for pictures), or in the browser."""
+
+from __future__ import annotations
+
+import subprocess
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+from urllib.parse import quote
+from urllib.request import urlopen
+
+from rerun.experimental import ViewerClient
+
+from demorec.errors import ConfigError, MissingDependencyError, RecordingError
+from demorec.playback.programs import free_port, has_display, viewer_environment, viewer_program
+from demorec.playback.times import SECONDS
+
+_START_SECONDS = 60.0
+_SETTLE_SECONDS = 30.0
+
+
+def show(recordings: Sequence[Path]) -> None:
+    """Open a window with .rrd files and wait until it is closed.
+
+    Raises:
+        ConfigError: There is no screen.
+        RecordingError: The viewer failed.
+    """
+    if not has_display():
+        raise ConfigError(
+            "There is no screen to open a window on: use --save x.rrd, --screenshot x.png, or --web for a browser."
+        )
+    command = [
+        viewer_program(),
+        "--port",
+        "auto",
+        "--bind",
+        "127.0.0.1",
+        "--hide-welcome-screen",
+        *map(str, recordings),
+    ]
+    code = subprocess.run(command, env=viewer_environment(), check=False).returncode
+    if code:
+        raise RecordingError(f"Rerun's viewer ended with exit code {code}.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report:
+    """What a view of the viewer complains about."""
+
+    view: str
+    severity: str
+    message: str
+
+
+class HeadlessViewer:
+    """Context manager over a viewer without a screen that shows .rrd or .mcap files, the first one in front.
+
+    Raises:
+        MissingDependencyError: No graphics driver.
+        RecordingError: The viewer does not come up, or cannot load the file.
+    """
+
+    def __init__(self, *recordings: Path, width: int = 1600, height: int = 950) -> None:
+        self._port = free_port()
+        self._recordings = recordings
+        self._process = subprocess.Popen(
+            [
+                viewer_program(), "--headless", "--port", str(self._port), "--bind", "127.0.0.1",
+                "--window-size", f"{width}x{height}", "--hide-welcome-screen", *map(str, recordings),
+            ],
+            env=viewer_environment(),
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+        )  # fmt: skip
+        try:
+            self.client = self._connect()
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the viewer; harmless when called twice."""
+        end_process(self._process)
+
+    def _connect(self) -> ViewerClient:
+        deadline = time.monotonic() + _START_SECONDS
+        while time.monotonic() < deadline:
+            if self._process.poll() is not None:
+                said = self._process.stderr.read() if self._process.stderr else ""
+                if "adapter" in said or "Vulkan" in said:
+                    raise MissingDependencyError(
+                        "A picture without a screen", "mesa-vulkan-drivers", "apt-get install mesa-vulkan-drivers"
+                    )
+                raise RecordingError(f"Rerun's viewer ended at once: {said.strip()[-300:]}")
+            try:
+                client = ViewerClient.connect(f"rerun+http://127.0.0.1:{self._port}/proxy")
+                state = client.get_state()
+            except (OSError, RuntimeError, ValueError):
+                time.sleep(0.2)
+                continue
+            loaded = [recording for recording in state.recordings if recording.timelines]
+            if not state.loading and len(loaded) >= len(self._recordings):
+                self._bring_to_front(client, loaded)
+                return client
+            time.sleep(0.2)
+        raise RecordingError(
+            f"Rerun's viewer has not loaded the file within {_START_SECONDS:.0f} s: {self._recordings[0]}"
+        )
+
+    @staticmethod
+    def _bring_to_front(client: ViewerClient, recordings: Sequence[Any]) -> None:
+        """Show the first recording (by name), since the viewer shows the one that it loaded last."""
+        if len(recordings) > 1:
+            client.set_location(min(recordings, key=lambda recording: str(recording.store_id)).location)
+
+    def seek(self, seconds: float) -> None:
+        """Pause at a time of the episode, and wait until the picture has settled (videos are decoded)."""
+        for recording in self.client.get_state().recordings:
+            self.client.set_time(timeline=SECONDS, duration=seconds, play_state="paused", recording=recording.store_id)
+        self._settle()
+
+    def _settle(self) -> None:
+        before, same = b"", 0
+        deadline = time.monotonic() + _SETTLE_SECONDS
+        while same < 3 and time.monotonic() < deadline:
+            time.sleep(0.4)
+            now = self.client.take_screenshot()
+            before, same = now, same + 1 if now == before else 0
+
+    def save_picture(self, target: Path) -> None:
+        """The whole window as PNG."""
+        target.write_bytes(self.client.take_screenshot())
+
+    def view_picture(self, name: str) -> bytes:
+        """One view as PNG; KeyError when no view has that name."""
+        for view in self.client.get_state().views:
+            if view.name == name:
+                return bytes(self.client.take_screenshot(view.view_id))
+        raise KeyError(name)
+
+    def reports(self) -> list[Report]:
+        """Every warning and error of a view."""
+        return [
+            Report(view=view.name, severity=report.severity, message=report.summary)
+            for view in self.client.get_state().views
+            for report in view.reports
+        ]
+
+    def state(self) -> Any:
+        """Recordings, views and time, as Rerun tells them."""
+        return self.client.get_state()
+
+
+def screenshot(recordings: Sequence[Path], target: Path, *, seconds: float, width: int, height: int) -> None:
+    """A picture of the viewer with .rrd files at a time of the episode.
+
+    Raises:
+        DemorecError: The viewer cannot work here, or a view reports an error.
+    """
+    with HeadlessViewer(*recordings, width=width, height=height) as viewer:
+        viewer.seek(seconds)
+        errors = [report for report in viewer.reports() if report.severity == "error"]
+        if errors:
+            raise RecordingError(f"The view {errors[0].view!r} cannot be drawn: {errors[0].message}.")
+        try:
+            viewer.save_picture(target)
+        except OSError as error:
+            raise RecordingError(f"The picture cannot be written ({error.strerror}): {target}") from error
+
+
+@contextmanager
+def serve_web(recordings: Sequence[Path], *, web_port: int = 0) -> Iterator[tuple[str, Callable[[], int]]]:
+    """Serve Rerun's web viewer and .rrd files to this machine alone.
+
+    Yields:
+        The address for the browser, and a function that waits until the server ends and returns its exit code.
+
+    Raises:
+        RecordingError: The port is taken, or the server does not come up.
+    """
+    data_port, web_port = free_port(), web_port or free_port()
+    memory = max(1024, 3 * sum(recording.stat().st_size for recording in recordings) // 2**20)
+    process = subprocess.Popen(
+        [
+            viewer_program(), "--serve-web", "--bind", "127.0.0.1", "--port", str(data_port),
+            "--web-viewer-port", str(web_port), "--server-memory-limit", f"{memory}MiB", *map(str, recordings),
+        ],
+        env=viewer_environment(),
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+    )  # fmt: skip
+    try:
+        page = f"http://127.0.0.1:{web_port}"
+        _wait_for_page(page, process)
+        yield f"{page}/?url={quote(f'rerun+http://127.0.0.1:{data_port}/proxy', safe='')}", process.wait
+    finally:
+        end_process(process)
+
+
+def _wait_for_page(page: str, process: subprocess.Popen[Any]) -> None:
+    deadline = time.monotonic() + _START_SECONDS
+    while time.monotonic() < deadline and process.poll() is None:
+        try:
+            with urlopen(page, timeout=5):
+                return
+        except OSError:
+            time.sleep(0.1)
+    raise RecordingError(f"Rerun's web server did not come up at {page}: is the port taken?")
+
+
+def end_process(process: subprocess.Popen[Any]) -> None:
+    """Ask a process to end, and make it when it does not within some seconds."""
+    if process.poll() is None:
+        process.terminate()
+        try:
+            process.wait(timeout=5)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+    if process.stderr is not None:
+        process.stderr.close()

@@ -1,0 +1,28 @@
+"""Recordings: one MCAP file an episode, readable by ROS 2, Rerun and Foxglove, and the source of everything after.
+
+with EpisodeWriter(path, info) as writer:
+    for frame in frames:
+        writer.write(frame)
+    writer.finish(outcome)
+
+with Recording(path) as recording:
+    recording.columns()            # all numbers
+    recording.images("front")      # decoded pictures
+"""
+
+from demorec.recording.pixels import PixelStatistics
+from demorec.recording.reader import Recording
+from demorec.recording.recover import Recovered, recover
+from demorec.recording.video import VideoPacket, VideoSettings
+from demorec.recording.writer import EpisodeWriter, WriteStats
+
+__all__ = [
+    "EpisodeWriter",
+    "PixelStatistics",
+    "Recording",
+    "Recovered",
+    "VideoPacket",
+    "VideoSettings",
+    "WriteStats",
+    "recover",
+]

@@ -1,0 +1,347 @@
+"""Random access to an MCAP file that trusts nothing: every byte that is used was covered by a checksum.
+
+The summary at the end tells where each chunk is and which topics it holds, so one topic is read without touching the
+others, one chunk at a time. The mcap library parses the records; what this adds is the checking, and one error.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Channel,
+    Chunk,
+    ChunkIndex,
+    Footer,
+    McapRecord,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+)
+
+from demorec.errors import RecordingError
+
+MAGIC = b"\x89MCAP0\r\n"
+_RECORD_HEAD = struct.Struct("<BQ")
+_MESSAGE_HEAD = struct.Struct("<HIQQ")
+_FOOTER_BYTES = _RECORD_HEAD.size + 20
+MAX_RECORD_BYTES = 1 << 30
+"""No recording has larger records; a damaged length must not fill the memory."""
+
+
+class Message(NamedTuple):
+    """One message: its topic, time and bytes."""
+
+    topic: str
+    time_ns: int
+    data: bytes
+
+
+@contextmanager
+def damage_as_recording_error(path: Path) -> Iterator[None]:
+    """Turn whatever a parser of damaged bytes raises into RecordingError."""
+    try:
+        yield
+    except RecordingError:
+        raise
+    except (OSError, MemoryError, ValueError, KeyError, IndexError, OverflowError, EOFError, struct.error) as error:
+        raise RecordingError(f"The recording is damaged ({_short(error)}): {path}") from error
+    except Exception as error:
+        # The parsers' own errors (mcap, zstandard) share no base class but Exception.
+        if type(error).__module__.split(".")[0] not in ("mcap", "zstandard", "zstd", "builtins"):
+            raise
+        raise RecordingError(f"The recording is damaged ({_short(error)}): {path}") from error
+
+
+def _short(error: BaseException) -> str:
+    text = str(error).splitlines()
+    return text[0][:120] if text and text[0] else type(error).__name__
+
+
+class Container:
+    """An open MCAP file.
+
+    Attributes:
+        channels: topic -> channel.
+        counts: topic -> number of messages.
+
+    Raises:
+        RecordingError: No such file, no MCAP, cut off, or a checksum that does not match.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        try:
+            self._file: BinaryIO = path.open("rb")
+        except OSError as error:
+            raise RecordingError(f"The recording cannot be read ({error.strerror}): {path}") from error
+        try:
+            with damage_as_recording_error(path):
+                self._read_summary()
+        except BaseException:
+            self._file.close()
+            raise
+
+    def close(self) -> None:
+        """Close the file; harmless when called twice."""
+        self._file.close()
+
+    def _read_summary(self) -> None:
+        size = self._file.seek(0, 2)
+        if size == 0:
+            raise RecordingError(f"The file is empty, so no recording: {self.path}")
+        if self._read_at(0, min(size, len(MAGIC))) != MAGIC:
+            raise RecordingError(f"The file is no MCAP file, so no recording: {self.path}")
+        tail_bytes = _FOOTER_BYTES + len(MAGIC)
+        if size < tail_bytes + len(MAGIC) or self._read_at(size - len(MAGIC), len(MAGIC)) != MAGIC:
+            raise RecordingError(
+                f"The recording is cut off, its index is missing; demorec recover makes a readable one of it: "
+                f"{self.path}"
+            )
+        footer_start = size - tail_bytes
+        footer = self._record_at(footer_start, _FOOTER_BYTES, Opcode.FOOTER, Footer)
+        if not len(MAGIC) <= footer.summary_start < footer_start:
+            raise RecordingError(f"The recording is damaged or has no index: {self.path}")
+        # The checksum covers the summary and the footer up to the checksum itself.
+        summary = self._read_at(footer.summary_start, footer_start - footer.summary_start + _FOOTER_BYTES - 4)
+        if zlib.crc32(summary) != footer.summary_crc:
+            raise RecordingError(f"The recording is damaged: the checksum of its index does not match: {self.path}")
+        self._parse_summary(summary[: footer_start - footer.summary_start])
+
+    def _parse_summary(self, summary: bytes) -> None:
+        channels: dict[int, Channel] = {}
+        self.schemas: dict[int, Schema] = {}
+        self._chunks: list[ChunkIndex] = []
+        self._metadata: dict[str, MetadataIndex] = {}
+        self._attachments: dict[str, AttachmentIndex] = {}
+        counts: dict[int, int] = {}
+        position = 0
+        while position < len(summary):
+            opcode, length = _RECORD_HEAD.unpack_from(summary, position)
+            position += _RECORD_HEAD.size
+            stream = ReadDataStream(BytesIO(summary[position : position + length]))
+            position += length
+            if opcode == Opcode.CHANNEL:
+                channel = Channel.read(stream)
+                channels[channel.id] = channel
+            elif opcode == Opcode.SCHEMA:
+                schema = Schema.read(stream)
+                self.schemas[schema.id] = schema
+            elif opcode == Opcode.CHUNK_INDEX:
+                self._chunks.append(ChunkIndex.read(stream))
+            elif opcode == Opcode.METADATA_INDEX:
+                metadata = MetadataIndex.read(stream)
+                self._metadata[metadata.name] = metadata
+            elif opcode == Opcode.ATTACHMENT_INDEX:
+                attachment = AttachmentIndex.read(stream)
+                self._attachments[attachment.name] = attachment
+            elif opcode == Opcode.STATISTICS:
+                counts = dict(Statistics.read(stream).channel_message_counts)
+        self._chunks.sort(key=lambda chunk: chunk.chunk_start_offset)
+        self._topics = {channel.id: channel.topic for channel in channels.values()}
+        self.channels = {channel.topic: channel for channel in channels.values()}
+        self.counts = {channel.topic: counts.get(channel.id, 0) for channel in channels.values()}
+
+    def _read_at(self, offset: int, length: int) -> bytes:
+        if not 0 <= length <= MAX_RECORD_BYTES:
+            raise RecordingError(f"The recording is damaged: a record of {length} bytes: {self.path}")
+        self._file.seek(offset)
+        data = self._file.read(length)
+        if len(data) != length:
+            raise RecordingError(f"The recording is damaged or cut off: {self.path}")
+        return data
+
+    def _record_at[R: McapRecord](self, offset: int, length: int, opcode: Opcode, kind: type[R]) -> R:
+        data = self._read_at(offset, length)
+        found, content_length = _RECORD_HEAD.unpack_from(data)
+        if found != opcode or content_length != length - _RECORD_HEAD.size:
+            raise RecordingError(f"The recording is damaged: no {kind.__name__} where its index says: {self.path}")
+        record: R = kind.read(ReadDataStream(BytesIO(data[_RECORD_HEAD.size :])))
+        return record
+
+    def metadata(self, name: str) -> dict[str, str] | None:
+        """A metadata record, or None; the caller checks its seal."""
+        index = self._metadata.get(name)
+        if index is None:
+            return None
+        with damage_as_recording_error(self.path):
+            record = self._record_at(index.offset, index.length, Opcode.METADATA, Metadata)
+            return dict(record.metadata)
+
+    @property
+    def metadata_names(self) -> tuple[str, ...]:
+        """Names of all metadata records."""
+        return tuple(self._metadata)
+
+    @property
+    def attachment_names(self) -> tuple[str, ...]:
+        """Names of all attachments."""
+        return tuple(self._attachments)
+
+    def attachment(self, name: str) -> bytes:
+        """The bytes of an attachment; KeyError when there is none of that name."""
+        index = self._attachments[name]
+        with damage_as_recording_error(self.path):
+            data = self._read_at(index.offset, index.length)
+            content, stored = data[_RECORD_HEAD.size : -4], int.from_bytes(data[-4:], "little")
+            if zlib.crc32(content) != stored:
+                raise RecordingError(
+                    f"The recording is damaged: the attachment {name!r} fails its checksum: {self.path}"
+                )
+            record = self._record_at(index.offset, index.length, Opcode.ATTACHMENT, Attachment)
+            return bytes(record.data)
+
+    def messages(self, topics: Collection[str]) -> Iterator[Message]:
+        """Messages of some topics in the order of the file; chunks without them are not read."""
+        wanted = {self.channels[topic].id: topic for topic in topics if topic in self.channels}
+        for index in self._chunks:
+            if wanted.keys().isdisjoint(index.message_index_offsets):
+                continue
+            with damage_as_recording_error(self.path):
+                found = list(_messages_of(self._chunk_content(index), wanted))
+            yield from found
+
+    def _chunk_content(self, index: ChunkIndex) -> bytes:
+        chunk = self._record_at(index.chunk_start_offset, index.chunk_length, Opcode.CHUNK, Chunk)
+        if chunk.uncompressed_size != index.uncompressed_size:
+            raise RecordingError(f"The recording is damaged: a chunk differs from its index: {self.path}")
+        return _uncompressed(chunk)
+
+
+def _uncompressed(chunk: Chunk) -> bytes:
+    """The records of a chunk; ValueError or ZstdError when it is damaged."""
+    if chunk.uncompressed_size > MAX_RECORD_BYTES:
+        raise ValueError(f"a chunk of {chunk.uncompressed_size} bytes")
+    if chunk.compression == "zstd":
+        data = zstandard.decompress(chunk.data, max_output_size=chunk.uncompressed_size)
+    elif chunk.compression == "":
+        data = chunk.data
+    else:
+        raise ValueError(f"a chunk compressed with {chunk.compression!r}, expected zstd")
+    if len(data) != chunk.uncompressed_size or zlib.crc32(data) != chunk.uncompressed_crc:
+        raise ValueError("a chunk fails its checksum")
+    return data
+
+
+def _records_of(content: bytes) -> Iterator[tuple[int, bytes]]:
+    """(opcode, content) of the records in a chunk."""
+    position = 0
+    while position < len(content):
+        opcode, length = _RECORD_HEAD.unpack_from(content, position)
+        position += _RECORD_HEAD.size
+        if position + length > len(content):
+            raise ValueError("a record that reaches beyond its chunk")
+        yield opcode, content[position : position + length]
+        position += length
+
+
+def _messages_of(content: bytes, wanted: dict[int, str]) -> Iterator[Message]:
+    # Every record of a chunk comes through here: those that are not wanted are stepped over, not copied.
+    position, end = 0, len(content)
+    while position < end:
+        opcode, length = _RECORD_HEAD.unpack_from(content, position)
+        start = position + _RECORD_HEAD.size
+        position = start + length
+        if position > end:
+            raise ValueError("a record that reaches beyond its chunk")
+        if opcode == Opcode.MESSAGE:
+            channel_id, _, log_time, _ = _MESSAGE_HEAD.unpack_from(content, start)
+            topic = wanted.get(channel_id)
+            if topic is not None:
+                yield Message(topic, log_time, content[start + _MESSAGE_HEAD.size : position])
+
+
+@dataclass(frozen=True, kw_only=True)
+class SalvagedMessage:
+    """A message of a file without an index; attributes as in the file."""
+
+    topic: str
+    schema: str
+    time_ns: int
+    data: bytes
+    is_latched: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class SalvagedMetadata:
+    """A metadata record of a file without an index."""
+
+    name: str
+    values: dict[str, str]
+
+
+def salvage(path: Path) -> Iterator[SalvagedMessage | SalvagedMetadata | str | None]:
+    """Everything whole from the front of a file: messages and metadata, None at the end of each chunk.
+
+    Ends with a string that says why reading stopped, or without one where the data ends as it should. Raises OSError.
+    """
+    with path.open("rb") as file:
+        size = file.seek(0, 2)
+        file.seek(0)
+        if file.read(len(MAGIC)) != MAGIC:
+            yield "the file is empty" if size == 0 else "the file is no MCAP file"
+            return
+        schemas: dict[int, str] = {}
+        channels: dict[int, Channel] = {}
+        while True:
+            head = file.read(_RECORD_HEAD.size)
+            if len(head) < _RECORD_HEAD.size:
+                yield "the end is missing"
+                return
+            opcode, length = _RECORD_HEAD.unpack(head)
+            if length > min(size - file.tell(), MAX_RECORD_BYTES):
+                yield "a record is cut off"
+                return
+            content = file.read(length)
+            if opcode in (Opcode.DATA_END, Opcode.FOOTER):
+                return
+            try:
+                with damage_as_recording_error(path):
+                    found = list(_salvaged(opcode, content, schemas, channels))
+            except RecordingError:
+                yield "a record is damaged"
+                return
+            yield from found
+            if opcode == Opcode.CHUNK:
+                yield None
+
+
+def _salvaged(
+    opcode: int, content: bytes, schemas: dict[int, str], channels: dict[int, Channel]
+) -> Iterator[SalvagedMessage | SalvagedMetadata]:
+    stream = ReadDataStream(BytesIO(content))
+    if opcode == Opcode.METADATA:
+        record = Metadata.read(stream)
+        yield SalvagedMetadata(name=record.name, values=dict(record.metadata))
+    elif opcode == Opcode.SCHEMA:
+        schema = Schema.read(stream)
+        schemas[schema.id] = schema.name
+    elif opcode == Opcode.CHANNEL:
+        channel = Channel.read(stream)
+        channels[channel.id] = channel
+    elif opcode == Opcode.CHUNK:
+        for inner, record_content in _records_of(_uncompressed(Chunk.read(stream))):
+            yield from _salvaged(inner, record_content, schemas, channels)
+    elif opcode == Opcode.MESSAGE:
+        channel_id, _, log_time, _ = _MESSAGE_HEAD.unpack_from(content)
+        channel = channels[channel_id]
+        yield SalvagedMessage(
+            topic=channel.topic,
+            schema=schemas[channel.schema_id],
+            time_ns=log_time,
+            data=content[_MESSAGE_HEAD.size :],
+            is_latched="offered_qos_profiles" in channel.metadata,
+        )

@@ -1,0 +1,208 @@
+"""URDF text of the robot and of each body that needs no other file to be drawn (see `shapes`)."""
+
+from __future__ import annotations
+
+import functools
+import math
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.assets import asset_path, mesh_path
+from demorec.errors import SceneError
+from demorec.geometry import Array, Pose
+from demorec.recording.shapes import Primitive, fit_primitives
+from demorec.scene import Body, Rgba
+from demorec.urdf import quat_from_rpy
+
+_WHITE: Rgba = (1.0, 1.0, 1.0, 1.0)
+
+
+@functools.lru_cache(maxsize=8)
+def robot_description(urdf: str, scale: float) -> str:
+    """The robot with every mesh replaced by primitives, without masses and collision shapes.
+
+    Raises:
+        SceneError: The URDF or one of its meshes cannot be read.
+    """
+    path = asset_path(urdf)
+    source = ET.parse(path).getroot()
+    colors = {
+        name: color
+        for material in source.iter("material")
+        if (name := material.get("name")) and (color := _color(material)) is not None
+    }
+    robot = ET.Element("robot", name=source.get("name", "robot"))
+    for link in source.findall("link"):
+        target = ET.SubElement(robot, "link", name=link.attrib["name"])
+        visuals = link.findall("visual")
+        # Collision shapes are simpler to begin with; their pose may differ from the picture's.
+        shapes = link.findall("collision") if len(link.findall("collision")) == len(visuals) else visuals
+        for visual, shape in zip(visuals, shapes, strict=True):
+            material = visual.find("material")
+            rgba = _WHITE
+            if material is not None:
+                rgba = _color(material) or colors.get(material.get("name", ""), _WHITE)
+            for primitive, pose in _primitives(shape, path.parent, scale):
+                _add_visual(target, primitive, pose, rgba)
+    for joint in source.findall("joint"):
+        robot.append(_joint(joint, scale))
+    return _text(robot)
+
+
+def body_description(body: Body) -> str:
+    """A URDF of one link, named like the body."""
+    robot = ET.Element("robot", name=body.name)
+    link = ET.SubElement(robot, "link", name=body.name)
+    rgba = body.rgba
+    if body.texture is not None:
+        first, second = body.texture.colors
+        rgba = (*((a + b) / 2 for a, b in zip(first, second, strict=True)), 1.0)  # type: ignore[assignment]
+    for primitive, pose in _body_primitives(body):
+        _add_visual(link, primitive, pose, rgba)
+    return _text(robot)
+
+
+def _body_primitives(body: Body) -> Iterator[tuple[Primitive, Pose]]:
+    shape = body.shape
+    origin = (0.0, 0.0, 0.0)
+    if shape.kind == "box":
+        yield Primitive(kind="box", center=origin, axis=2, size=shape.size, volume=0.0), Pose()
+    elif shape.kind == "sphere":
+        yield Primitive(kind="sphere", center=origin, axis=2, size=shape.size, volume=0.0), Pose()
+    elif shape.kind in ("cylinder", "capsule"):
+        radius, length = shape.size
+        yield Primitive(kind="cylinder", center=origin, axis=2, size=(radius, length), volume=0.0), Pose()
+        if shape.kind == "capsule":
+            for end in (-length / 2, length / 2):
+                yield Primitive(kind="sphere", center=(0.0, 0.0, end), axis=2, size=(radius,), volume=0.0), Pose()
+    elif shape.kind == "mesh":
+        for primitive in _mesh_primitives(asset_path(shape.file), (shape.scale,) * 3):
+            yield primitive, shape.body_from_mesh
+    else:
+        path = asset_path(shape.file)
+        for link in ET.parse(path).getroot().findall("link"):
+            for visual in link.findall("visual"):
+                yield from _primitives(visual, path.parent, shape.scale)
+
+
+def _primitives(element: ET.Element, folder: Path, scale: float) -> Iterator[tuple[Primitive, Pose]]:
+    """The geometry of a <visual> or <collision> as primitives in a frame, and that frame in the link's."""
+    origin = element.find("origin")
+    pose = Pose()
+    if origin is not None:
+        xyz = np.array([float(v) * scale for v in origin.get("xyz", "0 0 0").split()])
+        pose = Pose(position=xyz, quat_xyzw=quat_from_rpy([float(v) for v in origin.get("rpy", "0 0 0").split()]))
+    geometry = element.find("geometry")
+    for shape in () if geometry is None else geometry:
+        center = (0.0, 0.0, 0.0)
+        if shape.tag == "box":
+            size = tuple(float(v) * scale for v in shape.attrib["size"].split())
+            yield Primitive(kind="box", center=center, axis=2, size=size, volume=0.0), pose
+        elif shape.tag == "sphere":
+            size = (float(shape.attrib["radius"]) * scale,)
+            yield Primitive(kind="sphere", center=center, axis=2, size=size, volume=0.0), pose
+        elif shape.tag in ("cylinder", "capsule"):
+            size = (float(shape.attrib["radius"]) * scale, float(shape.attrib["length"]) * scale)
+            yield Primitive(kind="cylinder", center=center, axis=2, size=size, volume=0.0), pose
+        elif shape.tag == "mesh":
+            own = tuple(float(v) * scale for v in shape.get("scale", "1 1 1").split())
+            for primitive in _mesh_primitives(mesh_path(folder, shape.attrib["filename"]), own):
+                yield primitive, pose
+
+
+@functools.lru_cache(maxsize=256)
+def _mesh_primitives(path: Path, scale: tuple[float, ...]) -> list[Primitive]:
+    try:
+        vertices, faces = _load_obj(path) if path.suffix.lower() == ".obj" else _load_mesh(path)
+    except (OSError, ValueError, IndexError) as error:
+        raise SceneError(f"A mesh of the scene cannot be read ({error}): {path}") from error
+    return fit_primitives(vertices * np.array(scale), faces)
+
+
+def _load_obj(path: Path) -> tuple[Array, NDArray[np.int64]]:
+    """Vertices (V, 3) and triangles (F, 3) of a Wavefront OBJ file, polygons cut into fans."""
+    vertices: list[list[float]] = []
+    faces: list[tuple[int, int, int]] = []
+    for line in path.read_text(errors="replace").splitlines():
+        words = line.split()
+        if line.startswith("v "):
+            vertices.append([float(word) for word in words[1:4]])
+        elif line.startswith("f "):
+            corners = [int(word.split("/")[0]) for word in words[1:]]
+            corners = [corner - 1 if corner > 0 else len(vertices) + corner for corner in corners]
+            faces += [(corners[0], second, third) for second, third in pairwise(corners[1:])]
+    if not faces:
+        raise ValueError("no triangles")
+    return np.array(vertices), np.array(faces, dtype=np.int64)
+
+
+def _load_mesh(path: Path) -> tuple[Array, NDArray[np.int64]]:
+    import trimesh  # takes a second to load, and the usual robot needs it for nothing
+
+    mesh = trimesh.load(path, force="mesh", process=False)
+    return np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
+
+
+def _add_visual(link: ET.Element, primitive: Primitive, frame: Pose, rgba: Sequence[float]) -> None:
+    half = math.pi / 2
+    along = {0: (0.0, half, 0.0), 1: (-half, 0.0, 0.0), 2: (0.0, 0.0, 0.0)}[primitive.axis]
+    pose = frame @ Pose(position=np.array(primitive.center), quat_xyzw=quat_from_rpy(along))
+    visual = ET.SubElement(link, "visual")
+    ET.SubElement(visual, "origin", xyz=_numbers(pose.position.tolist()), rpy=_numbers(_rpy(pose)))
+    geometry = ET.SubElement(visual, "geometry")
+    if primitive.kind == "box":
+        ET.SubElement(geometry, "box", size=_numbers(primitive.size))
+    elif primitive.kind == "sphere":
+        ET.SubElement(geometry, "sphere", radius=_numbers(primitive.size))
+    else:
+        radius, length = primitive.size
+        ET.SubElement(geometry, "cylinder", radius=_numbers((radius,)), length=_numbers((length,)))
+    material = ET.SubElement(visual, "material", name="color_" + "_".join(f"{round(v * 255):02x}" for v in rgba))
+    ET.SubElement(material, "color", rgba=_numbers(rgba))
+
+
+def _rpy(pose: Pose) -> tuple[float, float, float]:
+    """Roll, pitch, yaw about fixed axes (rad), as URDF has them."""
+    r = pose.rotation
+    pitch = math.asin(min(1.0, max(-1.0, -float(r[2, 0]))))
+    if abs(r[2, 0]) > 1 - 1e-9:  # roll and yaw turn about the same axis
+        return math.atan2(-float(r[1, 2]), float(r[1, 1])), pitch, 0.0
+    return math.atan2(float(r[2, 1]), float(r[2, 2])), pitch, math.atan2(float(r[1, 0]), float(r[0, 0]))
+
+
+def _joint(source: ET.Element, scale: float) -> ET.Element:
+    joint = ET.Element("joint", name=source.attrib["name"], type=source.attrib["type"])
+    for child in source:
+        if child.tag not in ("origin", "parent", "child", "axis", "limit", "mimic"):
+            continue
+        copy = ET.SubElement(joint, child.tag, dict(child.attrib))
+        if child.tag == "origin" and scale != 1.0:
+            # Every bit, since kinematics is computed from this; a single product is the same on every CPU.
+            copy.set("xyz", " ".join(repr(float(v) * scale) for v in child.get("xyz", "0 0 0").split()))
+        if child.tag == "limit" and scale != 1.0 and joint.get("type") == "prismatic":
+            for bound in ("lower", "upper"):
+                copy.set(bound, _numbers([float(child.get(bound, "0")) * scale]))
+    return joint
+
+
+def _color(material: ET.Element) -> Rgba | None:
+    color = material.find("color")
+    if color is None:
+        return None
+    r, g, b, a = (float(v) for v in color.attrib["rgba"].split())
+    return (r, g, b, a)
+
+
+def _numbers(values: Sequence[float]) -> str:
+    # Tenths of a millimetre and of a milliradian: more would only differ between CPUs.
+    return " ".join(f"{round(value, 4) + 0.0:g}" for value in values)
+
+
+def _text(robot: ET.Element) -> str:
+    ET.indent(robot, " ")
+    return ET.tostring(robot, encoding="unicode") + "\n"

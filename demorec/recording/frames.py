@@ -1,0 +1,111 @@
+"""A recording's rows back into frames: for whoever writes a recording from another one (re-render, replay, tests)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from demorec.episode import Action, CameraImages, EpisodeColumns, Event, Frame, JointSample, Observation
+from demorec.geometry import Array, Pose
+from demorec.recording.reader import Recording
+
+
+def pose_of(row: Array) -> Pose:
+    """The pose of a row (7,): position, quaternion xyzw."""
+    return Pose(position=row[:3], quat_xyzw=row[3:])
+
+
+def observation_at(columns: EpisodeColumns, frame: int) -> Observation:
+    """The observation of a frame, to the bit."""
+    return Observation(
+        joint_position=columns.joint_position[frame].copy(),
+        joint_velocity=columns.joint_velocity[frame].copy(),
+        joint_effort=columns.joint_effort[frame].copy(),
+        gripper_width=float(columns.gripper_width[frame]),
+        base_from_tcp=pose_of(columns.base_from_tcp[frame]),
+        object_poses={name: pose_of(rows[frame]) for name, rows in columns.object_poses.items()},
+        contact_force=float(columns.contact_force[frame]),
+    )
+
+
+def action_at(columns: EpisodeColumns, frame: int) -> Action:
+    """What the expert wanted at a frame."""
+    return Action(
+        joint_target=columns.action_joint_target[frame].copy(),
+        gripper_target=float(columns.action_gripper[frame]),
+        base_from_tcp_target=pose_of(columns.action_base_from_tcp[frame]),
+    )
+
+
+def command_at(columns: EpisodeColumns, frame: int) -> Action:
+    """What was sent to the motors at a frame."""
+    return Action(
+        joint_target=columns.command_joint_target[frame].copy(),
+        gripper_target=float(columns.command_gripper[frame]),
+        base_from_tcp_target=pose_of(columns.command_base_from_tcp[frame]),
+    )
+
+
+def frames_of(recording: Recording, columns: EpisodeColumns | None = None) -> Iterator[Frame]:
+    """Every frame without its pictures: numbers, phase, events, and the joint samples before it.
+
+    Args:
+        recording: An open recording.
+        columns: Its columns, where the caller has read (or changed) them already.
+    """
+    columns = recording.columns() if columns is None else columns
+    times = columns.time_ns.tolist()
+    events: dict[int, list[Event]] = {}
+    for time_ns, event in recording.events():
+        frame = max(int(np.searchsorted(columns.time_ns, time_ns, side="right")) - 1, 0)
+        events.setdefault(frame, []).append(event)
+    samples = _samples_before_frames(recording, times)
+    for index, time_ns in enumerate(times):
+        yield Frame(
+            frame_index=index,
+            time_ns=time_ns,
+            observation=observation_at(columns, index),
+            action=action_at(columns, index),
+            command=command_at(columns, index),
+            phase=columns.phase[index],
+            events=tuple(events.get(index, ())),
+            joint_samples=samples.get(index, ()),
+            is_deliberate_miss=bool(columns.is_deliberate_miss[index]),
+        )
+
+
+def _samples_before_frames(recording: Recording, times: list[int]) -> dict[int, tuple[JointSample, ...]]:
+    number = {time_ns: index for index, time_ns in enumerate(times)}
+    result: dict[int, tuple[JointSample, ...]] = {}
+    waiting: list[JointSample] = []
+    for sample in recording.joint_samples():
+        if sample.time_ns in number:
+            if waiting:
+                result[number[sample.time_ns]] = tuple(waiting)
+            waiting = []
+        else:
+            waiting.append(sample)
+    return result
+
+
+def decoded_images(recording: Recording, columns: EpisodeColumns) -> Iterator[Mapping[str, CameraImages]]:
+    """The recorded pictures of every frame, decoded (so not those that were coded), with the recorded camera poses."""
+    streams = {
+        name: (
+            recording.images(name),
+            recording.depth(name) if recording.has_depth(name) else None,
+            recording.segmentation(name) if recording.has_segmentation(name) else None,
+        )
+        for name in recording.cameras
+    }
+    for index in range(columns.num_frames):
+        yield {
+            name: CameraImages(
+                color=next(color),
+                depth=None if depth is None else next(depth),
+                segmentation=None if labels is None else next(labels),
+                world_from_camera=pose_of(columns.world_from_camera[name][index]),
+            )
+            for name, (color, depth, labels) in streams.items()
+        }

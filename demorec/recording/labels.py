@@ -1,0 +1,83 @@
+"""Segmentation pictures: which body and link each pixel shows, as 16-bit PNG files with a table of names.
+
+Uncompressed pictures of one channel Rerun takes for depth, and stands them in the scene.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from demorec.assets import asset_path
+from demorec.episode import EpisodeInfo
+from demorec.errors import RecordingError
+from demorec.urdf import Urdf
+
+BACKGROUND = -1
+FORMAT = "mono16; png compressed "
+"""In the words of ROS's compressed_image_transport, blank included."""
+_LINK_SHIFT = 24
+_BODY_MASK = (1 << _LINK_SHIFT) - 1
+
+
+def to_labels(segmentation: NDArray[np.int32]) -> NDArray[np.uint16]:
+    """(H, W) body + ((link + 1) << 24), background -1, as 256 (body + 1) + link + 1, background 0.
+
+    Raises:
+        RecordingError: More than 255 bodies, or links of a body.
+    """
+    values = segmentation.astype(np.int64)
+    body, link = values & _BODY_MASK, values >> _LINK_SHIFT
+    known = values >= 0
+    if bool(((body > 254) & known).any()) or bool(((link > 255) & known).any()):
+        raise RecordingError("Segmentation can be recorded of at most 255 bodies with 255 links each.")
+    return np.where(known, ((body + 1) << 8) + link, 0).astype(np.uint16)
+
+
+def from_labels(labels: NDArray[np.uint16]) -> NDArray[np.int32]:
+    """Inverse of `to_labels`."""
+    values = labels.astype(np.int64)
+    return np.where(labels > 0, ((values >> 8) - 1) + ((values & 255) << _LINK_SHIFT), BACKGROUND).astype(np.int32)
+
+
+def encode_labels(segmentation: NDArray[np.int32]) -> bytes:
+    """A PNG file of `to_labels`."""
+    buffer = io.BytesIO()
+    Image.fromarray(to_labels(segmentation)).save(buffer, format="PNG", compress_level=3)
+    return buffer.getvalue()
+
+
+def decode_labels(data: bytes) -> NDArray[np.int32]:
+    """Inverse of `encode_labels`; ValueError or OSError when the bytes are no such file."""
+    with Image.open(io.BytesIO(data), formats=("PNG",)) as image:
+        if image.mode != "I;16":
+            raise ValueError(f"a segmentation picture of the kind {image.mode!r}")
+        return from_labels(np.asarray(image, dtype=np.uint16))
+
+
+def segment_names(info: EpisodeInfo) -> Iterator[tuple[int, str]]:
+    """(segmentation value, name) of the background, every body and every link of the robot.
+
+    Bodies are numbered in the order in which a world loads them (what stands still, the robot, what moves), links as
+    PyBullet does: depth first, in the order of the URDF's joints.
+    """
+    yield BACKGROUND, "background"
+    fixed = [body.name for body in info.scene.bodies if not body.movable]
+    for index, name in enumerate([*fixed, info.robot.name, *(body.name for body in info.scene.movable)]):
+        if index != len(fixed):
+            yield index, name
+            continue
+        urdf = Urdf.load(asset_path(info.robot.urdf))
+        for link_index, link in enumerate(_depth_first(urdf, urdf.root), start=-1):
+            yield index + ((link_index + 1) << _LINK_SHIFT), f"{name}/{link}"
+
+
+def _depth_first(urdf: Urdf, link: str) -> Iterator[str]:
+    yield link
+    for joint in urdf.joints:
+        if joint.parent == link:
+            yield from _depth_first(urdf, joint.child)

@@ -1,0 +1,264 @@
+"""The messages that are written one by one: pictures, text, and what is said once."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from demorec.episode import Event
+from demorec.geometry import Array, Pose
+from demorec.recording.cdr import CdrReader, CdrWriter
+from demorec.recording.pixels import PixelStatistics
+from demorec.scene import Camera
+
+JOINT_STATE = "sensor_msgs/msg/JointState"
+POSE = "geometry_msgs/msg/PoseStamped"
+STRING = "std_msgs/msg/String"
+BOOL = "std_msgs/msg/Bool"
+LOG = "rcl_interfaces/msg/Log"
+INT64_ARRAY = "std_msgs/msg/Int64MultiArray"
+COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
+PROTOBUF_VIDEO = "foxglove.CompressedVideo"
+COMPRESSED_VIDEO = "foxglove_msgs/msg/CompressedVideo"
+CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
+LABEL_INFO = "vision_msgs/msg/LabelInfo"
+
+_LOG_LEVELS = {"info": 20, "warning": 30, "error": 40}
+
+
+def string(text: str) -> bytes:
+    """std_msgs/String."""
+    message = CdrWriter()
+    message.text(text)
+    return message.finish()
+
+
+def read_string(data: bytes) -> str:
+    """Inverse of `string`."""
+    return CdrReader(data).text()
+
+
+def boolean(value: bool) -> bytes:
+    """std_msgs/Bool."""
+    message = CdrWriter()
+    message.u8(value)
+    return message.finish()
+
+
+def read_boolean(data: bytes) -> bool:
+    """Inverse of `boolean`."""
+    return bool(CdrReader(data).u8())
+
+
+def log(time_ns: int, event: Event) -> bytes:
+    """rcl_interfaces/Log."""
+    message = CdrWriter()
+    message.time(time_ns)
+    message.u8(_LOG_LEVELS[event.level])
+    message.text(event.name)
+    message.text(event.message)
+    message.text("")  # file
+    message.text("")  # function
+    message.u32(0)  # line
+    return message.finish()
+
+
+def read_log(data: bytes) -> Event:
+    """Inverse of `log`; ValueError for an unknown level."""
+    message = CdrReader(data)
+    message.time()
+    level_number = message.u8()
+    for level, number in _LOG_LEVELS.items():
+        if number == level_number:
+            return Event(name=message.text(), message=message.text(), level=level)  # type: ignore[arg-type]
+    raise ValueError(f"a log message of level {level_number}")
+
+
+class PictureMessages:
+    """sensor_msgs/CompressedImage and foxglove_msgs/CompressedVideo of one camera and format, laid out once.
+
+    Args:
+        frame_id: Coordinate frame of the camera.
+        picture_format: As the type wants it.
+    """
+
+    def __init__(self, frame_id: str, picture_format: str) -> None:
+        image = CdrWriter()
+        image.header(frame_id)
+        image.text(picture_format)
+        image.u32(0)
+        self._image = image.finish()
+        video = CdrWriter()
+        video.header(frame_id)
+        video.u32(0)
+        self._video = video.finish()
+        self._format = struct.pack("<I", len(picture_format) + 1) + picture_format.encode() + b"\x00"
+
+    def compressed_image(self, time_ns: int, data: bytes) -> bytes:
+        """sensor_msgs/CompressedImage."""
+        return self._filled(self._image, time_ns, data)
+
+    def compressed_video(self, time_ns: int, data: bytes) -> bytes:
+        """foxglove_msgs/CompressedVideo."""
+        message = self._filled(self._video, time_ns, data)
+        return message + b"\x00" * (-len(message) % 4) + self._format
+
+    @staticmethod
+    def _filled(head: bytes, time_ns: int, data: bytes) -> bytes:
+        # Encapsulation, stamp, the constant fields, length of the data, data.
+        stamp = struct.pack("<II", *divmod(time_ns, 1_000_000_000))
+        return head[:4] + stamp + head[12:-4] + struct.pack("<I", len(data)) + data
+
+
+_U32 = struct.Struct("<I")
+
+
+def read_compressed_image(data: bytes) -> bytes:
+    """The coded picture of a `compressed_image`."""
+    # By hand, since every picture of an export comes through here: encapsulation (4 bytes) and stamp (8), then two
+    # strings and the octets, each after its length, which starts at a multiple of four.
+    position = 12
+    for _ in range(2):
+        (length,) = _U32.unpack_from(data, position)
+        position = (position + 4 + length + 3) & ~3
+    (length,) = _U32.unpack_from(data, position)
+    picture = data[position + 4 : position + 4 + length]
+    if len(picture) != length:
+        raise ValueError("a picture that is cut off")
+    return picture
+
+
+def protobuf_video(time_ns: int, frame_id: str, video_format: str, data: bytes) -> bytes:
+    """foxglove.CompressedVideo in protobuf: the only form in which Rerun plays AV1 from an MCAP file."""
+    from foxglove.messages import CompressedVideo, Timestamp
+
+    stamp = Timestamp(sec=time_ns // 1_000_000_000, nsec=time_ns % 1_000_000_000)
+    message = CompressedVideo(timestamp=stamp, frame_id=frame_id, data=data, format=video_format)
+    return bytes(message.encode())
+
+
+def read_protobuf_video(data: bytes) -> bytes:
+    """The coded picture: field 3 of foxglove.CompressedVideo (all its fields are length-delimited)."""
+    position = 0
+    while position < len(data):
+        tag, position = _varint(data, position)
+        if tag & 7 != 2:
+            raise ValueError(f"a video message with a field of wire type {tag & 7}")
+        length, position = _varint(data, position)
+        if position + length > len(data):
+            break
+        if tag >> 3 == 3:
+            return data[position : position + length]
+        position += length
+    raise ValueError("a video message without a picture")
+
+
+def _varint(data: bytes, position: int) -> tuple[int, int]:
+    value = shift = 0
+    while position < len(data):
+        byte = data[position]
+        position += 1
+        value |= (byte & 127) << shift
+        if byte < 128:
+            return value, position
+        shift += 7
+    raise ValueError("a video message that ends within a number")
+
+
+def pixel_statistics(statistics: PixelStatistics) -> bytes:
+    """std_msgs/Int64MultiArray, a table of 3 x 256 counts after one number: how many pictures were counted."""
+    message = CdrWriter()
+    message.u32(2)
+    for label, size, stride in (("red, green, blue", 3, 3 * 256), ("value", 256, 256)):
+        message.text(label)
+        message.u32(size)
+        message.u32(stride)
+    message.u32(1)  # data_offset: what comes in front of the table
+    message.integers(np.concatenate(([statistics.num_images], statistics.counts.reshape(-1))))
+    return message.finish()
+
+
+def read_pixel_statistics(data: bytes) -> PixelStatistics:
+    """Inverse of `pixel_statistics`."""
+    message = CdrReader(data)
+    for _ in range(message.u32()):
+        message.text()
+        message.u32()
+        message.u32()
+    message.u32()
+    values = message.integers()
+    return PixelStatistics(num_images=int(values[0]), counts=values[1:].reshape(3, 256))
+
+
+def camera_info(camera: Camera, frame_id: str) -> bytes:
+    """sensor_msgs/CameraInfo of a camera without distortion."""
+    k = camera.intrinsics
+    message = CdrWriter()
+    message.header(frame_id)
+    message.u32(camera.height)
+    message.u32(camera.width)
+    message.text("plumb_bob")
+    message.u32(5)
+    message.floats([0.0] * 5)
+    message.floats(k.reshape(-1).tolist())
+    message.floats(np.eye(3).reshape(-1).tolist())
+    message.floats(np.hstack((k, np.zeros((3, 1)))).reshape(-1).tolist())
+    message.u32(0)  # binning_x
+    message.u32(0)  # binning_y
+    for _ in range(4):  # the region of interest is the whole picture
+        message.u32(0)
+    message.u8(False)
+    return message.finish()
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Calibration:
+    """What a `camera_info` message says: picture size in pixels and K (3, 3)."""
+
+    width: int
+    height: int
+    intrinsics: Array
+
+
+def read_camera_info(data: bytes) -> Calibration:
+    """Inverse of `camera_info`."""
+    message = CdrReader(data)
+    message.header()
+    height, width = message.u32(), message.u32()
+    message.text()
+    message.floats(message.u32())
+    return Calibration(width=width, height=height, intrinsics=message.floats(9).reshape(3, 3))
+
+
+def transforms(rows: Sequence[tuple[str, str, Pose]]) -> bytes:
+    """tf2_msgs/TFMessage at time 0: (parent frame, child frame, parent_from_child) each."""
+    message = CdrWriter()
+    message.u32(len(rows))
+    for parent, child, pose in rows:
+        message.header(parent)
+        message.text(child)
+        message.floats(pose.vector().tolist())
+    return message.finish()
+
+
+def label_info(labels: Sequence[tuple[int, str]]) -> bytes:
+    """vision_msgs/LabelInfo: which number stands for what in segmentation pictures."""
+    message = CdrWriter()
+    message.header("")
+    message.u32(len(labels))
+    for number, name in labels:
+        message.u16(number)
+        message.text(name)
+    message.f32(0.0)
+    return message.finish()
+
+
+def read_label_info(data: bytes) -> dict[int, str]:
+    """Inverse of `label_info`."""
+    message = CdrReader(data)
+    message.header()
+    return {message.u16(): message.text() for _ in range(message.u32())}

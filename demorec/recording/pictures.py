@@ -1,0 +1,118 @@
+"""The picture streams of one camera: colour as video, depth, segmentation, and the statistics of the colours."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from numpy.typing import NDArray
+
+from demorec.config import VideoConfig
+from demorec.episode import CameraImages, Frame
+from demorec.errors import RecordingError
+from demorec.recording import messages
+from demorec.recording.channels import camera_topic, video_topic
+from demorec.recording.depth import FORMAT as DEPTH_FORMAT
+from demorec.recording.depth import encode_depth
+from demorec.recording.labels import FORMAT as LABELS_FORMAT
+from demorec.recording.labels import encode_labels
+from demorec.recording.metadata import CameraStreams
+from demorec.recording.pixels import PixelCounter
+from demorec.recording.transforms import camera_frame
+from demorec.recording.video import make_encoder
+from demorec.scene import Camera
+
+Message = tuple[str, str, bytes]
+"""Topic, type, bytes."""
+
+
+class CameraRecorder:
+    """Codes what a camera sees and keeps it until it is written.
+
+    Attributes:
+        streams: What is recorded; depth and segmentation when the first frame has them.
+        num_ready: Frames whose pictures have left the encoder since the beginning.
+        num_video_bytes: Of coded colour pictures.
+    """
+
+    def __init__(self, camera: Camera, first: CameraImages, *, video: VideoConfig, fps: int) -> None:
+        self._camera = camera
+        self._encoder = make_encoder(video=video, width=camera.width, height=camera.height, fps=fps)
+        self.streams = CameraStreams(
+            video=self._encoder.settings, depth=first.depth is not None, segmentation=first.segmentation is not None
+        )
+        self._pixels = PixelCounter()
+        frame_id = camera_frame(camera.name)
+        self._color = messages.PictureMessages(frame_id, video.codec)
+        self._depth = messages.PictureMessages(frame_id, DEPTH_FORMAT)
+        self._labels = messages.PictureMessages(frame_id, LABELS_FORMAT)
+        self._packets: list[bytes] = []
+        self._others: list[list[Message]] = []
+        self.num_ready = 0
+        self.num_video_bytes = 0
+
+    def add(self, frame: Frame) -> None:
+        """Take the camera's pictures of the next frame.
+
+        Raises:
+            RecordingError: A picture is missing or of another size.
+        """
+        name = self._camera.name
+        images = frame.images.get(name)
+        if images is None:
+            raise RecordingError(f"Frame {frame.frame_index} has no picture of the camera {name!r}.")
+        others: list[Message] = []
+        self._check(frame.frame_index, "colour", images.color, True)
+        self._check(frame.frame_index, "depth", images.depth, self.streams.depth)
+        self._check(frame.frame_index, "segmentation", images.segmentation, self.streams.segmentation)
+        self._pixels.add(images.color)
+        self._take(self._encoder.encode(images.color))
+        if images.depth is not None:
+            data = self._depth.compressed_image(frame.time_ns, encode_depth(images.depth))
+            others.append((camera_topic(name, "depth"), messages.COMPRESSED_IMAGE, data))
+        if images.segmentation is not None:
+            data = self._labels.compressed_image(frame.time_ns, encode_labels(images.segmentation))
+            others.append((camera_topic(name, "segmentation"), messages.COMPRESSED_IMAGE, data))
+        self._others.append(others)
+
+    def _check(self, frame_index: int, kind: str, pixels: NDArray[Any] | None, is_recorded: bool) -> None:
+        size = (self._camera.height, self._camera.width)
+        if (pixels is not None) != is_recorded or (pixels is not None and pixels.shape[:2] != size):
+            found = "is missing" if pixels is None else f"has shape {pixels.shape}"
+            raise RecordingError(
+                f"The {kind} picture of the camera {self._camera.name!r} at frame {frame_index} {found}: every frame "
+                f"has the same pictures of {size[1]}x{size[0]} pixels."
+            )
+
+    def end(self) -> None:
+        """Take what the encoder held back."""
+        self._take(self._encoder.finish())
+
+    def _take(self, packets: list[bytes]) -> None:
+        self._packets += packets
+        self.num_ready += len(packets)
+        self.num_video_bytes += sum(map(len, packets))
+
+    def take_messages(self, time_ns: list[int]) -> Iterator[list[Message]]:
+        """The messages of the oldest frames that are not yet written, one list a frame."""
+        name, codec = self._camera.name, self.streams.video.codec
+        topic, again_topic = video_topic(name, codec), camera_topic(name, "video")
+        count = len(time_ns)
+        for time, packet, others in zip(time_ns, self._packets[:count], self._others[:count], strict=True):
+            if codec == "av1":
+                message = messages.protobuf_video(time, camera_frame(name), codec, packet)
+                yield [(topic, messages.PROTOBUF_VIDEO, message), *others]
+                continue
+            result = [(topic, messages.COMPRESSED_IMAGE, self._color.compressed_image(time, packet))]
+            if codec == "h264":
+                # The same bytes once more, as Foxglove wants them; next to the first, compression folds them.
+                again = self._color.compressed_video(time, packet)
+                result.append((again_topic, messages.COMPRESSED_VIDEO, again))
+            yield result + others
+        del self._packets[:count]
+        del self._others[:count]
+
+    def statistics(self) -> Message:
+        """What `pixels` counted."""
+        data = messages.pixel_statistics(self._pixels.statistics())
+        return camera_topic(self._camera.name, "histogram"), messages.INT64_ARRAY, data

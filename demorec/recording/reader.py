@@ -1,0 +1,337 @@
+"""Reads a recording: numbers as columns, pictures as packets or decoded, one chunk in memory at a time."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.episode import EpisodeColumns, Event, JointSample, frame_time_ns
+from demorec.errors import RecordingError
+from demorec.geometry import Array
+from demorec.plain import to_json, to_plain
+from demorec.recording import channels, messages, metadata
+from demorec.recording.container import Container, damage_as_recording_error
+from demorec.recording.depth import decode_depth
+from demorec.recording.labels import decode_labels, from_labels
+from demorec.recording.pixels import PixelCounter, PixelStatistics
+from demorec.recording.video import Rgb, VideoPacket, VideoSettings, decode, is_keyframe
+
+
+class Recording:
+    """Context manager over one recording.
+
+    Attributes:
+        path: Of the file.
+        info: What was known before the first frame.
+        outcome: How the episode ended; None when a crash cut it off (`is_recovered`).
+        num_frames: Length.
+
+    Raises:
+        RecordingError: No recording, cut off, damaged, or of an unknown format version; so do all methods.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = Path(path)
+        self._container = Container(self.path)
+        try:
+            self._read_metadata()
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file; harmless when called twice."""
+        self._container.close()
+
+    def _read_metadata(self) -> None:
+        found = self._container.metadata(metadata.EPISODE)
+        if found is None:
+            raise RecordingError(f"The MCAP file is no demorec recording, it has no episode metadata: {self.path}")
+        try:
+            self.info, self._cameras = metadata.read_episode_metadata(found)
+            outcome = self._container.metadata(metadata.OUTCOME)
+            self.outcome = None if outcome is None else metadata.read_outcome_metadata(outcome)
+            recovered = self._container.metadata(metadata.RECOVERED)
+            if recovered is not None:
+                metadata.check_seal(metadata.RECOVERED, recovered)
+        except RecordingError as error:
+            raise RecordingError(f"{error} {self.path}") from error
+        self.is_recovered = recovered is not None
+        self.num_frames = self._container.counts.get(channels.GRIPPER, 0)
+        if self.outcome is None and not self.is_recovered:
+            raise RecordingError(f"The recording was never finished: demorec recover makes a readable one: {self.path}")
+        if self.outcome is not None and self.outcome.num_frames != self.num_frames:
+            raise RecordingError(
+                f"The recording has {self.num_frames} frames, but its outcome says {self.outcome.num_frames}: "
+                f"{self.path}"
+            )
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Names of the recorded cameras, in the scene's order."""
+        return tuple(camera.name for camera in self.info.scene.cameras if camera.name in self._cameras)
+
+    @property
+    def topics(self) -> dict[str, tuple[str, int]]:
+        """topic -> (type, number of messages), sorted by topic."""
+        container = self._container
+        return {
+            topic: (container.schemas[container.channels[topic].schema_id].name, container.counts[topic])
+            for topic in sorted(container.channels)
+        }
+
+    def video_settings(self, camera: str) -> VideoSettings:
+        """How the pictures of a camera were coded."""
+        return self._camera(camera).video
+
+    def has_depth(self, camera: str) -> bool:
+        """Whether depth pictures of a camera were recorded."""
+        return self._camera(camera).depth
+
+    def has_segmentation(self, camera: str) -> bool:
+        """Whether segmentation pictures of a camera were recorded."""
+        return self._camera(camera).segmentation
+
+    def _camera(self, camera: str) -> metadata.CameraStreams:
+        if camera not in self._cameras:
+            raise RecordingError(
+                f"The recording has no camera {camera!r}, its cameras are {', '.join(self._cameras) or 'none'}: "
+                f"{self.path}"
+            )
+        return self._cameras[camera]
+
+    def _frame_times(self) -> list[int]:
+        return [frame_time_ns(index, self.info.fps) for index in range(self.num_frames)]
+
+    def columns(self) -> EpisodeColumns:
+        """All numbers, one row a frame, to the bit as they were written."""
+        streams = {stream.topic: stream for stream in channels.state_streams(self.info)}
+        data: dict[str, list[bytes]] = {topic: [] for topic in streams}
+        times: dict[str, list[int]] = {topic: [] for topic in streams}
+        changes: dict[str, list[tuple[int, bytes]]] = {channels.PHASE: [], channels.DELIBERATE_MISS: []}
+        expected = self._frame_times()
+        is_frame = frozenset(expected)
+        for message in self._container.messages((*streams, *changes)):
+            if message.topic in changes:
+                changes[message.topic].append((message.time_ns, message.data))
+            elif message.topic != channels.JOINT_STATES or message.time_ns in is_frame:
+                data[message.topic].append(message.data)
+                times[message.topic].append(message.time_ns)
+        rows: dict[str, Array] = {}
+        with damage_as_recording_error(self.path):
+            for topic, stream in streams.items():
+                if times[topic] != expected:
+                    raise RecordingError(
+                        f"The recording has {len(times[topic])} messages on {topic} at other times than its "
+                        f"{len(expected)} frames: {self.path}"
+                    )
+                rows[topic] = stream.layout.decode(data[topic])
+            phases = [(time, messages.read_string(raw)) for time, raw in changes[channels.PHASE]]
+            misses = [(time, messages.read_boolean(raw)) for time, raw in changes[channels.DELIBERATE_MISS]]
+        joints = rows[channels.JOINT_STATES].reshape(self.num_frames, 3, len(self.info.robot.joint_names))
+        gripper, action, command = (rows[topic] for topic in (channels.GRIPPER, channels.ACTION, channels.COMMAND))
+        num_arm = len(self.info.robot.arm_joints)
+        return EpisodeColumns(
+            time_ns=np.array(expected, dtype=np.int64),
+            joint_position=joints[:, 0].copy(),
+            joint_velocity=joints[:, 1].copy(),
+            joint_effort=joints[:, 2].copy(),
+            gripper_width=gripper[:, 0].copy(),
+            base_from_tcp=rows[channels.EE_POSE],
+            object_poses={body.name: rows[channels.object_topic(body.name)] for body in self.info.scene.movable},
+            contact_force=gripper[:, 2].copy(),
+            action_joint_target=action[:, :num_arm].copy(),
+            action_gripper=action[:, num_arm].copy(),
+            action_base_from_tcp=rows[channels.ACTION + channels.EE_POSE],
+            command_joint_target=command[:, :num_arm].copy(),
+            command_gripper=command[:, num_arm].copy(),
+            command_base_from_tcp=rows[channels.COMMAND + channels.EE_POSE],
+            phase=tuple(_held(phases, expected, "")),
+            is_deliberate_miss=np.array(list(_held(misses, expected, False)), dtype=np.bool_),
+            world_from_camera={name: rows[channels.camera_topic(name, "pose")] for name in self.cameras},
+        )
+
+    def description(self, body: str = "") -> str:
+        """URDF of the robot, or of the body of that name: primitives only, complete without any other file."""
+        topic = channels.description_topic(body)
+        for message in self._container.messages((topic,)):
+            with damage_as_recording_error(self.path):
+                return messages.read_string(message.data)
+        raise RecordingError(f"The recording has no description on {topic}: {self.path}")
+
+    def joint_samples(self) -> Iterator[JointSample]:
+        """Every recorded joint state in order of time: the frames' own and those between them."""
+        stream = next(row for row in channels.state_streams(self.info) if row.topic == channels.JOINT_STATES)
+        for message in self._container.messages((channels.JOINT_STATES,)):
+            with damage_as_recording_error(self.path):
+                position, velocity, effort = stream.layout.decode([message.data]).reshape(3, -1)
+            yield JointSample(
+                time_ns=message.time_ns, joint_position=position, joint_velocity=velocity, joint_effort=effort
+            )
+
+    def events(self) -> Iterator[tuple[int, Event]]:
+        """(time_ns, event) in order of time; changes of phase are in `columns().phase`."""
+        for message in self._container.messages((channels.EVENTS,)):
+            with damage_as_recording_error(self.path):
+                event = messages.read_log(message.data)
+            if event.name != channels.PHASE_EVENT:
+                yield message.time_ns, event
+
+    def packets(self, camera: str) -> Iterator[VideoPacket]:
+        """The coded pictures of a camera, one a frame, in order."""
+        codec = self.video_settings(camera).codec
+        read = messages.read_protobuf_video if codec == "av1" else messages.read_compressed_image
+        for index, (time_ns, data) in enumerate(self._pictures(channels.video_topic(camera, codec), read)):
+            yield VideoPacket(frame_index=index, time_ns=time_ns, data=data, is_keyframe=is_keyframe(codec, data))
+
+    def packets_of_all_cameras(self) -> dict[str, list[VideoPacket]]:
+        """camera -> what `packets` gives, in one pass over the file; all of them are in memory then."""
+        codecs = {camera: self.video_settings(camera).codec for camera in self.cameras}
+        cameras = {channels.video_topic(camera, codec): camera for camera, codec in codecs.items()}
+        times = self._frame_times()
+        found: dict[str, list[VideoPacket]] = {camera: [] for camera in self.cameras}
+        with damage_as_recording_error(self.path):
+            for message in self._container.messages(tuple(cameras)):
+                camera = cameras[message.topic]
+                codec, index = codecs[camera], len(found[camera])
+                if index >= self.num_frames or message.time_ns != times[index]:
+                    raise RecordingError(
+                        f"Picture {index} of {message.topic} is at {message.time_ns} ns, not at its frame's time: "
+                        f"{self.path}"
+                    )
+                read = messages.read_protobuf_video if codec == "av1" else messages.read_compressed_image
+                data = read(message.data)
+                packet = VideoPacket(
+                    frame_index=index, time_ns=message.time_ns, data=data, is_keyframe=is_keyframe(codec, data)
+                )
+                found[camera].append(packet)
+        for camera, packets in found.items():
+            if len(packets) != self.num_frames:
+                raise RecordingError(
+                    f"The recording has {self.num_frames} frames, but {len(packets)} pictures of camera {camera}: "
+                    f"{self.path}"
+                )
+        return found
+
+    def depth(self, camera: str) -> Iterator[NDArray[np.float32]]:
+        """Depth pictures, (H, W) float32 metres in steps of a millimetre, 0 where nothing was hit, one a frame."""
+        if not self.has_depth(camera):
+            raise RecordingError(f"The recording has no depth pictures of the camera {camera!r}: {self.path}")
+        topic = channels.camera_topic(camera, "depth")
+        for _, picture in self._pictures(topic, lambda data: decode_depth(messages.read_compressed_image(data))):
+            yield picture
+
+    def segmentation(self, camera: str) -> Iterator[NDArray[np.int32]]:
+        """Segmentation pictures, (H, W) int32 as in `CameraImages`, one a frame; `segment_names` tells what is what."""
+        if not self.has_segmentation(camera):
+            raise RecordingError(f"The recording has no segmentation pictures of the camera {camera!r}: {self.path}")
+        topic = channels.camera_topic(camera, "segmentation")
+        for _, labels in self._pictures(topic, lambda data: decode_labels(messages.read_compressed_image(data))):
+            yield labels
+
+    def segment_names(self) -> dict[int, str]:
+        """Segmentation value -> name of the body, or ROBOT/LINK; empty when no segmentation was recorded."""
+        for message in self._container.messages((channels.LABELS,)):
+            with damage_as_recording_error(self.path):
+                labels = messages.read_label_info(message.data)
+                values = from_labels(np.array([list(labels)], dtype=np.uint16))[0].tolist()
+            return dict(zip(values, labels.values(), strict=True))
+        return {}
+
+    def _pictures[P](self, topic: str, read: Callable[[bytes], P]) -> Iterator[tuple[int, P]]:
+        """(time_ns, picture) of a topic that has one message a frame."""
+        count = 0
+        for message in self._container.messages((topic,)):
+            if count >= self.num_frames or message.time_ns != frame_time_ns(count, self.info.fps):
+                raise RecordingError(
+                    f"Picture {count} of {topic} is at {message.time_ns} ns, not at its frame's time: {self.path}"
+                )
+            with damage_as_recording_error(self.path):
+                picture = read(message.data)
+            yield message.time_ns, picture
+            count += 1
+        if count != self.num_frames:
+            raise RecordingError(
+                f"The recording has {self.num_frames} frames, but {count} pictures on {topic}: {self.path}"
+            )
+
+    def images(self, camera: str) -> Iterator[Rgb]:
+        """The decoded pictures of a camera, (H, W, 3) uint8 RGB, one a frame, in order."""
+        return decode(self.video_settings(camera), self.packets(camera))
+
+    def pixel_statistics(self, camera: str) -> PixelStatistics:
+        """Histograms of a camera's pictures: as written, or counted now in a recording that a crash cut off."""
+        self._camera(camera)
+        topic = channels.camera_topic(camera, "histogram")
+        for message in self._container.messages((topic,)):
+            with damage_as_recording_error(self.path):
+                return messages.read_pixel_statistics(message.data)
+        counter = PixelCounter()
+        for picture in self.images(camera):
+            counter.add(picture)
+        return counter.statistics()
+
+    def digest(self) -> str:
+        """SHA-256 (hex) of the content: metadata, numbers, phases, events, coded pictures.
+
+        Not of how a file lays it out, nor of the versions that wrote it: two recordings of one digest hold the same
+        episode to the bit.
+        """
+        described = to_plain(self.info)
+        del described["versions"], described["format_version"]
+        result = hashlib.sha256(json.dumps(described, sort_keys=True).encode())
+        result.update(b"no outcome" if self.outcome is None else to_json(self.outcome).encode())
+        for name, value in _column_bytes(self.columns()):
+            result.update(name.encode() + value)
+        for sample in self.joint_samples():
+            result.update(sample.time_ns.to_bytes(8, "little"))
+            for vector in (sample.joint_position, sample.joint_velocity, sample.joint_effort):
+                result.update(vector.tobytes())
+        for time_ns, event in self.events():
+            result.update(f"{time_ns} {to_json(event)}".encode())
+        for camera in self.cameras:
+            result.update(camera.encode())
+            for packet in self.packets(camera):
+                result.update(hashlib.sha256(packet.data).digest())
+            for depth in self.depth(camera) if self.has_depth(camera) else ():
+                result.update(depth.tobytes())
+            for labels in self.segmentation(camera) if self.has_segmentation(camera) else ():
+                result.update(labels.tobytes())
+        return result.hexdigest()
+
+
+def _column_bytes(columns: EpisodeColumns) -> Iterator[tuple[str, bytes]]:
+    """Name and bytes of every column."""
+    for field in dataclasses.fields(columns):
+        value = getattr(columns, field.name)
+        if isinstance(value, Mapping):
+            for key in sorted(value):
+                yield f"{field.name}/{key}", value[key].tobytes()
+        else:
+            yield field.name, value.tobytes() if isinstance(value, np.ndarray) else "\n".join(value).encode()
+
+
+def _held[V](changes: list[tuple[int, V]], times: list[int], first: V) -> Iterator[V]:
+    """The value that holds at each time, given the values at the times when it changed."""
+    position, value = 0, first
+    for time in times:
+        while position < len(changes) and changes[position][0] <= time:
+            value = changes[position][1]
+            position += 1
+        yield value

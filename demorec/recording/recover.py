@@ -1,0 +1,136 @@
+"""What a crash left of a recording, as an indexed recording.
+
+A file without its end has no index, but every chunk in it is whole and has its checksum. They are read from the
+front until one is cut off or damaged; what all streams have in common up to there are the frames that are kept.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from demorec.episode import frame_time_ns
+from demorec.errors import RecordingError
+from demorec.recording import channels, messages, metadata
+from demorec.recording.container import SalvagedMessage, SalvagedMetadata, salvage
+from demorec.recording.part_file import PartFile
+from demorec.recording.reader import Recording
+from demorec.recording.ros2 import DEFINITIONS
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recovered:
+    """What was kept.
+
+    Attributes:
+        path: The indexed recording.
+        num_frames: Kept.
+        num_messages: Kept, of all streams.
+        is_complete: Whether nothing was missing, only the name.
+        reason: Why reading stopped, "" when the file was complete.
+    """
+
+    path: Path
+    num_frames: int
+    num_messages: int
+    is_complete: bool
+    reason: str
+
+
+def recover(source: Path, target: Path, *, overwrite: bool = False) -> Recovered:
+    """Write an indexed recording of all whole frames of `source`, which stays as it is.
+
+    Raises:
+        RecordingError: Not one frame could be kept, `target` is there already, or a file cannot be read or written.
+    """
+    if source.resolve() == target.resolve():
+        raise RecordingError(f"The recovered recording needs another name than the damaged one: {source}")
+    try:
+        survey = _survey(source)
+    except RecordingError as error:
+        if str(error).endswith(str(source)):
+            raise
+        raise RecordingError(f"{error} {source}") from error
+    if survey.episode is None or survey.num_frames == 0:
+        raise RecordingError(f"Nothing can be recovered, the file holds no whole frame ({survey.reason}): {source}")
+    info, _ = metadata.read_episode_metadata(survey.episode)
+    last_ns = frame_time_ns(survey.num_frames - 1, info.fps)
+    num_messages = 0
+    # The usual place for an unfinished file is where the source may lie.
+    file = PartFile(target, part=target.with_name(f"{target.name}.recovering"), overwrite=overwrite)
+    try:
+        file.metadata(metadata.EPISODE, survey.episode)
+        for item in _items(source):
+            if isinstance(item, str):
+                break
+            if isinstance(item, SalvagedMessage) and item.time_ns <= last_ns and _is_known(item.schema):
+                file.log(item.topic, item.schema, item.data, item.time_ns, latched=item.is_latched)
+                num_messages += 1
+            elif item is None:
+                file.flush()
+        if survey.outcome is not None:
+            file.metadata(metadata.OUTCOME, survey.outcome)
+        else:
+            file.metadata(metadata.RECOVERED, metadata.recovered_metadata(kept_frames=survey.num_frames))
+        file.publish()
+    finally:
+        file.close()
+    with Recording(target) as recording:
+        recording.columns()  # a recovered file that cannot be read would be worse than none
+    return Recovered(
+        path=target,
+        num_frames=survey.num_frames,
+        num_messages=num_messages,
+        is_complete=survey.outcome is not None,
+        reason="" if survey.outcome is not None else survey.reason,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Survey:
+    episode: dict[str, str] | None
+    outcome: dict[str, str] | None
+    num_frames: int
+    reason: str
+
+
+def _items(source: Path) -> Iterator[SalvagedMessage | SalvagedMetadata | str | None]:
+    try:
+        yield from salvage(source)
+    except OSError as error:
+        raise RecordingError(f"The file cannot be read ({error.strerror}): {source}") from error
+
+
+def _survey(source: Path) -> _Survey:
+    """Read everything once to learn how many frames all streams have in common."""
+    episode = outcome = None
+    reason = ""
+    counts: Counter[str] = Counter()
+    for item in _items(source):
+        if isinstance(item, str):
+            reason = item
+        elif isinstance(item, SalvagedMetadata):
+            metadata.check_seal(item.name, item.values)
+            if item.name == metadata.EPISODE:
+                episode = item.values
+            elif item.name == metadata.OUTCOME:
+                outcome = item.values
+        elif item is not None:
+            counts[item.topic] += 1
+    if episode is None:
+        return _Survey(episode=None, outcome=None, num_frames=0, reason=reason or "no episode metadata")
+    info, cameras = metadata.read_episode_metadata(episode)
+    topics = [stream.topic for stream in channels.state_streams(info) if stream.topic != channels.JOINT_STATES]
+    for camera, streams in cameras.items():
+        topics.append(channels.video_topic(camera, streams.video.codec))
+        topics += [channels.camera_topic(camera, name) for name in ("depth", "segmentation") if getattr(streams, name)]
+    num_frames = min(counts[topic] for topic in topics)
+    if outcome is not None and metadata.read_outcome_metadata(outcome).num_frames != num_frames:
+        outcome = None
+    return _Survey(episode=episode, outcome=outcome, num_frames=num_frames, reason=reason or "the end is missing")
+
+
+def _is_known(schema: str) -> bool:
+    return schema in DEFINITIONS or schema == messages.PROTOBUF_VIDEO

@@ -1,0 +1,119 @@
+"""What a recording holds, in a few lines of plain data."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from demorec.episode import Check
+from demorec.recording.reader import Recording
+from demorec.recording.video import VideoSettings
+
+
+@dataclass(frozen=True, kw_only=True)
+class StreamSummary:
+    """One topic: its name, type and number of messages."""
+
+    topic: str
+    type: str
+    messages: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraSummary:
+    """One camera: how its pictures were coded, and what beside colour was recorded."""
+
+    name: str
+    mount: str
+    video: VideoSettings
+    depth: bool
+    segmentation: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordingSummary:
+    """What `demorec info` tells of a recording; times in seconds.
+
+    Attributes:
+        success: None when a crash cut the episode off.
+        digest: Of the content.
+    """
+
+    path: str
+    bytes: int
+    format_version: int
+    episode_index: int
+    attempt: int
+    root_seed: int
+    task: str
+    instruction: str
+    robot: str
+    objects: tuple[str, ...]
+    success: bool | None
+    failure_phase: str
+    failure_reason: str
+    checks: tuple[Check, ...]
+    retries: int
+    frames: int
+    fps: int
+    physics_hz: int
+    seconds: float
+    cameras: tuple[CameraSummary, ...]
+    streams: tuple[StreamSummary, ...]
+    origin: str
+    config_digest: str
+    digest: str
+    final_state_digest: str
+    versions: Mapping[str, str]
+
+
+def summarize(path: Path) -> RecordingSummary:
+    """Read a recording, all of its content included, and tell what it holds.
+
+    Raises:
+        RecordingError: It is none, or damaged.
+    """
+    with Recording(path) as recording:
+        info, outcome = recording.info, recording.outcome
+        return RecordingSummary(
+            path=str(path),
+            bytes=path.stat().st_size,
+            format_version=info.format_version,
+            episode_index=info.episode_index,
+            attempt=info.attempt,
+            root_seed=info.root_seed,
+            task=info.task,
+            instruction=info.instruction,
+            robot=info.robot.name,
+            objects=tuple(body.name for body in info.scene.movable),
+            success=None if outcome is None else outcome.success,
+            failure_phase="" if outcome is None else outcome.failure_phase,
+            failure_reason="" if outcome is None else outcome.failure_reason,
+            checks=() if outcome is None else outcome.checks,
+            retries=0 if outcome is None else outcome.num_retries,
+            frames=recording.num_frames,
+            fps=info.fps,
+            physics_hz=info.physics_hz,
+            seconds=recording.num_frames / info.fps,
+            cameras=tuple(
+                CameraSummary(
+                    name=camera.name,
+                    mount=camera.mount,
+                    video=recording.video_settings(camera.name),
+                    depth=recording.has_depth(camera.name),
+                    segmentation=recording.has_segmentation(camera.name),
+                )
+                for camera in info.scene.cameras
+                if camera.name in recording.cameras
+            ),
+            streams=tuple(
+                StreamSummary(topic=topic, type=kind, messages=count)
+                for topic, (kind, count) in recording.topics.items()
+            ),
+            origin=info.origin,
+            config_digest=info.config_digest,
+            digest=recording.digest(),
+            final_state_digest="" if outcome is None else outcome.final_state_digest,
+            versions=info.versions,
+        )

@@ -1,0 +1,232 @@
+"""Writes an episode as it happens into NAME.mcap.part, which becomes NAME.mcap when it is complete.
+
+Frames are gathered for one simulated second and then written at once, each stream as a batch, the numbers and the
+pictures in chunks of their own: so a reader of the numbers never decompresses a picture, the recorder costs little,
+and a crash loses at most the last second.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from operator import itemgetter
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+
+from demorec.config import VideoConfig
+from demorec.episode import EpisodeInfo, Event, Frame, JointSample, Outcome, frame_time_ns
+from demorec.errors import RecordingError
+from demorec.geometry import Array
+from demorec.recording import channels, messages, metadata
+from demorec.recording.part_file import PartFile
+from demorec.recording.pictures import CameraRecorder
+from demorec.recording.transforms import FrameTree
+
+
+@dataclass(frozen=True, kw_only=True)
+class WriteStats:
+    """What was written.
+
+    Attributes:
+        path: The finished file.
+        num_frames: Frames in it.
+        num_bytes: Its size.
+        video_bytes: camera -> bytes of its coded colour pictures.
+    """
+
+    path: Path
+    num_frames: int
+    num_bytes: int
+    video_bytes: Mapping[str, int]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Pending:
+    """A frame that waits to be written, without its pictures.
+
+    Attributes:
+        time_ns: When.
+        values: Of all streams that have one message a frame, one after the other.
+        joint_samples: Joint states since the frame before.
+        changes: (time_ns, topic, type, message) of events and of what is written only when it changes.
+    """
+
+    time_ns: int
+    values: Array
+    joint_samples: tuple[JointSample, ...]
+    changes: list[tuple[int, str, str, bytes]]
+
+
+class EpisodeWriter:
+    """Context manager that writes one episode; leaving it without `finish` leaves NAME.mcap.part for `recover`.
+
+    Depth and segmentation are recorded when the first frame has them.
+
+    Args:
+        path: The file to be made; its folder must exist.
+        info: Written first.
+        video: How colour pictures are coded.
+        overwrite: Whether a file of that name may be replaced.
+
+    Raises:
+        RecordingError: The file, or an unfinished one of that name, is there already; or it cannot be written.
+    """
+
+    def __init__(
+        self, path: Path, info: EpisodeInfo, *, video: VideoConfig | None = None, overwrite: bool = False
+    ) -> None:
+        self._info = info
+        self._video = video or VideoConfig()
+        self._tree = FrameTree(info)
+        self._streams = [*channels.state_streams(info), channels.tf_stream(self._tree)]
+        self._columns: list[slice] = []  # of `_Pending.values`, one for each stream; known from the first frame on
+        self._cameras: dict[str, CameraRecorder] = {}
+        self._pending: list[_Pending] = []
+        self._num_frames = 0
+        self._num_written = 0
+        self._phase: str | None = None
+        self._is_miss: bool | None = None
+        self._file = PartFile(path, overwrite=overwrite)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._file.close()
+
+    def write(self, frame: Frame) -> None:
+        """Add the next frame.
+
+        Raises:
+            RecordingError: Frames out of order, pictures missing or of another size, or a full disk.
+        """
+        due = (self._num_frames, frame_time_ns(self._num_frames, self._info.fps))
+        if (frame.frame_index, frame.time_ns) != due:
+            raise RecordingError(
+                f"Frame {frame.frame_index} at {frame.time_ns} ns came where frame {due[0]} at {due[1]} ns was due: "
+                "frames are written in order, one each."
+            )
+        if self._num_frames == 0:
+            self._begin(frame)
+        for camera in self._cameras.values():
+            camera.add(frame)
+        self._pending.append(
+            _Pending(
+                time_ns=frame.time_ns,
+                values=np.concatenate([piece for stream in self._streams for piece in stream.parts(frame)]),
+                joint_samples=frame.joint_samples,
+                changes=self._changes(frame),
+            )
+        )
+        self._num_frames += 1
+        if len(self._pending) >= self._info.fps:
+            self._write_pending()
+
+    def _begin(self, first: Frame | None) -> None:
+        """Write what is said once, as soon as it is known which pictures there are."""
+        for camera in self._info.scene.cameras if first is not None else ():
+            assert first is not None
+            if camera.name not in first.images:
+                raise RecordingError(f"Frame 0 has no picture of the camera {camera.name!r}.")
+            self._cameras[camera.name] = CameraRecorder(
+                camera, first.images[camera.name], video=self._video, fps=self._info.fps
+            )
+        start = 0
+        for stream in self._streams if first is not None else ():
+            assert first is not None
+            stop = start + sum(len(piece) for piece in stream.parts(first))
+            self._columns.append(slice(start, stop))
+            start = stop
+        streams = {name: camera.streams for name, camera in self._cameras.items()}
+        self._file.metadata(metadata.EPISODE, metadata.episode_metadata(self._info, streams))
+        has_labels = any(camera.segmentation for camera in streams.values())
+        for topic, schema, data in channels.said_once(self._info, self._tree, has_labels=has_labels):
+            self._file.log(topic, schema, data, 0, latched=True)
+        self._file.flush()
+
+    def _write_pending(self) -> None:
+        """Write the frames whose pictures have all left the encoders: numbers first, then pictures."""
+        num_ready = min((camera.num_ready for camera in self._cameras.values()), default=self._num_frames)
+        frames = self._pending[: num_ready - self._num_written]
+        if not frames:
+            return
+        time_ns = [frame.time_ns for frame in frames]
+        values = np.array([frame.values for frame in frames])
+        rows = self._sample_messages(frames)
+        for stream, columns in zip(self._streams, self._columns, strict=True):
+            encoded = stream.encode(time_ns, values[:, columns])
+            rows += [(time, stream.topic, stream.schema, row) for time, row in zip(time_ns, encoded, strict=True)]
+        rows += [row for frame in frames for row in frame.changes]
+        rows.sort(key=itemgetter(0))  # by time; a stable sort, so streams stay in their order
+        for time, topic, schema, data in rows:
+            self._file.log(topic, schema, data, time)
+        self._file.flush()
+        if self._cameras:
+            pictures = (camera.take_messages(time_ns) for camera in self._cameras.values())
+            for time, *cameras in zip(time_ns, *pictures, strict=True):
+                for topic, schema, data in (message for camera in cameras for message in camera):
+                    self._file.log(topic, schema, data, time)
+            self._file.flush()
+        del self._pending[: len(frames)]
+        self._num_written += len(frames)
+
+    def _sample_messages(self, frames: list[_Pending]) -> list[tuple[int, str, str, bytes]]:
+        """Joint states between the frames."""
+        samples = [sample for frame in frames for sample in frame.joint_samples]
+        if not samples:
+            return []
+        joints = self._streams[0]
+        times = [sample.time_ns for sample in samples]
+        values = np.array([(s.joint_position, s.joint_velocity, s.joint_effort) for s in samples])
+        data = joints.encode(times, values.reshape(len(samples), -1))
+        return [(time, joints.topic, joints.schema, message) for time, message in zip(times, data, strict=True)]
+
+    def _changes(self, frame: Frame) -> list[tuple[int, str, str, bytes]]:
+        result = []
+        time = frame.time_ns
+        if any(event.name == channels.PHASE_EVENT for event in frame.events):
+            raise RecordingError(f"Frame {frame.frame_index} has an event {channels.PHASE_EVENT!r}, a reserved name.")
+        events = list(frame.events)
+        if frame.phase != self._phase:
+            self._phase = frame.phase
+            events.insert(0, Event(name=channels.PHASE_EVENT, message=frame.phase))
+            result.append((time, channels.PHASE, messages.STRING, messages.string(frame.phase)))
+        if frame.is_deliberate_miss != self._is_miss:
+            self._is_miss = frame.is_deliberate_miss
+            data = messages.boolean(frame.is_deliberate_miss)
+            result.append((time, channels.DELIBERATE_MISS, messages.BOOL, data))
+        return result + [(time, channels.EVENTS, messages.LOG, messages.log(time, event)) for event in events]
+
+    def finish(self, outcome: Outcome) -> WriteStats:
+        """Write the rest, make the file durable and give it its name.
+
+        Raises:
+            RecordingError: The outcome speaks of another number of frames, a file of that name has appeared
+                meanwhile, or the disk is full.
+        """
+        if outcome.num_frames != self._num_frames:
+            raise RecordingError(f"The outcome has {outcome.num_frames} frames, the recording {self._num_frames}.")
+        if self._num_frames == 0:
+            self._begin(None)
+        for camera in self._cameras.values():
+            camera.end()
+        self._write_pending()
+        if self._pending:
+            raise RecordingError(f"The video encoder kept the last {len(self._pending)} pictures to itself.")
+        last_ns = frame_time_ns(max(self._num_frames - 1, 0), self._info.fps)
+        for camera in self._cameras.values():
+            topic, schema, data = camera.statistics()
+            self._file.log(topic, schema, data, last_ns)
+        self._file.metadata(metadata.OUTCOME, metadata.outcome_metadata(outcome))
+        self._file.publish()
+        return WriteStats(
+            path=self._file.path,
+            num_frames=self._num_frames,
+            num_bytes=self._file.path.stat().st_size,
+            video_bytes={name: camera.num_video_bytes for name, camera in self._cameras.items()},
+        )

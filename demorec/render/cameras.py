@@ -1,0 +1,67 @@
+"""Camera presets: one constant and one row of `demorec.tables.CAMERAS` each."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from demorec.episode import RobotSpec
+from demorec.geometry import Pose, look_at
+from demorec.scene import Camera, Vector3
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraPreset:
+    """A camera before it knows its picture size and robot.
+
+    Attributes:
+        summary: One line for `demorec list cameras`.
+        mount: "world", or "tcp" for a camera that the hand carries.
+        eye, target: Where it is and what it looks at, in the mount's frame, metres.
+        up: Direction that is up in the picture, in the mount's frame.
+        fov_y: Vertical field of view, rad.
+    """
+
+    summary: str
+    mount: Literal["world", "tcp"]
+    eye: Vector3
+    target: Vector3
+    up: Vector3 = (0.0, 0.0, 1.0)
+    fov_y: float = math.radians(45.0)
+
+    def camera(self, name: str, robot: RobotSpec, *, width: int, height: int) -> Camera:
+        """The camera for a picture size and a robot."""
+        return Camera(
+            name=name,
+            width=width,
+            height=height,
+            fov_y=self.fov_y,
+            mount=self.mount if self.mount == "world" else robot.tcp_link,
+            mount_from_camera=self.mount_from_camera(),
+        )
+
+    def mount_from_camera(self) -> Pose:
+        """Pose in the mount's frame, OpenCV axes."""
+        return look_at(np.array(self.eye), np.array(self.target), np.array(self.up))
+
+
+FRONT = CameraPreset(
+    summary="in front of the table, looking at the arm: sees the whole workspace",
+    mount="world",
+    eye=(1.45, 0.0, 0.95),
+    target=(0.40, 0.0, 0.19),
+    fov_y=math.radians(44.0),
+)
+
+# In TCP axes: z out of the hand, y along the fingers' motion; the camera sits on the hand's side, tilted to the tips.
+WRIST = CameraPreset(
+    summary="on the hand, looking at the finger tips",
+    mount="tcp",
+    eye=(0.075, 0.0, -0.08),
+    target=(0.03, 0.0, 0.02),
+    up=(-1.0, 0.0, 0.0),
+    fov_y=math.radians(72.0),
+)

@@ -1,0 +1,10 @@
+"""The default renderer: a rasteriser on the CPU, compiled with numba, that redraws only what moved.
+
+From PyBullet's visual shapes (`shapes`) to meshes (`mesh`, `mesh_files`, `primitives`, `decimate`, `textures`),
+merged into the arrays (`batch`) that the compiled loops read (`kernels`); `stage` holds what the cameras of a step
+share, `view` one camera's picture, `renderer` the whole.
+"""
+
+from demorec.render.raster.renderer import RasterRenderer, warm_up
+
+__all__ = ["RasterRenderer", "warm_up"]

@@ -1,0 +1,150 @@
+"""The scene's meshes at one level of detail, merged into the arrays that the kernels read."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.render.raster import textures
+from demorec.render.raster.kernels import layout
+from demorec.render.raster.mesh import Floats
+from demorec.render.raster.shapes import Instance
+from demorec.render.raster.textures import Picture
+
+Ints = NDArray[np.int64]
+Floats32 = NDArray[np.float32]
+SPECULAR_FACES = 100
+"""Shapes with more faces than this shine; boxes and boards stay matt, or whole faces would flash."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Geometry:
+    """Vertices and faces of all instances, the vertices numbered in their order.
+
+    Attributes:
+        vertex_start, vertex_count: (n,) of each instance.
+        face_start, face_end: (n,) of each instance.
+        vertices: Blocks of vertices (kernels.layout), room for `spare` more at the end.
+        num_vertices: Without the spare ones.
+        faces: (f, 3) int32 vertex addresses.
+    """
+
+    vertex_start: Ints
+    vertex_count: Ints
+    face_start: Ints
+    face_end: Ints
+    vertices: Floats32
+    num_vertices: int
+    faces: NDArray[np.int32]
+
+    @property
+    def capacity(self) -> int:
+        """How many vertices there is room for."""
+        return len(self.vertices) // layout.BLOCK * layout.LANES
+
+
+def merge(attributes: Sequence[Floats], faces: Sequence[NDArray[np.integer]], *, spare: int = 0) -> Geometry:
+    """Merge meshes given by vertex attributes (v, up to 8: position, normal, u, v) and vertex numbers (f, 3)."""
+    counts = np.array([len(a) for a in attributes], dtype=np.int64)
+    face_counts = np.array([len(f) for f in faces], dtype=np.int64)
+    starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    face_starts = np.concatenate([[0], np.cumsum(face_counts)]).astype(np.int64)
+    total = int(starts[-1])
+    vertices = np.zeros(max(1, layout.blocks_for(total + spare)) * layout.BLOCK, dtype=np.float32)
+    if total:
+        place = layout.addresses(total)
+        together = np.concatenate(attributes)
+        for column in range(together.shape[1]):
+            vertices[place + column * layout.LANES] = together[:, column]
+    numbers = [f + start for f, start in zip(faces, starts, strict=False)]
+    all_faces = np.concatenate(numbers) if numbers else np.zeros((0, 3), dtype=np.int64)
+    address = layout.addresses(max(1, total))
+    return Geometry(
+        vertex_start=starts[:-1].copy(),
+        vertex_count=counts,
+        face_start=face_starts[:-1].copy(),
+        face_end=face_starts[1:].copy(),
+        vertices=vertices,
+        num_vertices=total,
+        faces=np.ascontiguousarray(address[all_faces].astype(np.int32).reshape(-1, 3)),
+    )
+
+
+def caster_geometry(instances: Sequence[Instance], levels: Sequence[int | None], casts: Sequence[bool]) -> Geometry:
+    """Positions only, for the shadow map; those that cast none have no faces."""
+    points, faces = [], []
+    for instance, level, does in zip(instances, levels, casts, strict=True):
+        piece = instance.caster(level) if does else None
+        points.append(np.zeros((0, 3)) if piece is None else piece.points * instance.scale)
+        faces.append(np.zeros((0, 3), dtype=np.int64) if piece is None else piece.point_faces)
+    return merge(points, faces)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Batch:
+    """All that is drawn for one camera.
+
+    Attributes:
+        geometry: Vertices and faces.
+        face_table: (f, 4) int32: flags, texture, segment, group (faces of equal look, which need no edge between).
+        face_color: (f, 4) float32: red, green, blue, specular, 0..255 (0..1 with a texture).
+        texels, mips: Packed textures.
+    """
+
+    geometry: Geometry
+    face_table: NDArray[np.int32]
+    face_color: Floats32
+    texels: NDArray[np.uint32]
+    mips: Ints
+
+
+SPARE_VERTICES = 4096
+"""First room for the vertices that clipping makes; grown when it does not suffice."""
+
+
+def make_batch(instances: Sequence[Instance], levels: Sequence[int | None], *, specular: float) -> Batch:
+    """Merge the instances at the given numbers of faces (None: all of them).
+
+    Args:
+        specular: Strength of highlights, 0..1.
+    """
+    attributes: list[Floats] = []
+    faces: list[NDArray[np.integer]] = []
+    tables: list[NDArray[np.int32]] = []
+    colors: list[Floats] = []
+    pictures: list[Picture] = []
+    rows: dict[int, int] = {}
+    num_groups = 0
+    for instance, level in zip(instances, levels, strict=True):
+        piece = instance.piece(level)
+        n = len(piece.faces)
+        attributes.append(piece.scaled_vertices(instance.scale))
+        faces.append(piece.oriented(piece.faces, instance.scale))
+        table = np.zeros((n, 4), dtype=np.int32)
+        table[:, layout.FACE_FLAGS] = piece.flags
+        table[:, layout.FACE_SEGMENT] = instance.segment
+        table[:, layout.FACE_GROUP] = piece.groups + num_groups
+        num_groups += int(piece.groups.max(initial=-1)) + 1
+        color = np.zeros((n, 4))
+        color[:, :3] = piece.colors * instance.color
+        if instance.texture is None:
+            color[:, :3] *= 255
+        else:
+            if id(instance.texture) not in rows:
+                rows[id(instance.texture)] = len(pictures)
+                pictures.append(instance.texture)
+            table[:, layout.FACE_TEXTURE] = rows[id(instance.texture)]
+        color[:, layout.FACE_SPECULAR] = 255 * specular if n > SPECULAR_FACES else 0
+        tables.append(table)
+        colors.append(color)
+    texels, mips = textures.pack(pictures)
+    return Batch(
+        geometry=merge(attributes, faces, spare=SPARE_VERTICES),
+        face_table=np.concatenate(tables) if tables else np.zeros((0, 4), dtype=np.int32),
+        face_color=np.ascontiguousarray(np.concatenate(colors) if colors else np.zeros((0, 4)), dtype=np.float32),
+        texels=texels,
+        mips=mips,
+    )

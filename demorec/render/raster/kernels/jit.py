@@ -1,0 +1,57 @@
+"""How the kernels are compiled: flags that keep every bit, and a cache that is right when sources change."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import llvmlite.binding
+import numba
+import numpy as np
+
+from demorec.render.raster.cache import cache_folder
+
+# Only flags that change no finite result: pictures are equal whatever vector width a CPU has. `contract`, `arcp` and
+# `reassoc` are left out on purpose.
+_FLAGS = {"nnan", "ninf", "nsz"}
+
+f4 = np.float32
+f8 = np.float64
+i4 = np.int32
+u4 = np.uint32
+index = np.uintp  # an unsigned index spares the test for negative ones
+
+
+@functools.cache
+def compiled_folder() -> Path:
+    """Cache of the compiled code, one folder for each state of the sources, numba and kind of CPU.
+
+    numba looks at the modification time of a kernel's own file, not at the files of the functions inlined into it.
+    """
+    digest = hashlib.sha256(f"{numba.__version__} {llvmlite.binding.get_host_cpu_name()}".encode())
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(path.name.encode() + path.read_bytes())
+    return cache_folder("compiled", digest.hexdigest()[:16])
+
+
+def _compile(function: Callable[..., Any], **options: Any) -> Any:
+    # numba reads the folder while decorating; its own setting is put back for other users of numba.
+    before = numba.config.CACHE_DIR
+    numba.config.CACHE_DIR = str(compiled_folder())
+    try:
+        return numba.njit(cache=True, fastmath=_FLAGS, error_model="numpy", **options)(function)
+    finally:
+        numba.config.CACHE_DIR = before
+
+
+def kernel(function: Callable[..., Any]) -> Any:
+    """Compile a function on first use, cached on disk."""
+    return _compile(function)
+
+
+def inlined(function: Callable[..., Any]) -> Any:
+    """Compile a function into each kernel that calls it."""
+    return _compile(function, forceinline=True)

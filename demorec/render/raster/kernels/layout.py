@@ -1,0 +1,72 @@
+"""How vertices, faces and records lie in memory: constants shared by all kernels and by the code that fills them.
+
+Vertices are stored in blocks of `LANES`, attribute after attribute (ROWS of them), in one float32 array. The
+distance between two attributes is thus known to the compiler, which then turns the loops over a block's vertices
+into vector code (numba cannot promise that two arrays do not overlap). A vertex is addressed by the place of its
+first attribute. LANES is no power of two, or all attributes would fall on the same cache lines.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+LANES = 1008
+ROWS = 20
+BLOCK = LANES * ROWS
+
+# Attributes, as distances from a vertex' address.
+POS_X, POS_Y, POS_Z = 0, LANES, 2 * LANES
+NORMAL_X, NORMAL_Y, NORMAL_Z = 3 * LANES, 4 * LANES, 5 * LANES
+TEX_U, TEX_V = 6 * LANES, 7 * LANES
+CLIP_X, CLIP_Y, CLIP_W = 8 * LANES, 9 * LANES, 10 * LANES  # homogeneous, +-w is the picture's border
+SCREEN_X, SCREEN_Y = 11 * LANES, 12 * LANES  # 1/256 sample, whole numbers
+INVERSE_W = 13 * LANES
+TO_LIGHT, UPWARD, HALFWAY = 14 * LANES, 15 * LANES, 16 * LANES  # normal times light, up and half-way vector
+SHADOW_X, SHADOW_Y, SHADOW_Z = 17 * LANES, 18 * LANES, 19 * LANES  # texels, texels, 0..1 (greater is nearer)
+
+# Columns of a face's int32 and float32 tables.
+FACE_FLAGS, FACE_TEXTURE, FACE_SEGMENT, FACE_GROUP = 0, 1, 2, 3
+SMOOTH, TEXTURED = 1, 2  # bits of FACE_FLAGS
+FACE_RED, FACE_GREEN, FACE_BLUE, FACE_SPECULAR = 0, 1, 2, 3
+
+# Columns of a record: what a triangle needs while it is shaded. Each quantity q is a plane over the picture, as
+# value at the origin, step in x, step in y; all but the first are divided by depth, so that they are planes at all.
+INVERSE_DEPTH_PLANE = 0
+SHADOW_X_PLANE, SHADOW_Y_PLANE, SHADOW_Z_PLANE = 3, 6, 9
+TO_LIGHT_PLANE, UPWARD_PLANE, HALFWAY_PLANE = 12, 15, 18
+TEX_U_PLANE, TEX_V_PLANE = 21, 24
+TEXEL_DENSITY = 27  # (texture widths / sample)^2 at inverse depth 1
+RECORD = 28
+
+# Values in the picture of record numbers.
+BACKGROUND = -1
+EDGE = -3  # shaded sample by sample
+QUEUED = -4  # an edge that is in the list already
+
+# Columns of the light's table.
+AMBIENT, AMBIENT_UP, DIFFUSE, IN_SHADOW, LIGHT_RED, LIGHT_GREEN, LIGHT_BLUE = range(7)
+LIGHT_SIZE = 7
+
+# Columns of the sky's table: ray = origin + x * step_x + y * step_y (world axes), colours at horizon and zenith.
+SKY_ORIGIN, SKY_STEP_X, SKY_STEP_Y, SKY_HORIZON, SKY_ZENITH = 0, 3, 6, 9, 12
+SKY_SIZE = 15
+
+# A pixel that stands still, with what its shading needs: ambient and direct colour, place in the shadow map.
+STILL_SIZE = 9
+
+TILE_SHIFT = 3
+"""Shadow tiles are 8x8 texels."""
+MIP_LEVELS = 11
+"""Columns of the mip table: the first texel of each level; then the log2 of the texture's side."""
+
+
+def addresses(count: int, start: int = 0) -> NDArray[np.int64]:
+    """(count,) addresses of the vertices `start`, `start` + 1, ..."""
+    number = np.arange(start, start + count, dtype=np.int64)
+    return number // LANES * BLOCK + number % LANES
+
+
+def blocks_for(count: int) -> int:
+    """How many blocks hold `count` vertices."""
+    return -(-count // LANES)

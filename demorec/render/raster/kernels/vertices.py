@@ -1,0 +1,214 @@
+# mypy: allow-untyped-defs, allow-incomplete-defs
+"""From link poses to vertices on the screen, in the light and in the shadow map."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from demorec.render.raster.kernels import layout as at
+from demorec.render.raster.kernels.jit import f4, index, kernel
+
+LANES, BLOCK = at.LANES, at.BLOCK
+PX, PY, PZ, NX, NY, NZ = at.POS_X, at.POS_Y, at.POS_Z, at.NORMAL_X, at.NORMAL_Y, at.NORMAL_Z
+CX, CY, CW, SX, SY, IW = at.CLIP_X, at.CLIP_Y, at.CLIP_W, at.SCREEN_X, at.SCREEN_Y, at.INVERSE_W
+TO_LIGHT, UPWARD, HALFWAY = at.TO_LIGHT, at.UPWARD, at.HALFWAY
+LX, LY, LZ = at.SHADOW_X, at.SHADOW_Y, at.SHADOW_Z
+
+
+@kernel
+def place_instances(
+    pose, link_from_shape, shadow_from_world, light, world_from_shape, shadow_from_shape, light_in_shape
+):
+    """Matrices of every instance that do not depend on a camera.
+
+    Args:
+        pose: (n, 7) world_from_link, position and quaternion xyzw.
+        link_from_shape: (n, 3, 4).
+        shadow_from_world: (3, 4), to texels and height.
+        light: (3,) unit vector towards the light, world.
+        world_from_shape, shadow_from_shape: (n, 3, 4) results.
+        light_in_shape: (n, 3) result.
+    """
+    r = np.empty((3, 3))
+    for k in range(pose.shape[0]):
+        x = pose[k, 3]
+        y = pose[k, 4]
+        z = pose[k, 5]
+        w = pose[k, 6]
+        r[0, 0] = 1 - 2 * (y * y + z * z)
+        r[0, 1] = 2 * (x * y - z * w)
+        r[0, 2] = 2 * (x * z + y * w)
+        r[1, 0] = 2 * (x * y + z * w)
+        r[1, 1] = 1 - 2 * (x * x + z * z)
+        r[1, 2] = 2 * (y * z - x * w)
+        r[2, 0] = 2 * (x * z - y * w)
+        r[2, 1] = 2 * (y * z + x * w)
+        r[2, 2] = 1 - 2 * (x * x + y * y)
+        local = link_from_shape[k]
+        m = world_from_shape[k]
+        for i in range(3):
+            for j in range(4):
+                m[i, j] = r[i, 0] * local[0, j] + r[i, 1] * local[1, j] + r[i, 2] * local[2, j]
+            m[i, 3] += pose[k, i]
+        s = shadow_from_world
+        for i in range(3):
+            for j in range(4):
+                shadow_from_shape[k, i, j] = s[i, 0] * m[0, j] + s[i, 1] * m[1, j] + s[i, 2] * m[2, j]
+            shadow_from_shape[k, i, 3] += s[i, 3]
+            light_in_shape[k, i] = m[0, i] * light[0] + m[1, i] * light[1] + m[2, i] * light[2]
+
+
+@kernel
+def project_instances(
+    world_from_shape, centre, radius, clip_from_world, eye, near, far, clip_from_shape, eye_in_shape, visible
+):
+    """Matrices of every instance for one camera, and whether its bounding sphere can be seen.
+
+    Args:
+        world_from_shape: (n, 3, 4).
+        centre, radius: (n, 3), (n,) bounding spheres in the shapes' frames.
+        clip_from_world: (3, 4), rows x, y (picture between -w and w, y down), w = depth.
+        eye: (3,) world.
+        near, far: Metres.
+        clip_from_shape: (n, 3, 4) result.
+        eye_in_shape: (n, 3) result.
+        visible: (n,) bool result.
+    """
+    p = clip_from_world
+    slope_x = math.sqrt(1 + p[0, 0] ** 2 + p[0, 1] ** 2 + p[0, 2] ** 2)
+    slope_y = math.sqrt(1 + p[1, 0] ** 2 + p[1, 1] ** 2 + p[1, 2] ** 2)
+    for k in range(world_from_shape.shape[0]):
+        m = world_from_shape[k]
+        c = clip_from_shape[k]
+        for i in range(3):
+            for j in range(4):
+                c[i, j] = p[i, 0] * m[0, j] + p[i, 1] * m[1, j] + p[i, 2] * m[2, j]
+            c[i, 3] += p[i, 3]
+            eye_in_shape[k, i] = (
+                m[0, i] * (eye[0] - m[0, 3]) + m[1, i] * (eye[1] - m[1, 3]) + m[2, i] * (eye[2] - m[2, 3])
+            )
+        x = c[0, 0] * centre[k, 0] + c[0, 1] * centre[k, 1] + c[0, 2] * centre[k, 2] + c[0, 3]
+        y = c[1, 0] * centre[k, 0] + c[1, 1] * centre[k, 1] + c[1, 2] * centre[k, 2] + c[1, 3]
+        w = c[2, 0] * centre[k, 0] + c[2, 1] * centre[k, 1] + c[2, 2] * centre[k, 2] + c[2, 3]
+        r = radius[k]
+        visible[k] = abs(x) < w + slope_x * r and abs(y) < w + slope_y * r and w > near - r and w < far + r
+
+
+@kernel
+def transform_vertices(
+    first,
+    last,
+    visible,
+    start,
+    count,
+    vertices,
+    clip_from_shape,
+    shadow_from_shape,
+    light_in_shape,
+    world_from_shape,
+    eye_in_shape,
+    offset,
+    width,
+    height,
+):
+    """Fill the per-camera attributes of the vertices of the visible instances `first` .. `last` - 1.
+
+    Args:
+        start, count: (n,) number of each instance's first vertex, and how many it has.
+        vertices: Blocks of vertices (see layout).
+        offset: How far along the normal a vertex is moved before it is looked up in the shadow map, metres.
+        width, height: Samples.
+    """
+    half_width = f4(width * 128.0)
+    half_height = f4(height * 128.0)
+    for k in range(first, last):
+        if not visible[k]:
+            continue
+        m = clip_from_shape[k]
+        m00, m01, m02, m03 = f4(m[0, 0]), f4(m[0, 1]), f4(m[0, 2]), f4(m[0, 3])
+        m10, m11, m12, m13 = f4(m[1, 0]), f4(m[1, 1]), f4(m[1, 2]), f4(m[1, 3])
+        m20, m21, m22, m23 = f4(m[2, 0]), f4(m[2, 1]), f4(m[2, 2]), f4(m[2, 3])
+        s = shadow_from_shape[k]
+        s00, s01, s02, s03 = f4(s[0, 0]), f4(s[0, 1]), f4(s[0, 2]), f4(s[0, 3])
+        s10, s11, s12, s13 = f4(s[1, 0]), f4(s[1, 1]), f4(s[1, 2]), f4(s[1, 3])
+        s20, s21, s22, s23 = f4(s[2, 0]), f4(s[2, 1]), f4(s[2, 2]), f4(s[2, 3])
+        l0, l1, l2 = f4(light_in_shape[k, 0]), f4(light_in_shape[k, 1]), f4(light_in_shape[k, 2])
+        w = world_from_shape[k]
+        u0, u1, u2 = f4(w[2, 0]), f4(w[2, 1]), f4(w[2, 2])
+        e0, e1, e2 = f4(eye_in_shape[k, 0]), f4(eye_in_shape[k, 1]), f4(eye_in_shape[k, 2])
+        vertex = start[k]
+        end = start[k] + count[k]
+        while vertex < end:
+            block = vertex // LANES
+            lane = vertex - block * LANES
+            n = min(LANES - lane, end - vertex)
+            base = block * BLOCK + lane
+            vertex += n
+            for j in range(n):
+                i = index(base + j)
+                x = vertices[i]
+                y = vertices[i + index(PY)]
+                z = vertices[i + index(PZ)]
+                cx = m00 * x + m01 * y + m02 * z + m03
+                cy = m10 * x + m11 * y + m12 * z + m13
+                cw = m20 * x + m21 * y + m22 * z + m23
+                inverse = f4(1) / cw
+                vertices[i + index(CX)] = cx
+                vertices[i + index(CY)] = cy
+                vertices[i + index(CW)] = cw
+                vertices[i + index(IW)] = inverse
+                vertices[i + index(SX)] = np.floor(cx * inverse * half_width + half_width + f4(0.5))
+                vertices[i + index(SY)] = np.floor(cy * inverse * half_height + half_height + f4(0.5))
+            for j in range(n):
+                i = index(base + j)
+                x = vertices[i]
+                y = vertices[i + index(PY)]
+                z = vertices[i + index(PZ)]
+                n0 = vertices[i + index(NX)]
+                n1 = vertices[i + index(NY)]
+                n2 = vertices[i + index(NZ)]
+                vertices[i + index(TO_LIGHT)] = n0 * l0 + n1 * l1 + n2 * l2
+                vertices[i + index(UPWARD)] = n0 * u0 + n1 * u1 + n2 * u2
+                vx = e0 - x
+                vy = e1 - y
+                vz = e2 - z
+                length = f4(1) / np.sqrt(vx * vx + vy * vy + vz * vz)
+                hx = vx * length + l0
+                hy = vy * length + l1
+                hz = vz * length + l2
+                vertices[i + index(HALFWAY)] = (n0 * hx + n1 * hy + n2 * hz) / np.sqrt(hx * hx + hy * hy + hz * hz)
+                x += n0 * offset
+                y += n1 * offset
+                z += n2 * offset
+                vertices[i + index(LX)] = s00 * x + s01 * y + s02 * z + s03
+                vertices[i + index(LY)] = s10 * x + s11 * y + s12 * z + s13
+                vertices[i + index(LZ)] = s20 * x + s21 * y + s22 * z + s23
+
+
+@kernel
+def transform_casters(first, last, start, count, vertices, shadow_from_shape):
+    """Fill screen position (1/256 texel) and height of the vertices of shadow casters `first` .. `last` - 1."""
+    for k in range(first, last):
+        s = shadow_from_shape[k]
+        s00, s01, s02, s03 = f4(s[0, 0]), f4(s[0, 1]), f4(s[0, 2]), f4(s[0, 3])
+        s10, s11, s12, s13 = f4(s[1, 0]), f4(s[1, 1]), f4(s[1, 2]), f4(s[1, 3])
+        s20, s21, s22, s23 = f4(s[2, 0]), f4(s[2, 1]), f4(s[2, 2]), f4(s[2, 3])
+        vertex = start[k]
+        end = start[k] + count[k]
+        while vertex < end:
+            block = vertex // LANES
+            lane = vertex - block * LANES
+            n = min(LANES - lane, end - vertex)
+            base = block * BLOCK + lane
+            vertex += n
+            for j in range(n):
+                i = index(base + j)
+                x = vertices[i]
+                y = vertices[i + index(PY)]
+                z = vertices[i + index(PZ)]
+                # Texel centres lie at whole numbers of the lookup, at half ones of the rasteriser.
+                vertices[i + index(SX)] = np.floor((s00 * x + s01 * y + s02 * z + s03 + f4(0.5)) * f4(256) + f4(0.5))
+                vertices[i + index(SY)] = np.floor((s10 * x + s11 * y + s12 * z + s13 + f4(0.5)) * f4(256) + f4(0.5))
+                vertices[i + index(IW)] = s20 * x + s21 * y + s22 * z + s23

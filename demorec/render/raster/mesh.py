@@ -1,0 +1,117 @@
+"""Triangle meshes as the renderer wants them, and the geometry that is done on them once, when they are loaded."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+
+Floats = NDArray[np.float64]
+Faces = NDArray[np.int32]
+CREASE_ANGLE = math.radians(35)
+"""Faces that meet at a sharper angle are shaded as an edge."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Mesh:
+    """Triangles with a normal and a texture coordinate at each corner.
+
+    Attributes:
+        points: (v, 3) metres, in the shape's frame.
+        faces: (f, 3) rows of `points`, counter-clockwise from outside.
+        normals: (f, 3, 3) unit normal at each corner.
+        uv: (f, 3, 2) texture coordinates at each corner, v upward; None without.
+        colors: (f, 3) each face's own colour, 0..1, by which the shape's colour is multiplied.
+        texture: Picture that covers the faces, or None.
+    """
+
+    points: Floats
+    faces: Faces
+    normals: Floats
+    uv: Floats | None
+    colors: Floats
+    texture: Path | None
+
+    @property
+    def num_faces(self) -> int:
+        """f."""
+        return len(self.faces)
+
+
+def make_mesh(
+    points: Floats,
+    faces: NDArray[np.integer],
+    *,
+    normals: Floats | None = None,
+    uv: Floats | None = None,
+    colors: Floats | None = None,
+    texture: Path | None = None,
+) -> Mesh:
+    """A mesh with what is missing made: normals smooth up to the crease angle, white faces; empty faces left out."""
+    faces = np.asarray(faces, dtype=np.int32).reshape(-1, 3)
+    keep = np.flatnonzero((face_normals(points, faces) ** 2).sum(1) > 0)
+    if len(keep) < len(faces):
+        faces = faces[keep]
+        normals, uv, colors = (None if a is None else a[keep] for a in (normals, uv, colors))
+    if normals is None:
+        normals = crease_normals(points, faces)
+    else:
+        # Zero normals, which some exporters write, become the face's.
+        length = np.sqrt((normals * normals).sum(2, keepdims=True))
+        flat = unit(face_normals(points, faces))[:, None, :]
+        normals = np.where(length > 1e-6, normals / np.maximum(length, 1e-12), flat)
+    return Mesh(
+        points=points,
+        faces=faces,
+        normals=normals,
+        uv=uv,
+        colors=np.ones((len(faces), 3)) if colors is None else colors,
+        texture=texture,
+    )
+
+
+def unit(vectors: Floats) -> Floats:
+    """Vectors (..., 3) to length 1; zero ones stay."""
+    length = np.sqrt((vectors * vectors).sum(-1, keepdims=True))
+    return np.asarray(vectors / np.maximum(length, 1e-30))
+
+
+def face_normals(points: Floats, faces: NDArray[np.integer]) -> Floats:
+    """(f, 3) normals, as long as twice the face's area."""
+    a, b, c = points[faces[:, 0]], points[faces[:, 1]], points[faces[:, 2]]
+    return np.asarray(np.cross(b - a, c - a))
+
+
+def weld(points: Floats, tolerance: float = 1e-7) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows of the distinct points, and for each point the number of its distinct one."""
+    extent = float(np.ptp(points, axis=0).max()) if len(points) else 1.0
+    grid = np.round((points - points.min(0)) / max(extent * tolerance, 1e-12)).astype(np.int64)
+    _, rows, inverse = np.unique(grid, axis=0, return_index=True, return_inverse=True)
+    return rows, inverse.reshape(-1)
+
+
+def crease_normals(points: Floats, faces: Faces, angle: float = CREASE_ANGLE) -> Floats:
+    """(f, 3, 3) corner normals: the area-weighted mean of the faces around a point that lie within `angle`."""
+    if len(faces) == 0:
+        return np.zeros((0, 3, 3))
+    _, inverse = weld(points)
+    normals = face_normals(points, faces)
+    units = unit(normals)
+    corner_point = inverse[faces].reshape(-1)
+    corner_face = np.repeat(np.arange(len(faces)), 3)
+    # Pairs (corner, face) that share a point: the product of two incidence matrices.
+    shape = (len(corner_point), int(inverse.max()) + 1)
+    ones = np.ones(len(corner_point), dtype=np.int8)
+    at_point = coo_matrix((ones, (np.arange(len(corner_point)), corner_point)), shape=shape).tocsr()
+    pairs = (at_point @ at_point.T).tocoo()
+    first, second = corner_face[pairs.row], corner_face[pairs.col]
+    near = (units[first] * units[second]).sum(1) > math.cos(angle)
+    total = np.zeros((len(corner_point), 3))
+    np.add.at(total, pairs.row[near], normals[second[near]])
+    empty = (total * total).sum(1) < 1e-30
+    total[empty] = units[corner_face[empty]]
+    return np.asarray(unit(total).reshape(-1, 3, 3))

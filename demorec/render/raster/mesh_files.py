@@ -1,0 +1,257 @@
+"""Meshes from OBJ, STL and COLLADA files, read as PyBullet reads them."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.errors import RenderError
+from demorec.render.raster.mesh import Floats, Mesh, make_mesh
+
+FORMATS = (".obj", ".stl", ".dae")
+
+
+def load_mesh(path: Path) -> Mesh:
+    """Read a mesh file.
+
+    Raises:
+        RenderError: The file is missing, of another format, broken or without faces; the message names it.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in FORMATS:
+        raise RenderError(
+            f"The mesh file {path.name!r} cannot be drawn: {', '.join(FORMATS)} are read, convert it to one of them: "
+            f"{path}"
+        )
+    try:
+        mesh = {".obj": load_obj, ".stl": load_stl, ".dae": load_collada}[suffix](path)
+    except OSError as error:
+        raise RenderError(f"The mesh file cannot be read ({error.strerror}): {path}") from error
+    except (ValueError, IndexError, KeyError, ElementTree.ParseError, UnicodeDecodeError) as error:
+        raise RenderError(f"The mesh file is broken ({error}): {path}") from error
+    if mesh.num_faces == 0:
+        raise RenderError(f"The mesh file holds no triangles: {path}")
+    if not np.isfinite(mesh.points).all():
+        raise RenderError(f"The mesh file holds points that are no numbers: {path}")
+    return mesh
+
+
+def _materials(path: Path) -> dict[str, tuple[Floats, Path | None]]:
+    """Material name -> diffuse colour and texture, of an MTL file; a missing file means no materials."""
+    found: dict[str, tuple[Floats, Path | None]] = {}
+    name = None
+    if not path.is_file():
+        return found
+    for line in path.read_text(errors="replace").splitlines():
+        words = line.split()
+        if not words:
+            continue
+        if words[0] == "newmtl":
+            name = " ".join(words[1:])
+            found[name] = (np.ones(3), None)
+        elif name is not None and words[0] == "Kd" and len(words) >= 4:
+            found[name] = (np.array([float(v) for v in words[1:4]]), found[name][1])
+        elif name is not None and words[0] == "map_Kd" and len(words) >= 2:
+            # Options (-s 1 1 1, ...) stand before the name.
+            texture = path.parent / words[-1]
+            found[name] = (found[name][0], texture if texture.is_file() else None)
+    return found
+
+
+def load_obj(path: Path) -> Mesh:
+    """An OBJ file with its materials; polygons are cut into fans.
+
+    As in PyBullet the first texture of the file covers all of it. The materials' colours count where there are
+    several and no texture; PyBullet ignores them unless told otherwise.
+    """
+    points: list[list[float]] = []
+    uvs: list[list[float]] = []
+    normals: list[list[float]] = []
+    corners: list[tuple[int, int, int]] = []
+    face_material: list[str] = []
+    materials: dict[str, tuple[Floats, Path | None]] = {}
+    material = ""
+
+    def parse(corner: str) -> tuple[int, int, int]:
+        parts = (corner + "//").split("/")[:3]
+        # Negative numbers count back from the latest; 0 stands for "none".
+        counts = (len(points), len(uvs), len(normals))
+        a, b, c = (
+            0 if not part else int(part) + (count + 1 if part[0] == "-" else 0)
+            for part, count in zip(parts, counts, strict=True)
+        )
+        return a, b, c
+
+    for line in path.read_text(errors="replace").splitlines():
+        words = line.split()
+        if not words:
+            continue
+        key = words[0]
+        if key == "v":
+            points.append([float(words[1]), float(words[2]), float(words[3])])
+        elif key == "vt":
+            uvs.append([float(words[1]), float(words[2]) if len(words) > 2 else 0.0])
+        elif key == "vn":
+            normals.append([float(words[1]), float(words[2]), float(words[3])])
+        elif key == "f":
+            polygon = [parse(word) for word in words[1:]]
+            for i in range(1, len(polygon) - 1):
+                corners += [polygon[0], polygon[i], polygon[i + 1]]
+                face_material.append(material)
+        elif key == "mtllib":
+            materials |= _materials(path.parent / " ".join(words[1:]))
+        elif key == "usemtl":
+            material = " ".join(words[1:])
+    index = np.array(corners, dtype=np.int64).reshape(-1, 3, 3)
+    faces = index[:, :, 0] - 1
+    if len(faces) and (faces.min() < 0 or faces.max() >= len(points)):
+        raise ValueError(f"a face names vertex {int(faces.max()) + 1} of {len(points)}")
+    texture = next((texture for _, texture in materials.values() if texture is not None), None)
+    uv = None
+    if uvs and len(faces):
+        if index[:, :, 1].max() > len(uvs):
+            raise ValueError(f"a face names texture coordinate {int(index[:, :, 1].max())} of {len(uvs)}")
+        # Corners without a coordinate get the middle of the texture, as in Bullet's loader.
+        uv = np.concatenate([[[0.5, 0.5]], np.array(uvs)])[index[:, :, 1]]
+    colors = None
+    if texture is None and len({tuple(kd) for kd, _ in materials.values()}) > 1:
+        white = (np.ones(3), None)
+        colors = np.array([materials.get(name, white)[0] for name in face_material])
+    corner_normals = None
+    if normals and len(faces) and index[:, :, 2].min() > 0:
+        if index[:, :, 2].max() > len(normals):
+            raise ValueError(f"a face names normal {int(index[:, :, 2].max())} of {len(normals)}")
+        corner_normals = np.array(normals)[index[:, :, 2] - 1]
+    return make_mesh(
+        np.array(points, dtype=np.float64).reshape(-1, 3),
+        faces,
+        normals=corner_normals,
+        uv=uv,
+        colors=colors,
+        texture=texture,
+    )
+
+
+def load_stl(path: Path) -> Mesh:
+    """A binary or text STL file; normals are made anew, since the file knows only flat ones."""
+    data = path.read_bytes()
+    count = int.from_bytes(data[80:84], "little") if len(data) >= 84 else -1
+    if len(data) == 84 + 50 * count:
+        rows = np.frombuffer(data, dtype=np.dtype([("f", "<f4", (4, 3)), ("flags", "<u2")]), offset=84)
+        corners: Floats = rows["f"][:, 1:].astype(np.float64).reshape(-1, 3)
+    elif data.lstrip().startswith(b"solid"):
+        words = [line.split() for line in data.decode().splitlines()]
+        corners = np.array([[float(v) for v in w[1:4]] for w in words if w and w[0] == "vertex"])
+    else:
+        raise ValueError(f"{len(data)} bytes do not hold the {count} triangles that its head tells")
+    return make_mesh(corners.reshape(-1, 3), np.arange(len(corners)).reshape(-1, 3))
+
+
+def load_collada(path: Path) -> Mesh:
+    """The triangles and polygons of a COLLADA file, placed by the nodes of its scene, in metres."""
+    root = ElementTree.parse(path).getroot()
+    tag = root.tag.removesuffix("COLLADA")
+
+    def all_of(node: ElementTree.Element, name: str) -> list[ElementTree.Element]:
+        return node.findall(f".//{tag}{name}")
+
+    by_id = {"#" + node.attrib["id"]: node for node in root.iter() if "id" in node.attrib}
+    points: list[Floats] = []
+    normals: list[Floats] = []
+    asset = root.find(f"{tag}asset")
+    unit = None if asset is None else asset.find(f"{tag}unit")
+    scale = 1.0 if unit is None else float(unit.attrib.get("meter", 1.0))
+    # PyBullet heeds the unit but not up_axis; shapes must lie as its physics has them.
+    axes = np.diag([scale, scale, scale, 1.0])
+
+    def numbers(source: ElementTree.Element) -> Floats:
+        array = source.find(f"{tag}float_array")
+        stride = source.find(f".//{tag}accessor")
+        width = 3 if stride is None else int(stride.attrib.get("stride", 3))
+        values = [] if array is None or array.text is None else array.text.split()
+        return np.array(values, dtype=np.float64).reshape(-1, width)[:, :3]
+
+    def resolve(reference: str) -> Floats:
+        node = by_id[reference]
+        if node.tag == f"{tag}vertices":
+            position = next(i for i in node.findall(f"{tag}input") if i.attrib["semantic"] == "POSITION")
+            return resolve(position.attrib["source"])
+        return numbers(node)
+
+    def add(geometry: ElementTree.Element, matrix: Floats) -> None:
+        for kind in ("triangles", "polylist", "polygons"):
+            for part in all_of(geometry, kind):
+                inputs = part.findall(f"{tag}input")
+                stride = 1 + max(int(i.attrib.get("offset", 0)) for i in inputs)
+                semantic = {i.attrib["semantic"]: i for i in inputs}
+                rows: list[NDArray[np.int64]] = [
+                    np.array((p.text or "").split(), dtype=np.int64).reshape(-1, stride)
+                    for p in part.findall(f"{tag}p")
+                ]
+                if kind == "polylist":
+                    counts = [int(v) for v in (part.findtext(f"{tag}vcount") or "").split()]
+                    rows = np.split(rows[0], np.cumsum(counts)[:-1]) if rows and counts else []
+                elif kind == "triangles":
+                    rows = list(rows[0].reshape(-1, 3, stride)) if rows else []
+                fans = [row[[0, i, i + 1]] for row in rows for i in range(1, len(row) - 1)]
+                if not fans:
+                    continue
+                index = np.concatenate(fans)
+                vertex = semantic["VERTEX"]
+                place = resolve(vertex.attrib["source"])[index[:, int(vertex.attrib.get("offset", 0))]]
+                linear = matrix[:3, :3]
+                points.append(place @ linear.T + matrix[:3, 3])
+                if "NORMAL" in semantic:
+                    normal = semantic["NORMAL"]
+                    direction = resolve(normal.attrib["source"])[index[:, int(normal.attrib.get("offset", 0))]]
+                    normals.append(direction @ np.linalg.inv(linear))
+                else:
+                    normals.append(np.zeros((0, 3)))
+
+    def visit(node: ElementTree.Element, matrix: Floats) -> None:
+        for child in node:
+            name = child.tag.removeprefix(tag)
+            value = np.array((child.text or "").split(), dtype=np.float64) if name in _TRANSFORMS else np.zeros(0)
+            if name in _TRANSFORMS:
+                matrix = matrix @ _transform(name, value)
+        for instance in node.findall(f"{tag}instance_geometry"):
+            add(by_id[instance.attrib["url"]], matrix)
+        for child in node.findall(f"{tag}node"):
+            visit(child, matrix)
+
+    for scene in all_of(root, "visual_scene"):
+        for node in scene.findall(f"{tag}node"):
+            visit(node, axes)
+    if not points:
+        raise ValueError("no visual scene with triangles")
+    corners = np.concatenate(points)
+    corner_normals = np.concatenate(normals)
+    complete = len(corner_normals) == len(corners)
+    return make_mesh(
+        corners,
+        np.arange(len(corners)).reshape(-1, 3),
+        normals=corner_normals.reshape(-1, 3, 3) if complete else None,
+    )
+
+
+_TRANSFORMS = ("matrix", "translate", "scale", "rotate")
+
+
+def _transform(name: str, value: Floats) -> Floats:
+    """(4, 4) matrix of one COLLADA transform element."""
+    if name == "matrix":
+        return value.reshape(4, 4)
+    m = np.eye(4)
+    if name == "translate":
+        m[:3, 3] = value
+    elif name == "scale":
+        m[:3, :3] = np.diag(value)
+    else:
+        axis = value[:3] / np.sqrt((value[:3] ** 2).sum())
+        angle = np.radians(value[3])
+        cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+        m[:3, :3] = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * (cross @ cross)
+    return m

@@ -1,0 +1,117 @@
+"""Meshes of the shapes that PyBullet describes by numbers: boxes, spheres, cylinders, capsules, planes."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from demorec.render.raster.mesh import Floats, Mesh, make_mesh
+
+SEGMENTS = 64
+"""Around a circle: the outline of a cylinder of 10 cm radius is then within 0.1 mm of round."""
+COARSE_SEGMENTS = 24
+"""Around a circle in the shadow map."""
+PLANE_EXTENT = 100.0
+"""Half the side of the square that stands for an infinite plane, metres."""
+
+
+def box(size: tuple[float, float, float]) -> Mesh:
+    """A box of full extents `size` around the origin, the texture once on each side."""
+    corners = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    points: list[Floats] = []
+    normals: list[Floats] = []
+    uv: list[Floats] = []
+    faces: list[list[int]] = []
+    for axis in range(3):
+        for sign in (1.0, -1.0):
+            u, v = (axis + 1) % 3, (axis + 2) % 3
+            side = np.zeros((4, 3))
+            side[:, axis] = sign
+            side[:, u], side[:, v] = corners[:, 0] * sign, corners[:, 1]
+            start = len(points) * 4
+            points.append(side * np.asarray(size) / 2)
+            faces += [[start, start + 1, start + 2], [start, start + 2, start + 3]]
+            normal = np.zeros(3)
+            normal[axis] = sign
+            normals += [np.tile(normal, (3, 1))] * 2
+            square = (corners + 1) / 2
+            uv += [square[[0, 1, 2]], square[[0, 2, 3]]]
+    return make_mesh(np.concatenate(points), np.array(faces), normals=np.array(normals), uv=np.array(uv))
+
+
+def roundness(segments: int) -> float:
+    """Factor by which a polygon's corners stand outside of a circle, so that it lies as much outside as inside."""
+    return 1 + 2 / 3 * (1 - math.cos(math.pi / segments))
+
+
+def revolve(profile: Floats, profile_normals: Floats, along: Floats, segments: int) -> Mesh:
+    """A surface of revolution about z.
+
+    Args:
+        profile: (n, 2) radius and height, from the lowest point to the highest.
+        profile_normals: (n, 2) outward normals, radial and axial part.
+        along: (n,) texture coordinate v.
+    """
+    angles = np.linspace(0, 2 * math.pi, segments + 1)
+    ring = np.stack([np.cos(angles), np.sin(angles)], 1)
+    n, m = len(profile), segments + 1
+    radial = ring[:, None, :]
+    profile = profile * [roundness(segments), 1.0]
+    points = np.concatenate(
+        [radial * profile[None, :, :1], np.broadcast_to(profile[None, :, 1:], (m, n, 1))], 2
+    ).reshape(-1, 3)
+    normals = np.concatenate(
+        [radial * profile_normals[None, :, :1], np.broadcast_to(profile_normals[None, :, 1:], (m, n, 1))], 2
+    ).reshape(-1, 3)
+    u = np.broadcast_to((angles / (2 * math.pi))[:, None], (m, n))
+    uv = np.stack([u, np.broadcast_to(along[None, :], (m, n))], 2).reshape(-1, 2)
+    i, j = (a.reshape(-1) for a in np.meshgrid(np.arange(segments), np.arange(n - 1), indexing="ij"))
+    a, b, c, d = i * n + j, (i + 1) * n + j, (i + 1) * n + j + 1, i * n + j + 1
+    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    # At a pole the side that has shrunk to a point makes an empty triangle, which make_mesh leaves out.
+    return make_mesh(points, faces, normals=normals[faces], uv=uv[faces])
+
+
+def sphere(radius: float, segments: int = SEGMENTS) -> Mesh:
+    """A sphere around the origin."""
+    angle = np.linspace(-math.pi / 2, math.pi / 2, segments // 2 + 1)
+    normals = np.stack([np.cos(angle), np.sin(angle)], 1)
+    normals[[0, -1], 0] = 0.0
+    # revolve rounds the circles of latitude; the meridians are polygons too.
+    profile = normals * [radius, radius * roundness(segments)]
+    return revolve(profile, normals, np.asarray(angle / math.pi + 0.5, dtype=np.float64), segments)
+
+
+def cylinder(radius: float, length: float, segments: int = SEGMENTS) -> Mesh:
+    """A cylinder along z around the origin, closed."""
+    h = length / 2
+    profile = np.array([[0, -h], [radius, -h], [radius, -h], [radius, h], [radius, h], [0, h]], dtype=np.float64)
+    normals = np.array([[0, -1], [0, -1], [1, 0], [1, 0], [0, 1], [0, 1]], dtype=np.float64)
+    return revolve(profile, normals, np.array([0, 0.25, 0.25, 0.75, 0.75, 1]), segments)
+
+
+def capsule(radius: float, length: float, segments: int = SEGMENTS) -> Mesh:
+    """A cylinder along z of `length` between the centres of two half spheres."""
+    angle = np.linspace(0, math.pi / 2, segments // 4 + 1)
+    top = np.stack([np.cos(angle), np.sin(angle)], 1)
+    top[-1, 0] = 0.0
+    bottom = top[::-1] * [1, -1]
+    h = length / 2
+    size = [radius, radius * roundness(segments)]
+    profile = np.concatenate([bottom * size - [0, h], top * size + [0, h]])
+    height = profile[:, 1]
+    along = (height - height[0]) / (height[-1] - height[0])
+    return revolve(profile, np.concatenate([bottom, top]), along, segments)
+
+
+def plane() -> Mesh:
+    """A large square in the xy plane that looks up, in cells of 2 m, the texture once on each metre."""
+    edge = np.arange(-PLANE_EXTENT, PLANE_EXTENT + 1, 20.0)
+    n = len(edge)
+    x, y = (a.reshape(-1) for a in np.meshgrid(edge, edge, indexing="ij"))
+    points = np.stack([x, y, np.zeros(n * n)], 1)
+    i, j = (a.reshape(-1) for a in np.meshgrid(np.arange(n - 1), np.arange(n - 1), indexing="ij"))
+    a = i * n + j
+    faces = np.concatenate([np.stack([a, a + n, a + n + 1], 1), np.stack([a, a + n + 1, a + 1], 1)])
+    return make_mesh(points, faces, uv=points[faces][:, :, :2])

@@ -1,0 +1,163 @@
+"""The renderer: takes over a scene, then draws all cameras of a step."""
+
+from __future__ import annotations
+
+import functools
+import logging
+import math
+from typing import Self
+
+from demorec.episode import CameraImages
+from demorec.render import RenderSetup
+from demorec.render.raster.batch import Batch, make_batch
+from demorec.render.raster.cache import folder_lock
+from demorec.render.raster.kernels.jit import compiled_folder
+from demorec.render.raster.shapes import Instance, ModelStore, VisualShapes, read_instances, visual_shapes
+from demorec.render.raster.stage import Stage
+from demorec.render.raster.view import View
+from demorec.render.setup_checks import check_setup, world_from_camera
+from demorec.scene import Camera
+
+log = logging.getLogger(__name__)
+
+FACES_PER_PIXEL = 9.0
+"""Triangles that a mesh keeps for each pixel of its diameter; below about 5, outlines look chipped."""
+WORKING_DISTANCE = {"world": 0.8, "link": 0.3}
+"""How far from a camera in the world, or on a link, moving things are expected, metres. Levels of detail depend on
+this and not on where things are, so that nothing pops and pictures depend on the present state alone."""
+CASTER_FACES_PER_METRE = 900.0
+"""Triangles that a mesh keeps in the shadow map for each metre of its diameter."""
+
+
+class RasterRenderer:
+    """Draws on the CPU, compiled with numba: no system package, no GPU. See docs/rendering.md.
+
+    Args:
+        exact: Draw every triangle of every mesh, for depth that must be exact to the file.
+        keep_still: Whether fixed cameras keep what stands still; the pictures are the same to the bit without.
+    """
+
+    def __init__(self, *, exact: bool = False, keep_still: bool = True) -> None:
+        self._exact = exact
+        self._keep_still = keep_still
+        self._store = ModelStore()
+        self._setup: RenderSetup | None = None
+        self._shapes: VisualShapes = ()
+        self._views: list[View] = []
+        self._stage: Stage | None = None
+        warm_up()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Free buffers, meshes and textures; harmless when called twice."""
+        self._setup, self._stage, self._views, self._shapes = None, None, [], ()
+        self._store = ModelStore()
+
+    def setup(self, setup: RenderSetup) -> None:
+        """Take over a freshly built scene.
+
+        Raises:
+            RenderError: A shape, mesh, texture or camera that cannot be drawn, by name.
+        """
+        check_setup(setup)
+        self._setup = setup
+        self._take_over(visual_shapes(setup.client))
+
+    def _take_over(self, shapes: VisualShapes) -> None:
+        setup = self._setup
+        assert setup is not None
+        self._shapes = shapes
+        instances = read_instances(setup.client, shapes, setup.textures, self._store)
+        largest = max((camera.height for camera in setup.cameras), default=0)
+        self._stage = Stage(
+            setup.client,
+            instances,
+            setup.light,
+            shadow_size=shadow_size(largest),
+            caster_faces=[None if self._exact else caster_faces(instance) for instance in instances],
+        )
+        batches: dict[tuple[int | None, ...], Batch] = {}
+        self._views = []
+        for camera in setup.cameras:
+            levels = tuple(None if self._exact else self._level(instance, camera) for instance in instances)
+            if levels not in batches:
+                batches[levels] = make_batch(instances, levels, specular=setup.light.specular)
+            self._views.append(
+                View(
+                    camera,
+                    batches[levels],
+                    self._stage,
+                    setup.light,
+                    antialias=setup.antialias,
+                    depth=setup.depth,
+                    segmentation=setup.segmentation,
+                    keep_still=self._keep_still and camera.mount == "world",
+                )
+            )
+
+    def _level(self, instance: Instance, camera: Camera) -> int | None:
+        """How many faces an instance keeps for a camera."""
+        distance = WORKING_DISTANCE["world" if camera.mount == "world" else "link"]
+        pixels = 2 * instance.radius * float(camera.intrinsics[1, 1]) / distance
+        return power_of_two(FACES_PER_PIXEL * pixels)
+
+    def render(self) -> dict[str, CameraImages]:
+        """Camera name -> images of the client's present state.
+
+        Raises:
+            RuntimeError: `setup` was not called.
+            RenderError: A shape or texture that was changed since cannot be drawn.
+        """
+        setup, stage = self._setup, self._stage
+        if setup is None or stage is None:
+            raise RuntimeError("the renderer has no scene: call setup first")
+        shapes = visual_shapes(setup.client)
+        if shapes != self._shapes:
+            self._take_over(shapes)  # a colour, texture or shape was changed
+            stage = self._stage
+            assert stage is not None
+        stage.update()
+        return {
+            camera.name: view.draw(world_from_camera(setup, camera))
+            for camera, view in zip(setup.cameras, self._views, strict=True)
+        }
+
+
+def shadow_size(height: int) -> int:
+    """Texels along the shadow map's side, for pictures of a height."""
+    return 512 if height <= 128 else 768 if height <= 320 else 1024
+
+
+def power_of_two(count: float) -> int:
+    """The nearest power of two, so that few levels are made and cached; at least 64."""
+    return 1 << max(6, round(math.log2(max(count, 1.0))))
+
+
+def caster_faces(instance: Instance) -> int:
+    """How many faces an instance keeps in the shadow map."""
+    return power_of_two(CASTER_FACES_PER_METRE * 2 * instance.radius)
+
+
+@functools.cache
+def warm_up() -> None:
+    """Compile the kernels unless that was done before, by this process or another; once for each kind of CPU.
+
+    Call it before several processes start: they then find compiled code instead of each making it.
+    """
+    folder = compiled_folder()
+    done = folder / "complete"
+    if done.exists():
+        return
+    with folder_lock(folder):
+        if done.exists():
+            return
+        log.warning("Compiling the renderer for this machine: about half a minute, once (kept in %s).", folder)
+        from demorec.render.raster.rehearsal import rehearse
+
+        rehearse()
+        done.touch()

@@ -1,0 +1,280 @@
+"""What is in the scene: PyBullet's visual shapes as instances of meshes."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from demorec.assets import asset_path
+from demorec.errors import DemorecError, RenderError
+from demorec.geometry import Pose
+from demorec.render.raster import primitives
+from demorec.render.raster.decimate import decimated
+from demorec.render.raster.mesh import Floats, Mesh
+from demorec.render.raster.mesh_cache import cached_mesh
+from demorec.render.raster.mesh_files import load_mesh
+from demorec.render.raster.pieces import Piece, make_piece
+from demorec.render.raster.textures import Picture, load_picture, palette_colors
+from demorec.scene import Texture
+from demorec.textures import texture_pixels
+
+VisualShapes = tuple[tuple[Any, ...], ...]
+"""As PyBullet tells them: body, link, kind, dimensions, file, position, orientation, colour. Of textures it knows
+only those of mesh files; those set by `changeVisualShape` come in `RenderSetup.textures`."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Model:
+    """A mesh of a file or a primitive, before scaling.
+
+    Attributes:
+        key: Digest of what it was made from: equal keys, equal meshes.
+        mesh: All its triangles.
+        is_palette: Whether the file's texture was turned into face colours.
+        coarse: For the shadow map, of a primitive; primitives are always drawn whole.
+    """
+
+    key: str
+    mesh: Mesh
+    is_palette: bool = False
+    coarse: Mesh | None = None
+    _pieces: dict[Any, Piece] = field(default_factory=dict)
+    _spheres: dict[bytes, tuple[Floats, float]] = field(default_factory=dict)
+
+    def piece(self, target: int | None, *, textured: bool) -> Piece:
+        """The mesh with about `target` faces (None: all), laid out for drawing; made once."""
+        if self.coarse is not None:
+            target = None
+        place = (target, textured)
+        if place not in self._pieces:
+            mesh = self.mesh if target is None else decimated(self.mesh, target, key=self.key)
+            self._pieces[place] = make_piece(mesh, textured=textured)
+        return self._pieces[place]
+
+    def caster(self, target: int | None) -> Piece:
+        """The same for the shadow map."""
+        if self.coarse is None:
+            return self.piece(target, textured=False)
+        if "caster" not in self._pieces:
+            self._pieces["caster"] = make_piece(self.coarse, textured=False)
+        return self._pieces["caster"]
+
+    def bounding_sphere(self, scale: Floats) -> tuple[Floats, float]:
+        """Centre (3,) and radius of a sphere around the scaled mesh."""
+        place = scale.tobytes()
+        if place not in self._spheres:
+            points = self.mesh.points * scale
+            centre = (points.min(0) + points.max(0)) / 2
+            self._spheres[place] = centre, float(np.sqrt(((points - centre) ** 2).sum(1).max()))
+        return self._spheres[place]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Instance:
+    """One visual shape of the scene.
+
+    Attributes:
+        body, link: PyBullet's numbers; the base is link -1.
+        model: Its mesh.
+        scale: (3,) of the mesh.
+        link_from_shape: (3, 4); for a base: from the inertial frame, in which PyBullet tells its pose.
+        color: (3,) 0..1.
+        texture: Picture, or None.
+        stands: Whether physics cannot move it.
+        centre, radius: Bounding sphere in the shape's frame.
+    """
+
+    body: int
+    link: int
+    model: Model
+    scale: Floats
+    link_from_shape: Floats
+    color: Floats
+    texture: Picture | None
+    stands: bool
+    centre: Floats
+    radius: float
+
+    @property
+    def segment(self) -> int:
+        """Its number in segmentation pictures."""
+        return self.body + ((self.link + 1) << 24)
+
+    def piece(self, target: int | None) -> Piece:
+        """Its mesh with about `target` faces, None for all of them; not scaled yet.
+
+        Textured meshes keep all: their texture coordinates would not survive.
+        """
+        return self.model.piece(None if self.texture is not None else target, textured=self.texture is not None)
+
+    def caster(self, target: int | None) -> Piece:
+        """Its mesh for the shadow map, where textures do not matter."""
+        return self.model.caster(target)
+
+
+@dataclass
+class ModelStore:
+    """Meshes and textures that were loaded, kept across scenes; files are looked at again when they change."""
+
+    _models: dict[tuple[Any, ...], Model] = field(default_factory=dict)
+    _pictures: dict[tuple[Any, ...], Picture] = field(default_factory=dict)
+
+    def file(self, path: Path) -> Model:
+        """The model of a mesh file; RenderError when it cannot be read."""
+        try:
+            stat = path.stat()
+        except OSError as error:
+            raise RenderError(f"The mesh file cannot be read ({error.strerror}): {path}") from error
+        place = (str(path), stat.st_mtime_ns, stat.st_size)
+        if place not in self._models:
+            digest = _source_digest(path)
+            mesh = cached_mesh(digest, lambda: load_mesh(path))
+            colors = None
+            if mesh.texture is not None and mesh.uv is not None:
+                picture = self.picture(mesh.texture)
+                digest += hashlib.sha256(picture.tobytes()).hexdigest()
+                colors = palette_colors(mesh, picture)
+            if colors is not None:
+                mesh = replace(mesh, colors=colors, texture=None)
+            self._models[place] = Model(key=digest, mesh=mesh, is_palette=colors is not None)
+        return self._models[place]
+
+    def primitive(self, name: str, *size: float) -> Model:
+        """A box (x, y, z), sphere (radius), cylinder or capsule (radius, length), or plane ()."""
+        place = (name, *size)
+        if place not in self._models:
+            if name in ("box", "plane"):
+                mesh = coarse = primitives.plane() if name == "plane" else primitives.box((size[0], size[1], size[2]))
+            else:
+                make: Any = {
+                    "sphere": primitives.sphere,
+                    "cylinder": primitives.cylinder,
+                    "capsule": primitives.capsule,
+                }[name]
+                mesh, coarse = make(*size), make(*size, segments=primitives.COARSE_SEGMENTS)
+            self._models[place] = Model(key=repr(place), mesh=mesh, coarse=coarse)
+        return self._models[place]
+
+    def procedural(self, texture: Texture) -> Picture:
+        """A procedural texture's picture."""
+        place = (texture,)
+        if place not in self._pictures:
+            self._pictures[place] = texture_pixels(texture)
+        return self._pictures[place]
+
+    def picture(self, path: Path) -> Picture:
+        """A texture file's picture."""
+        try:
+            place = (str(path), path.stat().st_mtime_ns)
+        except OSError as error:
+            raise RenderError(f"The texture cannot be read ({error.strerror}): {path}") from error
+        if place not in self._pictures:
+            self._pictures[place] = load_picture(path)
+        return self._pictures[place]
+
+
+def _source_digest(path: Path) -> str:
+    """Digest of a mesh file, its place (a mesh holds the path of its texture) and its materials."""
+    data = path.read_bytes()
+    digest = hashlib.sha256(f"{path} ".encode() + data)
+    for line in re.findall(rb"^mtllib\s+(.+?)\s*$", data, re.MULTILINE):
+        materials = path.parent / line.decode(errors="replace")
+        if materials.is_file():
+            digest.update(materials.read_bytes())
+    return digest.hexdigest()
+
+
+def visual_shapes(client: Any) -> VisualShapes:
+    """Every visual shape of every body, as PyBullet tells them; equal results look equal."""
+    return tuple(
+        shape
+        for number in range(client.getNumBodies())
+        for shape in client.getVisualShapeData(client.getBodyUniqueId(number))
+    )
+
+
+def read_instances(
+    client: Any, shapes: VisualShapes, textures: Mapping[int, Texture], store: ModelStore
+) -> list[Instance]:
+    """The instances of the scene, those that stand still first.
+
+    Args:
+        textures: body -> procedural texture, of the bodies that have one.
+
+    Raises:
+        RenderError: A shape or texture that cannot be drawn, with the body and link that it belongs to.
+    """
+    instances = []
+    dynamics: dict[int, tuple[Any, ...]] = {}
+    for shape in shapes:
+        body, link, kind, size, file, position, orientation, rgba = shape[:8]
+        if rgba[3] == 0:
+            continue  # invisible
+        if body not in dynamics:
+            dynamics[body] = client.getDynamicsInfo(body, -1)
+        try:
+            model, scale = _model(client, kind, size, file.decode(), store)
+            texture = _texture(model, textures.get(body), store)
+        except DemorecError as error:
+            raise RenderError(f"Body {body} ({_name(client, body)!r}), link {link}: {error}") from error
+        place = Pose(position=np.array(position), quat_xyzw=np.array(orientation))
+        if link == -1:
+            inertial = Pose(position=np.array(dynamics[body][3]), quat_xyzw=np.array(dynamics[body][4]))
+            place = inertial.inverse() @ place
+        centre, radius = model.bounding_sphere(scale)
+        instances.append(
+            Instance(
+                body=body,
+                link=link,
+                model=model,
+                scale=scale,
+                link_from_shape=place.matrix()[:3].copy(),
+                color=np.array(rgba[:3], dtype=np.float64),
+                texture=texture,
+                stands=link == -1 and dynamics[body][0] == 0,
+                centre=centre,
+                radius=radius,
+            )
+        )
+    return sorted(instances, key=lambda instance: not instance.stands)
+
+
+def _name(client: Any, body: int) -> str:
+    return str(client.getBodyInfo(body)[1].decode())
+
+
+def _model(client: Any, kind: int, size: tuple[float, ...], file: str, store: ModelStore) -> tuple[Model, Floats]:
+    """The model and its scale."""
+    one = np.ones(3)
+    if kind == client.GEOM_MESH:
+        path = Path(file)
+        return store.file(path if path.is_absolute() or path.exists() else asset_path(file)), np.array(size)
+    if kind == client.GEOM_BOX:
+        return store.primitive("box", 1.0, 1.0, 1.0), np.array(size)
+    if kind == client.GEOM_SPHERE:
+        return store.primitive("sphere", 1.0), one * size[0]
+    if kind == client.GEOM_CYLINDER:
+        return store.primitive("cylinder", 1.0, 1.0), np.array([size[1], size[1], size[0]])
+    if kind == client.GEOM_CAPSULE:
+        return store.primitive("capsule", size[1], size[0]), one
+    if kind == client.GEOM_PLANE:
+        return store.primitive("plane"), one
+    raise RenderError(
+        f"a visual shape of PyBullet's kind {kind} cannot be drawn by the raster renderer: use a mesh, box, sphere, "
+        "cylinder, capsule or plane, or --renderer tiny."
+    )
+
+
+def _texture(model: Model, texture: Texture | None, store: ModelStore) -> Picture | None:
+    """The picture that covers a shape: one that was set on it, else the mesh file's own."""
+    if texture is not None and model.mesh.uv is not None:
+        return store.procedural(texture)
+    if model.mesh.texture is not None and model.mesh.uv is not None:
+        return store.picture(model.mesh.texture)
+    return None

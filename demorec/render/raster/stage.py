@@ -1,0 +1,193 @@
+"""What all cameras of a step share: poses, light and the shadow map."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.errors import RenderError
+from demorec.render.raster.batch import caster_geometry
+from demorec.render.raster.kernels import layout
+from demorec.render.raster.kernels.triangles import draw_casters
+from demorec.render.raster.kernels.vertices import place_instances, transform_casters
+from demorec.render.raster.mesh import Floats
+from demorec.render.raster.shapes import Instance
+from demorec.scene import Light
+
+REACH = 0.9
+"""How far a robot's shadow is expected around its base, metres."""
+LARGEST_RADIUS = 1.2
+"""Of the shadowed region, metres: beyond, texels would grow coarse. What lies outside is lit."""
+LARGE = 2.0
+"""Shapes of a larger radius (floors) receive shadows but cast none."""
+BELOW = -1e9
+"""Height of the empty shadow map."""
+
+
+class Stage:
+    """The scene's instances, their poses at this step and the shadow that they cast.
+
+    Args:
+        client: PyBullet client.
+        instances: Those that stand still first.
+        light: Direction, colour and strengths.
+        shadow_size: Texels along the side of the shadow map; a multiple of the tile.
+        caster_faces: Faces of each instance in the shadow map, None for all.
+    """
+
+    def __init__(
+        self,
+        client: Any,
+        instances: Sequence[Instance],
+        light: Light,
+        *,
+        shadow_size: int,
+        caster_faces: Sequence[int | None],
+    ) -> None:
+        self.client = client
+        self.instances = tuple(instances)
+        self.num_still = sum(instance.stands for instance in instances)
+        n = len(instances)
+        self.link_from_shape = np.array([i.link_from_shape for i in instances]).reshape(n, 3, 4)
+        self.centre = np.array([i.centre for i in instances]).reshape(n, 3)
+        self.radius = np.array([i.radius for i in instances])
+        bodies = sorted({instance.body for instance in instances})
+        self._bodies = [(body, list(range(client.getNumJoints(body)))) for body in bodies]
+        row_of, count = {}, 0
+        for body, links in self._bodies:
+            row_of[body] = count
+            count += 1 + len(links)
+        self._rows = np.array([row_of[i.body] + i.link + 1 for i in instances], dtype=np.int64)
+        self.pose: Floats = np.zeros((n, 7))
+        self.world_from_shape = np.zeros((n, 3, 4))
+        self.shadow_from_shape = np.zeros((n, 3, 4))
+        self.light_in_shape = np.zeros((n, 3))
+        self.light_table = _light_table(light)
+        self.still_version = 0
+        """Grows when something of what stands still was moved after all."""
+        self._still_pose = b""
+        self.read_poses()
+
+        direction = np.asarray(light.direction, dtype=np.float64)
+        length = math.sqrt(float((direction * direction).sum()))
+        if length == 0 or not math.isfinite(length):
+            raise RenderError(f"The light's direction is {light.direction}: it needs a finite length above 0.")
+        self.light = direction / length
+        self.shadow_size = shadow_size
+        self.shadow_from_world, self.texel = self._fit_shadow()
+        casts = [instance.radius < LARGE and light.shadow > 0 for instance in instances]
+        self._casters = caster_geometry(instances, caster_faces, casts)
+        tiles = shadow_size >> layout.TILE_SHIFT
+        self.heights = np.full((shadow_size, shadow_size), BELOW, dtype=np.float32)
+        self.still_heights = self.heights.copy()
+        self.touched = np.zeros((tiles, tiles), dtype=np.uint8)
+        self._bounds = np.array([shadow_size, 0, shadow_size, 0], dtype=np.int64)
+        self._no_ids = np.zeros(1, dtype=np.int32)
+
+    def read_poses(self) -> None:
+        """Ask PyBullet where everything is."""
+        client = self.client
+        rows: list[tuple[float, ...]] = []
+        for body, links in self._bodies:
+            position, quat = client.getBasePositionAndOrientation(body)
+            rows.append(position + quat)
+            if links:
+                states = client.getLinkStates(body, links, computeForwardKinematics=1)
+                rows += [state[4] + state[5] for state in states]
+        if rows:
+            self.pose = np.array(rows)[self._rows]
+
+    def _fit_shadow(self) -> tuple[Floats, float]:
+        """(3, 4) world to shadow map (texels, texels, metres), and metres a texel.
+
+        The region depends on what stands still alone: a shadow must not change because something moved elsewhere.
+        """
+        low, high = np.full(3, np.inf), np.full(3, -np.inf)
+        jointed = {body for body, links in self._bodies if links}
+        for number, instance in enumerate(self.instances):
+            if not instance.stands or instance.radius >= LARGE:
+                continue
+            place = np.array(self.pose[number, :3])
+            reach = REACH if instance.body in jointed else instance.radius
+            low, high = np.minimum(low, place - reach), np.maximum(high, place + reach)
+        if not np.isfinite(low).all():
+            low, high = np.full(3, -1.0), np.full(3, 1.0)
+        centre = (low + high) / 2
+        radius = min(LARGEST_RADIUS, float(np.sqrt((((high - low) / 2) ** 2).sum())))
+        helper = np.array([0.0, 1.0, 0.0]) if abs(self.light[1]) < 0.9 else np.array([1.0, 0.0, 0.0])
+        right = np.cross(helper, self.light)
+        right /= math.sqrt(float((right * right).sum()))
+        up = np.cross(self.light, right)
+        scale = self.shadow_size / (2 * radius)
+        matrix = np.zeros((3, 4))
+        for row, axis, factor, offset in (
+            (0, right, scale, self.shadow_size / 2 - 0.5),
+            (1, up, scale, self.shadow_size / 2 - 0.5),
+            (2, self.light, 1.0, 0.0),
+        ):
+            matrix[row, :3] = axis * factor
+            matrix[row, 3] = offset - float((axis * centre).sum()) * factor
+        return matrix, 1 / scale
+
+    def update(self) -> None:
+        """Take over the present poses and draw the shadow map: what stands still once, what moves each time."""
+        self.read_poses()
+        place_instances(
+            self.pose,
+            self.link_from_shape,
+            self.shadow_from_world,
+            self.light,
+            self.world_from_shape,
+            self.shadow_from_shape,
+            self.light_in_shape,
+        )
+        still_pose = self.pose[: self.num_still].tobytes()
+        bounds = self._bounds
+        if still_pose != self._still_pose:
+            self._still_pose = still_pose
+            self.still_version += 1
+            self.still_heights.fill(BELOW)
+            self._draw(0, self.num_still, self.still_heights, mark=False)
+            self.heights[:] = self.still_heights
+        elif bounds[1] > bounds[0]:
+            x, y = slice(int(bounds[0]), int(bounds[1])), slice(int(bounds[2]), int(bounds[3]))
+            self.heights[y, x] = self.still_heights[y, x]
+        self.touched.fill(0)
+        bounds[:] = (self.shadow_size, 0, self.shadow_size, 0)
+        self._draw(self.num_still, len(self.instances), self.heights, mark=True)
+
+    def _draw(self, first: int, last: int, heights: NDArray[np.float32], *, mark: bool) -> None:
+        casters = self._casters
+        transform_casters(
+            first, last, casters.vertex_start, casters.vertex_count, casters.vertices, self.shadow_from_shape
+        )
+        draw_casters(
+            first,
+            last,
+            casters.face_start,
+            casters.face_end,
+            casters.faces,
+            casters.vertices,
+            self.shadow_size,
+            heights.reshape(-1),
+            self.touched,
+            mark,
+            self._bounds,
+            self._no_ids,
+            self._no_ids,
+        )
+
+
+def _light_table(light: Light) -> NDArray[np.float32]:
+    """See kernels.layout; surfaces that look up get a little more of the ambient light than those that look down."""
+    table = np.zeros(layout.LIGHT_SIZE, dtype=np.float32)
+    table[layout.AMBIENT] = light.ambient * 0.88
+    table[layout.AMBIENT_UP] = light.ambient * 0.12
+    table[layout.DIFFUSE] = light.diffuse
+    table[layout.IN_SHADOW] = 1 - light.shadow
+    table[layout.LIGHT_RED : layout.LIGHT_BLUE + 1] = light.color
+    return table

@@ -1,0 +1,106 @@
+"""Textures as pyramids of ever smaller pictures, and palettes turned into face colours."""
+
+from __future__ import annotations
+
+import math
+from collections import OrderedDict
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, UnidentifiedImageError
+
+from demorec.errors import RenderError
+from demorec.render.raster.kernels.layout import MIP_LEVELS
+from demorec.render.raster.mesh import Floats, Mesh, face_normals
+
+LARGEST_SIDE = 1 << (MIP_LEVELS - 1)
+Picture = NDArray[np.uint8]
+
+
+def load_picture(path: Path) -> Picture:
+    """(H, W, 3) uint8 RGB of a picture file; RenderError names one that cannot be read."""
+    try:
+        with Image.open(path) as image:
+            return np.asarray(image.convert("RGB"))
+    except (OSError, UnidentifiedImageError) as error:
+        raise RenderError(f"The texture cannot be read ({error}): {path}") from error
+
+
+_pyramids: OrderedDict[int, tuple[Picture, list[NDArray[np.uint32]], int]] = OrderedDict()
+KEPT_PYRAMIDS = 32
+
+
+def pyramid(picture: Picture) -> tuple[list[NDArray[np.uint32]], int]:
+    """As `make_pyramid`; those of the last pictures are kept, since most scenes share them."""
+    found = _pyramids.pop(id(picture), None)
+    if found is None:
+        found = (picture, *make_pyramid(picture))  # the picture itself too, so that its id stays its own
+    _pyramids[id(picture)] = found
+    if len(_pyramids) > KEPT_PYRAMIDS:
+        _pyramids.popitem(last=False)
+    return found[1], found[2]
+
+
+def make_pyramid(picture: Picture) -> tuple[list[NDArray[np.uint32]], int]:
+    """Packed texels of each level, from the largest, and log2 of the largest's side.
+
+    Each level is square, a power of two wide, and carries its first row and column again at the end, so that a
+    bilinear lookup needs no second wrap.
+    """
+    side = min(LARGEST_SIDE, 1 << max(0, math.ceil(math.log2(max(picture.shape[:2])))))
+    image = Image.fromarray(picture).resize((side, side), Image.Resampling.BOX)
+    levels: list[NDArray[np.uint32]] = []
+    log2_side = side.bit_length() - 1
+    for level in range(log2_side + 1):
+        small = image.resize((side >> level, side >> level), Image.Resampling.BOX)
+        padded = np.pad(np.asarray(small), ((0, 1), (0, 1), (0, 0)), "wrap").reshape(-1, 3).astype(np.uint32)
+        red, green, blue = padded[:, 0], padded[:, 1], padded[:, 2]
+        levels.append(np.asarray(red | green << 8 | blue << 16, dtype=np.uint32))
+    return levels, log2_side
+
+
+def pack(pictures: list[Picture]) -> tuple[NDArray[np.uint32], NDArray[np.int64]]:
+    """All pyramids in one array, and (textures, MIP_LEVELS + 1) where each level starts; the last column is log2."""
+    texels: list[NDArray[np.uint32]] = [np.zeros(2, dtype=np.uint32)]
+    table = np.zeros((max(1, len(pictures)), MIP_LEVELS + 1), dtype=np.int64)
+    start = 2
+    for row, picture in enumerate(pictures):
+        levels, log2_side = pyramid(picture)
+        for level, data in enumerate(levels):
+            table[row, level] = start
+            texels.append(data)
+            start += len(data)
+        table[row, MIP_LEVELS] = log2_side
+    return np.concatenate(texels), table
+
+
+PALETTE_ERROR = 4.0
+"""Mean difference (of 255) within the faces up to which a texture counts as a palette."""
+PALETTE_COLORS = 24
+"""And so few colours cover nearly all of the surface."""
+
+
+def palette_colors(mesh: Mesh, picture: Picture) -> Floats | None:
+    """(f, 3) face colours 0..1 of a mesh whose faces each lie on one colour of the texture; None when they do not.
+
+    Such a texture is a palette: colours by face are faster, do not bleed into each other in small pictures, and
+    survive decimation.
+    """
+    if mesh.uv is None or mesh.num_faces == 0:
+        return None
+    height, width = picture.shape[:2]
+    spots = np.concatenate([mesh.uv, mesh.uv.mean(1, keepdims=True)], 1)  # (f, 4, 2)
+    x = np.floor(spots[..., 0] % 1.0 * width).astype(np.int64) % width
+    y = np.floor((1.0 - spots[..., 1]) % 1.0 * height).astype(np.int64) % height
+    found = picture[y, x].astype(np.float64)
+    difference = np.abs(found - found[:, 3:]).max((1, 2))
+    area = np.sqrt((face_normals(mesh.points, mesh.faces) ** 2).sum(1))
+    if float((area * difference).sum() / area.sum()) > PALETTE_ERROR:
+        return None
+    color = np.median(found, axis=1)
+    _, kind = np.unique(np.round(color / 8), axis=0, return_inverse=True)
+    share = np.sort(np.bincount(kind.reshape(-1), weights=area))[::-1]
+    if share[:PALETTE_COLORS].sum() < 0.95 * area.sum():
+        return None
+    return np.asarray(color / 255.0)

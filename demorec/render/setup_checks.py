@@ -1,0 +1,60 @@
+"""What all renderers ask of a setup: cameras that can draw, on mounts that exist."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from demorec.errors import RenderError
+from demorec.geometry import Pose
+from demorec.render import RenderSetup
+from demorec.scene import Camera
+
+MAX_SAMPLES = 1 << 28
+"""Of a picture; beyond, buffers would take several GB. (PyBullet ends the process on sizes that it cannot draw.)"""
+
+
+def check_setup(setup: RenderSetup) -> None:
+    """Raise RenderError for a camera that cannot draw, or whose mount does not exist."""
+    for camera in setup.cameras:
+        check_camera(camera, antialias=setup.antialias)
+        if camera.mount != "world" and camera.mount not in setup.mounts:
+            raise RenderError(
+                f"The camera {camera.name!r} is mounted on the link {camera.mount!r}, which the robot does not have; "
+                f"allowed are world, {', '.join(setup.mounts)}."
+            )
+
+
+def check_camera(camera: Camera, *, antialias: bool) -> None:
+    """Raise RenderError for a camera that cannot draw: no pixels, too many, or clipping distances that cross."""
+    if camera.width < 1 or camera.height < 1:
+        raise RenderError(f"Camera {camera.name!r} is {camera.width}x{camera.height}: both sizes must be at least 1.")
+    samples = camera.width * camera.height * (4 if antialias else 1)
+    if samples > MAX_SAMPLES:
+        raise RenderError(
+            f"Camera {camera.name!r} is {camera.width}x{camera.height}, {samples} samples a picture; allowed are "
+            f"{MAX_SAMPLES}: make it smaller{' or draw without antialiasing' if antialias else ''}."
+        )
+    if not 0 < camera.near < camera.far < math.inf:
+        raise RenderError(
+            f"Camera {camera.name!r} clips at near {camera.near} m and far {camera.far} m: 0 < near < far is needed."
+        )
+    if not 0 < camera.fov_y < math.pi:
+        raise RenderError(f"Camera {camera.name!r} has a field of view of {camera.fov_y} rad: allowed is 0 to pi.")
+
+
+def world_from_camera(setup: RenderSetup, camera: Camera) -> Pose:
+    """Present pose of a camera, OpenCV axes."""
+    if camera.mount == "world":
+        return camera.mount_from_camera
+    body, link = setup.mounts[camera.mount]
+    if link < 0:
+        position, quat = setup.client.getBasePositionAndOrientation(body)
+        inertial = setup.client.getDynamicsInfo(body, -1)
+        centre = Pose(position=np.array(inertial[3]), quat_xyzw=np.array(inertial[4]))
+        world_from_mount = Pose(position=np.array(position), quat_xyzw=np.array(quat)) @ centre.inverse()
+    else:
+        state = setup.client.getLinkState(body, link, computeForwardKinematics=True)
+        world_from_mount = Pose(position=np.array(state[4]), quat_xyzw=np.array(state[5]))
+    return world_from_mount @ camera.mount_from_camera

@@ -1,0 +1,397 @@
+"""Recorded states, new pictures: any camera, size, renderer or looks, without simulating anything.
+
+A new recording keeps every number of the old one and names it as its origin. With the recording's own cameras and
+looks the pictures come out again as they were before coding, so the coded packets are equal, byte for byte.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+
+from demorec.config import EpisodePlan, GenerateConfig, VideoConfig, read_toml
+from demorec.episode import CameraImages, EpisodeInfo, Frame, Outcome
+from demorec.errors import ConfigError, DemorecError, RecordingError
+from demorec.geometry import Pose, look_at
+from demorec.plain import digest, from_plain
+from demorec.recording import EpisodeWriter, Recording
+from demorec.recording.frames import frames_of
+from demorec.registry import nearest_match
+from demorec.render import Renderer, RenderSetup
+from demorec.rollout import prepare
+from demorec.scene import Camera, Scene
+from demorec.seeding import generator
+from demorec.sim.world import World
+from demorec.tables import CAMERAS, RENDERERS
+from demorec.tasks.vary import vary_looks
+from demorec.variation import Ranges, resolve
+
+
+@dataclass(frozen=True, kw_only=True)
+class FreeCamera:
+    """A camera described in a TOML table of its own; angles in degrees, lengths in metres.
+
+    Attributes:
+        position: In the mount's frame.
+        look_at: Point that it looks at, in the mount's frame; this or `quat_xyzw`.
+        up: Direction that is up in the picture.
+        quat_xyzw: Rotation mount_from_camera, OpenCV axes, in place of `look_at`.
+        fov_y_degrees: Vertical field of view.
+        mount: "world", or a link of the robot.
+        width, height: Pixels; default: as the other cameras.
+    """
+
+    position: tuple[float, float, float]
+    look_at: tuple[float, float, float] | None = None
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    quat_xyzw: tuple[float, float, float, float] | None = None
+    fov_y_degrees: float = 45.0
+    mount: str = "world"
+    width: int | None = None
+    height: int | None = None
+
+    def camera(self, name: str, *, width: int, height: int) -> Camera:
+        """The camera; ConfigError for an impossible description."""
+        if (self.look_at is None) == (self.quat_xyzw is None):
+            raise ConfigError(f"The camera {name!r} needs either look_at or quat_xyzw, not both and not neither.")
+        if not 1.0 <= self.fov_y_degrees <= 170.0:
+            raise ConfigError(f"fov_y_degrees of the camera {name!r} is {self.fov_y_degrees}, allowed are 1 to 170.")
+        try:
+            if self.quat_xyzw is None:
+                assert self.look_at is not None
+                pose = look_at(self.position, self.look_at, self.up)
+            else:
+                length = math.sqrt(sum(v * v for v in self.quat_xyzw))
+                if abs(length - 1.0) > 1e-3:
+                    raise ValueError(f"quat_xyzw has length {length:.4f}, must have 1")
+                pose = Pose(position=np.array(self.position), quat_xyzw=np.array(self.quat_xyzw) / length)
+        except ValueError as error:
+            raise ConfigError(f"The camera {name!r} cannot stand like this ({error}).") from error
+        return Camera(
+            name=name,
+            width=self.width or width,
+            height=self.height or height,
+            fov_y=math.radians(self.fov_y_degrees),
+            mount=self.mount,
+            mount_from_camera=pose,
+        )
+
+
+def read_cameras(path: Path) -> dict[str, FreeCamera]:
+    """Cameras of a TOML file, one table each; ConfigError names every bad key."""
+    cameras = {}
+    for name, table in read_toml(path).items():
+        try:
+            cameras[name] = from_plain(_tuples(table), FreeCamera)
+        except (ValueError, TypeError, AttributeError) as error:
+            raise ConfigError(f"{path}, camera {name!r}: {error}.") from error
+    if not cameras:
+        raise ConfigError(f"The file describes no camera; write a table, e.g. [side] with position and look_at: {path}")
+    return cameras
+
+
+def _tuples(table: Any) -> Any:
+    if not isinstance(table, dict):
+        raise TypeError("a camera is a table of its own, e.g. [side]")
+    return {key: [float(v) for v in value] if isinstance(value, list) else value for key, value in table.items()}
+
+
+@dataclass(frozen=True, kw_only=True)
+class RerenderOptions:
+    """What the new pictures shall be; None keeps what was recorded.
+
+    Attributes:
+        cameras: Names: of the recording, of `free_cameras`, or of the cameras' table.
+        free_cameras: Cameras by pose and field of view.
+        width, height: Pixels, of every camera that does not say its own.
+        renderer: Row of the renderers' table.
+        antialias: Whether edges are smoothed.
+        depth, segmentation: Whether these are recorded too.
+        looks: Seed of random light, colours and textures; None keeps the recorded looks.
+        video: Fields of `VideoConfig` that change.
+    """
+
+    cameras: tuple[str, ...] | None = None
+    free_cameras: Mapping[str, FreeCamera] = field(default_factory=dict)
+    width: int | None = None
+    height: int | None = None
+    renderer: str | None = None
+    antialias: bool | None = None
+    depth: bool | None = None
+    segmentation: bool | None = None
+    looks: int | None = None
+    video: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RerenderReport:
+    """What was done.
+
+    Attributes:
+        source, path: The recording and the new one.
+        num_frames, num_pictures: In it.
+        compared: Cameras whose coded pictures were compared with the recorded ones, because nothing about them was
+            to change.
+        differing: Of these, camera -> first frame whose packet differs.
+    """
+
+    source: Path
+    path: Path
+    num_frames: int
+    num_pictures: int
+    compared: tuple[str, ...] = ()
+    differing: Mapping[str, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class View:
+    """Where the pictures of an episode are taken from.
+
+    Attributes:
+        scene: As it is drawn and recorded; its cameras are where they are believed to be.
+        true_cameras: Where they are: the same, but for the calibration error of `--variation full`.
+        true_from_recorded: Camera name -> that error.
+    """
+
+    scene: Scene
+    true_cameras: tuple[Camera, ...]
+    true_from_recorded: Mapping[str, Pose] = field(default_factory=dict)
+
+
+def recorded_view(info: EpisodeInfo) -> View:
+    """The view of a recording.
+
+    Recorded extrinsics may be off on purpose, as those of a real camera are; where the cameras really were follows
+    from the seed. Only if the scene cannot be drawn again from it (another version, a scene of somebody else's), the
+    recorded cameras are taken for the true ones.
+    """
+    if not info.origin and any(name.startswith("calibration_") for name in info.behaviour):
+        try:
+            config = from_plain(info.config, GenerateConfig)
+            plan = EpisodePlan(config=config, episode_index=info.episode_index, attempt=info.attempt)
+            episode = prepare(plan)
+        except (ValueError, DemorecError):
+            episode = None
+        if episode is not None and episode.info.scene == info.scene:
+            return View(
+                scene=info.scene, true_cameras=episode.cameras, true_from_recorded=dict(episode.true_from_recorded)
+            )
+    return View(scene=info.scene, true_cameras=info.scene.cameras)
+
+
+def new_view(info: EpisodeInfo, options: RerenderOptions) -> View:
+    """The view that the options ask for.
+
+    Raises:
+        ConfigError: An unknown camera, or a picture size that cannot be coded.
+    """
+    old = recorded_view(info)
+    names = options.cameras or tuple(dict.fromkeys((*(c.name for c in info.scene.cameras), *options.free_cameras)))
+    if not names:
+        raise ConfigError("The recording has no cameras: name some with --cameras.")
+    if len(set(names)) != len(names):
+        raise ConfigError(f"A camera is named twice: {' '.join(names)}.")
+    recorded = {camera.name: camera for camera in info.scene.cameras}
+    true = {camera.name: camera for camera in old.true_cameras}
+    width, height = _default_size(info, options)
+    believed_cameras, true_cameras = [], []
+    for name in names:
+        if name in options.free_cameras:
+            believed = actual = options.free_cameras[name].camera(name, width=width, height=height)
+        elif name in recorded:
+            w, h = options.width or recorded[name].width, options.height or recorded[name].height
+            believed, actual = (replace(c, width=w, height=h) for c in (recorded[name], true[name]))
+        elif name in CAMERAS.rows:
+            believed = actual = CAMERAS.load(name).camera(name, info.robot, width=width, height=height)
+        else:
+            known = tuple(dict.fromkeys((*recorded, *options.free_cameras, *CAMERAS.rows)))
+            raise ConfigError(f"Unknown camera {name!r}.{nearest_match(name, known)} Allowed: {', '.join(known)}.")
+        _check_size(believed)
+        believed_cameras.append(believed)
+        true_cameras.append(actual)
+    scene = replace(info.scene, cameras=tuple(believed_cameras))
+    if options.looks is not None:
+        rng = generator(
+            root_seed=options.looks, episode_index=info.episode_index, attempt=info.attempt, purpose="looks"
+        )
+        scene = vary_looks(scene, resolve("full", Ranges()), rng)
+    kept = {name: error for name, error in old.true_from_recorded.items() if name in names and name in recorded}
+    kept = {name: error for name, error in kept.items() if name not in options.free_cameras}
+    return View(scene=scene, true_cameras=tuple(true_cameras), true_from_recorded=kept)
+
+
+def _default_size(info: EpisodeInfo, options: RerenderOptions) -> tuple[int, int]:
+    first = info.scene.cameras[0] if info.scene.cameras else None
+    width = options.width or (first.width if first else int(info.config.get("width", 224)))
+    height = options.height or (first.height if first else int(info.config.get("height", 224)))
+    return width, height
+
+
+def _check_size(camera: Camera) -> None:
+    for what, value in (("width", camera.width), ("height", camera.height)):
+        if not 16 <= value <= 8192 or value % 2:
+            raise ConfigError(f"The {what} of the camera {camera.name!r} is {value}: it must be even, 16 to 8192.")
+
+
+class Painter:
+    """Draws the present state of a world as a view asks for; a context manager that keeps the renderer warm.
+
+    Args:
+        renderer: Row of the renderers' table.
+    """
+
+    def __init__(self, renderer: str) -> None:
+        self._renderer: Renderer = RENDERERS.load(renderer)()
+        self._errors: Mapping[str, Pose] = {}
+
+    def __enter__(self) -> Self:
+        self._renderer.__enter__()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._renderer.__exit__(*exc)
+
+    def setup(self, world: World, view: View, *, depth: bool, segmentation: bool, antialias: bool) -> None:
+        """Take over a world that was just reset to the view's scene."""
+        self._errors = view.true_from_recorded
+        self._renderer.setup(
+            RenderSetup(
+                client=world.client,
+                cameras=view.true_cameras,
+                mounts=world.mounts(),
+                light=view.scene.light,
+                textures=world.textures,
+                depth=depth,
+                segmentation=segmentation,
+                antialias=antialias,
+            )
+        )
+
+    def images(self) -> dict[str, CameraImages]:
+        """Camera name -> images, with the poses at which the cameras are believed to be."""
+        images = self._renderer.render()
+        for name, error in self._errors.items():
+            images[name] = replace(images[name], world_from_camera=images[name].world_from_camera @ error)
+        return images
+
+
+def drawing_config(info: EpisodeInfo, options: RerenderOptions) -> dict[str, Any]:
+    """The recording's config with what the options change about the pictures."""
+    config = dict(info.config)
+    changes = {
+        "renderer": options.renderer,
+        "antialias": options.antialias,
+        "depth": options.depth,
+        "segmentation": options.segmentation,
+        "width": options.width,
+        "height": options.height,
+        "video": {**config.get("video", {}), **options.video} if options.video else None,
+        "cameras": None if options.cameras is None else list(options.cameras),
+    }
+    config |= {name: value for name, value in changes.items() if value is not None}
+    return config
+
+
+def rerender(source: Path, out: Path, options: RerenderOptions, *, overwrite: bool = False) -> RerenderReport:
+    """Draw a recording anew.
+
+    Args:
+        source: The recording.
+        out: The file to be made.
+        options: What is to change.
+        overwrite: Whether `out` may be replaced.
+
+    Raises:
+        RecordingError: The source is damaged or empty, or `out` is there already.
+        ConfigError: The options cannot be.
+        RenderError: The renderer cannot draw the scene.
+    """
+    if out.resolve() == source.resolve():
+        raise ConfigError(f"The new recording would replace its own source, choose another --out: {out}")
+    with Recording(source) as recording:
+        info, columns = recording.info, recording.columns()
+        if columns.num_frames == 0:
+            raise RecordingError(f"The recording has no frames: {source}")
+        view = new_view(info, options)
+        config = drawing_config(info, options)
+        RENDERERS.check_name(str(config.get("renderer", "raster")))
+        video = from_plain(config.get("video", {}), VideoConfig)
+        new_info = replace(
+            info,
+            scene=view.scene,
+            config=config,
+            config_digest=digest(config),
+            origin=f"render of {recording.digest()[:16]}",
+        )
+        out.parent.mkdir(parents=True, exist_ok=True)
+        with (
+            World(info.robot, fps=info.fps) as world,
+            Painter(str(config.get("renderer", "raster"))) as painter,
+            EpisodeWriter(out, new_info, video=video, overwrite=overwrite) as writer,
+        ):
+            world.reset(view.scene)
+            painter.setup(
+                world,
+                view,
+                depth=bool(config.get("depth", False)),
+                segmentation=bool(config.get("segmentation", False)),
+                antialias=bool(config.get("antialias", True)),
+            )
+            for frame in frames_of(recording, columns):
+                writer.write(replace(frame, images=_draw(world, painter, frame)))
+            writer.finish(_outcome(recording))
+        compared, differing = _compare(recording, out, options)
+    return RerenderReport(
+        source=source,
+        path=out,
+        num_frames=columns.num_frames,
+        num_pictures=columns.num_frames * len(view.scene.cameras),
+        compared=compared,
+        differing=differing,
+    )
+
+
+def _draw(world: World, painter: Painter, frame: Frame) -> dict[str, CameraImages]:
+    observation = frame.observation
+    world.set_state(joint_position=observation.joint_position, object_poses=observation.object_poses)
+    return painter.images()
+
+
+def _outcome(recording: Recording) -> Outcome:
+    if recording.outcome is not None:
+        return recording.outcome
+    return Outcome(
+        success=False,
+        checks=(),
+        failure_phase="recording",
+        failure_reason="interrupted",
+        num_frames=recording.num_frames,
+    )
+
+
+def _compare(recording: Recording, out: Path, options: RerenderOptions) -> tuple[tuple[str, ...], dict[str, int]]:
+    """The packets of the cameras that were to stay as they were: equal pictures give equal packets."""
+    if options.looks is not None:
+        return (), {}
+    compared, differing = [], {}
+    with Recording(out) as new:
+        renderer = (recording.info.config.get("renderer"), recording.info.config.get("antialias", True))
+        if renderer != (new.info.config.get("renderer"), new.info.config.get("antialias", True)):
+            return (), {}
+        before = {camera.name: camera for camera in recording.info.scene.cameras}
+        for camera in new.info.scene.cameras:
+            if before.get(camera.name) != camera or new.video_settings(camera.name) != recording.video_settings(
+                camera.name
+            ):
+                continue
+            compared.append(camera.name)
+            pairs = zip(recording.packets(camera.name), new.packets(camera.name), strict=True)
+            first = next((a.frame_index for a, b in pairs if a.data != b.data), None)
+            if first is not None:
+                differing[camera.name] = first
+    return tuple(compared), differing

@@ -1,0 +1,154 @@
+"""An arm with a parallel gripper in the simulator: load it, drive it, read it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from demorec.assets import asset_path
+from demorec.episode import Action, RobotSpec
+from demorec.errors import SceneError
+from demorec.geometry import Array, Pose
+from demorec.kinematics import ArmKinematics
+from demorec.scene import RobotPlacement
+from demorec.sim.urdf_file import urdf_file
+
+POSITION_GAIN = 0.2
+FINGER_SPEED = 0.1
+"""Of each finger, m/s."""
+FINGER_STIFFNESS, FINGER_DAMPING = 30_000.0, 1_000.0
+"""Contact of the finger pads, N/m and N s/m (the values of panda.urdf)."""
+
+
+class Arm:
+    """The robot of a world, freshly loaded into its client.
+
+    Attributes:
+        spec: The robot.
+        body: PyBullet index.
+        links: Link name -> PyBullet link index, -1 for the base.
+        kinematics: Of the arm, in the base frame.
+        target: (n_arm,) joint targets of the last command, rad.
+        gripper_target: Opening of the last command, metres.
+        world_from_base: Pose of the base.
+    """
+
+    def __init__(self, client: Any, spec: RobotSpec, placement: RobotPlacement) -> None:
+        self.spec = spec
+        self.world_from_base = placement.world_from_base
+        self._client = client
+        try:
+            with urdf_file(spec.urdf) as path:
+                self.body = client.loadURDF(
+                    path,
+                    placement.world_from_base.position.tolist(),
+                    placement.world_from_base.quat_xyzw.tolist(),
+                    useFixedBase=True,
+                    globalScaling=placement.scale,
+                )
+        except SceneError:
+            raise
+        except Exception as error:  # PyBullet raises its own bare pybullet.error
+            raise SceneError(f"The robot {spec.name!r} cannot be loaded from {spec.urdf!r} ({error}).") from error
+        info = [client.getJointInfo(self.body, i) for i in range(client.getNumJoints(self.body))]
+        self.links = {spec.base_link: -1} | {row[12].decode(): row[0] for row in info}
+        by_name = {row[1].decode(): row[0] for row in info}
+        self._arm = [by_name[name] for name in spec.arm_joints]
+        self._fingers = [by_name[name] for name in spec.gripper_joints]
+        self._tcp = self.links[spec.tcp_link]
+        self.finger_links = tuple(self.links[name] for name in spec.finger_links)
+        self.kinematics = arm_kinematics(spec, scale=placement.scale)
+        self._forces = list(spec.torque_limit)
+        self._gains = [POSITION_GAIN] * len(self._arm)
+        self._make_gripper()
+        self.place(np.array(placement.joint_position), placement.gripper_width)
+        self.target = np.array(placement.joint_position, dtype=np.float64)
+        self.gripper_target = placement.gripper_width
+
+    def _make_gripper(self) -> None:
+        for link in self.finger_links:
+            self._client.changeDynamics(
+                self.body,
+                link,
+                lateralFriction=1.0,
+                spinningFriction=0.1,
+                rollingFriction=0.0,
+                # Without the anchor a held object creeps by a millimetre in ten seconds.
+                frictionAnchor=1,
+                contactStiffness=FINGER_STIFFNESS,
+                contactDamping=FINGER_DAMPING,
+            )
+        # PyBullet ignores the URDF's mimic joint; without a gear the fingers do not centre the object.
+        left, right = self._fingers
+        gear = self._client.createConstraint(
+            self.body, left, self.body, right, self._client.JOINT_GEAR, [1, 0, 0], [0, 0, 0], [0, 0, 0]
+        )
+        self._client.changeConstraint(gear, gearRatio=-1, erp=0.1, maxForce=50)
+
+    def place(self, joint_position: Array, gripper_width: float) -> None:
+        """Set the arm joints (n_arm,) rad and the opening (m) at once, at rest, without physics."""
+        for joint, position in zip(self._arm, joint_position.tolist(), strict=True):
+            self._client.resetJointState(self.body, joint, position)
+        for joint in self._fingers:
+            self._client.resetJointState(self.body, joint, gripper_width / 2)
+
+    def place_joints(self, joint_position: Array) -> None:
+        """Set all joints (n_joints,), fingers included, at once, at rest, without physics."""
+        for joint, position in zip(self._arm + self._fingers, joint_position.tolist(), strict=True):
+            self._client.resetJointState(self.body, joint, position)
+
+    def command(self, action: Action) -> None:
+        """Begin a control step: the gripper's motors are set for all of it."""
+        for joint in self._fingers:
+            self._client.setJointMotorControl2(
+                self.body,
+                joint,
+                self._client.POSITION_CONTROL,
+                targetPosition=action.gripper_target / 2,
+                force=self.spec.gripper_force,
+                maxVelocity=FINGER_SPEED,
+            )
+        self.gripper_target = action.gripper_target
+
+    def drive(self, joint_target: Array) -> None:
+        """Set the arm's motors to (n_arm,) targets for the next physics step."""
+        self._client.setJointMotorControlArray(
+            self.body,
+            self._arm,
+            self._client.POSITION_CONTROL,
+            targetPositions=joint_target.tolist(),
+            forces=self._forces,
+            positionGains=self._gains,
+        )
+
+    def joint_states(self) -> tuple[Array, Array, Array]:
+        """Positions, velocities and applied motor torques of all joints, each (n_joints,)."""
+        states = self._client.getJointStates(self.body, self._arm + self._fingers)
+        position, velocity, effort = (np.array([state[i] for state in states]) for i in (0, 1, 3))
+        return position, velocity, effort
+
+    def gripper_width(self) -> float:
+        """Opening, metres."""
+        return float(sum(state[0] for state in self._client.getJointStates(self.body, self._fingers)))
+
+    def arm_position(self) -> Array:
+        """(n_arm,) joint positions, rad."""
+        return np.array([state[0] for state in self._client.getJointStates(self.body, self._arm)])
+
+    def world_from_tcp(self) -> Pose:
+        """TCP pose as the simulator has it (the link frame, not the centre of mass)."""
+        state = self._client.getLinkState(self.body, self._tcp, computeForwardKinematics=True)
+        return Pose(position=np.array(state[4]), quat_xyzw=np.array(state[5]))
+
+
+def arm_kinematics(spec: RobotSpec, *, scale: float = 1.0) -> ArmKinematics:
+    """Kinematics of a robot from its URDF."""
+    return ArmKinematics.from_urdf(
+        asset_path(spec.urdf),
+        arm_joints=spec.arm_joints,
+        tcp_link=spec.tcp_link,
+        lower=spec.position_lower,
+        upper=spec.position_upper,
+        scale=scale,
+    )

@@ -1,0 +1,272 @@
+"""One simulated world, built from a `Scene` alone and stepped by commands.
+
+An episode is a pure function of scene and commands: everything is built anew at each reset, in a fixed order, with
+every engine parameter set (PyBullet leaks some of them into later clients of the process).
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from typing import Any, Self
+
+import numpy as np
+
+from demorec.episode import Action, JointSample, Observation, RobotSpec, frame_time_ns
+from demorec.errors import ConfigError, SceneError
+from demorec.geometry import Array, Pose
+from demorec.scene import Body, Physics, Scene, Texture
+from demorec.sim.arm import Arm
+from demorec.sim.bodies import add_body, cover
+from demorec.sim.client import connect
+from demorec.sim.hold import ConstraintHold
+from demorec.textures import texture_pixels
+
+SETTLE_SECONDS = 0.1
+"""Physics time before the first frame, so that objects rest on their support."""
+
+
+class World:
+    """A PyBullet client with one robot and the bodies of a scene; a context manager, reused across episodes.
+
+    Args:
+        robot: The arm.
+        fps: Control steps per second; divides the scene's physics rate.
+        sample_joints: Whether `apply` keeps the joint states of every physics step (see `joint_samples`).
+    """
+
+    def __init__(self, robot: RobotSpec, *, fps: int = 30, sample_joints: bool = False) -> None:
+        self.robot = robot
+        self.fps = fps
+        self.client: Any = connect()
+        self.textures: dict[int, Texture] = {}
+        """Body index -> procedural texture, of the bodies that have one; empty for a scene without cameras."""
+        self.joint_samples: tuple[JointSample, ...] = ()
+        """Of the last control step, both ends left out."""
+        self._sample_joints = sample_joints
+        self._closed = False
+        self._scene: Scene | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Free the client; harmless when called twice."""
+        if not self._closed:
+            self._closed = True
+            self.client.disconnect()
+
+    @property
+    def scene(self) -> Scene:
+        """The scene of the last reset."""
+        if self._scene is None:
+            raise RuntimeError("the world is empty: call reset first")
+        return self._scene
+
+    def reset(self, scene: Scene) -> None:
+        """Empty the world, build `scene` and let it settle for 0.1 s.
+
+        Raises:
+            SceneError: A model file is missing or broken, two bodies have one name, or the scene's robot is another.
+            ConfigError: The frame rate does not divide the physics rate.
+        """
+        if scene.robot.name != self.robot.name:
+            raise SceneError(f"The scene is for the robot {scene.robot.name!r}, this world has {self.robot.name!r}.")
+        names = [body.name for body in scene.bodies]
+        if len(set(names)) != len(names):
+            raise SceneError(f"Two bodies of the scene have one name: {', '.join(sorted(names))}.")
+        if scene.physics.hz % self.fps:
+            raise ConfigError(f"fps is {self.fps}, which does not divide the physics rate of {scene.physics.hz} Hz.")
+        self._scene = scene
+        self._substeps = scene.physics.hz // self.fps
+        self._steps = 0
+        self.joint_samples = ()
+        self.textures = {}
+        self.client.resetSimulation()
+        _set_engine(self.client, scene.physics)
+        self._bodies: dict[str, int] = {}
+        self._specs: dict[str, Body] = {body.name: body for body in scene.bodies}
+        # Fixed order: what stands still, the robot, what moves.
+        for body in scene.bodies:
+            if not body.movable:
+                self._bodies[body.name] = self._add(body)
+        self.arm = Arm(self.client, self.robot, scene.robot)
+        for body in scene.bodies:
+            if body.movable:
+                self._bodies[body.name] = self._add(body)
+        self._inertial = {
+            name: Pose(position=np.array(row[3]), quat_xyzw=np.array(row[4]))
+            for name, index in self._bodies.items()
+            for row in [self.client.getDynamicsInfo(index, -1)]
+        }
+        movable = [self._bodies[body.name] for body in scene.movable]
+        self._hold = ConstraintHold(self.client, self.arm, movable) if scene.hold == "constraint" else None
+        self.arm.command(self._stay())
+        for _ in range(round(SETTLE_SECONDS * scene.physics.hz)):
+            self.arm.drive(self.arm.target)
+            self.client.stepSimulation()
+
+    def _add(self, body: Body) -> int:
+        index = add_body(self.client, body)
+        # Nothing but pictures needs textures.
+        if body.texture is not None and self.scene.cameras:
+            cover(self.client, index, texture_pixels(body.texture))
+            self.textures[index] = body.texture
+        return index
+
+    def _stay(self) -> Action:
+        q = self.arm.target
+        return Action(
+            joint_target=q,
+            gripper_target=self.arm.gripper_target,
+            base_from_tcp_target=self.arm.kinematics.forward(q),
+        )
+
+    def apply(self, command: Action) -> None:
+        """Advance by one control step; the joint targets move linearly from the last command to this one."""
+        start, end = self.arm.target, np.asarray(command.joint_target, dtype=np.float64)
+        if self._hold is not None:
+            self._hold.update(opens=command.gripper_target > self.arm.gripper_target + 1e-6)
+        self.arm.command(command)
+        samples = []
+        for substep in range(1, self._substeps + 1):
+            self.arm.drive(start + (end - start) * (substep / self._substeps))
+            self.client.stepSimulation()
+            if self._sample_joints and substep < self._substeps:
+                position, velocity, effort = self.arm.joint_states()
+                samples.append(
+                    JointSample(
+                        time_ns=frame_time_ns(self._steps * self._substeps + substep, self.scene.physics.hz),
+                        joint_position=position,
+                        joint_velocity=velocity,
+                        joint_effort=effort,
+                    )
+                )
+        self._steps += 1
+        self.joint_samples = tuple(samples)
+        self.arm.target = end.copy()
+
+    def observe(self) -> Observation:
+        """All that is sensed now."""
+        position, velocity, effort = self.arm.joint_states()
+        n = len(self.robot.arm_joints)
+        return Observation(
+            joint_position=position,
+            joint_velocity=velocity,
+            joint_effort=effort,
+            gripper_width=float(position[n:].sum()),
+            base_from_tcp=self.arm.kinematics.forward(position[:n]),
+            object_poses={body.name: self.pose(body.name) for body in self.scene.movable},
+            contact_force=sum(
+                contact[9]
+                for link in self.arm.finger_links
+                for contact in self.client.getContactPoints(bodyA=self.arm.body, linkIndexA=link)
+            ),
+        )
+
+    def body(self, name: str) -> Body:
+        """The scene's body called `name`; KeyError when there is none."""
+        return self._specs[name]
+
+    def body_index(self, name: str) -> int:
+        """PyBullet's index of a body of the scene; KeyError when there is none."""
+        return self._bodies[name]
+
+    def mounts(self) -> dict[str, tuple[int, int]]:
+        """Robot link name -> (body index, link index), for cameras."""
+        return {name: (self.arm.body, link) for name, link in self.arm.links.items()}
+
+    def pose(self, name: str) -> Pose:
+        """`world_from_body` of a body of the scene."""
+        position, quat = self.client.getBasePositionAndOrientation(self._bodies[name])
+        centre = Pose(position=np.array(position), quat_xyzw=np.array(quat))
+        inertial = self._inertial[name]
+        if inertial == Pose():
+            return centre
+        return centre @ inertial.inverse()
+
+    def velocity(self, name: str) -> tuple[Array, Array]:
+        """Linear (m/s) and angular (rad/s) velocity of a body of the scene, each (3,)."""
+        linear, angular = self.client.getBaseVelocity(self._bodies[name])
+        return np.array(linear), np.array(angular)
+
+    def finger_forces(self, name: str) -> tuple[float, ...]:
+        """Normal force (N) of each finger on a body of the scene."""
+        return tuple(
+            float(
+                sum(contact[9] for contact in self.client.getContactPoints(self.arm.body, self._bodies[name], link, -1))
+            )
+            for link in self.arm.finger_links
+        )
+
+    def pressed_from_above(self, name: str, *, force: float = 3.0) -> bool:
+        """Whether the hand pushes down on a body with more than `force` N (at a contact steeper than 45 degrees)."""
+        contacts = self.client.getContactPoints(self.arm.body, self._bodies[name])
+        return any(abs(contact[7][2]) > 0.7 and contact[9] > force for contact in contacts)
+
+    def touches_robot(self, name: str) -> bool:
+        """Whether any part of the robot touches a body of the scene."""
+        return bool(self.client.getContactPoints(self.arm.body, self._bodies[name]))
+
+    def touches(self, name: str, other: str, *, gap: float = 5e-4) -> bool:
+        """Whether two bodies of the scene are closer than `gap` metres."""
+        contacts = self.client.getContactPoints(self._bodies[name], self._bodies[other])
+        return any(contact[8] < gap for contact in contacts)
+
+    def state_digest(self) -> str:
+        """SHA-256 (hex) over positions and velocities of all joints and movable bodies, every bit."""
+        sha = hashlib.sha256()
+        position, velocity, _ = self.arm.joint_states()
+        sha.update(position.tobytes())
+        sha.update(velocity.tobytes())
+        for body in self.scene.movable:
+            index = self._bodies[body.name]
+            place, quat = self.client.getBasePositionAndOrientation(index)
+            linear, angular = self.client.getBaseVelocity(index)
+            sha.update(np.array([*place, *quat, *linear, *angular]).tobytes())
+        return sha.hexdigest()
+
+    def set_state(self, *, joint_position: Array | None = None, object_poses: Mapping[str, Pose] | None = None) -> None:
+        """Place joints and bodies without physics, at rest, to draw a recorded state.
+
+        Args:
+            joint_position: (n_joints,), fingers included; None leaves the robot as it is.
+            object_poses: name -> world_from_body; bodies left out stay.
+        """
+        if joint_position is not None:
+            self.arm.place_joints(np.asarray(joint_position, dtype=np.float64))
+            self.arm.target = np.array(joint_position[: len(self.robot.arm_joints)], dtype=np.float64)
+        for name, pose in (object_poses or {}).items():
+            centre = pose if self._inertial[name] == Pose() else pose @ self._inertial[name]
+            self.client.resetBasePositionAndOrientation(
+                self._bodies[name], centre.position.tolist(), centre.quat_xyzw.tolist()
+            )
+
+
+def _set_engine(client: Any, physics: Physics) -> None:
+    """Set every engine parameter, those at their default value too: some survive resetSimulation."""
+    client.setGravity(*physics.gravity)
+    client.setPhysicsEngineParameter(
+        fixedTimeStep=1.0 / physics.hz,
+        numSolverIterations=physics.solver_iterations,
+        numSubSteps=0,
+        deterministicOverlappingPairs=1,
+        enableConeFriction=1,
+        contactBreakingThreshold=0.02,
+        collisionFilterMode=1,
+        enableFileCaching=1,
+        restitutionVelocityThreshold=0.2,
+        erp=0.2,
+        contactERP=0.08,
+        frictionERP=0.2,
+        solverResidualThreshold=1e-7,
+        contactSlop=1e-5,
+        enableSAT=0,
+        constraintSolverType=client.CONSTRAINT_SOLVER_LCP_SI,
+        globalCFM=0.0,
+        minimumSolverIslandSize=1,
+        warmStartingFactor=0.85,
+    )

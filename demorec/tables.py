@@ -1,0 +1,120 @@
+"""The tables of everything that a user can name. Adding a row here and one file makes a new one (CONTRIBUTING.md)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from demorec.registry import Registry
+
+if TYPE_CHECKING:
+    from demorec.check.base import Check
+    from demorec.episode import RobotSpec
+    from demorec.render import Renderer
+    from demorec.render.cameras import CameraPreset
+    from demorec.tasks.base import Task
+
+TASKS: Registry[type[Task]] = Registry(
+    kind="task",
+    rows={
+        "pick_place": "demorec.tasks.pick_place:PickPlace",
+        "place_in_tray": "demorec.tasks.place_in_tray:PlaceInTray",
+        "stack": "demorec.tasks.stack:Stack",
+        "stack_three": "demorec.tasks.stack:StackThree",
+        "unstack": "demorec.tasks.stack:Unstack",
+        "sort_by_color": "demorec.tasks.sort_by_color:SortByColor",
+        "line_up": "demorec.tasks.line_up:LineUp",
+        "pick_from_clutter": "demorec.tasks.pick_from_clutter:PickFromClutter",
+        "pick_shapes": "demorec.tasks.pick_shapes:PickShapes",
+        "tutorial": "demorec.tasks.tutorial:Tutorial",
+    },
+    open_to_others=True,
+)
+
+ROBOTS: Registry[RobotSpec] = Registry(
+    kind="robot",
+    rows={"panda": "demorec.sim.robots.panda:PANDA", "iiwa": "demorec.sim.robots.iiwa:IIWA"},
+)
+
+CAMERAS: Registry[CameraPreset] = Registry(
+    kind="camera",
+    rows={"front": "demorec.render.cameras:FRONT", "wrist": "demorec.render.cameras:WRIST"},
+)
+
+RENDERERS: Registry[type[Renderer]] = Registry(
+    kind="renderer",
+    rows={
+        "raster": "demorec.render.raster:RasterRenderer",
+        "tiny": "demorec.render.tiny:TinyRenderer",
+        "egl": "demorec.render.egl:EglRenderer",
+    },
+)
+
+CHECKS: Registry[Check] = Registry(
+    kind="check",
+    rows={
+        "opens": "demorec.check.file:opens",
+        "checksums": "demorec.check.file:checksums",
+        "topics": "demorec.check.file:topics",
+        "readable": "demorec.check.file:readable",
+        "complete": "demorec.check.file:complete",
+        "frame_times": "demorec.check.timing:frame_times",
+        "joint_sample_times": "demorec.check.timing:joint_sample_times",
+        "stamps": "demorec.check.timing:stamps",
+        "video_frames": "demorec.check.timing:video_frames",
+        "outcome_consistent": "demorec.check.outcome:outcome_consistent",
+        "final_state": "demorec.check.outcome:final_state",
+        "at_rest_in_the_end": "demorec.check.outcome:at_rest_in_the_end",
+        "finite_numbers": "demorec.check.physics:finite_numbers",
+        "joint_position": "demorec.check.physics:joint_position",
+        "joint_velocity": "demorec.check.physics:joint_velocity",
+        "action_acceleration": "demorec.check.physics:action_acceleration",
+        "joint_acceleration": "demorec.check.physics:joint_acceleration",
+        "velocity_matches_position": "demorec.check.physics:velocity_matches_position",
+        "forward_kinematics": "demorec.check.physics:forward_kinematics",
+        "unit_quaternions": "demorec.check.physics:unit_quaternions",
+        "gripper_width": "demorec.check.physics:gripper_width",
+        "command_tracking": "demorec.check.physics:command_tracking",
+        "action_matches_command": "demorec.check.physics:action_matches_command",
+        "idle_frames": "demorec.check.physics:idle_frames",
+        "object_motion": "demorec.check.objects:object_motion",
+        "teleports": "demorec.check.objects:teleports",
+        "starts_as_scene_says": "demorec.check.objects:starts_as_scene_says",
+        "penetration": "demorec.check.objects:penetration",
+        "carried_by_gripper": "demorec.check.objects:carried_by_gripper",
+        "command_lag": "demorec.check.alignment:command_lag",
+        "action_lag": "demorec.check.alignment:action_lag",
+        "gripper_lag": "demorec.check.alignment:gripper_lag",
+        "intrinsics": "demorec.check.calibration:intrinsics",
+        "extrinsics": "demorec.check.calibration:extrinsics",
+        "projection": "demorec.check.calibration:projection",
+        "projected_size": "demorec.check.calibration:projected_size",
+        "depth_matches_scene": "demorec.check.calibration:depth_matches_scene",
+        "segmentation_matches_scene": "demorec.check.calibration:segmentation_matches_scene",
+        "picture_lag": "demorec.check.calibration:picture_lag",
+        "pictures_decode": "demorec.check.pictures:pictures_decode",
+        "pictures_exposed": "demorec.check.pictures:pictures_exposed",
+        "exposure": "demorec.check.pictures:exposure",
+        "frozen": "demorec.check.pictures:frozen",
+        "repeated_pictures": "demorec.check.pictures:repeated_pictures",
+        "distinct_cameras": "demorec.check.pictures:distinct_cameras",
+        "pixel_statistics": "demorec.check.pictures:pixel_statistics",
+        "run_files": "demorec.check.run:run_files",
+        "run_agrees": "demorec.check.run:run_agrees",
+        "run_duplicates": "demorec.check.run:run_duplicates",
+        "run_coverage": "demorec.check.run:run_coverage",
+        "run_dataset": "demorec.check.run:run_dataset",
+        "dataset_readable": "demorec.check.dataset:dataset_readable",
+        "dataset_counts": "demorec.check.dataset:dataset_counts",
+        "dataset_videos": "demorec.check.dataset:dataset_videos",
+        "dataset_statistics": "demorec.check.dataset:dataset_statistics",
+        "dataset_picture_statistics": "demorec.check.dataset:dataset_picture_statistics",
+        "dataset_duplicates": "demorec.check.dataset:dataset_duplicates",
+        "dataset_coverage": "demorec.check.dataset:dataset_coverage",
+        "dataset_joint_limits": "demorec.check.dataset:dataset_joint_limits",
+        "dataset_velocity": "demorec.check.dataset:dataset_velocity",
+        "dataset_forward_kinematics": "demorec.check.dataset:dataset_forward_kinematics",
+        "dataset_action_lag": "demorec.check.dataset:dataset_action_lag",
+        "dataset_sidecar": "demorec.check.dataset:dataset_sidecar",
+        "dataset_opens": "demorec.check.dataset:dataset_opens",
+    },
+)

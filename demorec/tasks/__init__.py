@@ -1,0 +1,1 @@
+"""What the robot does: one task per file, rows in `demorec.tables.TASKS`."""

@@ -1,0 +1,84 @@
+"""Strict conditions of success, one function each, shared by all tasks."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from demorec.episode import Check
+from demorec.geometry import Pose
+from demorec.scene import Body, Goal
+from demorec.sim.world import World
+
+MAX_DISTANCE = 0.02
+MAX_HEIGHT_ERROR = 0.004
+MAX_TILT = math.radians(5.0)
+MAX_SPEED = 0.01
+MAX_SPIN = 0.1
+MIN_OPENING = 0.875
+"""Share of the gripper's full opening that counts as open."""
+
+
+def goal_pose(world: World, goal: Goal) -> Pose:
+    """`world_from_goal` now: it moves with the body that the goal lies on."""
+    if not goal.onto:
+        return goal.onto_from_goal
+    return world.pose(goal.onto) @ goal.onto_from_goal
+
+
+def resting_half_height(body: Body, pose: Pose) -> float:
+    """Half the extent, metres, of the body axis that is nearest to vertical."""
+    vertical = int(np.argmax(np.abs(pose.rotation[2])))
+    return body.shape.extents[vertical] / 2
+
+
+def tilt_of(pose: Pose) -> float:
+    """Angle, rad, between the vertical and the body axis nearest to it."""
+    return math.acos(min(1.0, float(np.abs(pose.rotation[2]).max())))
+
+
+def at_most(name: str, value: float, limit: float, unit: str) -> Check:
+    """A check that holds when value <= limit."""
+    return Check(name=name, value=float(value), limit=limit, unit=unit, passed=bool(value <= limit))
+
+
+def at_least(name: str, value: float, limit: float, unit: str) -> Check:
+    """A check that holds when value >= limit."""
+    return Check(name=name, value=float(value), limit=limit, unit=unit, passed=bool(value >= limit))
+
+
+def on_support(world: World, name: str, onto: str) -> bool:
+    """Whether a body touches what it is meant to stand on: `onto`, or any support for a place in the world."""
+    if onto:
+        return world.touches(name, onto)
+    return any(
+        world.touches(name, body.name) for body in world.scene.bodies if body.role == "support" and body.collides
+    )
+
+
+def placement_checks(world: World, goal: Goal, *, max_distance: float = MAX_DISTANCE) -> tuple[Check, ...]:
+    """That one object lies at its goal: near, on its support, upright, at rest and let go.
+
+    The names end in the object's name when the scene has more than one goal.
+    """
+    suffix = f":{goal.object}" if len(world.scene.goals) > 1 else ""
+    pose, wanted = world.pose(goal.object), goal_pose(world, goal)
+    body = world.body(goal.object)
+    linear, angular = world.velocity(goal.object)
+    # The wanted height is that of the resting face that was meant; a cube may rest on any face.
+    height = wanted.position[2] + resting_half_height(body, pose) - resting_half_height(body, wanted)
+    return (
+        at_most(f"distance_to_goal{suffix}", math.dist(pose.position[:2], wanted.position[:2]), max_distance, "m"),
+        at_most(f"height_error{suffix}", abs(pose.position[2] - height), MAX_HEIGHT_ERROR, "m"),
+        at_least(f"on_support{suffix}", on_support(world, goal.object, goal.onto), 1.0, ""),
+        at_most(f"tilt{suffix}", tilt_of(pose), MAX_TILT, "rad"),
+        at_most(f"speed{suffix}", math.hypot(*linear.tolist()), MAX_SPEED, "m/s"),
+        at_most(f"spin{suffix}", math.hypot(*angular.tolist()), MAX_SPIN, "rad/s"),
+        at_most(f"touched_by_robot{suffix}", world.touches_robot(goal.object), 0.0, ""),
+    )
+
+
+def gripper_open_check(world: World) -> Check:
+    """That the hand has let go."""
+    return at_least("gripper_width", world.arm.gripper_width(), MIN_OPENING * world.robot.gripper_max_width, "m")

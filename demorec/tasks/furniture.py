@@ -1,0 +1,97 @@
+"""What stands still in most scenes: table, floor and target marks, and the colours that have a name."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from demorec.episode import RobotSpec
+from demorec.geometry import Pose
+from demorec.scene import Body, Rgba, RobotPlacement, Shape, Vector3
+from demorec.tasks.sampling import Sampler
+
+TABLE_HEIGHT = 0.62
+MARK_THICKNESS = 0.001
+
+COLORS: Mapping[str, Rgba] = {
+    "red": (0.82, 0.14, 0.12, 1.0),
+    "green": (0.16, 0.62, 0.24, 1.0),
+    "blue": (0.13, 0.33, 0.78, 1.0),
+    "yellow": (0.93, 0.76, 0.13, 1.0),
+    "orange": (0.93, 0.47, 0.10, 1.0),
+    "purple": (0.48, 0.22, 0.62, 1.0),
+}
+"""Colours that have a name in instructions."""
+
+
+def table_and_floor() -> tuple[Body, Body]:
+    """The floor and a table whose top is at z = 0."""
+    floor = Body(
+        name="floor",
+        role="fixture",
+        shape=Shape(kind="box", size=(8.0, 8.0, 0.02)),
+        world_from_body=Pose(position=np.array([0.0, 0.0, -TABLE_HEIGHT - 0.01])),
+        lateral_friction=1.0,
+        rgba=(0.47, 0.49, 0.52, 1.0),
+    )
+    table = Body(
+        name="table",
+        role="support",
+        shape=Shape(kind="box", size=(1.0, 1.5, TABLE_HEIGHT)),
+        world_from_body=Pose(position=np.array([0.35, 0.0, -TABLE_HEIGHT / 2])),
+        lateral_friction=0.6,
+        rgba=(0.80, 0.70, 0.57, 1.0),
+    )
+    return floor, table
+
+
+def mark(name: str, point: tuple[float, float], yaw: float, *, side: float, color_name: str) -> Body:
+    """A thin square on the table that is only seen, its top a millimetre above it."""
+    return Body(
+        name=name,
+        role="target",
+        shape=Shape(kind="box", size=(side, side, MARK_THICKNESS)),
+        world_from_body=Pose.from_yaw((point[0], point[1], MARK_THICKNESS / 2), yaw),
+        rgba=COLORS[color_name],
+        color_name=color_name,
+        collides=False,
+        yaw_symmetry=4,
+    )
+
+
+def cube(
+    name: str,
+    point: tuple[float, float],
+    yaw: float,
+    *,
+    side: float,
+    mass: float,
+    friction: float,
+    color_name: str,
+    z: float = 0.0,
+) -> Body:
+    """A cube standing with its lower face at height `z`, metres."""
+    position: Vector3 = (point[0], point[1], z + side / 2 + 5e-4)
+    return Body(
+        name=name,
+        role="object",
+        shape=Shape(kind="box", size=(side, side, side)),
+        world_from_body=Pose.from_yaw(position, yaw),
+        mass=mass,
+        lateral_friction=friction,
+        rgba=COLORS[color_name],
+        color_name=color_name,
+        yaw_symmetry=4,
+    )
+
+
+def robot_at_origin(robot: RobotSpec, sampler: Sampler) -> RobotPlacement:
+    """The robot at the world's origin, its arm near the home configuration (range joint_spread), gripper open."""
+    spread = sampler.ranges.number("joint_spread")
+    return RobotPlacement(
+        name=robot.name,
+        world_from_base=Pose(),
+        joint_position=tuple(q + sampler.uniform(-spread, spread) for q in robot.home_q),
+        gripper_width=robot.gripper_max_width,
+    )

@@ -1,0 +1,61 @@
+"""A cube goes into a tray."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from demorec.episode import RobotSpec
+from demorec.geometry import Pose
+from demorec.scene import Goal, Scene
+from demorec.tasks.furniture import robot_at_origin, table_and_floor
+from demorec.tasks.placing import TRAY_FLOOR, PlacingTask, random_cube, tray
+from demorec.tasks.sampling import Region, Sampler, wording
+
+CUBES = Region(x=(0.35, 0.65), y=(-0.25, 0.15))
+TRAYS = Region(x=(0.40, 0.50), y=(0.36, 0.40))
+"""Of the tray's middle: its far corner must be within the reach of a hand that points down."""
+
+
+class PlaceInTray(PlacingTask):
+    """Pick up the cube and put it into the tray.
+
+    Task: one cube on the table, one shallow tray at the robot's left.
+    Randomised: the cube's place (0.30 x 0.40 m), yaw, size (3-6 cm), mass (20-200 g), friction (0.4-1.2) and the
+        tray's place and yaw (within 0.25 rad); where in the tray (3 cm about its middle); the arm's initial joints.
+    Success: the cube's centre within 2 cm of the place, on the tray's floor, upright within 5 degrees, at rest, not
+        touched, the gripper open.
+    """
+
+    summary = "a cube into a tray"
+
+    def sample_scene(self, robot: RobotSpec, sampler: Sampler) -> Scene:
+        """Draw a layout."""
+        point = sampler.point(CUBES, what="the cube")
+        yaw = sampler.yaw()
+        body = random_cube(sampler, "red", point, yaw, sides=(0.03, 0.06))
+        target = tray(
+            "blue_tray",
+            sampler.point(TRAYS, what="the tray"),
+            sampler.uniform(-0.25, 0.25),
+            color_name="blue",
+        )
+        offset = (sampler.uniform(-0.03, 0.03), sampler.uniform(-0.02, 0.02))
+        height = TRAY_FLOOR + body.shape.size[2] / 2
+        goal = Goal(
+            object=body.name,
+            onto=target.name,
+            onto_from_goal=Pose.from_yaw((*offset, height), sampler.uniform(-np.pi, np.pi)),
+        )
+        return Scene(robot=robot_at_origin(robot, sampler), bodies=(*table_and_floor(), target, body), goals=(goal,))
+
+    def instruction(self, scene: Scene, rng: np.random.Generator) -> str:
+        """What to do, in words."""
+        goal = scene.goals[0]
+        words = {"cube": scene.body(goal.object).color_name, "tray": scene.body(goal.onto).color_name}
+        return wording(
+            rng,
+            "pick up the {cube} cube and put it into the {tray} tray",
+            "put the {cube} cube in the {tray} tray",
+            "place the {cube} cube inside the {tray} tray",
+            **words,
+        )

@@ -1,0 +1,103 @@
+"""What tasks made of pick-and-place goals share: their script, their strict conditions, common bodies."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from demorec.episode import Check
+from demorec.geometry import Pose
+from demorec.scene import Body, Goal, Rgba, Shape
+from demorec.sim.world import World
+from demorec.tasks.base import Step, Task
+from demorec.tasks.checks import at_most, gripper_open_check, placement_checks
+from demorec.tasks.furniture import COLORS, cube
+from demorec.tasks.sampling import Sampler
+from demorec.tasks.skills import Expert
+
+TRAY_FLOOR = 0.004
+"""Height of a tray's floor above its lower face, metres (tray.urdf)."""
+MAX_DISTURBANCE = 0.02
+"""How far an object that is not to be moved may end from where it was, metres."""
+
+
+class PlacingTask(Task):
+    """A task whose goals are served one after the other, in the order of the scene.
+
+    Success: every goal's object lies at its goal (`placement_checks`), whatever was not to be moved is where it
+    was (2 cm), and the gripper is open.
+    """
+
+    def script(self, expert: Expert) -> Iterator[Step]:
+        """One pick-and-place per goal."""
+        for goal in expert.world.scene.goals:
+            yield from expert.pick_and_place(goal)
+
+    def evaluate(self, world: World) -> tuple[Check, ...]:
+        """Goals, bystanders, gripper."""
+        placed = [check for goal in world.scene.goals for check in placement_checks(world, goal)]
+        return (*placed, *undisturbed_checks(world), gripper_open_check(world))
+
+
+def undisturbed_checks(world: World) -> tuple[Check, ...]:
+    """That each movable body without a goal of its own still lies where it lay."""
+    moved = {goal.object for goal in world.scene.goals}
+    return tuple(
+        at_most(
+            f"disturbed:{body.name}",
+            math.dist(world.pose(body.name).position[:2], body.world_from_body.position[:2]),
+            MAX_DISTURBANCE,
+            "m",
+        )
+        for body in world.scene.movable
+        if body.name not in moved
+    )
+
+
+def tray(name: str, point: tuple[float, float], yaw: float, *, color_name: str) -> Body:
+    """A shallow tray that stands still, its long side (0.27 m) along x at yaw 0."""
+    return Body(
+        name=name,
+        role="target",
+        shape=Shape(kind="urdf", file="demorec:tray.urdf", size=(0.27, 0.21, 0.019)),
+        world_from_body=Pose.from_yaw((point[0], point[1], 0.0005), yaw),
+        lateral_friction=0.6,
+        # Paler than the cubes, so that a cube shows on a tray of its own colour.
+        rgba=_paler(COLORS[color_name]),
+        color_name=color_name,
+        yaw_symmetry=2,
+    )
+
+
+def _paler(rgba: Rgba) -> Rgba:
+    red, green, blue = (0.55 * channel + 0.45 * 0.92 for channel in rgba[:3])
+    return (red, green, blue, rgba[3])
+
+
+def random_cube(
+    sampler: Sampler, color_name: str, point: tuple[float, float], yaw: float, *, sides: tuple[float, float]
+) -> Body:
+    """A cube on the table with drawn side (m), mass (20-200 g) and friction (0.4-1.2)."""
+    return cube(
+        f"{color_name}_cube",
+        point,
+        yaw,
+        side=sampler.named("cube_side", *sides),
+        mass=sampler.named("cube_mass", 0.02, 0.2),
+        friction=sampler.named("cube_friction", 0.4, 1.2),
+        color_name=color_name,
+    )
+
+
+def onto_cube(object_: Body, base: Body, *, yaw: float = 0.0) -> Goal:
+    """The goal that one cube stands centred on another."""
+    height = (base.shape.size[2] + object_.shape.size[2]) / 2
+    return Goal(object=object_.name, onto=base.name, onto_from_goal=Pose.from_yaw((0.0, 0.0, height), yaw))
+
+
+def on_table(object_: Body, point: tuple[float, float], yaw: float, *, yaw_symmetry: int = 4) -> Goal:
+    """The goal that an object stands upright at a point of the table."""
+    pose = Pose.from_yaw(np.array([point[0], point[1], object_.shape.extents[2] / 2]), yaw)
+    return Goal(object=object_.name, onto="", onto_from_goal=pose, yaw_symmetry=yaw_symmetry)

@@ -1,0 +1,185 @@
+"""Random layouts: numbers for placements, and rejection sampling with a bound."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+
+from demorec.errors import SceneError
+from demorec.geometry import Array
+from demorec.scene import Vector3
+from demorec.seeding import generator
+from demorec.variation import PRESETS, Ranges
+
+MAX_TRIES = 1000
+STRATIFIED_NUMBERS = 12
+"""How many placements of a layout are spread evenly: x, y and yaw of the first four objects."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Region:
+    """A rectangle on the table, metres, world frame, cut by a ring about the robot's base.
+
+    Attributes:
+        x, y: (low, high).
+        min_radius, max_radius: Distance from the base at (0, 0) that the hand reaches while it points down.
+    """
+
+    x: tuple[float, float]
+    y: tuple[float, float]
+    min_radius: float = 0.30
+    max_radius: float = 0.72
+
+    def contains(self, point: tuple[float, float]) -> bool:
+        """Whether a point (x, y) is inside."""
+        radius = math.hypot(*point)
+        return (
+            self.x[0] <= point[0] <= self.x[1]
+            and self.y[0] <= point[1] <= self.y[1]
+            and self.min_radius <= radius <= self.max_radius
+        )
+
+    def cut(self, other: Region, what: str) -> Region:
+        """The part of this rectangle within the other; SceneError when there is none."""
+        x = (max(self.x[0], other.x[0]), min(self.x[1], other.x[1]))
+        y = (max(self.y[0], other.y[0]), min(self.y[1], other.y[1]))
+        if x[0] >= x[1] or y[0] >= y[1]:
+            raise SceneError(
+                f"The held-out rectangle x {other.x}, y {other.y} lies outside of where {what} is placed "
+                f"(x {self.x}, y {self.y}): choose another with ranges held_out_x and held_out_y."
+            )
+        return replace(self, x=x, y=y)
+
+
+WORKSPACE = Region(x=(0.35, 0.65), y=(-0.25, 0.25))
+"""Where objects are placed unless a task says otherwise."""
+
+
+@dataclass
+class Sampler:
+    """Draws the numbers of a layout.
+
+    Attributes:
+        rng: The stream of purpose "scene".
+        unit_point: Coordinates in 0..1 of a stratified point (Sobol, Latin hypercube): the first placements take
+            theirs from it, one per call of `placement`; empty for plain random sampling.
+        ranges: Resolved ranges of the run, for what `named` draws and for the initial joints.
+        split: "train" keeps every point out of the held-out rectangle, "eval" puts the first one into it.
+        fixed: Whether the task's exact layout is wanted, of those that have one.
+    """
+
+    rng: np.random.Generator
+    unit_point: Sequence[float] = ()
+    ranges: Ranges = PRESETS["mild"]
+    split: Literal["all", "train", "eval"] = "all"
+    fixed: bool = False
+    _used: int = field(default=0, init=False)
+    _points: int = field(default=0, init=False)
+
+    def uniform(self, low: float, high: float) -> float:
+        """A number in low..high."""
+        return float(self.rng.uniform(low, high))
+
+    def named(self, name: Literal["cube_side", "cube_mass", "cube_friction"], low: float, high: float) -> float:
+        """A number in the user's range of that name, or in the task's own low..high."""
+        chosen = getattr(self.ranges, name)
+        return self.uniform(*((low, high) if chosen is None else chosen))
+
+    def choice[T](self, options: Sequence[T]) -> T:
+        """One of the options."""
+        return options[int(self.rng.integers(len(options)))]
+
+    def placement(self, low: float, high: float) -> float:
+        """A number in low..high that is spread evenly over the episodes of a stratified run."""
+        if self._used < len(self.unit_point):
+            value = self.unit_point[self._used]
+            self._used += 1
+            return low + (high - low) * value
+        return self.uniform(low, high)
+
+    def yaw(self) -> float:
+        """An angle in -pi..pi."""
+        return self.placement(-math.pi, math.pi)
+
+    def point(
+        self,
+        region: Region,
+        *,
+        away_from: Sequence[tuple[float, float]] = (),
+        min_distance: float = 0.0,
+        accept: Callable[[tuple[float, float]], bool] = lambda point: True,
+        what: str = "an object",
+    ) -> tuple[float, float]:
+        """A point (x, y) in a region, at least `min_distance` from the points of `away_from`.
+
+        Raises:
+            SceneError: None was found in 1000 tries.
+        """
+        held_out = Region(
+            x=self.ranges.range("held_out_x"), y=self.ranges.range("held_out_y"), min_radius=0.0, max_radius=math.inf
+        )
+        self._points += 1
+        if self.split == "eval" and self._points == 1:
+            region = region.cut(held_out, what)
+        for _ in range(MAX_TRIES):
+            candidate = (self.placement(*region.x), self.placement(*region.y))
+            far = all(math.dist(candidate, other) >= min_distance for other in away_from)
+            allowed = self.split != "train" or not held_out.contains(candidate)
+            if far and allowed and region.contains(candidate) and accept(candidate):
+                return candidate
+        raise SceneError(
+            f"No place was found for {what} in {MAX_TRIES} tries: x {region.x}, y {region.y}, {min_distance:g} m from "
+            f"{len(away_from)} others; widen the region or place fewer or smaller objects."
+        )
+
+
+def stratified_point(
+    method: Literal["random", "sobol", "lhs"], *, root_seed: int, episode_index: int, block: int
+) -> tuple[float, ...]:
+    """Coordinates in 0..1 of one episode's layout, spread evenly over the episodes of a run; empty for "random".
+
+    Args:
+        method: A scrambled Sobol sequence, or one Latin hypercube per `block` episodes (scipy.stats.qmc).
+        root_seed: Of the run.
+        episode_index: Which point.
+        block: Episodes in one Latin hypercube.
+    """
+    if method == "random":
+        return ()
+    if method == "sobol":
+        return tuple(float(v) for v in _sobol(root_seed, episode_index))
+    cube, row = divmod(episode_index, block)
+    return tuple(float(v) for v in _latin_hypercube(root_seed, cube, block)[row])
+
+
+def _sobol(root_seed: int, index: int) -> Array:
+    from scipy.stats import qmc
+
+    rng = generator(root_seed=root_seed, episode_index=0, attempt=0, purpose="sampling")
+    sequence = qmc.Sobol(d=STRATIFIED_NUMBERS, scramble=True, seed=rng)
+    if index:
+        sequence.fast_forward(index)
+    return np.asarray(sequence.random(1)[0], dtype=np.float64)
+
+
+@functools.lru_cache(maxsize=4)
+def _latin_hypercube(root_seed: int, cube: int, block: int) -> Array:
+    from scipy.stats import qmc
+
+    rng = generator(root_seed=root_seed, episode_index=cube, attempt=1, purpose="sampling")
+    return np.asarray(qmc.LatinHypercube(d=STRATIFIED_NUMBERS, seed=rng).random(block), dtype=np.float64)
+
+
+def at(point: tuple[float, float], z: float) -> Vector3:
+    """A point on the table as (x, y, z)."""
+    return (point[0], point[1], z)
+
+
+def wording(rng: np.random.Generator, *templates: str, **words: str) -> str:
+    """One of several wordings of an instruction, filled in."""
+    return templates[int(rng.integers(len(templates)))].format(**words)

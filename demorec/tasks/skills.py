@@ -1,0 +1,391 @@
+"""The pick-and-place skill: every task of the arm is a sequence of it.
+
+perceive, approach, descend, close, lift, transport, lower, release, retreat, verify; tried again up to three times.
+The poses of objects are looked at only where a camera could see them still: before the approach and before lowering.
+No step is wasted waiting: a policy that learns from idle frames learns to stand still.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Generator, Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from demorec.episode import Action, Event
+from demorec.geometry import Array, Pose, wrap_angle
+from demorec.motion import MotionLimits, plan_straight
+from demorec.scene import Body, Goal, yaw_of
+from demorec.sim.world import World
+from demorec.tasks.base import Behaviour, Step
+from demorec.tasks.checks import goal_pose, on_support, placement_checks, resting_half_height
+from demorec.tasks.grasping import grasp_yaws, hand_down, hand_yaw, raised, symmetric_yaws
+
+MAX_TRIES = 3
+FREE_SPEED, DESCEND_SPEED, LIFT_SPEED, TOUCH_DOWN_SPEED = 0.6, 0.25, 0.3, 0.08
+"""Peak speeds of the TCP, m/s."""
+SETTLE_TOLERANCE, SETTLE_SECONDS = 0.03, 0.1
+"""Joint error, rad, at which a motion counts as finished; waited for at most so long."""
+ARRIVAL_TOLERANCE, ARRIVAL_SECONDS = 0.006, 0.34
+"""The same after a free motion: the expert goes on only where it wanted to be. If it went on while exploration noise
+still held the arm a centimetre off, a policy would learn that a centimetre off is good enough."""
+LOST_WIDTH = 0.012
+"""Opening, metres, below which the hand holds nothing."""
+TRANSPORT_HEIGHT = 0.10
+"""Above the goal, metres."""
+
+
+class GaveUp(Exception):
+    """The expert cannot go on; ends the script with a failure."""
+
+    def __init__(self, phase: str, reason: str) -> None:
+        super().__init__(phase, reason)
+        self.phase, self.reason = phase, reason
+
+
+@dataclass
+class Expert:
+    """The arm's skills in one episode; its methods yield control steps.
+
+    Attributes:
+        world: After reset.
+        behaviour: How fast, how high, with which errors.
+        phase: Present phase.
+        num_retries: How often something had to be tried again.
+        trouble: (phase, reason) of what went wrong last.
+    """
+
+    world: World
+    behaviour: Behaviour = field(default_factory=Behaviour)
+    phase: str = "start"
+    num_retries: int = 0
+    trouble: tuple[str, str] = ("", "")
+    _events: list[Event] = field(default_factory=list)
+    _free: bool = False
+    _missing: bool = False
+    _has_missed: bool = False
+    _clear_height: float = -math.inf
+
+    def __post_init__(self) -> None:
+        robot = self.world.robot
+        self.arm = self.world.arm.kinematics
+        self.joint_target = self.world.arm.target.copy()
+        self.gripper_target = self.world.arm.gripper_target
+        self.limits = MotionLimits(
+            joint_velocity=0.6 * np.array(robot.velocity_limit),
+            joint_acceleration=0.8 * np.array(robot.acceleration_limit),
+        )
+        home = self.arm.forward(np.array(robot.home_q)).position
+        # Azimuths are seen from the first joint's axis, which need not be the base frame's.
+        self._axis = self.arm.origins[0]
+        self._home_azimuth = math.atan2(home[1] - self._axis[1], home[0] - self._axis[0])
+        self._base_from_world = self.world.arm.world_from_base.inverse()
+
+    @property
+    def open_width(self) -> float:
+        """The gripper's full opening, metres."""
+        return self.world.robot.gripper_max_width
+
+    def note(self, name: str, message: str, *, trouble: bool = False) -> None:
+        """Record an event with the next step; `trouble` also keeps it as the reason of a failure."""
+        self._events.append(Event(name=name, message=message, level="warning" if trouble else "info"))
+        if trouble:
+            self.trouble = (self.phase, name)
+
+    def step(self) -> Step:
+        """The control step that holds the present targets."""
+        events, self._events = tuple(self._events), []
+        return Step(
+            action=Action(
+                joint_target=self.joint_target.copy(),
+                gripper_target=self.gripper_target,
+                base_from_tcp_target=self.arm.forward(self.joint_target),
+            ),
+            phase=self.phase,
+            noise_allowed=self._free and self.tcp().position[2] > self._clear_height,
+            events=events,
+            is_deliberate_miss=self._missing,
+        )
+
+    def tcp(self) -> Pose:
+        """`world_from_tcp` as sensed."""
+        return self.world.arm.world_from_base @ self.arm.forward(self.world.arm.arm_position())
+
+    def tcp_target(self) -> Pose:
+        """`world_from_tcp` as commanded."""
+        return self.world.arm.world_from_base @ self.arm.forward(self.joint_target)
+
+    def rest_for(self, world_from_tcp: Pose) -> Array:
+        """The home configuration turned towards a pose: what the goal configuration is pulled to."""
+        position = (self._base_from_world @ world_from_tcp).position
+        rest = np.array(self.world.robot.home_q)
+        rest[0] += wrap_angle(math.atan2(position[1] - self._axis[1], position[0] - self._axis[0]) - self._home_azimuth)
+        return rest
+
+    def reaches(self, world_from_tcp: Pose) -> bool:
+        """Whether the arm can get there."""
+        goal = self._base_from_world @ world_from_tcp
+        return self.arm.inverse(goal, start=self.joint_target, rest=self.rest_for(world_from_tcp)) is not None
+
+    def move(
+        self,
+        world_from_tcp: Pose,
+        *,
+        speed: float,
+        free: bool = False,
+        settle: bool = True,
+        until: Callable[[], bool] | None = None,
+    ) -> Iterator[Step]:
+        """Move in a straight line.
+
+        Args:
+            world_from_tcp: Where to.
+            speed: Peak speed, m/s; multiplied by the behaviour's speed.
+            free: Whether exploration noise is allowed.
+            settle: Whether to wait, for a fraction of a second, until the joints have caught up.
+            until: Stop as soon as this holds.
+
+        Raises:
+            GaveUp: The arm cannot follow this line.
+        """
+        self._free = free
+        path = plan_straight(
+            self.arm,
+            start=self.joint_target,
+            goal=self._base_from_world @ world_from_tcp,
+            rest=self.rest_for(world_from_tcp),
+            speed=speed * self.behaviour.speed,
+            turn_speed=self.behaviour.speed,
+            limits=self.limits,
+            dt=1.0 / self.world.fps,
+        )
+        if path is None:
+            raise GaveUp(self.phase, "unreachable")
+        for joint_target in path:
+            self.joint_target = joint_target
+            yield self.step()
+            if until is not None and until():
+                self.joint_target = self.world.arm.arm_position()
+                return
+        if settle:
+            self._free = False
+            tolerance, seconds = (ARRIVAL_TOLERANCE, ARRIVAL_SECONDS) if free else (SETTLE_TOLERANCE, SETTLE_SECONDS)
+            for _ in range(max(1, round(seconds * self.world.fps))):
+                if float(np.abs(self.world.arm.arm_position() - self.joint_target).max()) < tolerance:
+                    return
+                yield self.step()
+
+    def set_gripper(self, width: float, *, max_seconds: float, done: Callable[[], bool]) -> Iterator[Step]:
+        """Command an opening (m) and hold still until `done`, or until the time is over."""
+        self._free = False
+        self.gripper_target = width
+        for _ in range(max(1, round(max_seconds * self.world.fps))):
+            yield self.step()
+            if done():
+                return
+
+    def pick_and_place(self, goal: Goal) -> Iterator[Step]:
+        """Bring one object to its goal, trying again after a miss, a drop or a bad placement.
+
+        Raises:
+            GaveUp: Out of reach, or three tries were not enough.
+        """
+        for attempt in range(MAX_TRIES):
+            if attempt > 0:
+                self.num_retries += 1
+            self._missing = self.behaviour.misses and not self._has_missed
+            picked = yield from self.pick(goal.object)
+            self._missing = False
+            if not picked:
+                continue
+            placed = yield from self.place(goal)
+            if placed:
+                return
+        raise GaveUp(*self.trouble)
+
+    def reachable_grasp(self, name: str, *, above_by: float) -> Pose:
+        """`world_from_tcp` to grasp an object, reachable there and `above_by` metres higher.
+
+        Raises:
+            GaveUp: Out of reach at every yaw.
+        """
+        pose = self.world.pose(name)
+        for grasp in (self._perturbed(grasp) for grasp in self._grasps(self.world.body(name), pose)):
+            if self.reaches(grasp) and self.reaches(raised(grasp, above_by)):
+                self.note("grasp", f"grasp {name} at yaw {hand_yaw(grasp):.4f} rad")
+                return grasp
+        self.note("unreachable", f"{name} at {np.round(pose.position, 3).tolist()} is out of reach", trouble=True)
+        raise GaveUp(self.phase, "unreachable")
+
+    def reachable_place(self, position: tuple[float, float, float]) -> Pose:
+        """`world_from_tcp` at a position, the hand pointing down at the reachable yaw nearest to the present one.
+
+        Raises:
+            GaveUp: Out of reach at every yaw.
+        """
+        now = hand_yaw(self.tcp())
+        yaws = sorted(symmetric_yaws(now, 24), key=lambda yaw: abs(wrap_angle(yaw - now)))
+        place = next((p for p in (hand_down(position, yaw) for yaw in yaws) if self.reaches(p)), None)
+        if place is None:
+            self.note("unreachable", f"{np.round(position, 3).tolist()} is out of reach", trouble=True)
+            raise GaveUp(self.phase, "unreachable")
+        return place
+
+    def pick(self, name: str) -> Generator[Step, None, bool]:
+        """Grasp and lift an object; the generator returns whether it is held."""
+        world, behaviour = self.world, self.behaviour
+        self.phase = "perceive"
+        above_by = behaviour.approach_height
+        start_height = world.pose(name).position[2]
+        grasp = self.reachable_grasp(name, above_by=above_by)
+
+        self.phase = "approach"
+        self.gripper_target = self.open_width
+        self._clear_height = -math.inf
+        yield from self.move(raised(grasp, above_by), speed=FREE_SPEED, free=True)
+        self.phase = "descend"
+        yield from self.move(grasp, speed=DESCEND_SPEED, until=lambda: world.pressed_from_above(name))
+
+        self.phase = "close"
+        yield from self.set_gripper(0.0, max_seconds=1.5, done=steady_width(world))
+        held = self.holds(name)
+        if held:
+            self.phase = "lift"
+            yield from self.move(raised(grasp, behaviour.lift_height), speed=LIFT_SPEED)
+            risen = world.pose(name).position[2] - start_height
+            held = self.holds(name) and risen > 0.5 * behaviour.lift_height
+        if held:
+            return True
+        deliberate, self._missing = self._missing, False
+        self._has_missed = True
+        self.note("miss", f"missed {name}" + (" on purpose" if deliberate else ""), trouble=not deliberate)
+        yield from self._recover(raised(grasp, above_by))
+        return False
+
+    def holds(self, name: str) -> bool:
+        """Whether both fingers press on an object that keeps them apart."""
+        return min(self.world.finger_forces(name)) > 0.5 and self.world.arm.gripper_width() > 0.01
+
+    def place(self, goal: Goal) -> Generator[Step, None, bool]:
+        """Carry the held object to its goal and let go; the generator returns whether it lies well."""
+        world = self.world
+        name = goal.object
+        self.phase = "transport"
+        wanted = self._place_pose(goal)
+        height = max(self.tcp_target().position[2], wanted.position[2] + TRANSPORT_HEIGHT)
+        if self.tcp_target().position[2] < height - 1e-3:
+            here = self.tcp_target()
+            yield from self.move(raised(here, height - here.position[2]), speed=LIFT_SPEED)
+        self.note("place", f"place {name} at hand yaw {hand_yaw(wanted):.4f} rad")
+        yield from self.move(
+            raised(wanted, height - wanted.position[2]), speed=FREE_SPEED, free=True, until=lambda: not self._is_full()
+        )
+        if self._is_full():
+            self.phase = "lower"
+            wanted = self._place_pose(goal, keep_yaw=True)
+            yield from self.move(raised(wanted, 0.015), speed=LIFT_SPEED, settle=False)
+            yield from self.move(
+                raised(wanted, -0.004),
+                speed=TOUCH_DOWN_SPEED,
+                until=lambda: on_support(world, name, goal.onto),
+            )
+        if not self._is_full():
+            self.note("drop", f"dropped {name}", trouble=True)
+            here = self.tcp()
+            yield from self._recover(raised(here, max(0.0, 0.2 - here.position[2])))
+            return False
+
+        self.phase = "release"
+        open_enough = self.open_width - 0.002
+        yield from self.set_gripper(
+            self.open_width, max_seconds=1.0, done=lambda: world.arm.gripper_width() > open_enough
+        )
+        self.phase = "retreat"
+        here = self.tcp_target()
+        self._clear_height = here.position[2] + 0.07
+        away = raised(here, max(0.1, self.behaviour.approach_height))
+        yield from self.move(away, speed=LIFT_SPEED, free=True, settle=False)
+        self._clear_height = -math.inf
+        self.phase = "verify"
+        failed = [check.name for check in placement_checks(world, goal) if not check.passed]
+        if failed:
+            self.note(f"misplaced_{failed[0]}", f"{name} lies badly: {', '.join(failed)}", trouble=True)
+        return not failed
+
+    def _is_full(self) -> bool:
+        return self.world.arm.gripper_width() > LOST_WIDTH
+
+    def _recover(self, world_from_tcp: Pose) -> Iterator[Step]:
+        """Let go of whatever is there and rise."""
+        self.phase = "recover"
+        self.joint_target = self.world.arm.arm_position()
+        opened = self.open_width - 0.002
+        yield from self.set_gripper(
+            self.open_width, max_seconds=0.3, done=lambda: self.world.arm.gripper_width() > opened
+        )
+        self._clear_height = self.tcp().position[2] + 0.07
+        yield from self.move(world_from_tcp, speed=0.4, free=True)
+        self._clear_height = -math.inf
+
+    def _grasps(self, body: Body, pose: Pose) -> list[Pose]:
+        """Grasp poses `world_from_tcp` of a body, the yaw nearest to the hand's present one first."""
+        robot = self.world.robot
+        half = resting_half_height(body, pose)
+        top, bottom = pose.position[2] + half, pose.position[2] - half
+        # At the centre, but no deeper than the palm allows, and with the finger tips above the support.
+        z = max(pose.position[2], top - (robot.palm_clearance - 0.007), bottom + robot.finger_depth + 0.005)
+        now = hand_yaw(self.tcp())
+        yaws = sorted(grasp_yaws(body, pose, now, self.open_width), key=lambda yaw: abs(wrap_angle(yaw - now)))
+        return [hand_down((pose.position[0], pose.position[1], z), yaw) for yaw in yaws]
+
+    def _perturbed(self, grasp: Pose) -> Pose:
+        """A grasp with the behaviour's offset, perception error and deliberate miss."""
+        behaviour = self.behaviour
+        yaw = hand_yaw(grasp)
+        shift = np.array([behaviour.perception_x, behaviour.perception_y, 0.0])
+        # The hand's x axis runs along the fingers' faces: a shift that way still grasps.
+        shift = shift + behaviour.grasp_offset * np.array([math.cos(yaw), math.sin(yaw), 0.0])
+        if self._missing:
+            shift = shift + np.array([behaviour.miss_x, behaviour.miss_y, 0.0])
+        return hand_down(grasp.position + shift, yaw + behaviour.perception_yaw)
+
+    def _place_pose(self, goal: Goal, *, keep_yaw: bool = False) -> Pose:
+        """`world_from_tcp` that puts the held object at its goal, with the offset in the hand compensated.
+
+        Raises:
+            GaveUp: Out of reach at every allowed yaw.
+        """
+        body, pose, hand = self.world.body(goal.object), self.world.pose(goal.object), self.tcp()
+        wanted = goal_pose(self.world, goal)
+        hand_from_object = (hand.inverse() @ pose).position
+        now = hand_yaw(hand)
+        height = wanted.position[2] - resting_half_height(body, wanted) + resting_half_height(body, pose)
+        centre = np.array([wanted.position[0], wanted.position[1], height])
+        if keep_yaw or goal.yaw_symmetry == 0:
+            yaws = [now]
+        else:
+            yaws = symmetric_yaws(yaw_of(wanted) + now - yaw_of(pose), goal.yaw_symmetry)
+            yaws.sort(key=lambda yaw: abs(wrap_angle(yaw - now)))
+        for yaw in yaws:
+            down = hand_down((0.0, 0.0, 0.0), yaw)
+            place = hand_down(centre - down.apply(hand_from_object), yaw)
+            if self.reaches(place) and self.reaches(raised(place, TRANSPORT_HEIGHT)):
+                return place
+        self.note("unreachable", f"the goal of {goal.object} is out of reach", trouble=True)
+        raise GaveUp(self.phase, "unreachable")
+
+
+def steady_width(world: World, *, tolerance: float = 0.006, seconds: float = 0.06) -> Callable[[], bool]:
+    """A condition that holds once the opening has changed by less than `tolerance` (m/s) for some time."""
+    last, steady = math.inf, 0
+    needed = max(1, round(seconds * world.fps))
+
+    def done() -> bool:
+        nonlocal last, steady
+        width = world.arm.gripper_width()
+        steady = steady + 1 if abs(width - last) * world.fps < tolerance else 0
+        last = width
+        return steady >= needed
+
+    return done

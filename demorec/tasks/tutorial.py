@@ -1,0 +1,168 @@
+"""The scene of the tutorial that this project grew from: a big cube as table, a robot beside it, a small cube."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from typing import ClassVar
+
+import numpy as np
+
+from demorec.episode import Check, RobotSpec
+from demorec.geometry import Pose
+from demorec.render.cameras import FRONT, CameraPreset
+from demorec.scene import Body, Goal, RobotPlacement, Scene, Shape
+from demorec.sim.world import World
+from demorec.tasks.base import Step, Task
+from demorec.tasks.checks import (
+    MAX_SPEED,
+    MAX_SPIN,
+    MAX_TILT,
+    at_least,
+    at_most,
+    gripper_open_check,
+    tilt_of,
+)
+from demorec.tasks.furniture import COLORS
+from demorec.tasks.grasping import raised
+from demorec.tasks.sampling import Sampler, wording
+from demorec.tasks.skills import Expert, steady_width
+
+ROBOT_SCALE = 1.3
+BASE = (1.0, 0.0, 0.1)
+CUBE_SIDE = 0.05 * 1.5
+CUBE_START = (1.0, 1.0, 0.1)
+TABLE_SIDE = 0.5
+ABOVE_CUBE = 0.25
+RELEASE_POINT = (0.16, 0.14, 0.80)
+MAX_FALL_SECONDS = 3.0
+
+
+class Tutorial(Task):
+    """Carry the cube over the table and let it drop.
+
+    Task: cube.urdf scaled by 0.5 stands fixed at the origin as a table; the Panda, scaled by 1.3, stands at
+        [1, 0, 0.1]; a red cube_small.urdf scaled by 1.5 lies at [1, 1, 0.1]. The steps are the tutorial's: open the
+        hand, go 25 cm above the cube with the hand down, close, hold by a fixed constraint, carry to 80 cm above
+        the table, open, release.
+    Randomised: the cube's place (an arc of 0.5 rad and 8 cm about the tutorial's point), yaw and the arm's initial
+        joints; nothing with `--fixed`.
+    Success: the cube lies on the table, at rest (1 cm/s, 0.1 rad/s), on a face (5 degrees), not touched, the
+        gripper open.
+
+    What was changed, since the listing cannot work as printed: unscaled, the cube lies 1.0 m from the base and the
+    hand-down reach is 0.80 m, so only the scale of the full listing (1.3) is used. Closing 25 cm above the cube
+    holds nothing, so a step "descend" goes down to it before "close". The cube (75 mm) is wider than the unscaled
+    hand's play allows, and fits the scaled one (104 mm). "80 cm above the table" is taken above its origin (55 cm
+    above its top), over the half that is nearer to the robot: higher or further is out of reach.
+    """
+
+    summary = "the tutorial's scene: a cube dropped onto a table from 80 cm, held by a constraint"
+    has_fixed_layout = True
+    camera_presets: ClassVar[Mapping[str, CameraPreset]] = {
+        "front": replace(FRONT, eye=(-1.35, 1.75, 1.55), target=(0.66, 0.38, 0.42), fov_y=math.radians(36.0))
+    }
+
+    def sample_scene(self, robot: RobotSpec, sampler: Sampler) -> Scene:
+        """Draw a layout, or give the tutorial's own."""
+        angle, radius, yaw = math.pi / 2, 1.0, 0.0
+        spread = sampler.ranges.number("joint_spread")
+        if sampler.fixed:
+            spread = 0.0
+        else:
+            angle += sampler.placement(-0.25, 0.25)
+            radius = sampler.placement(0.92, 1.0)
+            yaw = sampler.yaw()
+        # Turned towards the side on which cube and table lie.
+        joints = (robot.home_q[0] + 2.0, *robot.home_q[1:])
+        table = Body(
+            name="table",
+            role="support",
+            shape=Shape(kind="urdf", file="cube.urdf", scale=0.5, size=(TABLE_SIDE,) * 3),
+            world_from_body=Pose(),
+            rgba=(0.80, 0.70, 0.57, 1.0),
+        )
+        floor = Body(
+            name="floor",
+            role="fixture",
+            shape=Shape(kind="box", size=(8.0, 8.0, 0.02)),
+            world_from_body=Pose(position=np.array([0.0, 0.0, -0.01])),
+            lateral_friction=1.0,
+            rgba=(0.47, 0.49, 0.52, 1.0),
+        )
+        place = (BASE[0] + radius * math.cos(angle), BASE[1] + radius * math.sin(angle), CUBE_START[2])
+        cube = Body(
+            name="red_cube",
+            role="object",
+            shape=Shape(kind="urdf", file="cube_small.urdf", scale=1.5, size=(CUBE_SIDE,) * 3),
+            world_from_body=Pose.from_yaw(place, yaw),
+            mass=0.1,
+            lateral_friction=0.8,
+            rgba=COLORS["red"],
+            color_name="red",
+            yaw_symmetry=4,
+        )
+        top = TABLE_SIDE / 2 + CUBE_SIDE / 2
+        goal = Goal(
+            object=cube.name,
+            onto=table.name,
+            onto_from_goal=Pose.from_yaw((RELEASE_POINT[0], RELEASE_POINT[1], top)),
+            yaw_symmetry=0,
+        )
+        return Scene(
+            robot=RobotPlacement(
+                name=robot.name,
+                world_from_base=Pose(position=np.array(BASE)),
+                scale=ROBOT_SCALE,
+                joint_position=tuple(q + sampler.uniform(-spread, spread) for q in joints),
+                gripper_width=robot.gripper_max_width * ROBOT_SCALE,
+            ),
+            bodies=(floor, table, cube),
+            goals=(goal,),
+            hold="constraint",
+        )
+
+    def instruction(self, scene: Scene, rng: np.random.Generator) -> str:
+        """What to do, in words."""
+        return wording(rng, "drop the red cube onto the table", "carry the red cube over the table and let it drop")
+
+    def script(self, expert: Expert) -> Iterator[Step]:
+        """The tutorial's steps."""
+        world = expert.world
+        goal = world.scene.goals[0]
+        expert.phase = "open"
+        open_width = expert.open_width
+        yield from expert.set_gripper(
+            open_width, max_seconds=1.0, done=lambda: world.arm.gripper_width() > open_width - 0.002
+        )
+        grasp = expert.reachable_grasp(goal.object, above_by=ABOVE_CUBE)
+        expert.phase = "above_cube"
+        yield from expert.move(raised(grasp, ABOVE_CUBE), speed=0.6, free=True)
+        expert.phase = "descend"
+        yield from expert.move(grasp, speed=0.3)
+        expert.phase = "close"
+        yield from expert.set_gripper(0.0, max_seconds=1.5, done=steady_width(world))
+        expert.phase = "hold"
+        yield from expert.move(raised(grasp, ABOVE_CUBE), speed=0.3)
+        expert.phase = "carry"
+        release = expert.reachable_place(RELEASE_POINT)
+        yield from expert.move(release, speed=0.5)
+        expert.phase = "release"
+        yield from expert.set_gripper(open_width, max_seconds=MAX_FALL_SECONDS, done=lambda: self._rests(world))
+
+    def evaluate(self, world: World) -> tuple[Check, ...]:
+        """The cube lies on the table."""
+        name = world.scene.goals[0].object
+        linear, angular = world.velocity(name)
+        return (
+            at_least("on_table", world.touches(name, "table"), 1.0, ""),
+            at_most("speed", math.hypot(*linear.tolist()), MAX_SPEED, "m/s"),
+            at_most("spin", math.hypot(*angular.tolist()), MAX_SPIN, "rad/s"),
+            at_most("tilt", tilt_of(world.pose(name)), MAX_TILT, "rad"),
+            at_most("touched_by_robot", world.touches_robot(name), 0.0, ""),
+            gripper_open_check(world),
+        )
+
+    def _rests(self, world: World) -> bool:
+        return all(check.passed for check in self.evaluate(world))

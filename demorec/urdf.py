@@ -1,0 +1,136 @@
+"""The joint tree of a URDF: enough for kinematics and for placing links, without the simulator."""
+
+from __future__ import annotations
+
+import math
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+
+from demorec.geometry import Array, Pose
+
+
+@dataclass(frozen=True, kw_only=True)
+class UrdfJoint:
+    """One joint of a URDF.
+
+    Attributes:
+        name, parent, child: Joint, parent link, child link.
+        kind: "revolute", "continuous", "prismatic" or "fixed".
+        parent_from_joint: Pose of the joint frame (= child link frame at position 0).
+        axis: Unit vector in the joint frame.
+        lower, upper: Position limits, rad or m; infinite where the URDF has none.
+    """
+
+    name: str
+    parent: str
+    child: str
+    kind: str
+    parent_from_joint: Pose
+    axis: tuple[float, float, float]
+    lower: float
+    upper: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Urdf:
+    """The joint tree of a URDF, lengths multiplied by `scale`."""
+
+    joints: tuple[UrdfJoint, ...]
+    root: str
+
+    @classmethod
+    def load(cls, path: Path, *, scale: float = 1.0) -> Urdf:
+        """Read the joints of a URDF file; ValueError when it has no single root link."""
+        return cls.parse(path.read_text(), scale=scale)
+
+    @classmethod
+    def parse(cls, text: str, *, scale: float = 1.0) -> Urdf:
+        """The same from its text; ValueError also when that is no XML."""
+        try:
+            robot = ET.fromstring(text)
+        except ET.ParseError as error:
+            raise ValueError(f"the URDF is no XML ({error})") from error
+        joints = tuple(_joint(element, scale) for element in robot.findall("joint"))
+        children = {joint.child for joint in joints}
+        roots = [link.attrib["name"] for link in robot.findall("link") if link.attrib["name"] not in children]
+        if len(roots) != 1:
+            raise ValueError(f"a URDF needs one root link, found {roots}")
+        return cls(joints=joints, root=roots[0])
+
+    def link_poses(self, joint_position: Mapping[str, float]) -> dict[str, Pose]:
+        """Link name -> base_from_link for the given joint positions (rad, m); joints left out are at 0."""
+        poses = {self.root: Pose()}
+        waiting = list(self.joints)
+        while waiting:
+            ready = [joint for joint in waiting if joint.parent in poses]
+            for joint in ready:
+                moved = joint_motion(joint, joint_position.get(joint.name, 0.0))
+                poses[joint.child] = poses[joint.parent] @ joint.parent_from_joint @ moved
+            waiting = [joint for joint in waiting if joint.child not in poses]
+            if not ready:
+                raise ValueError(f"the joints {[joint.name for joint in waiting]} hang on no link")
+        return poses
+
+    def path_to(self, link: str) -> tuple[UrdfJoint, ...]:
+        """The joints from the root to `link`; KeyError when there is no such link."""
+        by_child = {joint.child: joint for joint in self.joints}
+        path: list[UrdfJoint] = []
+        while link != self.root:
+            path.append(by_child[link])
+            link = by_child[link].parent
+        return tuple(reversed(path))
+
+
+def joint_motion(joint: UrdfJoint, position: float) -> Pose:
+    """The transform of a joint at `position` (rad or m), about or along its axis."""
+    if joint.kind == "prismatic":
+        return Pose(position=np.array(joint.axis) * position)
+    if joint.kind == "fixed":
+        return Pose()
+    half = math.sin(position / 2)
+    x, y, z = joint.axis
+    return Pose(quat_xyzw=np.array([x * half, y * half, z * half, math.cos(position / 2)]))
+
+
+def _joint(element: ET.Element, scale: float) -> UrdfJoint:
+    def vector(tag: str, attribute: str, default: str) -> list[float]:
+        child = element.find(tag)
+        return [float(v) for v in (default if child is None else child.get(attribute, default)).split()]
+
+    kind = element.attrib["type"]
+    axis = np.array(vector("axis", "xyz", "1 0 0"))
+    length = math.sqrt(float((axis * axis).sum()))
+    limit = element.find("limit")
+    bounded = limit is not None and kind in ("revolute", "prismatic")
+    unit = scale if kind == "prismatic" else 1.0
+    return UrdfJoint(
+        name=element.attrib["name"],
+        parent=cast(ET.Element, element.find("parent")).attrib["link"],
+        child=cast(ET.Element, element.find("child")).attrib["link"],
+        kind=kind,
+        parent_from_joint=Pose(
+            position=np.array(vector("origin", "xyz", "0 0 0")) * scale,
+            quat_xyzw=quat_from_rpy(vector("origin", "rpy", "0 0 0")),
+        ),
+        axis=(1.0, 0.0, 0.0) if length == 0.0 else tuple(float(v) for v in axis / length),  # type: ignore[arg-type]
+        lower=unit * float(cast(ET.Element, limit).get("lower", 0)) if bounded else -math.inf,
+        upper=unit * float(cast(ET.Element, limit).get("upper", 0)) if bounded else math.inf,
+    )
+
+
+def quat_from_rpy(rpy: Sequence[float]) -> Array:
+    """URDF's roll, pitch, yaw about fixed axes (rad) as a unit quaternion (x, y, z, w)."""
+    (sr, sp, sy), (cr, cp, cy) = [math.sin(a / 2) for a in rpy], [math.cos(a / 2) for a in rpy]
+    return np.array(
+        [
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+            cr * cp * cy + sr * sp * sy,
+        ]
+    )

@@ -1,0 +1,157 @@
+"""`demorec export` as a user types it: exit codes, one sentence per error, what it prints."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+from helpers_export import episode_rows, files_of, make_run
+
+import demorec.export.hub
+import demorec.export.prepare
+from demorec.cli import main
+from demorec.export import ExportOptions, dataset_digest, export_lerobot
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_run(tmp_path_factory.mktemp("run") / "run", (8, 7), failures=(1,))
+
+
+def demorec(*arguments: object) -> int:
+    with pytest.raises(SystemExit) as done:
+        main([str(argument) for argument in arguments])
+    return int(done.value.code or 0)
+
+
+def test_an_export(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "d"
+    assert demorec("export", "lerobot", run, "--out", out, "--repo-id", "me/cubes", "--no-verify") == 0
+    printed = capsys.readouterr()
+    assert "2 episodes, 15 frames" in printed.out
+    assert "1 failed attempts left out" in printed.out
+    assert dataset_digest(out) in printed.out
+    assert printed.err == ""  # quiet without a terminal
+    assert "# me/cubes" in (out / "README.md").read_text()
+
+
+def test_options_reach_the_export(run: Path, tmp_path: Path) -> None:
+    out = tmp_path / "d"
+    arguments = ("--include-failures", "--episodes", "1", "--action", "ee_delta", "--privileged", "--fps", "15")
+    assert demorec("export", "lerobot", run, "--out", out, "--no-verify", *arguments) == 0
+    assert [row["length"] for row in episode_rows(out)] == [6, 4]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "message"),
+    [
+        (("--fps", "7"), 1, "does not divide"),
+        (("--append", "--overwrite"), 2, "exclude each other"),
+        (("--episodes", "x"), 2, "0:100"),
+        (("--action", "velocity"), 2, "joint_increment"),
+    ],
+)
+def test_a_mistake_is_told_in_one_sentence(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], code: int, message: str
+) -> None:
+    assert demorec("export", "lerobot", run, "--out", tmp_path / "d", "--no-verify", *arguments) == code
+    printed = capsys.readouterr()
+    assert message in printed.err
+    assert "Traceback" not in printed.err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_dataset_in_the_way(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "d").mkdir()
+    (tmp_path / "d" / "thesis.txt").write_text("years of work")
+    assert demorec("export", "lerobot", run, "--out", tmp_path / "d", "--no-verify") == 1
+    assert "--overwrite" in capsys.readouterr().err
+    assert (tmp_path / "d" / "thesis.txt").read_text() == "years of work"
+
+
+def test_no_recordings_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert demorec("export", "lerobot", "--out", tmp_path / "d") == 2
+    assert "No recordings are given" in capsys.readouterr().err
+
+
+def test_uploading_without_a_token_keeps_the_dataset(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("huggingface_hub.get_token", lambda: None)
+    out = tmp_path / "d"
+    arguments = ("--no-verify", "--push-to-hub", "--repo-id", "me/cubes")
+    assert demorec("export", "lerobot", run, "--out", out, *arguments) == 1
+    assert "hf auth login" in capsys.readouterr().err
+    assert len(episode_rows(out)) == 2
+
+
+def test_uploading_without_a_network_keeps_the_dataset(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("huggingface_hub.get_token", lambda: "hf_made_up")
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
+    out = tmp_path / "d"
+    arguments = ("--no-verify", "--push-to-hub", "--repo-id", "me/cubes")
+    assert demorec("export", "lerobot", run, "--out", out, *arguments) == 1
+    printed = capsys.readouterr().err
+    assert "was not uploaded to me/cubes" in printed
+    assert "Traceback" not in printed
+    assert len(episode_rows(out)) == 2
+
+
+def test_an_upload_is_private_and_tagged(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    calls = []
+
+    class Hub:
+        def create_repo(self, repo_id: str, **arguments: object) -> str:
+            calls.append(("create", repo_id, arguments))
+            return f"https://hub/{repo_id}"
+
+        def upload_folder(self, **arguments: object) -> None:
+            calls.append(("upload", arguments["folder_path"], len(files_of(arguments["folder_path"]))))  # type: ignore[arg-type]
+
+        def create_tag(self, repo_id: str, **arguments: object) -> None:
+            calls.append(("tag", repo_id, arguments["tag"]))
+
+    monkeypatch.setattr("huggingface_hub.HfApi", Hub)
+    monkeypatch.setattr("huggingface_hub.get_token", lambda: "hf_made_up")
+    out = tmp_path / "d"
+    arguments = ("--no-verify", "--push-to-hub", "--repo-id", "me/cubes")
+    assert demorec("export", "lerobot", run, "--out", out, *arguments) == 0
+    assert calls[0] == ("create", "me/cubes", {"repo_type": "dataset", "private": True, "exist_ok": True})
+    assert calls[1] == ("upload", out, len(files_of(out)))
+    assert calls[2] == ("tag", "me/cubes", "v3.0")
+    assert "https://hub/me/cubes" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_verification_passes_a_good_dataset_and_drops_a_bad_one(run: Path, tmp_path: Path) -> None:
+    report = export_lerobot([run], tmp_path / "good", ExportOptions(privileged=True, fps=15))
+    assert report.verified_frames == 4
+    # The recordings change after they were read: what LeRobot reads is no longer what they say.
+    changing = tmp_path / "run"
+    shutil.copytree(run, changing)
+
+    def swap(done: int, total: int) -> None:
+        if done == total:
+            episodes = changing / "episodes"
+            (episodes / "episode_000000.mcap").rename(episodes / "x")
+            (episodes / "episode_000001.mcap").rename(episodes / "episode_000000.mcap")
+            (episodes / "x").rename(episodes / "episode_000001.mcap")
+
+    with pytest.raises(Exception, match="dropped") as error:
+        export_lerobot([changing], tmp_path / "bad", ExportOptions(), swap)
+    assert "observation.state" in str(error.value)
+    assert not (tmp_path / "bad").exists()
+
+
+def test_info_tells_the_digest_and_the_attempts(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    report = export_lerobot([run], tmp_path / "d", ExportOptions(verify=False))
+    assert demorec("info", tmp_path / "d") == 0
+    printed = capsys.readouterr().out
+    assert report.digest in printed
+    assert "2, of 3 attempts" in printed
+    assert "wrist 64x48 h264" in printed

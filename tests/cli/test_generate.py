@@ -1,0 +1,172 @@
+"""generate-dataset as a user types it: what is refused, with which words and exit code, and what is left behind."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from demorec.cli import generate_dataset_main, main
+
+
+def run(capsys, *args: str) -> tuple[int, str, str]:
+    with pytest.raises(SystemExit) as ended:
+        generate_dataset_main(list(args))
+    told = capsys.readouterr()
+    return int(ended.value.code or 0), told.out, told.err
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (["--task", "pick_palce"], "Unknown task 'pick_palce'. Did you mean 'pick_place'?"),
+        (["--cameras", "frnt"], "Unknown camera 'frnt'. Did you mean 'front'?"),
+        (["--cameras", "front", "front"], "A camera is named twice"),
+        (["--cameras", "none", "front"], "--cameras none stands alone"),
+        (["--robot", "pandas"], "Unknown robot 'pandas'. Did you mean 'panda'?"),
+        (["--renderer", "rastr"], "Unknown renderer 'rastr'. Did you mean 'raster'?"),
+        (["--num-episodes", "0"], "num-episodes is 0, allowed are 1 to 10,000,000."),
+        (["--num_episodes", "-3"], "num-episodes is -3"),
+        (["--fps", "31"], "fps is 31, which does not divide the physics rate of 240 Hz. Did you mean '30'?"),
+        (["--width", "225"], "width is 225, but yuv420p video needs even sizes: use 224 or 226."),
+        (["--height", "8"], "height is 8, allowed are 16 to 8192."),
+        (["--crf", "52"], "video.crf is 52, allowed are 0 to 51."),
+        (["--seed", "-1"], "seed is -1"),
+        (["--workers", "0"], "workers is 0"),
+        (["--repo-id", "cubes"], "repo-id is 'cubes', but must be OWNER/NAME"),
+        (["--address", "auto"], "--address is for Ray"),
+        (["--config", "missing.toml"], "The config file cannot be read (No such file or directory): missing.toml"),
+    ],
+)
+def test_impossible_requests_end_with_one_sentence_and_leave_nothing(capsys, tmp_path, monkeypatch, args, message):
+    monkeypatch.chdir(tmp_path)
+    code, out, err = run(capsys, *args)
+    assert code == 2
+    assert message in err
+    assert (out, len(err.splitlines()), list(tmp_path.iterdir())) == ("", 1, [])
+
+
+@pytest.mark.parametrize(
+    ("args", "words"),
+    [
+        (["--num-epsodes", "3"], ["Unrecognized options: --num-epsodes", "Perhaps you meant", "--num-episodes INT"]),
+        (["--width", "wide"], ["Error parsing --width"]),
+        (["--executor", "slurm"], ["invalid choice 'slurm'", "local", "ray"]),
+    ],
+)
+def test_unknown_options_name_the_nearest(capsys, tmp_path, monkeypatch, args, words):
+    monkeypatch.chdir(tmp_path)
+    code, out, err = run(capsys, *args)
+    assert code == 2
+    for word in words:
+        assert word in out + err
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("num_episods = 3", "unknown key 'num_episods'. Did you mean 'num_episodes'?"),
+        ("width = 224.5", "width: 224.5 is no whole number"),
+        ('depth = "false"', "depth: 'false' is no boolean"),
+        ('codec = "h265"', "codec"),
+        ("seed = ", "is no valid TOML"),
+        ("fps = 7", "fps is 7, which does not divide"),
+        ('out = "x"\ntempo = 1\nwidht = 3', "an unknown key 'widht'. Did you mean 'width'?"),
+    ],
+)
+def test_bad_config_files_are_told(capsys, tmp_path, monkeypatch, content, message):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "run.toml").write_text(content)
+    code, _, err = run(capsys, "--config", "run.toml")
+    assert code == 2
+    assert message in err
+    assert [p.name for p in tmp_path.iterdir()] == ["run.toml"]
+
+
+def parsed(monkeypatch, args: list[str]):
+    """What the command would run with."""
+    from demorec.cli.generate import Generate
+
+    seen = []
+    monkeypatch.setattr(Generate, "run", lambda self: seen.append(self) or 0)
+    with pytest.raises(SystemExit) as ended:
+        generate_dataset_main(args)
+    assert ended.value.code == 0
+    return seen[0]
+
+
+def test_a_flag_wins_over_the_file_and_the_file_over_the_default(monkeypatch, tmp_path):
+    file = tmp_path / "run.toml"
+    file.write_text(
+        'num_episodes = 7\nseed = 5\ncameras = "wrist"\ncodec = "av1"\ncrf = 20\nout = "there"\nexport = false\n'
+        "max-episode-seconds = 30\n"
+    )
+    command = parsed(monkeypatch, [f"--config={file}", "--seed", "6", "--gop", "4"])
+    assert (command.options.num_episodes, command.options.out, command.options.export) == (7, Path("there"), False)
+    assert (command.episodes.seed, command.episodes.cameras, command.episodes.fps) == (6, ("wrist",), 30)
+    assert (command.episodes.video.codec, command.episodes.video.crf, command.episodes.video.gop) == ("av1", 20, 4)
+    assert command.episodes.max_episode_seconds == 30.0
+
+
+def test_flags_of_the_file_can_be_taken_back(monkeypatch, tmp_path):
+    file = tmp_path / "run.toml"
+    file.write_text("depth = true\nexport = false\n")
+    command = parsed(monkeypatch, ["--config", str(file), "--no-depth", "--export", "--cameras", "none"])
+    assert (command.episodes.depth, command.options.export, command.episodes.cameras) == (False, True, ())
+
+
+def test_underscores_and_equals_signs_work_too(monkeypatch):
+    command = parsed(monkeypatch, ["--num_episodes=3", "--repo_id=me/cubes", "--joint-rate=physics"])
+    assert (command.options.num_episodes, command.options.repo_id) == (3, "me/cubes")
+    assert command.episodes.joint_rate == "physics"
+
+
+def test_the_demo_file_is_valid(monkeypatch):
+    file = Path(__file__).parents[2] / "demo.toml"
+    command = parsed(monkeypatch, ["--config", str(file)])
+    command.episodes.validate()
+    command.options.validate()
+    assert command.options.num_episodes == 5
+
+
+def test_help_has_examples_and_every_option(capsys):
+    code, out, _ = run(capsys, "--help")
+    assert code == 0
+    assert "Examples:\n  generate-dataset --num-episodes 50 --out recordings/cubes" in out
+    for flag in (
+        "--out PATH",
+        "--workers INT",
+        "--num-episodes INT",
+        "--cameras",
+        "--codec",
+        "--executor",
+        "--no-export",
+    ):
+        assert flag in out
+    assert "{None}|INT" not in out
+
+
+@pytest.mark.parametrize(
+    ("what", "names"),
+    [("tasks", "pick_place"), ("cameras", "front"), ("robots", "panda"), ("renderers", "raster"), ("checks", "opens")],
+)
+def test_list_tells_every_row_in_one_line(capsys, what, names):
+    from demorec import tables
+
+    with pytest.raises(SystemExit) as ended:
+        main(["list", what])
+    assert ended.value.code == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == list(getattr(tables, what.upper()).rows)
+    assert any(line.startswith(names + " ") for line in lines)
+    assert all(re.match(r"\S+\s+\S+", line) for line in lines), "a row without a summary"
+
+
+def test_reproduce_needs_a_run_or_a_dataset(capsys, tmp_path):
+    with pytest.raises(SystemExit) as ended:
+        main(["reproduce", str(tmp_path), "--out", str(tmp_path / "copy")])
+    assert ended.value.code == 2
+    assert "No run (run.json) and no dataset of demorec" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []

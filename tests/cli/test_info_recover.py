@@ -1,0 +1,168 @@
+"""`demorec info` and `demorec recover` as a user meets them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from helpers_recording import make_episode, write_episode
+
+from demorec.cli import COMMANDS, main, run_command
+from demorec.recording import EpisodeWriter, Recording
+
+
+def run(name: str, *args: str | Path) -> int:
+    return run_command(COMMANDS.load(name), [str(arg) for arg in args], prog=f"demorec {name}")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("recordings")
+    write_episode(folder / "a.mcap", num_frames=45, depth=True)
+    write_episode(folder / "b.mcap", num_frames=30, success=False, episode_index=7, cameras=())
+    info, frames, _ = make_episode(num_frames=70)
+    with EpisodeWriter(folder / "c.mcap", info) as writer:
+        for frame in frames:
+            writer.write(frame)
+    part = folder / "c.mcap.part"
+    part.write_bytes(part.read_bytes()[:-3000])
+    return folder
+
+
+def test_info_of_a_recording(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("info", folder / "a.mcap") == 0
+    text = capsys.readouterr().out
+    rows = dict(line.split("  ", 1) for line in text.split("\n\n")[0].splitlines())
+    rows = {key: value.strip() for key, value in rows.items()}
+    assert rows["instruction"] == "pick up the red cube and place it on the green target"
+    assert rows["outcome"] == "success"
+    assert rows["length"] == "45 frames, 1.50 s at 30 Hz (physics 240 Hz)"
+    assert rows["camera front"] == "64x48 h264, GOP 2, crf 23, depth"
+    assert rows["check distance_to_target"] == "passed: 0.004 m (limit 0.02)"
+    streams = {line.split()[0]: line.split()[1:] for line in text.split("\n\n")[1].splitlines()}
+    assert streams["/joint_states"] == ["45", "sensor_msgs/msg/JointState"]
+    assert streams["/tf_static"] == ["1", "tf2_msgs/msg/TFMessage"]
+
+
+def test_info_as_json(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("info", folder / "a.mcap", "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    with Recording(folder / "a.mcap") as recording:
+        assert found["digest"] == recording.digest()
+    assert (found["kind"], found["frames"], found["success"], found["root_seed"]) == ("recording", 45, True, 0)
+    assert found["cameras"][0]["video"]["codec"] == "h264"
+    assert found["cameras"][0]["depth"] is True
+    assert run("info", folder / "a.mcap", folder / "b.mcap", "--json") == 0
+    assert [item["episode_index"] for item in json.loads(capsys.readouterr().out)] == [0, 7]
+
+
+def test_info_of_a_failure_says_why(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("info", folder / "b.mcap") == 0
+    text = capsys.readouterr().out
+    assert "failure in phase place: distance_to_target" in text
+    assert "FAILED: 0.2 m (limit 0.02)" in text
+
+
+def test_info_of_a_folder(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("info", folder) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == f"2 recordings in {folder}"
+    assert lines[3].split()[:5] == ["a.mcap", "pick_place", "0", "0", "success"]
+    assert lines[4].split()[:6] == ["b.mcap", "pick_place", "0", "7", "failure", "30"]
+
+
+def test_info_of_a_dataset(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "meta").mkdir()
+    info = {
+        "codebase_version": "v3.0",
+        "total_episodes": 3,
+        "total_frames": 90,
+        "total_tasks": 1,
+        "fps": 30,
+        "robot_type": "panda",
+        "features": {"action": {"dtype": "float32", "shape": [8], "names": [f"j{n}" for n in range(8)]}},
+    }
+    (tmp_path / "meta" / "info.json").write_text(json.dumps(info))
+    assert run("info", tmp_path) == 0
+    text = capsys.readouterr().out
+    assert "LeRobot v3.0" in text
+    assert "90 (3.0 s at 30 Hz)" in text
+    assert "j0 .. j7" in text
+    (tmp_path / "meta" / "info.json").write_text("{}")
+    assert run("info", tmp_path) == 2
+    assert "info.json is damaged" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("make", "code", "message"),
+    [
+        (lambda folder: folder / "nothing", 2, "There is no such file or folder"),
+        (lambda folder: folder, 2, "holds no run"),
+        (lambda folder: folder / "text.mcap", 1, "no MCAP file"),
+        (lambda folder: folder / "x.mcap.part", 1, "unfinished; demorec recover"),
+    ],
+)
+def test_info_of_something_else(
+    tmp_path: Path, make, code: int, message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = make(tmp_path)
+    if path.suffix:
+        path.write_text("just words, more than eight")
+    assert run("info", path) == code
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+
+
+def test_info_without_a_path(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("info") == 2
+    assert "No path is given" in capsys.readouterr().err
+
+
+def test_recover(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    part = tmp_path / "c.mcap.part"
+    part.write_bytes((folder / "c.mcap.part").read_bytes())
+    before = part.read_bytes()
+    assert run("recover", part) == 0
+    assert capsys.readouterr().out == f"Kept 60 frames, then the end is missing: {tmp_path / 'c.mcap'}\n"
+    with Recording(tmp_path / "c.mcap") as recording:
+        assert (recording.num_frames, recording.outcome, recording.is_recovered) == (60, None, True)
+    assert part.read_bytes() == before
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["c.mcap", "c.mcap.part"]
+    assert run("info", tmp_path / "c.mcap") == 0
+    assert "unknown: recovered after a crash" in capsys.readouterr().out
+    assert run("recover", part) == 1
+    assert "there already" in capsys.readouterr().err
+    assert run("recover", part, "--overwrite") == 0
+    assert run("recover", part, "--out", tmp_path / "d.mcap") == 0
+
+
+def test_recovering_a_complete_file_keeps_everything(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = tmp_path / "a.mcap"
+    source.write_bytes((folder / "a.mcap").read_bytes())
+    assert run("recover", source) == 0
+    assert "Complete: all 45 frames" in capsys.readouterr().out
+    with Recording(source) as one, Recording(tmp_path / "a.recovered.mcap") as other:
+        assert one.digest() == other.digest()
+        assert one.pixel_statistics("front").counts.tolist() == other.pixel_statistics("front").counts.tolist()
+
+
+def test_recover_of_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("recover", tmp_path / "nothing.mcap.part") == 2
+    (tmp_path / "empty.mcap.part").touch()
+    assert run("recover", tmp_path / "empty.mcap.part") == 1
+    assert "the file is empty" in capsys.readouterr().err
+    assert not (tmp_path / "empty.mcap").exists()
+
+
+def test_both_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("info", "recover"):
+        with pytest.raises(SystemExit) as caught:
+            main([name, "--help"])
+        assert caught.value.code == 0
+        text = capsys.readouterr().out
+        assert "Examples:" in text
+        assert f"demorec {name} " in text

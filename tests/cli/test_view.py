@@ -1,0 +1,165 @@
+"""`demorec view` through the real viewer: pictures of recordings, runs and datasets; the browser."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers_recording import write_episode
+from helpers_viewer import chromium, need_chromium, need_vulkan, num_colors, pixels
+
+from demorec.cli import run_command
+from demorec.cli.view import View
+from demorec.playback.live import LiveViewer
+from demorec.playback.save import save, save_each
+from demorec.playback.sources import find_episodes
+from demorec.playback.viewer import HeadlessViewer, serve_web
+
+
+def view(*args: object) -> int:
+    return run_command(View, [str(arg) for arg in args], prog="demorec view")
+
+
+@pytest.fixture(scope="module")
+def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs") / "cubes"
+    (folder / "episodes").mkdir(parents=True)
+    for index in range(2):
+        path = folder / "episodes" / f"episode_{index:06d}.mcap"
+        write_episode(path, num_frames=45, width=96, height=72, episode_index=index)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        ((), "There is no such file"),
+        (("--save", "x.mp4"), "writes a .rrd file"),
+        (("--port", "80"), "--port belongs to --web"),
+        (("--web", "--save", "x.rrd"), "--web serves"),
+    ],
+)
+def test_bad_requests_are_one_sentence(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], flags: tuple[str, ...], words: str
+) -> None:
+    assert view(tmp_path / "nothing.mcap", *flags) == 2
+    said = capsys.readouterr().err
+    assert words in said
+    assert "Traceback" not in said
+    assert len(said.strip().splitlines()) == 1
+
+
+def test_damage_is_one_sentence_and_leaves_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = write_episode(tmp_path / "e.mcap", num_frames=5)
+    path.write_bytes(path.read_bytes()[:-2000])
+    assert view(path, "--save", tmp_path / "x.rrd") == 1
+    assert len(capsys.readouterr().err.strip().splitlines()) == 1
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["e.mcap"]
+
+
+def test_saving_never_replaces_a_file_unasked(run_folder: Path, tmp_path: Path) -> None:
+    target = tmp_path / "x.rrd"
+    assert view(run_folder, "--episodes", "0", "--save", target) == 0
+    before = target.stat().st_mtime_ns
+    assert view(run_folder, "--episodes", "1", "--save", target) == 2
+    assert target.stat().st_mtime_ns == before
+    assert view(run_folder, "--episodes", "1", "--save", target, "--overwrite") == 0
+    assert target.stat().st_mtime_ns > before
+
+
+def test_several_episodes_are_several_files(run_folder: Path, tmp_path: Path) -> None:
+    assert view(run_folder, "--save", tmp_path / "x.rrd") == 0
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["x-0000.rrd", "x-0001.rrd"]
+
+
+def _check_views(viewer: HeadlessViewer, cameras: tuple[str, ...] = ("front", "wrist")) -> None:
+    """No view complains; the 3D view shows robot, table and frusta; the cameras show their moving red square."""
+    assert viewer.reports() == []
+    world = pixels(viewer.view_picture("pick_place: the world"))
+    assert num_colors(world) > 100
+    white = (world.min(axis=2) > 150).mean()
+    assert white > 0.005, "no robot"
+    for camera in cameras:
+        picture = pixels(viewer.view_picture(f"{camera} camera")).astype(int)
+        red = (picture[..., 0] > 150) & (picture[..., 1] < 90) & (picture[..., 2] < 90)
+        assert red.mean() > 0.01, f"no video of {camera}"
+
+
+@pytest.mark.viewer
+def test_the_viewer_shows_a_run(run_folder: Path, tmp_path: Path) -> None:
+    need_vulkan()
+    files = save_each(find_episodes([run_folder]), tmp_path)
+    with HeadlessViewer(*files) as viewer:
+        viewer.seek(1.0)
+        _check_views(viewer)
+        state = viewer.state()
+        assert len(state.recordings) == 2
+        assert {recording.current_time for recording in state.recordings} == {1_000_000_000}
+        before = pixels(viewer.view_picture("front camera"))
+        viewer.seek(0.2)
+        after = pixels(viewer.view_picture("front camera"))
+    assert before.shape == after.shape
+    assert np.abs(before.astype(int) - after).mean() > 1.0, "the video stands still"
+
+
+@pytest.mark.viewer
+def test_the_viewer_shows_a_dataset(run_folder: Path, tmp_path: Path) -> None:
+    need_vulkan()
+    from helpers_export import export
+
+    dataset = tmp_path / "dataset"
+    export(run_folder, dataset)
+    sources = find_episodes([dataset])
+    assert len(sources) == 2
+    save(sources[1], tmp_path / "x.rrd")
+    with HeadlessViewer(tmp_path / "x.rrd") as viewer:
+        viewer.seek(1.0)
+        _check_views(viewer)
+
+
+@pytest.mark.viewer
+def test_screenshots_of_an_episode_and_of_a_comparison(run_folder: Path, tmp_path: Path) -> None:
+    need_vulkan()
+    episode = run_folder / "episodes" / "episode_000000.mcap"
+    assert view(episode, "--screenshot", tmp_path / "x.png", "--size", 900, 600) == 0
+    picture = pixels((tmp_path / "x.png").read_bytes())
+    assert picture.shape == (600, 900, 3)
+    assert num_colors(picture) > 200
+    assert view(run_folder, "--compare", "--screenshot", tmp_path / "c.png") == 0
+    assert num_colors(pixels((tmp_path / "c.png").read_bytes())) > 200
+
+
+@pytest.mark.viewer
+def test_episodes_arrive_while_the_viewer_is_open(run_folder: Path, tmp_path: Path) -> None:
+    need_vulkan()
+    first, second = sorted((run_folder / "episodes").iterdir())
+    save(find_episodes([first])[0], tmp_path / "x.rrd")
+    with HeadlessViewer(tmp_path / "x.rrd") as viewer:
+        with LiveViewer(viewer.client.url) as live:
+            live.add(second)
+        deadline = time.monotonic() + 30
+        while len(viewer.state().recordings) < 2 and time.monotonic() < deadline:
+            time.sleep(0.2)
+        names = [recording.store_id for recording in viewer.state().recordings]
+    assert len(names) == 2
+    assert any("episode_000001" in name for name in names)
+
+
+@pytest.mark.slow  # the web viewer takes a minute to draw on a software rasteriser
+@pytest.mark.viewer
+def test_the_browser_shows_an_episode(run_folder: Path, tmp_path: Path) -> None:
+    program = need_chromium()
+    files = save_each(find_episodes([run_folder])[:1], tmp_path)
+    with serve_web(files) as (address, _), chromium(program, address) as page:
+        assert address.startswith("http://127.0.0.1:")
+        deadline = time.monotonic() + 150
+        colors, red = 0, 0.0
+        while time.monotonic() < deadline and (colors < 200 or red < 0.002):
+            time.sleep(2)
+            picture = pixels(page.picture()).astype(int)
+            colors = num_colors(picture.astype(np.uint8))
+            red = float(((picture[..., 0] > 150) & (picture[..., 1] < 90) & (picture[..., 2] < 90)).mean())
+    assert colors >= 200, "the page is empty"
+    assert red >= 0.002, "neither the cube nor the videos are there"

@@ -1,0 +1,124 @@
+"""The whole job with the real simulator: one digest whatever the workers and the order, and it can be made again."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from demorec.cli import generate_dataset_main, main
+from demorec.config import EpisodePlan, GenerateConfig, deciding_versions
+from demorec.generate.export_step import export_run
+from demorec.generate.options import RunOptions
+from demorec.generate.run import NoProgress, RunResult, generate
+from demorec.generate.run_file import load_run_file
+
+CONFIG = GenerateConfig(seed=11, width=48, height=32)
+NUM_EPISODES = 3
+
+
+def make(out: Path, *, workers: int, episodes: list[int] | None = None, num_episodes: int = NUM_EPISODES) -> RunResult:
+    options = RunOptions(out=out, num_episodes=num_episodes, workers=workers)
+    return generate(CONFIG, options, progress=NoProgress(), episodes=episodes)
+
+
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory) -> RunResult:
+    """Made by one worker in order."""
+    return make(tmp_path_factory.mktemp("reference") / "run", workers=1)
+
+
+def test_the_run_is_what_was_asked_for(reference):
+    assert len(reference.run.successes) == NUM_EPISODES
+    assert load_run_file(reference.folder) == reference.run
+    assert sorted(p.name for p in (reference.folder / "episodes").iterdir()) == [
+        f"episode_{i:06d}.mcap" for i in range(NUM_EPISODES)
+    ]
+    assert not list((reference.folder / "unfinished").iterdir())
+    seconds = reference.run.attempts[-1].seconds
+    assert set(seconds) == {"simulation", "rendering", "recording"}
+    assert all(value > 0 for value in seconds.values())
+
+
+def test_two_workers_in_reversed_order_make_the_same_bytes(tmp_path, reference):
+    result = make(tmp_path / "run", workers=2, episodes=list(reversed(range(NUM_EPISODES))))
+    assert result.run.digest == reference.run.digest
+    assert [a.sha256 for a in result.run.attempts] == [a.sha256 for a in reference.run.attempts]
+    for attempt in result.run.attempts:
+        assert (result.folder / attempt.file).read_bytes() == (reference.folder / attempt.file).read_bytes()
+
+
+def test_recordings_know_the_run_that_they_belong_to(tmp_path, reference):
+    """run.json is lost: everything in it that matters is read back from the recordings."""
+    out = tmp_path / "run"
+    shutil.copytree(reference.folder, out)
+    (out / "run.json").unlink()
+    result = make(out, workers=1)
+    assert result.made == ()
+    assert result.run.digest == reference.run.digest
+    assert [a.sha256 for a in result.run.attempts] == [a.sha256 for a in reference.run.attempts]
+
+
+def test_a_run_knows_the_versions_that_its_recordings_know(reference):
+    from demorec.rollout import prepare
+
+    assert reference.run.versions == deciding_versions()
+    assert prepare(EpisodePlan(config=CONFIG, episode_index=0)).info.versions == deciding_versions()
+
+
+def test_reproduce_makes_runs_and_datasets_again_and_sees_a_difference(tmp_path, capsys, reference):
+    source = tmp_path / "source"
+    shutil.copytree(reference.folder, source)
+    record, _ = export_run(source, repo_id="me/cubes")
+    assert record.dataset_digest
+    assert reproduce(source, tmp_path / "copy") == 0
+    assert f"{NUM_EPISODES} of {NUM_EPISODES} episodes are the same to the bit" in capsys.readouterr().out
+    # The same folder again, now against the dataset: nothing has to be simulated.
+    assert reproduce(source / "dataset", tmp_path / "copy") == 0
+    assert f"{NUM_EPISODES} of {NUM_EPISODES} episodes are the same to the bit" in capsys.readouterr().out
+    text = (source / "run.json").read_text()
+    first = reference.run.attempts[0].digest
+    (source / "run.json").write_text(text.replace(first, "0" * len(first)))
+    assert reproduce(source, tmp_path / "copy") == 1
+    assert "Different: 0 (attempt 0)" in capsys.readouterr().err
+
+
+def reproduce(source: Path, out: Path) -> int:
+    with pytest.raises(SystemExit) as ended:
+        main(["reproduce", str(source), "--out", str(out), "--workers", "1"])
+    return int(ended.value.code or 0)
+
+
+def test_the_export_is_made_once_and_again_when_the_run_has_grown(tmp_path, reference):
+    out = tmp_path / "run"
+    shutil.copytree(reference.folder, out)
+    first, report = export_run(out, repo_id="me/cubes")
+    assert report is not None
+    assert report.num_episodes == NUM_EPISODES
+    again, report = export_run(out, repo_id="me/cubes")
+    assert (again, report) == (first, None)
+    make(out, workers=1, num_episodes=NUM_EPISODES + 1)
+    grown, report = export_run(out, repo_id="me/cubes")
+    assert report is not None
+    assert report.num_episodes == NUM_EPISODES + 1
+    assert grown.dataset_digest != first.dataset_digest
+
+
+def test_the_command_does_it_all_and_says_so(tmp_path, capsys):
+    out = tmp_path / "run"
+    args = ["--out", str(out), "--num-episodes", "1", "--workers", "1", "--seed", "11", "--cameras", "wrist"]
+    args += ["--width", "48", "--height", "32"]
+    for made in (1, 0):
+        with pytest.raises(SystemExit) as ended:
+            generate_dataset_main(args)
+        told = capsys.readouterr().out
+        assert ended.value.code == 0
+        assert f"1 of 1 asked, {made} attempts made now" in told
+        assert load_run_file(out).digest in told
+        for word in ("success", "frames", "recordings", "dataset", "simulation", "rendering", "export", "checks"):
+            assert word in told
+    with pytest.raises(SystemExit) as ended:
+        generate_dataset_main([*args, "--fps", "60"])
+    assert ended.value.code == 2
+    assert "fps is 30 there and 60 here" in capsys.readouterr().err

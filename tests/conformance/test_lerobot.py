@@ -1,0 +1,356 @@
+"""The installed LeRobot as the judge of a dataset with several files of each kind."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers_export import data_table, episode_rows, export, make_run
+from helpers_recording import make_episode
+
+import demorec.export.writer
+from demorec.export import dataset_digest
+from demorec.export.depth import code_values, quantised
+from demorec.recording import Recording
+
+LENGTHS = (20, 15, 17, 9, 31, 12)
+CAMERAS = ("front", "wrist")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Copies of the tables that HF datasets makes go to a temporary folder."""
+    import datasets
+
+    before = datasets.config.HF_DATASETS_CACHE
+    datasets.config.HF_DATASETS_CACHE = tmp_path_factory.mktemp("hf-datasets")
+    yield
+    datasets.config.HF_DATASETS_CACHE = before
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_run(tmp_path_factory.mktemp("run") / "run", LENGTHS, failures=(2,))
+
+
+@pytest.fixture(scope="module")
+def dataset(run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("dataset") / "d"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(demorec.export.writer, "_EPISODE_ROWS_PER_GROUP", 2)
+        export(run, out, privileged=True, video_files_mb=0.006, data_files_mb=0.03, files_per_chunk=2)
+    for folder in ("data", "meta/episodes", "videos/observation.images.front", "videos/observation.images.wrist"):
+        assert len(list((out / folder).rglob("file-*"))) > 1, folder
+    return out
+
+
+def open_dataset(root: Path, **arguments: Any) -> Any:
+    from lerobot.datasets import LeRobotDataset
+
+    return LeRobotDataset("local/test", root=root, **{"video_backend": "pyav", "return_uint8": True, **arguments})
+
+
+def recorded_pictures(run: Path, episode: int) -> dict[str, list[np.ndarray]]:
+    with Recording(run / "episodes" / f"episode_{episode:06d}.mcap") as recording:
+        return {camera: list(recording.images(camera)) for camera in CAMERAS}
+
+
+def picture(item: dict[str, Any], camera: str) -> np.ndarray:
+    return np.asarray(item[f"observation.images.{camera}"].numpy().transpose(1, 2, 0))
+
+
+@pytest.mark.parametrize("backend", ["pyav", "torchcodec"])
+def test_lerobot_reads_every_frame_as_it_was_recorded(run: Path, dataset: Path, backend: str) -> None:
+    if backend == "torchcodec":
+        try:
+            import torchcodec.decoders  # noqa: F401
+        except (ImportError, RuntimeError, OSError) as error:
+            pytest.skip(f"torchcodec does not load here: {str(error).splitlines()[0]}")
+    found = open_dataset(dataset, video_backend=backend)
+    assert (found.num_episodes, found.num_frames, found.fps) == (len(LENGTHS), sum(LENGTHS), 30)
+    row = 0
+    for episode, length in enumerate(LENGTHS):
+        pictures = recorded_pictures(run, episode)
+        _, frames, _ = make_episode(num_frames=length, episode_index=episode)
+        for t in range(length):
+            item = found[row]
+            observation, action = frames[t].observation, frames[t].action
+            state = np.float32([*observation.joint_position[:7], observation.gripper_width])
+            assert np.array_equal(item["observation.state"].numpy(), state)
+            assert np.array_equal(item["action"].numpy(), np.float32([*action.joint_target, action.gripper_target]))
+            assert (int(item["episode_index"]), int(item["frame_index"]), int(item["index"])) == (episode, t, row)
+            assert item["task"] == "pick up the red cube and place it on the green target"
+            assert bool(item["next.done"]) is bool(item["next.success"]) is (t == length - 1)
+            for camera in CAMERAS:
+                assert np.array_equal(picture(item, camera), pictures[camera][t]), (episode, t, camera)
+            row += 1
+
+
+def test_some_episodes_only(run: Path, dataset: Path) -> None:
+    found = open_dataset(dataset, episodes=[4, 1])
+    assert found.num_frames == 31 + 15
+    # LeRobot keeps the order of the files.
+    for row, (episode, t) in ((0, (1, 0)), (14, (1, 14)), (15, (4, 0)), (45, (4, 30))):
+        item = found[row]
+        assert (int(item["episode_index"]), int(item["frame_index"])) == (episode, t)
+        assert np.array_equal(picture(item, "wrist"), recorded_pictures(run, episode)["wrist"][t])
+
+
+def test_windows_in_time_stop_at_the_ends_of_an_episode(run: Path, dataset: Path) -> None:
+    steps = [-0.1, 0.0, 1 / 30, 0.2]
+    found = open_dataset(dataset, delta_timestamps={"action": steps, "observation.images.front": steps})
+    first, last = 20, 34  # of episode 1
+    pictures = recorded_pictures(run, 1)["front"]
+    for row in (first, 27, last):
+        item = found[row]
+        wanted = [row - 3, row, row + 1, row + 6]
+        pad = [not first <= index <= last for index in wanted]
+        assert item["action_is_pad"].tolist() == item["observation.images.front_is_pad"].tolist() == pad
+        for k, index in enumerate(wanted):
+            held = min(max(index, first), last)
+            assert np.array_equal(item["action"][k].numpy(), found.hf_dataset[held]["action"].numpy())
+            image = item["observation.images.front"][k].numpy().transpose(1, 2, 0)
+            assert np.array_equal(image, pictures[held - first])
+
+
+def test_a_loader_with_worker_processes_sees_every_frame_once(dataset: Path) -> None:
+    import torch
+
+    loader = torch.utils.data.DataLoader(open_dataset(dataset), batch_size=16, shuffle=True, num_workers=2)
+    seen = [index for batch in loader for index in batch["index"].tolist()]
+    assert sorted(seen) == list(range(sum(LENGTHS)))
+
+
+def test_statistics_equal_those_of_the_decoded_data(dataset: Path) -> None:
+    found = open_dataset(dataset)
+    stats = found.meta.stats
+    names = {"min": 0.0, "max": 1.0, "q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
+    assert set(stats) == set(found.features)
+    for name in found.hf_dataset.column_names:
+        values = np.array(data_table(dataset).column(name).to_pylist(), dtype=np.float64).reshape(sum(LENGTHS), -1)
+        for what, q in names.items():
+            assert np.allclose(stats[name][what], np.quantile(values, q, axis=0), rtol=1e-12, atol=1e-12), (name, what)
+        assert np.allclose(stats[name]["mean"], values.mean(axis=0), rtol=1e-9, atol=1e-12)
+        assert np.allclose(stats[name]["std"], values.std(axis=0), rtol=1e-9, atol=1e-12)
+        assert stats[name]["count"] == [sum(LENGTHS)]
+    pictures = [found[row] for row in range(sum(LENGTHS))]
+    for camera in CAMERAS:
+        key = f"observation.images.{camera}"
+        pixels = np.stack([picture(item, camera) for item in pictures]).reshape(-1, 3) / 255
+        shaped = {what: np.asarray(value).reshape(-1) for what, value in stats[key].items()}
+        assert stats[key]["mean"].shape == (3, 1, 1)
+        # Counted before coding, on every other picture.
+        assert np.abs(shaped["mean"] - pixels.mean(axis=0)).max() < 0.01
+        assert np.abs(shaped["std"] - pixels.std(axis=0)).max() < 0.02
+        for what in ("q10", "q50", "q90"):
+            assert np.abs(shaped[what] - np.quantile(pixels, names[what], axis=0)).max() < 0.06, (camera, what)
+        assert shaped["count"] == sum((length + 1) // 2 for length in LENGTHS)
+
+
+def test_statistics_of_each_episode_are_of_that_episode(dataset: Path) -> None:
+    table = data_table(dataset)
+    for row in episode_rows(dataset):
+        part = table.slice(row["dataset_from_index"], row["length"])
+        values = np.array(part.column("action").to_pylist(), dtype=np.float64)
+        assert np.allclose(row["stats/action/mean"], values.mean(axis=0), rtol=1e-9)
+        assert np.allclose(row["stats/action/q90"], np.quantile(values, 0.9, axis=0), rtol=1e-12)
+
+
+def test_depth_is_read_as_metres(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "run", (6, 5), depth=True)
+    export(run, tmp_path / "d", depth=True)
+    found = open_dataset(tmp_path / "d", depth_output_unit="m")
+    assert found.meta.depth_keys == ["observation.images.front_depth", "observation.images.wrist_depth"]
+    with Recording(run / "episodes" / "episode_000001.mcap") as recording:
+        for t, recorded in enumerate(recording.depth("front")):
+            seen = found[6 + t]["observation.images.front_depth"].numpy()[0]
+            hit = recorded > 0
+            assert hit.any()
+            assert not hit.all()
+            assert np.abs(seen - recorded)[hit].max() < 1e-3
+            assert np.allclose(seen[~hit], 0.01, atol=1e-6)
+    from lerobot.datasets.depth_utils import quantize_depth
+
+    depth = np.random.default_rng(0).uniform(0, 12, (48, 64)).astype(np.float32)
+    assert np.array_equal(quantised(depth), quantize_depth(depth, video_backend=None, input_unit="m"))
+    values = code_values()
+    assert found.meta.stats["observation.images.front_depth"]["min"].reshape(-1)[0] == pytest.approx(values[0])
+
+
+# ------------------------------------------------------------------------------------------- LeRobot's own tools, slow
+
+
+def assert_readable(root: Path, lengths: tuple[int, ...]) -> Any:
+    found = open_dataset(root)
+    assert [row["length"] for row in found.meta.episodes] == list(lengths)
+    for row in range(0, sum(lengths), 5):
+        item = found[row]
+        assert int(item["index"]) == row
+    return found
+
+
+@pytest.mark.slow
+def test_datasets_can_be_merged(run: Path, dataset: Path, tmp_path: Path) -> None:
+    from lerobot.datasets.aggregate import aggregate_datasets
+    from lerobot.datasets.dataset_tools import merge_datasets
+
+    other = tmp_path / "other"
+    export(run, other, privileged=True, episodes=":2")
+    aggregate_datasets(["a/a", "b/b"], "c/c", roots=[dataset, other], aggr_root=tmp_path / "both")
+    found = assert_readable(tmp_path / "both", (*LENGTHS, *LENGTHS[:2]))
+    for row, episode, t in ((sum(LENGTHS) + 3, 0, 3), (sum(LENGTHS) + 20 + 14, 1, 14), (33, 1, 13)):
+        assert np.array_equal(picture(found[row], "wrist"), recorded_pictures(run, episode)["wrist"][t])
+    merged = merge_datasets([open_dataset(other), open_dataset(dataset)], "d/d", tmp_path / "merged")
+    assert merged.num_episodes == len(LENGTHS) + 2
+    assert_readable(tmp_path / "merged", (*LENGTHS[:2], *LENGTHS))
+
+
+@pytest.mark.slow
+def test_features_can_be_added_and_removed(dataset: Path, tmp_path: Path) -> None:
+    from lerobot.datasets.dataset_tools import add_features, remove_feature
+
+    extra = np.arange(sum(LENGTHS), dtype=np.float32)[:, None]
+    added = add_features(
+        open_dataset(dataset), {"extra": (extra, {"dtype": "float32", "shape": (1,), "names": None})}, tmp_path / "a"
+    )
+    assert float(added[40]["extra"]) == 40
+    removed = remove_feature(open_dataset(dataset), "observation.velocity", tmp_path / "b")
+    assert "observation.velocity" not in removed.features
+
+
+def lerobot_command(name: str, *arguments: str, timeout: float = 280) -> str:
+    program = Path(sys.executable).parent / name
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "HF_HUB_OFFLINE": "1", "WANDB_MODE": "disabled"}
+    done = subprocess.run(
+        [program, *arguments], check=False, capture_output=True, text=True, timeout=timeout, env=environment
+    )
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+    return done.stdout + done.stderr
+
+
+@pytest.mark.slow
+def test_lerobots_editing_command_deletes_and_splits(dataset: Path, tmp_path: Path) -> None:
+    root = tmp_path / "d"
+    shutil.copytree(dataset, root)
+    common = ["--repo_id=local/test", f"--root={root}"]
+    lerobot_command("lerobot-edit-dataset", *common, f"--new_root={tmp_path / 'less'}", "--new_repo_id=local/less",
+                    "--operation.type=delete_episodes", "--operation.episode_indices=[1,4]")  # fmt: skip
+    assert_readable(tmp_path / "less", (20, 17, 9, 12))
+    from lerobot.datasets.dataset_tools import split_dataset
+
+    parts = split_dataset(open_dataset(root), {"train": [0, 1, 2, 3], "test": [4, 5]}, tmp_path / "split")
+    assert [parts["train"].num_frames, parts["test"].num_frames] == [61, 43]
+
+
+@pytest.mark.slow
+def test_lerobot_goes_on_recording_and_then_demorec_appends(run: Path, tmp_path: Path) -> None:
+    from lerobot.configs.video import RGBEncoderConfig
+    from lerobot.datasets import LeRobotDataset
+
+    root = tmp_path / "d"
+    export(run, root, episodes=":2")
+    encoder = RGBEncoderConfig(vcodec="h264", crf=23, preset="veryfast", extra_options={"bf": 0})
+    resumed = LeRobotDataset.resume("local/test", root=root, rgb_encoder=encoder)
+    rng = np.random.default_rng(0)
+    for _ in range(2):
+        for _ in range(11):
+            frame: dict[str, Any] = {}
+            for name, feature in resumed.features.items():
+                if feature["dtype"] == "video":
+                    frame[name] = rng.integers(0, 255, feature["shape"], dtype=np.uint8)
+                elif feature["dtype"] == "bool":
+                    frame[name] = np.array([False])
+                elif feature["dtype"] == "float32" and name != "timestamp":
+                    frame[name] = rng.normal(size=feature["shape"]).astype(np.float32)
+            resumed.add_frame({**frame, "task": "another task"})
+        resumed.save_episode()
+    resumed.finalize()
+    report = export(run, root, episodes="2:4", append=True)
+    assert (report.num_episodes, report.new_episodes) == (6, 2)
+    assert report.digest == dataset_digest(root)
+    found = assert_readable(root, (20, 15, 11, 11, 17, 9))
+    assert np.array_equal(picture(found[35 + 22 + 5], "front"), recorded_pictures(run, 2)["front"][5])
+    assert found[40]["task"] == "another task"
+    values = np.array(data_table(root).column("action").to_pylist(), dtype=np.float64)
+    assert np.allclose(found.meta.stats["action"]["q50"], np.quantile(values, 0.5, axis=0), rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_append_to_a_dataset_that_lerobot_wrote_from_the_start(run: Path, tmp_path: Path) -> None:
+    from lerobot.configs.video import RGBEncoderConfig
+    from lerobot.datasets import LeRobotDataset
+
+    root = tmp_path / "d"
+    joints = [f"panda_joint{n}.pos" for n in range(1, 8)] + ["gripper.width"]
+    features = {
+        "action": {"dtype": "float32", "shape": (8,), "names": joints},
+        "observation.state": {"dtype": "float32", "shape": (8,), "names": joints},
+        "observation.images.front": {"dtype": "video", "shape": (48, 64, 3), "names": ["height", "width", "channels"]},
+    }
+    encoder = RGBEncoderConfig(vcodec="h264", crf=23, preset="veryfast")
+    theirs = LeRobotDataset.create("local/test", 30, features, root=root, robot_type="panda", rgb_encoder=encoder)
+    rng = np.random.default_rng(0)
+    for t in range(13):
+        image = np.full((48, 64, 3), 10 * t, dtype=np.uint8)
+        vector = rng.normal(size=8).astype(np.float32)
+        theirs.add_frame(
+            {"action": vector, "observation.state": vector, "observation.images.front": image, "task": "t"}
+        )
+    theirs.save_episode()
+    theirs.finalize()
+    report = export(run, root, episodes="1", append=True)
+    assert report.num_frames == 28
+    assert set(report.left_out) >= {"observation.images.wrist", "next.done"}
+    found = assert_readable(root, (13, 15))
+    assert np.array_equal(picture(found[13 + 14], "front"), recorded_pictures(run, 1)["front"][14])
+
+
+@pytest.mark.slow
+def test_lerobot_doctor_finds_no_fault(run: Path, tmp_path: Path) -> None:
+    export(run, tmp_path / "d", video_files_mb=0.006, data_files_mb=0.03)
+    text = lerobot_command("lerobot-doctor", "check", str(tmp_path / "d"), "--ci")
+    report, _ = json.JSONDecoder().raw_decode(text)
+    assert report["summary"]["FAIL"] == 0
+    # Warnings remain about what is made up here: short episodes, joints that hardly move.
+    assert report["summary"]["PASS"] >= 6
+
+
+@pytest.mark.slow
+def test_rerun_opens_the_folder(dataset: Path, tmp_path: Path) -> None:
+    import rerun as rr
+
+    with rr.RecordingStream("demorec_test") as stream:
+        stream.save(tmp_path / "d.rrd")
+        stream.log_file_from_path(dataset)
+        stream.flush()
+    assert (tmp_path / "d.rrd").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("inputs", ["pictures", "privileged"])
+def test_a_policy_trains_on_it(run: Path, tmp_path: Path, inputs: str) -> None:
+    root = tmp_path / "d"
+    export(run, root, privileged=inputs == "privileged", action="joint_increment")
+    if inputs == "privileged":  # ACT takes what there is: without pictures it learns from the state alone
+        root = tmp_path / "blind"
+        blind = make_run(tmp_path / "run", LENGTHS, cameras=())
+        export(blind, root, privileged=True, action="joint_increment")
+    out = lerobot_command(
+        "lerobot-train", "--dataset.repo_id=local/test", f"--dataset.root={root}", "--dataset.video_backend=pyav",
+        "--policy.type=act", "--policy.device=cpu", "--policy.push_to_hub=false", "--policy.dim_model=64",
+        "--policy.n_heads=4", "--policy.dim_feedforward=128", "--policy.n_encoder_layers=1", "--policy.use_vae=false",
+        "--policy.chunk_size=8", "--policy.n_action_steps=8", "--policy.pretrained_backbone_weights=null",
+        "--steps=4", "--batch_size=4", "--num_workers=0", "--log_freq=1", "--wandb.enable=false",
+        "--save_checkpoint=false", f"--output_dir={tmp_path / 'out'}",
+    )  # fmt: skip
+    losses = [float(part.split("loss:")[1].split()[0]) for part in out.splitlines() if "loss:" in part]
+    assert len(losses) >= 4
+    assert np.isfinite(losses).all()

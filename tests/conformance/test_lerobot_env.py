@@ -1,0 +1,154 @@
+"""LeRobot's own commands find the environment, train for it and run in it; demorec evaluate runs what they save."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers_sim import episode
+
+from demorec.cli import main
+from demorec.config import GenerateConfig
+from demorec.errors import ConfigError
+from demorec.evaluate.policy import find_checkpoint, trained_action
+from demorec.evaluate.rollouts import evaluate, load_evaluation, settings_for
+from demorec.export.lerobot import export_lerobot
+from demorec.export.options import ExportOptions
+from demorec.recording import EpisodeWriter, Recording
+from demorec.rollout import Rollout, make_world
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]  # each command of LeRobot takes 15 s of CPU to start
+
+PLUGIN = ["--env.discover_packages_path=demorec.lerobot_env", "--env.type=demorec", "--env.task=pick_place"]
+ACT = [
+    *("--policy.type=act", "--policy.device=cpu", "--policy.push_to_hub=false", "--policy.dim_model=16"),
+    *("--policy.n_heads=2", "--policy.dim_feedforward=32", "--policy.n_encoder_layers=1", "--policy.use_vae=false"),
+    *("--policy.chunk_size=8", "--policy.n_action_steps=4", "--policy.pretrained_backbone_weights=null"),
+]
+
+
+def lerobot(command: str, *args: str, cwd: Path) -> str:
+    """Run one of LeRobot's commands as a user would, offline."""
+    program = Path(sys.executable).with_name(command)
+    env = {**os.environ, "HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1"}
+    result = subprocess.run(
+        [program, *args], cwd=cwd, env=env, capture_output=True, text=True, timeout=800, check=False
+    )
+    assert result.returncode == 0, result.stdout[-3000:] + result.stderr[-3000:]
+    return result.stdout + result.stderr
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A policy of few parameters, trained by lerobot-train for two steps on an exported dataset."""
+    folder = tmp_path_factory.mktemp("trained")
+    recordings = folder / "recordings"
+    recordings.mkdir()
+    prepared = episode(0)
+    with make_world(prepared.info) as world, EpisodeWriter(recordings / "episode_000000.mcap", prepared.info) as writer:
+        rollout = Rollout(world, prepared)
+        for frame in rollout:
+            writer.write(frame)
+        assert rollout.outcome is not None
+        writer.finish(rollout.outcome)
+    options = ExportOptions(repo_id="local/cubes", action="joint_increment", privileged=True)
+    export_lerobot((recordings,), folder / "dataset", options)
+    lerobot(
+        "lerobot-train",
+        *("--dataset.repo_id=local/cubes", f"--dataset.root={folder / 'dataset'}", *ACT),
+        *(*PLUGIN, "--env.action=joint_increment", "--env.episode_length=12"),
+        *("--steps=2", "--save_freq=2", "--env_eval_freq=2", "--eval.n_episodes=1", "--eval.batch_size=1"),
+        *("--batch_size=4", "--num_workers=0", "--wandb.enable=false", f"--output_dir={folder / 'train'}"),
+        cwd=folder,
+    )
+    return folder
+
+
+def test_lerobot_eval_runs_the_environment_and_writes_videos(trained: Path) -> None:
+    lerobot(
+        "lerobot-eval",
+        f"--policy.path={find_checkpoint(trained / 'train')}",
+        *(*PLUGIN, "--env.action=joint_increment", "--env.episode_length=10", "--env.render_width=64"),
+        *("--env.render_height=48", "--eval.n_episodes=4", "--eval.batch_size=2", f"--output_dir={trained / 'eval'}"),
+        cwd=trained,
+    )
+    result = json.loads((trained / "eval" / "eval_info.json").read_text())
+    assert result["overall"]["n_episodes"] == 4
+    assert result["overall"]["pc_success"] == 0.0
+    videos = sorted((trained / "eval" / "videos").rglob("*.mp4"))
+    assert len(videos) == 4
+    assert all(video.stat().st_size > 1000 for video in videos)
+
+
+def test_the_plugin_maps_features_as_the_dataset_names_them(trained: Path) -> None:
+    from lerobot.envs.utils import env_to_policy_features
+
+    from demorec.lerobot_env import DemorecEnvConfig
+
+    info = json.loads((trained / "dataset" / "meta" / "info.json").read_text())["features"]
+    found = env_to_policy_features(DemorecEnvConfig(action="joint_increment"))
+    names = [name for name in info if name.startswith("observation.") or name == "action"]
+    assert {name: list(found[name].shape) for name in names} == {name: info[name]["shape"] for name in names}
+    cameras = DemorecEnvConfig(cameras=["front"], observation_width=64, observation_height=48)
+    pictures = env_to_policy_features(cameras)["observation.images.front"]
+    assert pictures.shape == (3, 48, 64)
+    assert "environment_state" not in cameras.features
+
+
+def test_evaluate_records_every_rollout_and_goes_on(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    policy = trained / "train"
+    assert trained_action(find_checkpoint(policy)) == "joint_increment"
+    settings = settings_for(policy, GenerateConfig(split="eval", cameras=()), episode_length=9)
+    assert settings.privileged
+    first = evaluate(settings, trained / "a", num_episodes=2, workers=1)
+    more = evaluate(settings, trained / "a", num_episodes=3, workers=2)
+    assert more.rollouts[:2] == first.rollouts
+    whole = evaluate(settings, trained / "b", num_episodes=3, workers=1)
+    assert [r.digest for r in whole.rollouts] == [r.digest for r in more.rollouts]
+    assert len({r.digest for r in whole.rollouts}) == 3
+    for rollout in whole.rollouts:
+        assert rollout.phase == "reach"
+        with Recording(trained / "b" / rollout.file) as recording:
+            assert recording.num_frames == 9
+            assert recording.info.origin == f"rollout of act {settings.policy_digest}"
+            columns = recording.columns()
+            assert np.array_equal(columns.command_joint_target, columns.action_joint_target)
+            # The commands led from each state to the next: the arm moved towards them.
+            assert np.abs(columns.joint_position[5, :7] - columns.command_joint_target[3]).max() < 0.05
+            assert recording.outcome is not None
+            assert not recording.outcome.success
+    assert load_evaluation(trained / "b").rate.trials == 3
+
+    with pytest.raises(SystemExit) as exit_info:
+        main(["evaluate", "--compare", str(trained / "a"), str(trained / "b")])
+    assert exit_info.value.code == 0
+    assert "0/3 = 0.0 %" in capsys.readouterr().out
+
+
+def test_another_evaluation_in_the_folder_is_refused(trained: Path) -> None:
+    settings = settings_for(trained / "train", GenerateConfig(split="eval", cameras=()), episode_length=4)
+    evaluate(settings, trained / "c", num_episodes=1, workers=1)
+    other = settings_for(trained / "train", GenerateConfig(split="eval", cameras=(), seed=5), episode_length=4)
+    with pytest.raises(ConfigError, match="config seed is 0 there and 5 here"):
+        evaluate(other, trained / "c", num_episodes=1, workers=1)
+    assert len(list((trained / "c" / "failed").iterdir())) == 1
+    replaced = evaluate(other, trained / "c", num_episodes=1, workers=1, overwrite=True)
+    assert replaced.settings.config.seed == 5
+    (trained / "mine").mkdir()
+    (trained / "mine" / "thesis.txt").write_text("precious")
+    with pytest.raises(ConfigError, match="no evaluation"):
+        evaluate(other, trained / "mine", num_episodes=1, workers=1, overwrite=True)
+    assert (trained / "mine" / "thesis.txt").read_text() == "precious"
+
+
+def test_what_is_no_policy_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="No policy that LeRobot saved"):
+        find_checkpoint(tmp_path)
+    (tmp_path / "config.json").write_text('{"type": "act", "input_features": {}}')
+    with pytest.raises(ConfigError, match="--action"):
+        settings_for(tmp_path, GenerateConfig(cameras=()))

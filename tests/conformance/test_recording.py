@@ -1,0 +1,331 @@
+"""Recordings read by other people's programs: mcap's reader, rosbags, FFmpeg, Rerun; and the robot by PyBullet."""
+
+from __future__ import annotations
+
+import io
+import re
+import subprocess
+import sys
+import zlib
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pytest
+from helpers_recording import frame_number, make_episode, write_episode
+from mcap.reader import make_reader
+from mcap.stream_reader import StreamReader
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from demorec.assets import asset_path
+from demorec.config import VideoConfig
+from demorec.recording.ros2 import DEFINITIONS
+
+NUM_FRAMES = 40
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("conformance")
+    return write_episode(
+        folder / "a.mcap", num_frames=NUM_FRAMES, depth=True, segmentation=True, physics_rate_joints=True
+    )
+
+
+@pytest.fixture(scope="module")
+def episode():
+    return make_episode(num_frames=NUM_FRAMES, depth=True, segmentation=True, physics_rate_joints=True)
+
+
+def test_the_mcap_reader_finds_every_checksum_right(path: Path) -> None:
+    with path.open("rb") as stream:
+        records = list(StreamReader(stream, validate_crcs=True).records)
+    assert len(records) > 1000
+    with path.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        assert reader.get_header().profile == "ros2"
+        summary = reader.get_summary()
+        assert summary is not None
+        assert summary.statistics is not None
+        assert sum(1 for _ in reader.iter_messages()) == summary.statistics.message_count
+        assert {metadata.name for metadata in reader.iter_metadata()} == {"demorec.episode", "demorec.outcome"}
+    with path.open("rb") as stream:
+        data_end = [record for record in records if type(record).__name__ == "DataEnd"]
+        assert data_end[0].data_section_crc not in (0, zlib.crc32(stream.read()))
+
+
+def test_mcap_decodes_what_was_written(path: Path, episode) -> None:
+    _, frames, _ = episode
+    with path.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        decoded: dict[str, list] = {}
+        for _, channel, message, content in reader.iter_decoded_messages():
+            decoded.setdefault(channel.topic, []).append((message.log_time, content))
+    assert len(decoded["/joint_states"]) == (NUM_FRAMES - 1) * 8 + 1
+    states = dict(decoded["/joint_states"])
+    for frame in frames:
+        content = states[frame.time_ns]
+        assert content.name == [
+            *(f"panda_joint{n}" for n in range(1, 8)),
+            "panda_finger_joint1",
+            "panda_finger_joint2",
+        ]
+        assert content.position == frame.observation.joint_position.tolist()
+        assert content.velocity == frame.observation.joint_velocity.tolist()
+        assert content.effort == frame.observation.joint_effort.tolist()
+        assert content.header.stamp.sec * 10**9 + content.header.stamp.nanosec == frame.time_ns
+    for frame, (time, content) in zip(frames, decoded["/action"], strict=True):
+        assert time == frame.time_ns
+        assert content.name[-1] == "gripper"
+        assert content.position == [*frame.action.joint_target.tolist(), frame.action.gripper_target]
+    for frame, (_, content) in zip(frames, decoded["/object/cube/pose"], strict=True):
+        pose, expected = content.pose, frame.observation.object_poses["cube"]
+        assert content.header.frame_id == "world"
+        assert [pose.position.x, pose.position.y, pose.position.z] == expected.position.tolist()
+        quat = [pose.orientation.x, pose.orientation.y, pose.orientation.z, pose.orientation.w]
+        assert quat == expected.quat_xyzw.tolist()
+    info = decoded["/camera/front/camera_info"][0][1]
+    assert (info.width, info.height) == (64, 48)
+    assert np.allclose(np.reshape(info.k, (3, 3)), [[49.68, 0, 32], [0, 49.68, 24], [0, 0, 1]], atol=0.01)
+    assert np.array_equal(np.reshape(info.p, (3, 4))[:, :3], np.reshape(info.k, (3, 3)))
+    assert [content.data for _, content in decoded["/phase"]] == list(dict.fromkeys(frame.phase for frame in frames))
+    assert [content.msg for _, content in decoded["/events"] if content.name == "grasp"] == [
+        "both fingers touch the cube"
+    ]
+    assert {content.level for _, content in decoded["/events"]} == {20, 30}
+    labels = {row.class_id: row.class_name for row in decoded["/labels"][0][1].class_map}
+    assert labels[0] == "background"
+    assert labels[(2 + 1) * 256 + 5] == "panda/panda_link5"
+    for frame, (_, content) in zip(frames, decoded["/camera/front/segmentation"], strict=True):
+        picture = cv2.imdecode(np.frombuffer(bytes(content.data), dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+        assert picture.dtype == np.uint16
+        assert (picture == 0).tolist() == (frame.images["front"].segmentation == -1).tolist()
+
+
+def test_rosbags_deserialises_every_message(path: Path, episode) -> None:
+    _, frames, _ = episode
+    store = get_typestore(Stores.EMPTY)
+    for name, definition in DEFINITIONS.items():
+        store.register(get_types_from_msg(definition, name))
+    count, positions = 0, []
+    with AnyReader([path], default_typestore=store) as reader:
+        for connection, _, raw in reader.messages():
+            message = reader.deserialize(raw, connection.msgtype)
+            # What was read, written again, gives the same bytes: no field was skipped or padded otherwise.
+            assert bytes(store.serialize_cdr(message, connection.msgtype)) == bytes(raw), connection.topic
+            count += 1
+            if connection.topic == "/ee_pose":
+                positions.append([message.pose.position.x, message.pose.position.y, message.pose.position.z])
+    assert count > 1000
+    assert np.array_equal(positions, [frame.observation.base_from_tcp.position for frame in frames])
+
+
+def test_definitions_are_those_of_ros(path: Path) -> None:
+    """Names, types and order of all fields, against the definitions that rosbags carries for ROS 2 Humble."""
+    theirs = get_typestore(Stores.ROS2_HUMBLE).fielddefs
+    compared = set()
+    for name, definition in DEFINITIONS.items():
+        for key, ours in get_types_from_msg(definition, name).items():
+            if key in theirs:
+                assert ours[1] == theirs[key][1], key
+                compared.add(key)
+    assert {"sensor_msgs/msg/JointState", "tf2_msgs/msg/TFMessage", "sensor_msgs/msg/CameraInfo"} <= compared
+    assert len(compared) >= 18
+
+
+@pytest.mark.parametrize("codec", ["h264", "av1", "jpeg"])
+def test_ffmpeg_decodes_the_bytes_of_the_topic(tmp_path: Path, codec: str) -> None:
+    path = write_episode(tmp_path / "a.mcap", num_frames=NUM_FRAMES, video=VideoConfig(codec=codec))
+    topic = {"h264": "/camera/wrist/h264", "av1": "/camera/wrist/video", "jpeg": "/camera/wrist/image/compressed"}
+    with path.open("rb") as stream:
+        messages = [message.data for _, _, message in make_reader(stream).iter_messages(topics=[topic[codec]])]
+    if codec == "av1":
+        packets = [protobuf_field(message, 3) for message in messages]
+    else:
+        packets = [cdr_compressed_image(message) for message in messages]
+    assert len(packets) == NUM_FRAMES
+    name = {"h264": "h264", "av1": "obu", "jpeg": "mjpeg"}[codec]
+    with av.open(io.BytesIO(b"".join(packets)), format=name) as container:
+        pictures = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+    assert [frame_number(picture) for picture in pictures] == list(range(NUM_FRAMES))
+
+
+def cdr_compressed_image(message: bytes) -> bytes:
+    """The last field of sensor_msgs/CompressedImage: a sequence that ends with the message, as the start of a code."""
+    for code in (b"\0\0\0\1", b"\xff\xd8\xff"):
+        at = message.find(code, 30)
+        if at > 0 and int.from_bytes(message[at - 4 : at], "little") == len(message) - at:
+            return message[at:]
+    raise AssertionError("no picture in the message")
+
+
+def protobuf_field(message: bytes, number: int) -> bytes:
+    """A field of foxglove.CompressedVideo, through Google's own protobuf and the schema that comes with it."""
+    from foxglove.messages import CompressedVideo
+    from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+
+    pool = descriptor_pool.DescriptorPool()
+    files = descriptor_pb2.FileDescriptorSet.FromString(CompressedVideo.get_schema().data)
+    for file in files.file:
+        pool.Add(file)
+    kind = message_factory.GetMessageClass(pool.FindMessageTypeByName("foxglove.CompressedVideo"))
+    parsed = kind.FromString(message)
+    assert parsed.format == "av1"
+    return getattr(parsed, kind.DESCRIPTOR.fields_by_number[number].name)
+
+
+def rerun_entities(path: Path, folder: Path) -> dict[str, set[str]]:
+    """Entity -> archetypes that `rerun mcap convert` makes of a recording, on its own."""
+    rerun = Path(sys.executable).with_name("rerun")
+    result = folder / "a.rrd"
+    subprocess.run([rerun, "mcap", "convert", path, "-o", result], check=True, capture_output=True, timeout=120)
+    printed = subprocess.run([rerun, "rrd", "print", result], check=True, capture_output=True, text=True, timeout=120)
+    entities: dict[str, set[str]] = {}
+    for entity, columns in re.findall(r"- (/\S*) - data columns: \[(.*)\]", printed.stdout):
+        names = {column.split(":")[0] for column in columns.split() if ":" in column}
+        entities.setdefault(entity, set()).update(names - {"McapChannel", "McapSchema"})
+    return entities
+
+
+def test_rerun_shows_everything_without_code_of_ours(path: Path, tmp_path: Path) -> None:
+    entities = rerun_entities(path, tmp_path)
+    expected = {
+        "/camera/front/h264": "VideoStream",
+        "/camera/wrist/h264": "VideoStream",
+        "/camera/front/camera_info": "Pinhole",
+        "/camera/front/depth": "EncodedDepthImage",
+        "/camera/front/segmentation": "EncodedImage",
+        "/joint_states/position": "Scalars",
+        "/joint_states/velocity": "Scalars",
+        "/joint_states/effort": "Scalars",
+        "/action/position": "Scalars",
+        "/gripper/position": "Scalars",
+        "/tf": "Transform3D",
+        "/tf_static": "Transform3D",
+        "/ee_pose": "InstancePoses3D",
+        "/object/cube/pose": "InstancePoses3D",
+        "/events": "TextLog",
+        "/phase": "TextDocument",
+    }
+    for entity, archetype in expected.items():
+        assert archetype in entities[entity], (entity, entities[entity])
+    shapes = {entity for entity, names in entities.items() if names & {"Boxes3D", "Cylinders3D", "Ellipsoids3D"}}
+    for link in ("panda_link0", "panda_link5", "panda_hand", "panda_leftfinger"):
+        assert any(link in entity for entity in shapes), link
+    assert any("cube" in entity for entity in shapes)
+    assert not any("Asset3D" in names for names in entities.values())
+
+
+@pytest.mark.parametrize(
+    ("codec", "entity", "archetype"),
+    [("av1", "/camera/front/video", "VideoStream"), ("jpeg", "/camera/front/image/compressed", "EncodedImage")],
+)
+def test_rerun_shows_the_other_codecs(tmp_path: Path, codec: str, entity: str, archetype: str) -> None:
+    path = write_episode(tmp_path / "a.mcap", num_frames=5, video=VideoConfig(codec=codec))
+    assert archetype in rerun_entities(path, tmp_path)[entity]
+
+
+def test_rerun_finds_no_fault(path: Path) -> None:
+    rerun = Path(sys.executable).with_name("rerun")
+    done = subprocess.run(
+        [rerun, "mcap", "check", "--full", path], check=True, capture_output=True, text=True, timeout=120
+    )
+    _, table = done.stdout.split("Status", 1)
+    rows = [line.split() for line in table.splitlines() if " /" in line]
+    assert len(rows) >= 25
+    assert {row[0] for row in rows} == {"ok"}, done.stdout
+
+
+def test_no_description_needs_another_file(path: Path) -> None:
+    """The robot of a copied recording is drawn from the recording alone."""
+    with path.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        texts = [
+            content.data
+            for _, channel, _, content in reader.iter_decoded_messages()
+            if channel.topic.endswith("robot_description")
+        ]
+    assert len(texts) == 4
+    for text in texts:
+        assert "<visual" in text
+        for word in ("mesh", "filename", "package:", "file:", str(Path.home()), str(asset_path("plane.urdf").parent)):
+            assert word not in text, word
+
+
+def test_coordinate_frames_are_where_pybullet_has_the_links(path: Path, episode) -> None:
+    """Every link's pose from /tf and /tf_static alone, against PyBullet's own forward kinematics."""
+    pybullet = pytest.importorskip("pybullet")
+    info, frames, _ = episode
+    transforms: dict[str, tuple[str, np.ndarray]] = {}
+    moving: dict[int, dict[str, tuple[str, np.ndarray]]] = {}
+    with path.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        for _, channel, message, content in reader.iter_decoded_messages(topics=["/tf", "/tf_static"]):
+            rows = {row.child_frame_id: (row.header.frame_id, matrix_of(row.transform)) for row in content.transforms}
+            if channel.topic == "/tf_static":
+                transforms.update(rows)
+            else:
+                moving[message.log_time] = rows
+    assert transforms["world"][0] == "tf#/"
+    client = pybullet.connect(pybullet.DIRECT)
+    try:
+        body = pybullet.loadURDF(str(asset_path(info.robot.urdf)), useFixedBase=True, physicsClientId=client)
+        count = pybullet.getNumJoints(body, physicsClientId=client)
+        joints = [pybullet.getJointInfo(body, index, physicsClientId=client) for index in range(count)]
+        numbers = {row[1].decode(): row[0] for row in joints}
+        for frame in (frames[0], frames[17], frames[-1]):
+            for name, value in zip(info.robot.joint_names, frame.observation.joint_position, strict=True):
+                pybullet.resetJointState(body, numbers[name], value, physicsClientId=client)
+            tree = {**transforms, **moving[frame.time_ns]}
+            for row in joints:
+                state = pybullet.getLinkState(body, row[0], computeForwardKinematics=True, physicsClientId=client)
+                expected = np.eye(4)
+                expected[:3, :3] = np.reshape(pybullet.getMatrixFromQuaternion(state[5]), (3, 3))
+                expected[:3, 3] = state[4]
+                assert np.allclose(world_from(row[12].decode(), tree), expected, atol=1e-6), row[12]
+            cube = frame.observation.object_poses["cube"].matrix()
+            assert np.allclose(world_from("cube", tree), cube, atol=1e-12)
+            front = frame.images["front"].world_from_camera.matrix()
+            assert np.allclose(world_from("camera_front", tree), front, atol=1e-9)
+    finally:
+        pybullet.disconnect(client)
+
+
+def matrix_of(transform) -> np.ndarray:
+    q = transform.rotation
+    x, y, z, w = q.x, q.y, q.z, q.w
+    matrix = np.eye(4)
+    matrix[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    matrix[:3, 3] = transform.translation.x, transform.translation.y, transform.translation.z
+    return matrix
+
+
+def world_from(frame: str, tree: dict[str, tuple[str, np.ndarray]]) -> np.ndarray:
+    result = np.eye(4)
+    while frame != "world":
+        frame, parent_from_child = tree[frame]
+        result = parent_from_child @ result
+    return result
+
+
+def test_segment_names_are_pybullets_links() -> None:
+    pybullet = pytest.importorskip("pybullet")
+    from demorec.recording.labels import segment_names
+
+    info, _, _ = make_episode(num_frames=1)
+    names = dict(segment_names(info))
+    client = pybullet.connect(pybullet.DIRECT)
+    try:
+        body = pybullet.loadURDF(str(asset_path(info.robot.urdf)), physicsClientId=client)
+        for index in range(pybullet.getNumJoints(body, physicsClientId=client)):
+            link = pybullet.getJointInfo(body, index, physicsClientId=client)[12].decode()
+            assert names[2 + ((index + 1) << 24)] == f"panda/{link}"
+    finally:
+        pybullet.disconnect(client)

@@ -1,0 +1,11 @@
+"""Shared by all tests: no network, one thread per process, a cache folder that is not the user's only when asked."""
+
+from __future__ import annotations
+
+import os
+
+# Heavy libraries read these once, at import; tests run in several processes on few cores.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("HF_HUB_OFFLINE", "1")
+os.environ.setdefault("HF_DATASETS_OFFLINE", "1")

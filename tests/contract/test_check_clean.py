@@ -1,0 +1,77 @@
+"""Clean data of every task passes every check without a warning, and the command says so."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from helpers_check import checked, simulate
+
+from demorec.cli import main
+from demorec.tables import CHECKS, ROBOTS, TASKS
+
+
+@pytest.mark.parametrize("task", TASKS.names())
+def test_every_task(task: str, tmp_path: Path) -> None:
+    report = checked(simulate(tmp_path / "e.mcap", task=task, seed=21))
+    assert [r for r in report.results if r.level in ("warn", "fail")] == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", TASKS.names())
+def test_every_task_with_pictures(task: str, tmp_path: Path) -> None:
+    path = simulate(tmp_path / "e.mcap", task=task, seed=22, cameras=("front", "wrist"), width=128, height=128)
+    assert [r for r in checked(path).results if r.level in ("warn", "fail")] == []
+
+
+@pytest.mark.parametrize("robot", ROBOTS.names())
+@pytest.mark.parametrize("variation", ["none", "full"])
+def test_every_robot_and_variation(robot: str, variation: str, tmp_path: Path) -> None:
+    report = checked(simulate(tmp_path / "e.mcap", robot=robot, variation=variation, seed=23))
+    assert [r for r in report.results if r.level in ("warn", "fail")] == []
+
+
+def test_every_check_says_what_it_measures() -> None:
+    for name in CHECKS.names():
+        check = CHECKS.load(name)
+        assert check.name == name
+        assert check.measures
+        assert check.warn <= check.fail
+        assert check.measure.__doc__
+
+
+def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = simulate(tmp_path / "e.mcap", seed=21)
+    cases = [
+        ((path,), 0),
+        ((path, "--strict", "--json"), 0),
+        ((path, "--only", "opens", "joint_velocity"), 0),
+        ((path, "--only", "joint_velocty"), 2),
+        ((tmp_path / "nothing",), 2),
+        ((), 2),
+        ((path, "--replay", "1"), 0),
+        ((path, "--coverage-picture", tmp_path / "c.png"), 0),
+    ]
+    for args, code in cases:
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as ended:
+            main(["check", *(str(arg) for arg in args)])
+        assert int(ended.value.code or 0) == code, args
+        if "--json" in args:
+            told = json.loads(capsys.readouterr().out)
+            assert told[0]["level"] == "pass"
+            assert len(told[0]["results"]) > 30
+    assert (tmp_path / "c.png").is_file()
+
+
+def test_strict_turns_warnings_into_failures(tmp_path: Path) -> None:
+    from demorec.recording import recover
+
+    whole = simulate(tmp_path / "e.mcap", seed=21)
+    (tmp_path / "cut.mcap.part").write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
+    recover(tmp_path / "cut.mcap.part", tmp_path / "cut.mcap")
+    for args, code in (((), 0), (("--strict",), 1)):
+        with pytest.raises(SystemExit) as ended:
+            main(["check", str(tmp_path / "cut.mcap"), *args])
+        assert int(ended.value.code or 0) == code

@@ -1,0 +1,243 @@
+"""The environment of every task: gymnasium's rules, and the very numbers of the recordings."""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
+from helpers_sim import episode
+
+import demorec.gym_env
+from demorec import features
+from demorec.acting import ACTION_KINDS
+from demorec.errors import ConfigError, SceneError
+from demorec.gym_env import DemorecEnv, env_id
+from demorec.recording import EpisodeWriter, Recording
+from demorec.rollout import Rollout, make_renderer, make_world
+from demorec.tables import TASKS
+
+FRAMES = 45
+VARYING = ("sort_by_color", "pick_from_clutter", "pick_shapes")
+"""Tasks whose scenes differ in the number of objects, so that no vector can hold their poses."""
+KEYS = {
+    "observation.state": "agent_pos",
+    "observation.velocity": "velocity",
+    "observation.ee_pose": "ee_pose",
+    "observation.environment_state": "environment_state",
+}
+
+
+def make(task: str = "pick_place", **options: Any) -> DemorecEnv:
+    env = gymnasium.make(env_id(task), disable_env_checker=True, **options).unwrapped
+    assert isinstance(env, DemorecEnv)
+    return env
+
+
+@pytest.mark.parametrize("task", TASKS.names())
+@pytest.mark.filterwarnings("ignore:.*(action space|observation space|Box).*:UserWarning")
+def test_gymnasium_accepts_the_environment(task: str) -> None:
+    env = make(task)
+    assert ("environment_state" in env.observation_space.spaces) == (task not in VARYING)
+    check_env(env, skip_render_check=True)
+    env.close()
+    env.close()
+
+
+@pytest.mark.parametrize("task", TASKS.names())
+def test_a_recordings_commands_give_its_observations_to_the_bit(task: str, tmp_path: Path) -> None:
+    """The numbers of the exported features of a file on disk, against those that a policy would see."""
+    prepared = episode(3, task=task)
+    path = tmp_path / "episode.mcap"
+    with make_world(prepared.info) as world, EpisodeWriter(path, prepared.info) as writer:
+        rollout = Rollout(world, prepared)
+        for frame in rollout:
+            writer.write(frame)
+        assert rollout.outcome is not None
+        writer.finish(rollout.outcome)
+    with Recording(path) as recording:
+        info, columns = recording.info, recording.columns()
+    rows = features.ObservationRows.of_columns(columns)
+    expected = features.observation_vectors(rows, info.robot, info.scene, privileged=True)
+    # The first task to its end, the others until they have touched something.
+    count = columns.num_frames if task == "pick_place" else min(columns.num_frames, 2 * FRAMES)
+
+    env = make(task, split="all")
+    observation, _ = env.reset(seed=3)
+    assert len(observation) == 4 - (task in VARYING)
+    for t in range(count):
+        for name, key in env.keys.items():
+            assert key == KEYS[name]
+            assert np.array_equal(observation[key], expected[name][t]), (name, t)
+        command = np.append(columns.command_joint_target[t], columns.command_gripper[t])
+        observation, _, terminated, _, _ = env.step(command)
+    assert terminated == (task == "pick_place")
+    env.close()
+
+
+@pytest.mark.parametrize("kind", ACTION_KINDS)
+def test_exported_actions_solve_the_task(kind: features.ActionKind) -> None:
+    """float32 actions of each kind, executed one after the other, do what the expert did (without noise)."""
+    prepared = episode(2, variation="none")
+    with make_world(prepared.info) as world:
+        frames = list(Rollout(world, prepared))
+    columns = columns_of(frames)
+    actions = features.action_vectors(columns, prepared.info.scene, kind)
+    assert actions.dtype == np.float32
+    env = make(split="all", variation="none", action=kind)
+    env.reset(seed=2)
+    assert env.info.scene == prepared.info.scene
+    rewards = []
+    for action in actions:
+        assert env.action_space.contains(action)
+        _, reward, terminated, truncated, info = env.step(action)
+        assert info["is_success"] == terminated == (reward == 1.0)
+        assert not truncated
+        rewards.append(reward)
+        if terminated:
+            break
+    assert sum(rewards) == rewards[-1] == 1.0
+    env.close()
+
+
+def columns_of(frames: list[Any]) -> Any:
+    """The columns of frames, through a file."""
+    import tempfile
+
+    from demorec.episode import Outcome
+
+    prepared = episode(2, variation="none")
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "e.mcap"
+        with EpisodeWriter(path, prepared.info) as writer:
+            for frame in frames:
+                writer.write(frame)
+            writer.finish(Outcome(success=True, checks=(), num_frames=len(frames)))
+        with Recording(path) as recording:
+            return recording.columns()
+
+
+def test_pictures_are_those_of_the_rollout() -> None:
+    options = {"cameras": ("front", "wrist"), "width": 64, "height": 48}
+    prepared = episode(5, **options)
+    env = make(split="all", **options)
+    assert "environment_state" not in env.observation_space.spaces
+    observation, _ = env.reset(seed=5)
+    with make_world(prepared.info) as world, make_renderer(prepared.info) as renderer:
+        for frame in Rollout(world, prepared, renderer):
+            for camera, images in frame.images.items():
+                assert np.array_equal(observation["pixels"][camera], images.color)
+            observation = env.step(np.append(frame.command.joint_target, frame.command.gripper_target))[0]
+            if frame.frame_index == 10:
+                break
+    env.close()
+
+
+def test_a_recordings_scene_can_be_set_up() -> None:
+    scene = episode(7, seed=99).info.scene
+    env = make(split="all")
+    env.reset(seed=0, options={"scene": scene, "something of LeRobot's": True})
+    assert env.info.scene == scene
+    env.close()
+
+
+def test_the_splits_and_seeds_give_other_scenes() -> None:
+    starts = set()
+    for split, seed in (("all", 0), ("all", 1), ("train", 0), ("eval", 0)):
+        env = make(split=split, seed=seed)
+        env.reset(seed=4)
+        starts.add(tuple(env.info.scene.body("red_cube").world_from_body.position))
+        env.close()
+    assert len(starts) >= 3
+
+
+def test_a_varying_number_of_objects_is_refused_where_a_vector_must_hold_them() -> None:
+    env = make("sort_by_color", privileged=True)
+
+    def look_at_several() -> None:
+        for seed in range(8):
+            env.reset(seed=seed)
+
+    with pytest.raises(SceneError, match="other objects"):
+        look_at_several()
+    env.close()
+
+
+def test_time_is_limited_and_nonsense_is_refused() -> None:
+    env = make(episode_length=3)
+    with pytest.raises(RuntimeError, match="reset"):
+        env.step(env.action_space.sample())
+    env.reset(seed=0)
+    hold = np.append(env.info.scene.robot.joint_position, 0.08)
+    ends = [env.step(hold)[2:4] for _ in range(3)]
+    assert ends == [(False, False), (False, False), (False, True)]
+    with pytest.raises(ValueError, match="finite"):
+        env.step(np.full(8, np.nan))
+    with pytest.raises(ValueError, match="shape"):
+        env.step(np.zeros(7))
+    env.close()
+    with pytest.raises(ConfigError, match="Did you mean 'joint_increment'"):
+        make(action="joint_increments")
+    with pytest.raises(ConfigError, match="render_mode"):
+        DemorecEnv(render_mode="human")
+    with pytest.raises(ConfigError, match="Did you mean 'stack'"):
+        env_id("stck")
+
+
+def test_commands_keep_to_the_limits() -> None:
+    env = make()
+    env.reset(seed=0)
+    robot = env.info.robot
+    before = np.array(env.info.scene.robot.joint_position)
+    for target in (np.full(7, 100.0), np.full(7, -100.0)):
+        env.step(np.append(target, 5.0))
+        command = env.situation.command
+        assert command is not None
+        step = np.abs(command.joint_target - before)
+        assert np.all(step <= np.array(robot.velocity_limit) / 30 + 1e-12)
+        assert command.gripper_target == robot.gripper_max_width
+        before = command.joint_target
+    env.close()
+
+
+def test_render_shows_the_world() -> None:
+    env = make(render_mode="rgb_array", render_width=64, render_height=48)
+    env.reset(seed=0)
+    picture = env.render()
+    assert picture is not None
+    assert picture.shape == (48, 64, 3)
+    assert picture.std() > 10
+    for _ in range(8):
+        env.step(np.append(np.array(env.info.scene.robot.joint_position) + 0.4, 0.08))
+    assert not np.array_equal(picture, env.render())
+    env.close()
+
+
+@pytest.mark.parametrize("vector", [SyncVectorEnv, AsyncVectorEnv])
+def test_vectors_of_environments_give_what_single_ones_give(vector: type) -> None:
+    fns = [functools.partial(gymnasium.make, "demorec.gym_env:demorec/PickPlace-v0", split="all")] * 2
+    options = {} if vector is SyncVectorEnv else {"context": "spawn"}
+    envs = vector(fns, **options)
+    single = make(split="all")
+    actions = np.stack([envs.single_action_space.sample() for _ in range(2)])
+    observations, _ = envs.reset(seed=[8, 9])
+    after, *_ = envs.step(actions)
+    for i, seed in enumerate((8, 9)):
+        expected, _ = single.reset(seed=seed)
+        for key, value in expected.items():
+            assert np.array_equal(observations[key][i], value)
+        for key, value in single.step(actions[i])[0].items():
+            assert np.array_equal(after[key][i], value)
+    envs.close()
+    single.close()
+
+
+def test_every_task_is_registered_on_import() -> None:
+    assert demorec.gym_env is not None
+    for task in TASKS.names():
+        assert gymnasium.spec(env_id(task)).kwargs["task"] == task

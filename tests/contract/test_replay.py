@@ -1,0 +1,168 @@
+"""Recorded actions and states, back in the simulator."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers_check import Spoilt, simulate, simulate_run
+
+from demorec.cli import main
+from demorec.errors import ConfigError
+from demorec.export.lerobot import export_lerobot
+from demorec.export.options import ExportOptions
+from demorec.recording import Recording
+from demorec.replay import ReplayOptions, ReplayReport, open_file, replay_all
+from demorec.tables import TASKS
+
+
+@pytest.fixture(scope="session")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return simulate(tmp_path_factory.mktemp("replay") / "recorded.mcap", seed=11)
+
+
+def _replay(path: Path, **options: object) -> ReplayReport:
+    chosen = ReplayOptions(**options)  # type: ignore[arg-type]
+    return next(iter(replay_all([open_file(path, chosen)], chosen)))[0]
+
+
+def _exit_code(*args: object) -> int:
+    with pytest.raises(SystemExit) as ended:
+        main([str(arg) for arg in args])
+    return int(ended.value.code or 0)
+
+
+@pytest.mark.parametrize("task", TASKS.names())
+def test_every_task_replays_to_the_bit(task: str, tmp_path: Path) -> None:
+    path = simulate(tmp_path / "e.mcap", task=task, seed=5)
+    report = _replay(path)
+    assert report.is_identical, report
+    assert report.joint_error == report.object_error == report.gripper_error == 0.0
+    assert report.success == report.recorded_success
+
+
+@pytest.mark.parametrize("fps", [10, 60])
+def test_other_rates_replay_to_the_bit(fps: int, tmp_path: Path) -> None:
+    assert _replay(simulate(tmp_path / "e.mcap", fps=fps, seed=5)).is_identical
+
+
+def test_the_first_different_step_is_found(recorded: Path, tmp_path: Path) -> None:
+    spoilt = Spoilt(recorded)
+    targets = spoilt.columns.command_joint_target.copy()
+    targets[70, 2] += 1e-12
+    spoilt.set(command_joint_target=targets)
+    report = _replay(spoilt.write(tmp_path / "s.mcap"))
+    assert report.first_difference == (71, "joint positions")  # command 70 shows in state 71
+    assert 0 < report.joint_error < 1e-6
+    assert report.success
+
+
+def test_a_state_that_was_changed_is_found(recorded: Path, tmp_path: Path) -> None:
+    spoilt = Spoilt(recorded)
+    poses = spoilt.columns.object_poses["red_cube"].copy()
+    poses[30, 0] += 0.25
+    spoilt.pose_of("red_cube", poses)
+    report = _replay(spoilt.write(tmp_path / "s.mcap"))
+    assert report.first_difference == (30, "the pose of red_cube")
+    assert report.object_error == pytest.approx(0.25, abs=1e-6)
+    assert report.object_error_step == 30
+
+
+def test_another_final_state_is_found(recorded: Path, tmp_path: Path) -> None:
+    spoilt = Spoilt(recorded)
+    assert spoilt.outcome is not None
+    spoilt.outcome = replace(spoilt.outcome, final_state_digest="0" * 64)
+    report = _replay(spoilt.write(tmp_path / "s.mcap"))
+    assert report.first_difference == (report.num_steps, "the final state")
+
+
+def test_states(recorded: Path) -> None:
+    report = _replay(recorded, states=True)
+    assert report.is_identical
+    assert report.success is None
+
+
+def test_noise_delay_and_rate_change_the_motion(recorded: Path) -> None:
+    plain = _replay(recorded)
+    noisy, again, other = (_replay(recorded, noise=0.01, seed=seed) for seed in (1, 1, 2))
+    assert noisy == again
+    assert noisy.joint_error != other.joint_error
+    assert 0.005 < noisy.joint_error < 0.2
+    late = _replay(recorded, delay=4)
+    assert late.num_steps == plain.num_steps + 4
+    assert late.joint_error > 0.02
+    slow = _replay(recorded, export_hz=10)
+    assert slow.num_steps == -(-plain.num_steps // 3)
+    assert not slow.is_identical
+    wild = _replay(recorded, noise=0.5)
+    assert wild.success is False
+
+
+def test_options_that_cannot_be(recorded: Path) -> None:
+    for options in ({"noise": -1.0}, {"delay": -1}, {"states": True, "delay": 1}):
+        with pytest.raises(ConfigError):
+            ReplayOptions(**options).validate()  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match="7"):
+        _replay(recorded, export_hz=7)
+
+
+def test_a_recording_of_the_replay(tmp_path: Path) -> None:
+    source = simulate(tmp_path / "e.mcap", seed=11, cameras=("front",), width=64, height=64)
+    assert _exit_code("replay", source, "--out", tmp_path / "out") == 0
+    with Recording(source) as a, Recording(tmp_path / "out" / "e.mcap") as b:
+        assert b.info.origin == f"replay of {a.digest()[:16]}"
+        x, y = a.columns(), b.columns()
+        assert np.array_equal(x.joint_position, y.joint_position)
+        assert np.array_equal(x.action_joint_target, y.action_joint_target)
+        assert x.phase == y.phase
+        assert [p.data for p in a.packets("front")] == [p.data for p in b.packets("front")]
+        assert b.outcome == a.outcome
+    # Not over what is there, unless asked for; never over the source.
+    assert _exit_code("replay", source, "--out", tmp_path / "out") == 1
+    assert _exit_code("replay", source, "--out", tmp_path / "out", "--overwrite") == 0
+    assert _exit_code("replay", source, "--out", tmp_path, "--overwrite") == 2
+
+
+def test_the_command(recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert _exit_code("replay", recorded) == 0
+    assert "identical, succeeds" in capsys.readouterr().out
+    assert _exit_code("replay", recorded, "--json") == 0
+    assert json.loads(capsys.readouterr().out)[0]["is_identical"] is True
+    assert _exit_code("replay", recorded, "--states") == 0
+    assert _exit_code("replay", recorded, "--noise", "0.5") == 1
+    assert _exit_code("replay", recorded, "--episodes", "5:9") == 2
+    assert _exit_code("replay", tmp_path / "nothing") == 2
+    spoilt = Spoilt(recorded)
+    targets = spoilt.columns.command_joint_target.copy()
+    targets[70, 2] += 1e-12
+    spoilt.set(command_joint_target=targets)
+    path = spoilt.write(tmp_path / "s.mcap")
+    assert _exit_code("replay", path) == 1
+    assert "differs from step 71" in capsys.readouterr().out
+    assert _exit_code("replay", path, "--tolerance", "0.001") == 0
+
+
+@pytest.mark.parametrize("action", ["joint", "joint_increment", "ee", "ee_delta"])
+def test_datasets_of_every_kind_of_action(action: str, tmp_path: Path) -> None:
+    # Without exploration noise, actions are what was executed, rounded to float32.
+    run = simulate_run(tmp_path / "run", 2, seed=3, variation="none")
+    export_lerobot([run], tmp_path / "ds", ExportOptions(verify=False, action=action))  # type: ignore[arg-type]
+    from demorec.cli.replay import demonstrations
+
+    found = [report for report, _ in replay_all(demonstrations([tmp_path / "ds"], ReplayOptions()), ReplayOptions())]
+    assert [report.success for report in found] == [True, True]
+    assert all(report.unreachable == 0 for report in found)
+    # Inverse kinematics may bend the elbow another way; the joints themselves come back to rounding and drift.
+    limit = 2e-3 if action.startswith("joint") else 0.5
+    assert max(report.joint_error for report in found) < limit
+    assert _exit_code("replay", tmp_path / "ds", "--episodes", "1") == 0
+
+
+def test_a_dataset_with_noise_still_succeeds(tmp_path: Path) -> None:
+    run = simulate_run(tmp_path / "run", 2, seed=3)
+    export_lerobot([run], tmp_path / "ds", ExportOptions(verify=False, fps=10))
+    assert _exit_code("replay", tmp_path / "ds") == 0
+    assert _exit_code("check", tmp_path / "ds", "--no-pictures", "--replay", "2") == 0

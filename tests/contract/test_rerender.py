@@ -1,0 +1,133 @@
+"""Recorded states, new pictures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers_check import checked, simulate
+
+from demorec.cli import main
+from demorec.errors import ConfigError
+from demorec.recording import Recording
+from demorec.rerender import RerenderOptions, read_cameras, rerender
+
+SIDE = """
+[side]
+position = [0.5, 0.9, 0.5]
+look_at = [0.5, 0.0, 0.1]
+fov_y_degrees = 50
+"""
+
+
+@pytest.fixture(scope="session")
+def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("rerender") / "filmed.mcap"
+    return simulate(path, seed=13, cameras=("front", "wrist"), width=64, height=64)
+
+
+def _exit_code(*args: object) -> int:
+    with pytest.raises(SystemExit) as ended:
+        main([str(arg) for arg in args])
+    return int(ended.value.code or 0)
+
+
+def test_own_cameras_and_looks_give_the_recorded_pictures_again(filmed: Path, tmp_path: Path) -> None:
+    report = rerender(filmed, tmp_path / "again.mcap", RerenderOptions())
+    assert report.compared == ("front", "wrist")
+    assert not report.differing
+    with Recording(filmed) as a, Recording(tmp_path / "again.mcap") as b:
+        for camera in a.cameras:
+            assert [p.data for p in a.packets(camera)] == [p.data for p in b.packets(camera)]
+            assert np.array_equal(a.pixel_statistics(camera).counts, b.pixel_statistics(camera).counts)
+        x, y = a.columns(), b.columns()
+        for name in ("joint_position", "joint_velocity", "command_joint_target", "action_joint_target"):
+            assert np.array_equal(getattr(x, name), getattr(y, name))
+        assert np.array_equal(x.world_from_camera["wrist"], y.world_from_camera["wrist"])
+        assert list(a.events()) == list(b.events())
+        assert a.outcome == b.outcome
+        assert b.info.origin == f"render of {a.digest()[:16]}"
+
+
+def test_calibration_errors_are_kept(tmp_path: Path) -> None:
+    # The recorded extrinsics are off on purpose; the pictures must come from where the cameras were.
+    source = simulate(tmp_path / "e.mcap", seed=2, cameras=("front",), width=64, height=64, variation="full")
+    report = rerender(source, tmp_path / "again.mcap", RerenderOptions())
+    assert report.compared == ("front",)
+    assert not report.differing
+
+
+def test_other_cameras_sizes_and_looks_pass_the_checks(filmed: Path, tmp_path: Path) -> None:
+    (tmp_path / "cameras.toml").write_text(SIDE)
+    out = tmp_path / "out"
+    args = ("--cameras", "side", "front", "--camera-file", tmp_path / "cameras.toml", "--width", 128, "--height", 96)
+    assert _exit_code("render", filmed, "--out", out, *args, "--looks", 3, "--depth", "--segmentation") == 0
+    report = checked(out / "filmed.mcap")
+    assert [r for r in report.results if r.level in ("warn", "fail")] == []
+    passed = {r.check for r in report.results if r.level == "pass"}
+    assert {"projection", "depth_matches_scene", "segmentation_matches_scene"} <= passed
+    with Recording(filmed) as a, Recording(out / "filmed.mcap") as b:
+        assert b.cameras == ("side", "front")
+        assert next(b.images("side")).shape == (96, 128, 3)
+        assert b.info.scene.light != a.info.scene.light
+        assert b.info.scene.goals == a.info.scene.goals
+
+
+def test_looks_are_a_function_of_the_seed(filmed: Path, tmp_path: Path) -> None:
+    scenes = []
+    for name, seed in (("a", 1), ("b", 1), ("c", 2)):
+        rerender(filmed, tmp_path / f"{name}.mcap", RerenderOptions(looks=seed, cameras=("front",)))
+        with Recording(tmp_path / f"{name}.mcap") as recording:
+            scenes.append((recording.info.scene, recording.digest()))
+    assert scenes[0] == scenes[1]
+    assert scenes[0][0] != scenes[2][0]
+
+
+def test_a_spoilt_picture_is_found(filmed: Path, tmp_path: Path) -> None:
+    from helpers_check import Spoilt
+
+    spoilt = Spoilt(filmed)
+    spoilt.picture("front", lambda t, p: p[::-1] if t == 20 else p)
+    path = spoilt.write(tmp_path / "s.mcap")
+    assert _exit_code("render", path, "--out", tmp_path / "out") == 1
+
+
+def test_impossible_requests(filmed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert _exit_code("render", filmed, "--out", tmp_path, "--cameras", "frnt") == 2
+    assert "Did you mean 'front'" in capsys.readouterr().err
+    assert _exit_code("render", filmed, "--out", tmp_path, "--width", 65) == 2
+    assert _exit_code("render", filmed, "--out", filmed.parent) == 2  # over its own source
+    assert _exit_code("render", tmp_path, "--out", tmp_path / "x") == 2
+    assert _exit_code("render", filmed, "--out", tmp_path, "--renderer", "rastr") == 2
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["[a]\nposition = [0, 0, 1]\n", "[a]\nposition = [0, 0, 1]\nlook_at = [0, 0, 0]\ncolour = 3\n", "", "a = 3\n"],
+)
+def test_bad_camera_files(text: str, tmp_path: Path) -> None:
+    (tmp_path / "c.toml").write_text(text)
+    with pytest.raises(ConfigError):
+        [camera.camera(name, width=64, height=64) for name, camera in read_cameras(tmp_path / "c.toml").items()]
+
+
+def test_a_free_camera_stands_where_it_is_said(tmp_path: Path) -> None:
+    (tmp_path / "c.toml").write_text(SIDE)
+    camera = read_cameras(tmp_path / "c.toml")["side"].camera("side", width=64, height=48)
+    assert camera.mount_from_camera.position.tolist() == [0.5, 0.9, 0.5]
+    assert np.degrees(camera.fov_y) == pytest.approx(50)
+    # The optical axis goes through the point that is looked at.
+    seen = camera.mount_from_camera.inverse().apply(np.array([0.5, 0.0, 0.1]))
+    assert seen[:2] == pytest.approx([0, 0], abs=1e-12)
+    assert seen[2] == pytest.approx(np.hypot(0.9, 0.4))
+
+
+@pytest.mark.slow
+def test_several_processes_give_the_same(filmed: Path, tmp_path: Path) -> None:
+    for index in range(2):
+        simulate(
+            tmp_path / "in" / f"{index}.mcap", seed=13, episode_index=index, cameras=("front",), width=64, height=64
+        )
+    assert _exit_code("render", tmp_path / "in", "--out", tmp_path / "out", "--workers", 2) == 0
+    assert sorted(path.name for path in (tmp_path / "out").glob("*.mcap")) == ["0.mcap", "1.mcap"]

@@ -1,0 +1,90 @@
+"""Exports that die: killed at any moment, or out of disk. The dataset before is whole afterwards, or the new one is."""
+
+from __future__ import annotations
+
+import multiprocessing
+import shutil
+import signal
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers_export import count_calls, export, export_in_child, files_of, make_run
+
+KILLS = 10  # of each of three kinds
+
+pytestmark = pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
+
+
+@pytest.fixture(scope="module")
+def context() -> Any:
+    """Children are copies of this process, which has exported before: they start at once and load nothing."""
+    return multiprocessing.get_context("fork")
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_run(tmp_path_factory.mktemp("run") / "run", (6, 5, 7, 6), failures=(1,))
+
+
+def exit_code(context: Any, *arguments: Any, **limits: int) -> int:
+    process = context.Process(target=export_in_child, args=arguments, kwargs=limits)
+    process.start()
+    process.join(120)
+    assert process.exitcode is not None
+    return int(process.exitcode)
+
+
+@pytest.mark.parametrize("mode", ["new", "overwrite", "append"])
+def test_killed_at_any_moment(context: Any, run: Path, tmp_path: Path, mode: str) -> None:
+    out = tmp_path / "d"
+    before: dict[str, bytes] = {}
+    options: dict[str, Any] = {
+        "new": {},
+        "overwrite": {"overwrite": True},
+        "append": {"append": True, "episodes": "2:"},
+    }[mode]
+
+    def start_anew() -> None:
+        shutil.rmtree(out, ignore_errors=True)
+        if mode != "new":
+            export(run, out, episodes=":2")
+
+    start_anew()
+    before = files_of(out)
+    export(run, out, **options)  # whatever is loaded at first use is loaded now
+    after = files_of(out)
+    start_anew()
+    calls = count_calls(run, out, options)
+    assert files_of(out) == after != before
+
+    rng = np.random.default_rng(["new", "overwrite", "append"].index(mode))
+    outcomes = []
+    for moment in ((np.arange(KILLS) + rng.random(KILLS)) / KILLS * calls).astype(int).tolist():
+        start_anew()
+        assert exit_code(context, run, out, options, kill_at=max(1, moment)) == -signal.SIGKILL
+        found = files_of(out)
+        assert found in (before, after), moment
+        outcomes.append((found == after, any(path.name.startswith(".d.") for path in tmp_path.iterdir())))
+    assert any(left_something for _, left_something in outcomes)  # some were killed in the middle of their work
+    # The next export cleans up and works.
+    start_anew()
+    export(run, out, **options)
+    assert files_of(out) == after
+    assert [path.name for path in tmp_path.iterdir()] == ["d"]
+
+
+@pytest.mark.parametrize("limit", [500, 4_000, 15_000])
+@pytest.mark.parametrize("mode", ["new", "append"])
+def test_a_full_disk(context: Any, run: Path, tmp_path: Path, mode: str, limit: int) -> None:
+    """A limit on the size of a file fails the write that crosses it, as a full disk does."""
+    out = tmp_path / "d"
+    options: dict[str, Any] = {}
+    if mode == "append":
+        export(run, out, episodes=":2")
+        options = {"append": True, "episodes": "2:"}
+    before = files_of(tmp_path)
+    assert exit_code(context, run, out, options, size_limit=limit) == 3  # ExportError, nothing else
+    assert files_of(tmp_path) == before
+    export(run, out, **options)  # and with room again it works

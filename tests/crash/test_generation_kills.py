@@ -1,0 +1,98 @@
+"""The real job killed at random moments, and on a disk that fills up: the same data in the end."""
+
+from __future__ import annotations
+
+import os
+import random
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+
+from demorec.generate.run_file import load_run_file
+
+pytestmark = pytest.mark.slow
+NUM_EPISODES = 24
+NUM_KILLS = 12
+
+
+def command(out: Path, *more: str) -> list[str]:
+    entry = "from demorec.cli import generate_dataset_main as main; main()"
+    arguments = ["--out", str(out), "--num-episodes", str(NUM_EPISODES), "--cameras", "wrist", "--no-check"]
+    return [sys.executable, "-c", entry, *arguments, "--width", "32", "--height", "32", "--workers", "2", *more]
+
+
+def start(out: Path) -> subprocess.Popen[str]:
+    return subprocess.Popen(command(out), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+
+
+def num_finished(out: Path) -> int:
+    return len(list((out / "episodes").glob("*.mcap")))
+
+
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("reference") / "run"
+    subprocess.run(command(out), check=True, stdout=subprocess.DEVNULL)
+    return out
+
+
+@pytest.mark.timeout(1800)
+def test_sigkill_at_random_moments_does_not_change_the_dataset(tmp_path, reference):
+    """Driver and workers in turn, at moments spread over the run, the start of a driver included."""
+    chance, out, killed = random.Random(7), tmp_path / "run", {"driver": 0, "worker": 0}
+    process = start(out)
+    while sum(killed.values()) < NUM_KILLS:
+        enough = num_finished(out) + chance.choice((0, 1, 1, 2))
+        while num_finished(out) < enough and process.poll() is None:
+            time.sleep(0.01)
+        time.sleep(chance.random())
+        if process.poll() is not None:
+            break
+        workers = [p for p in psutil.Process(process.pid).children() if "spawn_main" in " ".join(p.cmdline())]
+        if workers and killed["worker"] < killed["driver"]:
+            chance.choice(workers).kill()
+            killed["worker"] += 1
+        else:
+            process.kill()
+            process.communicate()
+            killed["driver"] += 1
+            process = start(out)
+    _, errors = process.communicate()
+    assert process.returncode == 0, errors
+    assert sum(killed.values()) == NUM_KILLS, "the run ended before it was killed often enough"
+    assert min(killed.values()) > 0
+    run, expected = load_run_file(out), load_run_file(reference)
+    assert run.digest == expected.digest
+    assert [a.sha256 for a in run.attempts] == [a.sha256 for a in expected.attempts]
+    assert run.export is not None
+    assert expected.export is not None
+    assert run.export.dataset_digest == expected.export.dataset_digest
+
+
+@pytest.fixture
+def small_disk(tmp_path) -> Iterator[Path]:
+    """A file system of two megabytes."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=2m", "tmpfs", str(folder)]
+    if os.getuid() != 0 or subprocess.run(mount, capture_output=True, check=False).returncode:
+        pytest.skip("a small file system cannot be mounted here")
+    yield folder
+    subprocess.run(["umount", str(folder)], check=True)
+
+
+def test_a_full_disk_is_told_and_nothing_finished_is_lost(small_disk, reference):
+    out = small_disk / "run"
+    done = subprocess.run(command(out, "--no-export"), capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "the disk is full" in done.stderr
+    assert "Traceback" not in done.stderr
+    finished = sorted((out / "episodes").glob("*.mcap"))
+    assert 0 < len(finished) < NUM_EPISODES
+    for path in finished:
+        assert path.read_bytes() == (reference / "episodes" / path.name).read_bytes()

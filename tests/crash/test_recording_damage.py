@@ -1,0 +1,295 @@
+"""Damaged files: whatever is done to a recording, reading it gives one sentence or the very data that were written.
+
+The fast run damages some hundred files, the slow one more than two thousand (`-m slow`); both print what came out.
+"""
+
+from __future__ import annotations
+
+import random
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from helpers_recording import write_episode
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
+
+from demorec.config import VideoConfig
+from demorec.errors import RecordingError
+from demorec.recording import Recording, recover
+
+Damage = Callable[[bytes, random.Random], bytes]
+
+
+def flip_bit(data: bytes, rng: random.Random) -> bytes:
+    at = rng.randrange(len(data))
+    return data[:at] + bytes([data[at] ^ (1 << rng.randrange(8))]) + data[at + 1 :]
+
+
+def change_bytes(data: bytes, rng: random.Random) -> bytes:
+    at = rng.randrange(len(data))
+    return data[:at] + rng.randbytes(rng.randrange(1, 65)) + data[at + 64 :]
+
+
+def truncate(data: bytes, rng: random.Random) -> bytes:
+    return data[: rng.randrange(len(data))]
+
+
+def lose_the_front(data: bytes, rng: random.Random) -> bytes:
+    return data[rng.randrange(1, len(data)) :]
+
+
+def cut_out(data: bytes, rng: random.Random) -> bytes:
+    at = rng.randrange(len(data) - 1)
+    return data[:at] + data[at + rng.randrange(1, 2000) :]
+
+
+def insert(data: bytes, rng: random.Random) -> bytes:
+    at = rng.randrange(len(data))
+    return data[:at] + rng.randbytes(rng.randrange(1, 200)) + data[at:]
+
+
+def zero_a_sector(data: bytes, rng: random.Random) -> bytes:
+    at = rng.randrange(len(data)) // 512 * 512
+    return data[:at] + bytes(min(512, len(data) - at)) + data[at + 512 :]
+
+
+def repeat_a_piece(data: bytes, rng: random.Random) -> bytes:
+    at = rng.randrange(len(data))
+    return data[:at] + data[at : at + rng.randrange(1, 3000)] + data[at:]
+
+
+def swap_pieces(data: bytes, rng: random.Random) -> bytes:
+    first, second = sorted(rng.sample(range(len(data) - 256), 2))
+    length = min(256, second - first)
+    a, b = data[first : first + length], data[second : second + length]
+    return data[:first] + b + data[first + length : second] + a + data[second + length :]
+
+
+def damage_the_index(data: bytes, rng: random.Random) -> bytes:
+    """A bit in the last fifth, where the summary is."""
+    at = rng.randrange(len(data) * 4 // 5, len(data))
+    return data[:at] + bytes([data[at] ^ (1 << rng.randrange(8))]) + data[at + 1 :]
+
+
+DAMAGES: tuple[Damage, ...] = (
+    flip_bit,
+    change_bytes,
+    truncate,
+    lose_the_front,
+    cut_out,
+    insert,
+    zero_a_sector,
+    repeat_a_piece,
+    swap_pieces,
+    damage_the_index,
+)
+
+
+def content(path: Path) -> tuple[object, ...]:
+    """Everything that a recording gives, read through every method."""
+    with Recording(path) as recording:
+        statistics = tuple(
+            (camera, recording.pixel_statistics(camera).counts.tobytes(), recording.pixel_statistics(camera).num_images)
+            for camera in recording.cameras
+        )
+        pictures = tuple(picture.tobytes() for camera in recording.cameras for picture in recording.images(camera))
+        return (
+            recording.digest(),
+            recording.info,
+            recording.outcome,
+            recording.num_frames,
+            tuple(sorted(recording.segment_names().items())),
+            tuple(recording.video_settings(camera) for camera in recording.cameras),
+            statistics,
+            pictures,
+        )
+
+
+def is_one_sentence(message: str, path: Path) -> bool:
+    """A message of one line that ends with the path."""
+    return "\n" not in message and message.endswith(str(path)) and "Traceback" not in message
+
+
+class Fuzz:
+    """One recording of each codec, and what reading damaged copies of them gave."""
+
+    def __init__(self, folder: Path) -> None:
+        self.target = folder / "damaged.mcap"
+        self.originals = []
+        for codec in ("h264", "av1", "jpeg"):
+            path = write_episode(
+                folder / f"{codec}.mcap",
+                num_frames=9,
+                width=32,
+                height=32,
+                cameras=("front",),
+                depth=codec == "h264",
+                segmentation=codec == "h264",
+                video=VideoConfig(codec=codec),
+            )
+            self.originals.append((path.read_bytes(), content(path)))
+        self.results: Counter[str] = Counter()
+
+    def try_one(self, damage: Damage, seed: int) -> None:
+        rng = random.Random(seed)
+        original, expected = self.originals[seed % len(self.originals)]
+        damaged = damage(original, rng)
+        if damaged == original:  # a byte was replaced by itself: nothing was tried
+            self.results["not damaged"] += 1
+            return
+        self.target.write_bytes(damaged)
+        self.results["damaged"] += 1
+        refusal = None
+        try:
+            found = content(self.target)
+        except RecordingError as error:
+            refusal = str(error)
+        if refusal is None:
+            assert found == expected, f"wrong data after {damage}, seed {seed}"
+            self.results["read, all data right"] += 1
+        else:
+            assert is_one_sentence(refusal, self.target), refusal
+            self.results["refused in one sentence"] += 1
+
+    def try_recover(self, damage: Damage, seed: int) -> None:
+        """Recovering gives a prefix of the episode or one sentence."""
+        rng = random.Random(seed)
+        original, expected = self.originals[seed % len(self.originals)]
+        self.target.write_bytes(damage(original, rng))
+        kept = self.target.with_name("kept.mcap")
+        kept.unlink(missing_ok=True)
+        refusal = None
+        try:
+            recover(self.target, kept)
+        except RecordingError as error:
+            refusal = str(error)
+        if refusal is not None:
+            assert is_one_sentence(refusal, self.target), refusal
+            assert not kept.exists()
+            self.results["nothing to recover"] += 1
+            return
+        with Recording(kept) as recording:
+            pictures = tuple(picture.tobytes() for picture in recording.images("front"))
+            assert recording.info == expected[1]
+        assert 0 < len(pictures) <= expected[3]
+        assert pictures == expected[-1][: len(pictures)]
+        self.results["recovered"] += 1
+
+
+@contextmanager
+def reported(capsys: pytest.CaptureFixture[str], fuzz: Fuzz, title: str) -> Iterator[None]:
+    yield
+    with capsys.disabled():
+        print(f"\n{title}: " + ", ".join(f"{count} {what}" for what, count in sorted(fuzz.results.items())))
+
+
+def run_fuzz(fuzz: Fuzz, examples: int) -> None:
+    @settings(
+        max_examples=examples,
+        deadline=None,
+        database=None,
+        derandomize=True,
+        phases=[Phase.generate, Phase.shrink],
+        suppress_health_check=list(HealthCheck),
+    )
+    @given(damage=st.sampled_from(DAMAGES), seed=st.integers(0, 2**48))
+    def one(damage: Damage, seed: int) -> None:
+        fuzz.try_one(damage, seed)
+
+    one()
+
+
+def test_damaged_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    fuzz = Fuzz(tmp_path)
+    with reported(capsys, fuzz, "damaged recordings"):
+        run_fuzz(fuzz, 300)
+    assert fuzz.results["damaged"] >= 250
+    assert fuzz.results["refused in one sentence"] > 100
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+def test_two_thousand_damaged_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    fuzz = Fuzz(tmp_path)
+    with reported(capsys, fuzz, "damaged recordings"):
+        run_fuzz(fuzz, 2400)
+    assert fuzz.results["damaged"] >= 2000
+    assert fuzz.results["read, all data right"] > 0  # the unused bytes of the format exist
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+def test_a_flipped_bit_all_over_the_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    fuzz = Fuzz(tmp_path)
+    places = range(0, len(fuzz.originals[0][0]), 17)
+    with reported(capsys, fuzz, f"one flipped bit at each of {len(places)} places"):
+        for at in places:
+            fuzz.try_one(
+                lambda data, rng, at=at: data[:at] + bytes([data[at] ^ (1 << at % 8)]) + data[at + 1 :], 3 * at
+            )
+
+
+def test_recovering_damaged_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    fuzz = Fuzz(tmp_path)
+    with reported(capsys, fuzz, "recovering damaged recordings"):
+        for seed in range(120):
+            fuzz.try_recover(DAMAGES[seed % len(DAMAGES)], seed)
+    assert fuzz.results["recovered"] > 10
+    assert fuzz.results["nothing to recover"] > 10
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (b"", "The file is empty, so no recording"),
+        (b"\x89MCAP0\r\n", "cut off"),
+        (b"\x89MC", "no MCAP file"),
+        (b"PK\x03\x04 a zip file, or so it says" * 99, "no MCAP file"),
+        (b"\x89MCAP0\r\n" + bytes(500) + b"\x89MCAP0\r\n", "damaged"),
+    ],
+)
+def test_files_that_are_no_recordings(tmp_path: Path, data: bytes, message: str) -> None:
+    path = tmp_path / "a.mcap"
+    path.write_bytes(data)
+    with pytest.raises(RecordingError, match=message):
+        Recording(path)
+
+
+def test_a_foreign_mcap_file(tmp_path: Path) -> None:
+    from mcap.writer import Writer
+
+    path = tmp_path / "foreign.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        channel = writer.register_channel("/chatter", "json", 0)
+        writer.add_message(channel, 1, b"{}", 1)
+        writer.finish()
+    with pytest.raises(RecordingError, match="no demorec recording"):
+        Recording(path)
+
+
+def test_a_folder_and_a_missing_file(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match="Is a directory"):
+        Recording(tmp_path)
+    with pytest.raises(RecordingError, match="No such file"):
+        Recording(tmp_path / "nothing.mcap")
+
+
+def test_a_newer_format_is_refused_by_its_number(tmp_path: Path) -> None:
+    from dataclasses import replace
+
+    from helpers_recording import make_episode
+
+    from demorec.recording import EpisodeWriter
+
+    info, frames, outcome = make_episode(num_frames=2, cameras=())
+    with EpisodeWriter(tmp_path / "a.mcap", replace(info, format_version=99)) as writer:
+        for frame in frames:
+            writer.write(frame)
+        writer.finish(outcome)
+    with pytest.raises(RecordingError, match=r"format version 99, this demorec reads 1 to 1"):
+        Recording(tmp_path / "a.mcap")

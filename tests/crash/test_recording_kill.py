@@ -1,0 +1,125 @@
+"""`kill -9` at any moment of writing loses at most the last second of the episode.
+
+Each child writes an endless episode and notes in a pipe how many frames it has handed to the recorder; it is killed
+at a random moment, and what `recover` keeps is compared with what it had written.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import pytest
+from helpers_recording import frame_number, make_episode, write_episode
+
+from demorec.config import VideoConfig
+from demorec.episode import EpisodeInfo, Frame
+from demorec.errors import RecordingError
+from demorec.recording import EpisodeWriter, Recording, recover
+
+FPS = 30
+
+
+def write_until_killed(path: Path, info: EpisodeInfo, frames: list[Frame], video: VideoConfig, notes: int) -> None:
+    """Write frames, each as soon as the one before is written, and note every one in the pipe."""
+    os.write(notes, b"r")
+    with EpisodeWriter(path, info, video=video) as writer:
+        for frame in frames:
+            writer.write(frame)
+            os.write(notes, b"f")
+            time.sleep(0.0005)
+
+
+def kill_while(write: Callable[[int], None], seconds: float) -> int:
+    """Run `write` in a child, kill it `seconds` after its start, and return how many frames it had written."""
+    read_end, write_end = os.pipe()
+    child = os.fork()
+    if child == 0:
+        os.close(read_end)
+        try:
+            write(write_end)
+        finally:
+            os._exit(0)
+    os.close(write_end)
+    try:
+        assert os.read(read_end, 1) == b"r"
+        time.sleep(seconds)
+    finally:
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+    with os.fdopen(read_end, "rb") as notes:
+        return len(notes.read())
+
+
+@pytest.mark.parametrize(
+    ("codec", "kills"),
+    [("h264", 8), pytest.param("h264", 50, marks=pytest.mark.slow), pytest.param("av1", 20, marks=pytest.mark.slow)],
+)
+def test_kill_at_random_moments(tmp_path: Path, codec: str, kills: int, capsys: pytest.CaptureFixture[str]) -> None:
+    rng = random.Random(5)
+    info, frames, _ = make_episode(num_frames=600, fps=FPS)
+    write_episode(tmp_path / "warm.mcap", num_frames=2)  # what is compiled or loaded once is not what is killed
+    lost, kept_nothing, written_total = [], 0, 0
+    for number in range(kills):
+        part = tmp_path / f"{number}.mcap.part"
+        written = kill_while(
+            partial(write_until_killed, part.with_suffix(""), info, frames, VideoConfig(codec=codec)),
+            rng.uniform(0.0, 0.8),
+        )
+        written_total += written
+        assert not part.with_suffix("").exists()
+        try:
+            recovered = recover(part, part.with_suffix(""))
+        except RecordingError:
+            kept = 0
+            kept_nothing += 1
+        else:
+            kept = recovered.num_frames
+            assert not recovered.is_complete
+            with Recording(recovered.path) as recording:
+                assert recording.outcome is None
+                assert recording.is_recovered
+                assert recording.columns().num_frames == kept
+                for camera in recording.cameras:
+                    numbers = [frame_number(picture) for picture in recording.images(camera)]
+                    assert numbers == [index % 256 for index in range(kept)]
+                assert recording.pixel_statistics("front").num_images == (kept + 1) // 2
+        # The frame that was being written when the signal came may be in the file without having been noted.
+        assert kept <= written + 1
+        assert written - kept <= FPS, f"{written} frames written, {kept} kept"
+        lost.append(max(0, written - kept))
+    with capsys.disabled():
+        print(
+            f"\n{codec}: {kills} kills, {written_total} frames written, lost at most {max(lost)} of {FPS} frames a "
+            f"second (mean {sum(lost) / kills:.1f}); {kept_nothing} within the first second"
+        )
+    assert written_total > kills * FPS  # most were killed in the middle, not before the beginning
+    assert kept_nothing < kills / 2
+
+
+def test_recover_exits_with_1_when_it_keeps_nothing(tmp_path: Path) -> None:
+    info, frames, _ = make_episode(num_frames=10)
+    with EpisodeWriter(tmp_path / "a.mcap", info) as writer:
+        for frame in frames:
+            writer.write(frame)
+    part = tmp_path / "a.mcap.part"
+    part.write_bytes(part.read_bytes()[:3000])
+    done = subprocess.run(
+        [sys.executable, "-c", "from demorec.cli import main; main()", "recover", str(part)],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 1
+    assert done.stderr.count("\n") == 1
+    assert "Nothing can be recovered" in done.stderr
+    assert not (tmp_path / "a.mcap").exists()
+    assert part.exists()

@@ -1,0 +1,355 @@
+"""Runs with real processes and stand-in recordings: resumed, killed, interrupted, with every fault that happens."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+from helpers_generate import Remembers, expected_attempts, run_fake
+
+from demorec.errors import ConfigError, DemorecError, GenerationError
+from demorec.generate.run_file import load_run_file
+
+
+def driver(out: Path, maker: str, num_episodes: int, workers: int = 2) -> subprocess.Popen[str]:
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[1]), *sys.path])}
+    return subprocess.Popen(
+        [sys.executable, "-m", "helpers_generate", str(out), maker, str(num_episodes), str(workers)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
+    )
+
+
+def wait_for(condition, seconds: float = 30.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "it never happened"
+        time.sleep(0.01)
+
+
+def assert_gone(processes: list[psutil.Process]) -> None:
+    assert processes
+    _, alive = psutil.wait_procs(processes, timeout=10)
+    assert not alive
+
+
+def num_finished(out: Path) -> int:
+    return len(list((out / "episodes").glob("*"))) if out.exists() else 0
+
+
+def wait_for_progress(process: subprocess.Popen[str], out: Path, count: int) -> None:
+    enough = num_finished(out) + count
+    wait_for(lambda: num_finished(out) >= enough or process.poll() is not None, 60)
+
+
+def attempts(result) -> dict[tuple[int, int], bool]:
+    return {(a.episode_index, a.attempt): a.success for a in result.run.attempts}
+
+
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory):
+    """Of 8 episodes, made by one worker without any trouble."""
+    result = run_fake(tmp_path_factory.mktemp("reference") / "run", workers=1)
+    assert attempts(result) == expected_attempts(8)
+    assert any(not success for success in attempts(result).values()), "the seed must make some attempt fail"
+    return result
+
+
+@pytest.mark.parametrize(
+    ("workers", "episodes", "recycle_after"),
+    [(2, None, 500), (1, list(reversed(range(8))), 500), (3, [5, 0, 7, 2, 1, 6, 3, 4], 2)],
+)
+def test_neither_workers_nor_order_nor_recycling_change_a_run(tmp_path, reference, workers, episodes, recycle_after):
+    result = run_fake(tmp_path / "run", workers=workers, episodes=episodes, recycle_after=recycle_after)
+    assert result.run.digest == reference.run.digest
+    assert attempts(result) == attempts(reference)
+    files = sorted(p.name for p in (tmp_path / "run").rglob("*.mcap"))
+    assert files == sorted(p.name for p in reference.folder.rglob("*.mcap"))
+
+
+def test_another_seed_is_another_run(tmp_path, reference):
+    assert run_fake(tmp_path / "run", seed=1).run.digest != reference.run.digest
+
+
+def test_workers_are_other_processes_with_one_thread_each_and_are_recycled(tmp_path):
+    run_fake(tmp_path / "run", maker="report_pid", workers=2, recycle_after=2)
+    seen = [p.name.split("-")[1:] for p in (tmp_path / "run/unfinished").glob("pid-*")]
+    assert {threads for _, threads in seen} == {"1"}
+    assert str(os.getpid()) not in {pid for pid, _ in seen}
+    assert len(seen) >= len(expected_attempts(8)) / 2
+
+
+def test_the_same_command_again_keeps_everything(tmp_path, reference):
+    first = run_fake(tmp_path / "run")
+    before = {p: p.stat().st_mtime_ns for p in (tmp_path / "run").rglob("*.mcap")}
+    second = run_fake(tmp_path / "run")
+    assert second.made == ()
+    assert first.run.digest == second.run.digest == reference.run.digest
+    assert before == {p: p.stat().st_mtime_ns for p in (tmp_path / "run").rglob("*.mcap")}
+
+
+def test_more_episodes_extend_a_run_and_fewer_leave_it(tmp_path, reference):
+    run_fake(tmp_path / "run", num_episodes=3)
+    grown = run_fake(tmp_path / "run", num_episodes=8)
+    assert grown.run.digest == reference.run.digest
+    assert len(grown.made) == len(expected_attempts(8)) - len(expected_attempts(3))
+    heard = Remembers()
+    assert run_fake(tmp_path / "run", num_episodes=3, progress=heard).run.digest == reference.run.digest
+    assert "more than asked" in heard.said[0]
+
+
+def test_another_config_is_refused_and_nothing_is_touched(tmp_path):
+    run_fake(tmp_path / "run")
+    before = {p: p.read_bytes() for p in (tmp_path / "run").rglob("*") if p.is_file() and p.name != ".lock"}
+    with pytest.raises(ConfigError, match=r"holds another run \(seed is 0 there and 1 here\).*--overwrite"):
+        run_fake(tmp_path / "run", seed=1)
+    assert before == {p: p.read_bytes() for p in before}
+
+
+def test_overwrite_begins_anew_and_leaves_the_files_of_others(tmp_path):
+    run_fake(tmp_path / "run")
+    (tmp_path / "run/notes.txt").write_text("mine")
+    result = run_fake(tmp_path / "run", seed=1, num_episodes=2, overwrite=True)
+    assert attempts(result) == expected_attempts(2, seed=1)
+    assert num_finished(tmp_path / "run") == sum(expected_attempts(2, seed=1).values())
+    assert (tmp_path / "run/notes.txt").read_text() == "mine"
+
+
+def test_a_folder_with_other_files_is_refused_even_with_overwrite(tmp_path):
+    (tmp_path / "thesis.tex").write_text("mine")
+    for overwrite in (False, True):
+        with pytest.raises(ConfigError, match=r"of no run \(thesis.tex\)"):
+            run_fake(tmp_path, overwrite=overwrite)
+    assert (tmp_path / "thesis.tex").read_text() == "mine"
+
+
+@pytest.mark.parametrize("damage", ["truncate", "flip", "swap", "empty"])
+def test_damaged_recordings_are_set_aside_and_made_again(tmp_path, reference, damage):
+    out = tmp_path / "run"
+    run_fake(out)
+    files = sorted((out / "episodes").glob("*"))
+    victim, other = files[1], files[2]
+    good = victim.read_bytes()
+    bad = {
+        "truncate": good[:-1],
+        "flip": bytes([good[0] ^ 1]) + good[1:],
+        "swap": other.read_bytes(),
+        "empty": b"",
+    }[damage]
+    assert bad != good
+    victim.write_bytes(bad)
+    heard = Remembers()
+    result = run_fake(out, progress=heard)
+    assert result.run.digest == reference.run.digest
+    assert victim.read_bytes() == good
+    assert (out / "unfinished" / victim.name).read_bytes() == bad
+    assert any(victim.name in said for said in heard.said)
+
+
+def test_missing_recordings_are_made_again(tmp_path, reference):
+    out = tmp_path / "run"
+    result = run_fake(out)
+    (out / result.run.failures[0].file).unlink()
+    (out / result.run.successes[0].file).unlink()
+    again = run_fake(out)
+    assert len(again.made) == 2
+    assert again.run.digest == reference.run.digest
+
+
+@pytest.mark.parametrize("content", [b"", b"{}", b"\xff\x00\xff", None])
+def test_a_lost_or_damaged_run_json_is_rebuilt_from_the_recordings(tmp_path, reference, content):
+    out = tmp_path / "run"
+    run_fake(out)
+    if content is None:
+        (out / "run.json").unlink()
+    else:
+        (out / "run.json").write_bytes(content)
+    heard = Remembers()
+    result = run_fake(out, progress=heard)
+    assert result.made == ()
+    assert result.run.digest == reference.run.digest
+    if content is not None:
+        assert (out / "run.json.damaged").read_bytes() == content
+        assert "damaged" in heard.said[0]
+
+
+def test_without_run_json_another_config_is_still_refused(tmp_path):
+    out = tmp_path / "run"
+    run_fake(out)
+    (out / "run.json").unlink()
+    with pytest.raises(ConfigError, match="seed is 0 there and 1 here"):
+        run_fake(out, seed=1)
+
+
+def test_a_recording_of_another_run_is_set_aside(tmp_path, reference):
+    other = run_fake(tmp_path / "other", seed=1)
+    out = tmp_path / "run"
+    run_fake(out, num_episodes=3)
+    stranger = sorted((tmp_path / "other/episodes").glob("*"))[-1]
+    (out / "episodes" / stranger.name).write_bytes(stranger.read_bytes())
+    result = run_fake(out)
+    assert result.run.digest == reference.run.digest != other.run.digest
+    assert (out / "unfinished" / stranger.name).read_bytes() == stranger.read_bytes()
+
+
+def test_a_killed_worker_costs_one_attempt(tmp_path, reference):
+    heard = Remembers()
+    result = run_fake(tmp_path / "run", maker="die_once", progress=heard)
+    assert result.run.digest == reference.run.digest
+    assert result.session.lost_workers == 1
+    assert heard.said == ["Episode 2 is made again: its worker was ended by SIGKILL (out of memory?)."]
+
+
+def test_an_episode_that_kills_every_worker_ends_the_run_with_a_sentence(tmp_path):
+    with pytest.raises(GenerationError, match=r"Episode 2 failed to be made 5 times.*SIGKILL.*are complete and kept"):
+        run_fake(tmp_path / "run", maker="die_always")
+    assert load_run_file(tmp_path / "run").sessions[-1].state == "stopped"
+    assert num_finished(tmp_path / "run") > 0
+
+
+def test_a_bad_moment_of_the_file_system_is_survived(tmp_path, reference):
+    assert run_fake(tmp_path / "run", maker="flicker").run.digest == reference.run.digest
+
+
+@pytest.mark.parametrize(
+    ("maker", "error", "message"),
+    [
+        ("fill_the_disk", GenerationError, "the disk is full; mend that and run the same command again"),
+        ("raise_a_bug", GenerationError, r"Episode 2 raised LocalError: the cube is a sphere \(the traceback is in"),
+        ("raise_ours", GenerationError, r"Episode \d cannot be made: No OpenGL library was found."),
+    ],
+)
+def test_what_stops_a_run_is_told_and_the_same_command_goes_on(tmp_path, reference, maker, error, message):
+    out = tmp_path / "run"
+    with pytest.raises(error, match=message) as caught:
+        run_fake(out, maker=maker)
+    assert "complete and kept" in str(caught.value)
+    assert len(str(caught.value).splitlines()) == 1
+    if maker == "raise_a_bug":
+        assert "the cube is a sphere" in (out / "unfinished/error_episode_000002.txt").read_text()
+    assert run_fake(out).run.digest == reference.run.digest
+
+
+def test_a_vanished_folder_is_told(tmp_path):
+    with pytest.raises(GenerationError, match="has vanished"):
+        run_fake(tmp_path / "run", maker="lose_the_folder")
+    assert not (tmp_path / "run").exists(), "it must not be begun anew"
+    assert num_finished(tmp_path / "elsewhere") > 0
+
+
+@pytest.mark.parametrize("place", ["a-file/run", "/proc/demorec-run"])
+def test_an_impossible_folder_is_told(tmp_path, place):
+    (tmp_path / "a-file").touch()
+    with pytest.raises(ConfigError, match="cannot be made"):
+        run_fake(tmp_path / place)
+
+
+def test_two_runs_into_one_folder_exclude_each_other_until_the_owner_dies(tmp_path):
+    out = tmp_path / "run"
+    first = driver(out, "make_for_ever", 4)
+    try:
+        wait_for(lambda: out.exists() and (out / "run.json").exists())
+        with pytest.raises(ConfigError, match=f"Another run is writing here \\(process {first.pid} on "):
+            run_fake(out)
+    finally:
+        first.kill()
+        first.communicate()
+    assert (out / ".lock").exists()
+    assert attempts(run_fake(out, num_episodes=4)) == expected_attempts(4)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_the_first_interrupt_lets_current_episodes_end(tmp_path, reference, number):
+    out = tmp_path / "run"
+    process = driver(out, "make_slowly", 8)
+    wait_for(lambda: num_finished(out) >= 1)
+    workers = psutil.Process(process.pid).children(recursive=True)
+    process.send_signal(number)
+    process.communicate(timeout=20)
+    assert process.returncode == 130
+    run = load_run_file(out)
+    assert run.sessions[-1].state == "interrupted"
+    assert len(run.successes) == num_finished(out) < 8
+    assert_gone(workers)
+    assert not list((out / "unfinished").glob("*.part")), "a second is enough to end what was begun"
+    assert run_fake(out).run.digest == reference.run.digest
+
+
+@pytest.mark.parametrize("maker", ["make_for_ever", "make_stubbornly"])
+def test_after_the_first_interrupt_nothing_goes_on_for_long(tmp_path, maker):
+    out = tmp_path / "run"
+    process = driver(out, maker, 4)
+    wait_for(lambda: len(psutil.Process(process.pid).children()) >= 2 and (out / "run.json").exists())
+    time.sleep(1.0)
+    workers = psutil.Process(process.pid).children(recursive=True)
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=25)
+    assert process.returncode == 130
+    assert_gone(workers)
+
+
+def test_the_second_interrupt_ends_at_once(tmp_path):
+    out = tmp_path / "run"
+    process = driver(out, "make_stubbornly", 4)
+    wait_for(lambda: len(psutil.Process(process.pid).children()) >= 2 and (out / "run.json").exists())
+    workers = psutil.Process(process.pid).children(recursive=True)
+    process.send_signal(signal.SIGINT)
+    time.sleep(0.5)
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=10)
+    assert process.returncode != 0
+    assert_gone(workers)
+
+
+def test_a_killed_driver_leaves_no_orphans(tmp_path):
+    process = driver(tmp_path / "run", "make_for_ever", 4)
+    wait_for(lambda: len(psutil.Process(process.pid).children()) >= 2)
+    time.sleep(0.5)
+    workers = psutil.Process(process.pid).children(recursive=True)
+    process.kill()
+    process.communicate()
+    assert_gone(workers)
+
+
+@pytest.mark.parametrize("kills", [4, pytest.param(40, marks=pytest.mark.slow)])
+def test_runs_that_are_killed_again_and_again_come_to_the_same_end(tmp_path, kills):
+    """SIGKILL to the driver or to a worker, at moments spread over the run."""
+    num_episodes, chance = 20 * kills, random.Random(kills)
+    reference = run_fake(tmp_path / "reference", num_episodes=num_episodes)
+    out = tmp_path / "run"
+    killed = {"driver": 0, "worker": 0}
+    process = driver(out, "make_quickly", num_episodes)
+    while sum(killed.values()) < kills and process.poll() is None:
+        wait_for_progress(process, out, chance.randrange(12))
+        time.sleep(chance.random() * 0.05)
+        workers = [p for p in psutil.Process(process.pid).children() if "spawn_main" in " ".join(p.cmdline())]
+        if process.poll() is not None:
+            break
+        if workers and chance.random() < 0.5:
+            chance.choice(workers).kill()
+            killed["worker"] += 1
+        else:
+            process.kill()
+            process.communicate()
+            killed["driver"] += 1
+            process = driver(out, "make_quickly", num_episodes)
+    process.communicate(timeout=120)
+    assert sum(killed.values()) == kills, f"the run ended before it was killed often enough: {killed}"
+    assert min(killed.values()) > 0
+    result = run_fake(out, num_episodes=num_episodes)
+    assert result.run.digest == reference.run.digest
+    assert attempts(result) == expected_attempts(num_episodes)
+
+
+def test_errors_are_of_the_tree():
+    assert issubclass(GenerationError, DemorecError)
+    assert GenerationError("x").exit_code == 1

@@ -1,0 +1,220 @@
+"""Good recordings, runs and datasets, and ways to spoil them one fault at a time.
+
+Nothing here knows what a check looks at. Every spoiler asserts that it changed something.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from demorec.check.report import CheckOptions, Subject, SubjectReport, check_subject
+from demorec.config import EpisodePlan, GenerateConfig
+from demorec.episode import CameraImages, EpisodeColumns, EpisodeInfo, Frame, Outcome
+from demorec.generate.recordings import inspect_recording
+from demorec.generate.run_file import RunFile, save_run_file
+from demorec.recording import EpisodeWriter, Recording
+from demorec.recording.container import Container
+from demorec.recording.frames import decoded_images, frames_of
+from demorec.recording.part_file import PartFile
+from demorec.rollout import Rollout, make_renderer, make_world, prepare
+
+Pictures = list[dict[str, CameraImages]]
+
+
+def simulate(path: Path, *, episode_index: int = 0, **config: Any) -> Path:
+    """Make and record one episode."""
+    config = {"cameras": (), "width": 96, "height": 96, **config}
+    plan = EpisodePlan(config=GenerateConfig(**config), episode_index=episode_index)
+    episode = prepare(plan)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with (
+        make_world(episode.info) as world,
+        make_renderer(episode.info) as renderer,
+        EpisodeWriter(path, episode.info, video=plan.config.video) as writer,
+    ):
+        rollout = Rollout(world, episode, renderer)
+        for frame in rollout:
+            writer.write(frame)
+        assert rollout.outcome is not None
+        writer.finish(rollout.outcome)
+    return path
+
+
+def simulate_run(folder: Path, num_episodes: int, **config: Any) -> Path:
+    """A run folder with run.json, made without worker processes."""
+    config = {"cameras": (), "width": 96, "height": 96, **config}
+    attempts = []
+    for index in range(num_episodes):
+        file = f"episodes/episode_{index:06d}.mcap"
+        simulate(folder / file, episode_index=index, **config)
+        attempts.append(replace(inspect_recording(folder / file).attempt, file=file))
+        assert attempts[-1].success
+    (folder / "failed").mkdir(exist_ok=True)
+    run = RunFile(config=GenerateConfig(**config), versions={}, num_episodes=num_episodes, attempts=tuple(attempts))
+    save_run_file(run, folder)
+    return folder
+
+
+def checked(path: Path, kind: str = "recording", *, only: Sequence[str] = (), pictures: bool = True) -> SubjectReport:
+    """The report of some checks, or of all."""
+    return check_subject(Subject(path=path, kind=kind), CheckOptions(only=tuple(only), pictures=pictures))  # type: ignore[arg-type]
+
+
+def level_of(path: Path, check: str, kind: str = "recording") -> str:
+    """What one check says."""
+    report = checked(path, kind, only=[check])
+    return next(result.level for result in report.results if result.check == check)
+
+
+class Spoilt:
+    """A recording in memory, to be changed and written again.
+
+    Attributes:
+        info, columns, outcome: Of the recording; replace them or write into the arrays.
+        pictures: Camera name -> images of every frame, decoded; empty without cameras.
+        frames: Numbers of the frames to be written, in order.
+    """
+
+    def __init__(self, path: Path) -> None:
+        with Recording(path) as recording:
+            self.info: EpisodeInfo = recording.info
+            self.columns: EpisodeColumns = recording.columns()
+            self.outcome: Outcome | None = recording.outcome
+            self.pictures: Pictures = [dict(images) for images in decoded_images(recording, self.columns)]
+            self._frames = list(frames_of(recording, self.columns))
+            self.joint_samples = [frame.joint_samples for frame in self._frames]
+        self._source = path
+        self.frames = list(range(len(self._frames)))
+
+    def set(self, **arrays: Any) -> None:
+        """Replace columns."""
+        for name, array in arrays.items():
+            before = getattr(self.columns, name)
+            same = (
+                all(np.array_equal(before[key], array[key], equal_nan=True) for key in before)
+                if isinstance(before, dict)
+                else np.array_equal(before, array, equal_nan=True)
+            )
+            assert not same, f"{name} was not changed"
+        self.columns = replace(self.columns, **arrays)
+
+    def pose_of(self, name: str, rows: Any) -> None:
+        """Replace the poses of an object."""
+        self.set(object_poses={**self.columns.object_poses, name: np.asarray(rows)})
+
+    def picture(self, camera: str, change: Callable[[int, np.ndarray[Any, Any]], Any]) -> None:
+        """Replace a camera's colour pictures by what `change(frame, picture)` returns."""
+        changed = 0
+        new = []
+        for frame, images in enumerate(self.pictures):
+            color = np.ascontiguousarray(change(frame, images[camera].color))
+            changed += int(not np.array_equal(color, images[camera].color))
+            new.append({**images, camera: replace(images[camera], color=color)})
+        assert changed > 0, "no picture was changed"
+        self.pictures = new
+
+    def write(self, path: Path) -> Path:
+        """Record it."""
+        with Recording(self._source) as recording:
+            frames = list(frames_of(recording, self.columns))
+        outcome = self.outcome
+        assert outcome is not None
+        with EpisodeWriter(path, self.info) as writer:
+            for number, index in enumerate(self.frames):
+                writer.write(self._frame(frames[index], number, index))
+            writer.finish(replace(outcome, num_frames=len(self.frames)))
+        return path
+
+    def _frame(self, frame: Frame, number: int, index: int) -> Frame:
+        from demorec.episode import frame_time_ns
+        from demorec.recording.frames import pose_of
+
+        images = {
+            name: replace(image, world_from_camera=pose_of(self.columns.world_from_camera[name][index]))
+            for name, image in self.pictures[index].items()
+        }
+        return replace(
+            frame, frame_index=number, time_ns=frame_time_ns(number, self.info.fps), images=images,
+            joint_samples=self.joint_samples[index],
+        )  # fmt: skip
+
+
+Message = tuple[str, str, bytes, int]
+"""Topic, type, bytes, time in ns."""
+
+
+def rewrite_messages(
+    source: Path,
+    target: Path,
+    edit: Callable[[Message], Iterable[Message]],
+    *,
+    metadata: Callable[[str, dict[str, str]], dict[str, str] | None] = lambda name, values: values,
+) -> Path:
+    """Copy an MCAP file message by message; `edit` returns what takes a message's place."""
+    container = Container(source)
+    writer = PartFile(target)
+    changed = 0
+    for name in container.metadata_names:
+        values = container.metadata(name)
+        assert values is not None
+        new = metadata(name, dict(values))
+        changed += int(new != dict(values))
+        if new is not None:
+            writer.metadata(name, new)
+    schemas = {topic: container.schemas[c.schema_id].name for topic, c in container.channels.items()}
+    for topic, time_ns, data in container.messages(list(schemas)):
+        before = (topic, schemas[topic], data, time_ns)
+        after = list(edit(before))
+        changed += int(after != [before])
+        for new_topic, schema, new_data, new_time in after:
+            writer.log(new_topic, schema, new_data, new_time)
+    writer.publish()
+    container.close()
+    assert changed > 0, "nothing was changed"
+    return target
+
+
+def flip_bits(source: Path, target: Path, *, offset: int) -> Path:
+    """Copy a file with one byte turned round; a negative offset counts from the end."""
+    data = bytearray(source.read_bytes())
+    data[offset] ^= 0xFF
+    assert bytes(data) != source.read_bytes()
+    target.write_bytes(data)
+    return target
+
+
+def edit_column(dataset: Path, name: str, change: Callable[[np.ndarray[Any, Any]], Any]) -> None:
+    """Change one column of the first data file, all rows together; everything else stays."""
+    path = next((dataset / "data").glob("*/*.parquet"))
+    table = pq.read_table(path)
+    field = table.schema.field(name)
+    values = np.array(table.column(name).to_pylist())
+    changed = np.asarray(change(values.copy())).astype(values.dtype)
+    assert not np.array_equal(values, changed)
+    column = pa.array(changed.tolist(), type=field.type)
+    table = table.set_column(table.schema.get_field_index(name), field, column)
+    pq.write_table(table, path)
+
+
+def edit_json(path: Path, change: Callable[[Any], None]) -> None:
+    """Change a JSON file in place."""
+    data = json.loads(path.read_text())
+    before = json.dumps(data)
+    change(data)
+    assert json.dumps(data) != before
+    path.write_text(json.dumps(data))
+
+
+def copy(source: Path, target: Path) -> Path:
+    """A copy of a folder."""
+    shutil.copytree(source, target)
+    return target

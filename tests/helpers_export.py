@@ -1,0 +1,115 @@
+"""Runs of made-up episodes and datasets made from them, for the tests of the export."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import signal
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+from helpers_recording import write_episode
+
+from demorec.config import VideoConfig
+from demorec.errors import ExportError
+from demorec.export import ExportOptions, ExportReport, export_lerobot
+
+
+def make_run(
+    folder: Path,
+    lengths: Sequence[int],
+    *,
+    failures: Sequence[int] = (),
+    video: VideoConfig | None = None,
+    **arguments: object,
+) -> Path:
+    """A run with successful episodes of the given lengths, and one failed attempt for each index of `failures`."""
+    (folder / "episodes").mkdir(parents=True)
+    (folder / "failed").mkdir()
+    for index, length in enumerate(lengths):
+        path = folder / "episodes" / f"episode_{index:06d}.mcap"
+        write_episode(path, video=video, num_frames=length, episode_index=index, **arguments)
+    for index in failures:
+        path = folder / "failed" / f"episode_{index:06d}.attempt_0.mcap"
+        write_episode(path, video=video, num_frames=12, episode_index=index, success=False, **arguments)
+    return folder
+
+
+def export(sources: Path | Sequence[Path], out: Path, **options: Any) -> ExportReport:
+    """`export_lerobot` without the verification, unless asked for."""
+    sources = [sources] if isinstance(sources, Path) else sources
+    return export_lerobot(sources, out, ExportOptions(**{"verify": False, **options}))
+
+
+def data_table(dataset: Path) -> pa.Table:
+    """All rows of a dataset."""
+    return pa.concat_tables([pq.read_table(path) for path in sorted((dataset / "data").glob("*/*.parquet"))])
+
+
+def episode_rows(dataset: Path) -> list[dict[str, Any]]:
+    """All rows of the episodes' table."""
+    return [
+        row
+        for path in sorted((dataset / "meta" / "episodes").glob("*/*.parquet"))
+        for row in pq.read_table(path).to_pylist()
+    ]
+
+
+def info(dataset: Path) -> dict[str, Any]:
+    """info.json."""
+    found: dict[str, Any] = json.loads((dataset / "meta" / "info.json").read_text())
+    return found
+
+
+def files_of(folder: Path) -> dict[str, bytes]:
+    """Relative path -> content of every file."""
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()
+    }
+
+
+def export_in_child(run: Path, out: Path, options: dict[str, Any], *, size_limit: int = 0, kill_at: int = 0) -> None:
+    """Target of a process that may die: exit code 3 for an ExportError.
+
+    `size_limit` bounds the size of its files; at call number `kill_at` of any function, C functions included, the
+    process kills itself with SIGKILL: a moment that does not depend on how busy the machine is.
+    """
+    if size_limit:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size_limit, size_limit))
+    calls = 0
+
+    def count(frame: object, event: str, argument: object) -> None:
+        nonlocal calls
+        calls += event in ("call", "c_call")
+        if calls == kill_at:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    if kill_at:
+        sys.setprofile(count)
+    try:
+        export(run, out, **options)
+    except ExportError:
+        raise SystemExit(3) from None
+    finally:
+        sys.setprofile(None)
+
+
+def count_calls(run: Path, out: Path, options: dict[str, Any]) -> int:
+    """How many calls such an export makes."""
+    calls = 0
+
+    def count(frame: object, event: str, argument: object) -> None:
+        nonlocal calls
+        calls += event in ("call", "c_call")
+
+    sys.setprofile(count)
+    try:
+        export(run, out, **options)
+    finally:
+        sys.setprofile(None)
+    return calls

@@ -1,0 +1,81 @@
+"""Runs of stand-in recordings (helpers_makers), with the real machinery around them.
+
+As a program (`python -m helpers_generate OUT MAKER NUM_EPISODES WORKERS`) it is a driver that tests can kill.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+from helpers_makers import line_of, succeeds
+
+from demorec.config import GenerateConfig
+from demorec.errors import DemorecError
+from demorec.generate.options import RunOptions
+from demorec.generate.recordings import Inspected
+from demorec.generate.run import NoProgress, RunResult, generate
+
+
+def inspect(path: Path) -> Inspected:
+    """Reads a stand-in recording."""
+    try:
+        content = json.loads(path.read_text())
+        return Inspected(
+            attempt=line_of(path, content, path.name), config=content["config"], versions=content["versions"]
+        )
+    except (ValueError, KeyError) as error:
+        raise DemorecError("it is no recording") from error
+
+
+class Remembers(NoProgress):
+    """Keeps what it was told."""
+
+    def __init__(self) -> None:
+        self.said: list[str] = []
+
+    def says(self, message: str) -> None:
+        self.said.append(message)
+
+
+def run_fake(
+    out: Path,
+    *,
+    maker: str = "make",
+    num_episodes: int = 8,
+    workers: int = 2,
+    seed: int = 0,
+    recycle_after: int = 500,
+    overwrite: bool = False,
+    progress: NoProgress | None = None,
+    episodes: list[int] | None = None,
+) -> RunResult:
+    """A run of stand-in recordings."""
+    return generate(
+        GenerateConfig(seed=seed, cameras=()),
+        RunOptions(
+            out=out, num_episodes=num_episodes, workers=workers, recycle_after=recycle_after, overwrite=overwrite
+        ),
+        progress=progress,
+        maker=f"helpers_makers:{maker}",
+        inspect=inspect,
+        episodes=episodes,
+    )
+
+
+def expected_attempts(num_episodes: int, *, seed: int = 0, max_attempts: int = 3) -> dict[tuple[int, int], bool]:
+    """What a run must come to, from the definition: attempts follow each other until one succeeds."""
+    expected = {}
+    for episode in range(num_episodes):
+        for attempt in range(max_attempts):
+            expected[episode, attempt] = succeeds(seed, episode, attempt)
+            if expected[episode, attempt]:
+                break
+    return expected
+
+
+if __name__ == "__main__":
+    result = run_fake(Path(sys.argv[1]), maker=sys.argv[2], num_episodes=int(sys.argv[3]), workers=int(sys.argv[4]))
+    print(result.run.digest)
+    sys.exit(130 if result.interrupted else 0)

@@ -1,0 +1,28 @@
+"""Running episodes in tests, without pictures unless asked for."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from demorec.config import EpisodePlan, GenerateConfig
+from demorec.episode import Frame, Outcome
+from demorec.rollout import Episode, Rollout, make_renderer, make_world, prepare
+from demorec.sim.world import World
+
+
+def episode(index: int = 0, **config: Any) -> Episode:
+    """Prepare an episode; no cameras by default."""
+    config.setdefault("cameras", ())
+    return prepare(EpisodePlan(config=GenerateConfig(**config), episode_index=index))
+
+
+def run(prepared: Episode, world: World | None = None) -> tuple[list[Frame], Outcome]:
+    """All frames and the outcome, in `world` or in a fresh one."""
+    if world is None:
+        with make_world(prepared.info) as fresh:
+            return run(prepared, fresh)
+    with make_renderer(prepared.info) as renderer:
+        rollout = Rollout(world, prepared, renderer)
+        frames = list(rollout)
+    assert rollout.outcome is not None
+    return frames, rollout.outcome

@@ -1,0 +1,81 @@
+"""Motions keep to their limits whatever the goal, and end where they should."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from demorec.motion import MotionLimits, plan_straight, quintic, slowdown
+from demorec.sim.arm import arm_kinematics
+from demorec.sim.robots.panda import PANDA
+from demorec.tasks.grasping import hand_down
+
+ARM = arm_kinematics(PANDA)
+HOME = np.array(PANDA.home_q)
+LIMITS = MotionLimits(
+    joint_velocity=0.6 * np.array(PANDA.velocity_limit), joint_acceleration=0.8 * np.array(PANDA.acceleration_limit)
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    x=st.floats(0.32, 0.62),
+    y=st.floats(-0.3, 0.3),
+    z=st.floats(0.02, 0.35),
+    yaw=st.floats(-1.5, 1.5),
+    speed=st.floats(0.05, 3.0),
+    fps=st.sampled_from([10, 30, 60]),
+    start=st.lists(st.floats(-0.2, 0.2), min_size=7, max_size=7),
+)
+def test_velocity_and_acceleration_limits_hold(x, y, z, yaw, speed, fps, start):
+    q = HOME + np.array(start)
+    goal = hand_down((x, y, z), yaw)
+    path = plan_straight(ARM, start=q, goal=goal, rest=HOME, speed=speed, limits=LIMITS, dt=1 / fps)
+    if path is None:
+        return
+    rows = np.vstack([q, q, path, path[-1]])
+    assert (np.abs(np.diff(rows, axis=0)) * fps <= LIMITS.joint_velocity * (1 + 1e-9)).all()
+    assert (np.abs(np.diff(rows, 2, axis=0)) * fps**2 <= LIMITS.joint_acceleration * (1 + 1e-9)).all()
+    end = ARM.forward(path[-1])
+    assert math.dist(end.position, goal.position) < 3e-4
+    assert (path >= ARM.lower).all()
+    assert (path <= ARM.upper).all()
+    # The peak speed of the hand is the wanted one or less (2 % for the time law's sampling).
+    hand = np.array([ARM.forward(row).position for row in rows[1:]])
+    assert np.linalg.norm(np.diff(hand, axis=0), axis=1).max() * fps <= speed * 1.02 + 2e-4 * fps
+
+
+def test_most_of_the_workspace_can_be_planned():
+    points = [(x, y) for x in np.linspace(0.35, 0.65, 5) for y in np.linspace(-0.25, 0.25, 5)]
+    paths = [
+        plan_straight(ARM, start=HOME, goal=hand_down((*p, 0.02), 0.3), rest=HOME, speed=0.6, limits=LIMITS, dt=1 / 30)
+        for p in points
+    ]
+    assert all(path is not None for path in paths)
+
+
+def test_the_time_law_starts_and_ends_at_rest():
+    u = np.linspace(0, 1, 2001)
+    s = quintic(u)
+    assert s[0] == 0
+    assert abs(s[-1] - 1) < 1e-12
+    velocity = np.gradient(s, u)
+    acceleration = np.gradient(velocity, u)
+    assert velocity[0] < 1e-4
+    assert velocity[-1] < 1e-4
+    assert abs(velocity.max() - 1.875) < 1e-3
+    assert abs(acceleration[5:-5].max() - 10 / math.sqrt(3)) < 1e-2
+
+
+def test_slowdown_is_the_analytic_factor():
+    limits = MotionLimits(joint_velocity=np.array([1.0]), joint_acceleration=np.array([1e9]))
+    path = np.array([[0.1], [0.3], [0.4]])
+    assert math.isclose(slowdown(path, start=np.array([0.0]), limits=limits, dt=0.1), 2.0)
+
+
+def test_an_unreachable_goal_is_none():
+    goal = hand_down((1.5, 0.0, 0.2), 0.0)
+    assert plan_straight(ARM, start=HOME, goal=goal, rest=HOME, speed=0.5, limits=LIMITS, dt=1 / 30) is None

@@ -1,0 +1,221 @@
+"""Depth, labels, CDR layouts and shapes: inverses that lose nothing, and covers that leave nothing out."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import struct
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from mcap_ros2._dynamic import generate_dynamic
+
+from demorec.assets import asset_path
+from demorec.errors import RecordingError
+from demorec.geometry import Pose
+from demorec.recording.cdr import CdrReader, CdrWriter
+from demorec.recording.depth import decode_depth, encode_depth
+from demorec.recording.description import body_description, robot_description
+from demorec.recording.labels import decode_labels, encode_labels
+from demorec.recording.messages import JOINT_STATE
+from demorec.recording.ros2 import DEFINITIONS
+from demorec.recording.shapes import Primitive, fit_primitives
+from demorec.scene import Body, Shape
+
+pictures = hnp.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=24)
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    hnp.arrays(
+        np.uint16, pictures, elements=st.one_of(st.just(0), st.integers(1, 12), st.integers(0, 65535)), fill=st.just(0)
+    )
+)
+def test_depth_is_exact_to_the_millimetre(millimetres: np.ndarray) -> None:
+    metres = (millimetres / np.float32(1000)).astype(np.float32)
+    decoded = decode_depth(encode_depth(metres))
+    assert decoded.shape == millimetres.shape
+    assert np.array_equal(np.rint(decoded.astype(np.float64) * 1000), millimetres)
+
+
+def test_depth_beyond_its_range_counts_as_nothing_hit() -> None:
+    metres = np.array([[np.nan, np.inf, -1.0, 65.6, 65.535, 0.0004, 0.0006, 1.2345]], dtype=np.float32)
+    found = decode_depth(encode_depth(metres))
+    assert np.allclose(found, [[0, 0, 0, 0, 65.535, 0, 0.001, 1.234]], atol=1e-6)
+
+
+def test_depth_is_rvl_of_the_paper() -> None:
+    """A picture small enough to be coded by hand: runs 0 and 2, pixels 5 and 3 (differences 5 and -2, zigzag 10 and 3),
+    then runs 2 and 0. Groups of three bits, the continuation bit above them: 0, 2, 10 = 010 001 -> A 1, 3, 2, 0."""
+    data = encode_depth(np.array([[0.005, 0.003, 0.0, 0.0]], dtype=np.float32))
+    assert data[:12] == bytes(12)
+    assert struct.unpack("<ii", data[12:20]) == (4, 1)
+    assert data[20:] == struct.pack("<I", 0x02A13200)
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    hnp.arrays(np.int32, pictures, elements=st.integers(0, 254)),
+    hnp.arrays(np.int32, (24, 24), elements=st.integers(-1, 254)),
+)
+def test_labels(bodies: np.ndarray, links: np.ndarray) -> None:
+    height, width = bodies.shape
+    values = np.where(links[:height, :width] == 7, -1, bodies + ((links[:height, :width] + 1) << 24 & 0x7F000000))
+    values = values.astype(np.int32)
+    assert np.array_equal(decode_labels(encode_labels(values)), values)
+
+
+def test_too_many_bodies_for_labels() -> None:
+    with pytest.raises(RecordingError, match="at most 255 bodies"):
+        encode_labels(np.array([[255]], dtype=np.int32))
+
+
+finite = st.floats(allow_nan=False, width=64)
+
+
+@settings(deadline=None, max_examples=40)
+@given(st.lists(st.text(max_size=9).filter(lambda text: "\0" not in text), max_size=5), st.data())
+def test_layouts_give_what_another_decoder_reads(names: list[str], data: st.DataObject) -> None:
+    """Joint states with names of any length, through the ROS 2 decoder of mcap-ros2-support."""
+    count = data.draw(st.integers(1, 4))
+    rows = data.draw(hnp.arrays(np.float64, (count, 3 * len(names)), elements=finite))
+    times = np.array(
+        data.draw(st.lists(st.integers(0, 2**31 * 10**9 - 1), min_size=count, max_size=count)), dtype=np.int64
+    )
+    writer = CdrWriter()
+    writer.header("frame é")
+    writer.u32(len(names))
+    for name in names:
+        writer.text(name)
+    for _ in range(3):
+        writer.u32(len(names))
+        writer.value_slot(len(names))
+    layout = writer.layout()
+    messages = layout.encode(times, rows)
+    decode = generate_dynamic(JOINT_STATE, DEFINITIONS[JOINT_STATE])[JOINT_STATE]
+    for time, row, message in zip(times.tolist(), rows, messages, strict=True):
+        read = decode(message)
+        assert read.header.frame_id == "frame é"
+        assert (read.header.stamp.sec, read.header.stamp.nanosec) == divmod(time, 10**9)
+        assert list(read.name) == names
+        assert [*read.position, *read.velocity, *read.effort] == row.tolist()
+    assert layout.decode(messages).tobytes() == rows.tobytes()
+
+
+def test_a_layout_refuses_another_message() -> None:
+    writer = CdrWriter()
+    writer.text("name")
+    writer.value_slot()
+    layout = writer.layout()
+    (message,) = layout.encode(np.zeros(1, dtype=np.int64), np.array([[1.5]]))
+    assert layout.decode([message]).tolist() == [[1.5]]
+    with pytest.raises(ValueError, match="other names"):
+        layout.decode([message, message.replace(b"name", b"nume")])
+    with pytest.raises(ValueError, match="bytes where"):
+        layout.decode([message, message + b"\0"])
+
+
+@settings(deadline=None, max_examples=100)
+@given(st.binary(max_size=40))
+def test_reading_junk_raises_nothing_but_value_errors(junk: bytes) -> None:
+    for data in (junk, b"\0\1\0\0" + junk):
+        for read in ("text", "octets", "integers", "time", "u32", "header"):
+            with contextlib.suppress(ValueError):
+                getattr(CdrReader(data), read)()
+
+
+def inside(primitive: Primitive, points: np.ndarray, slack: float) -> np.ndarray:
+    offset = np.abs(points - np.array(primitive.center))
+    if primitive.kind == "box":
+        return np.all(offset <= np.array(primitive.size) / 2 + slack, axis=1)
+    if primitive.kind == "sphere":
+        return np.sqrt((offset**2).sum(axis=1)) <= primitive.size[0] + slack
+    radius, length = primitive.size
+    across = np.delete(offset, primitive.axis, axis=1)
+    return (np.sqrt((across**2).sum(axis=1)) <= radius + slack) & (offset[:, primitive.axis] <= length / 2 + slack)
+
+
+@pytest.mark.parametrize("name", [f"link{n}" for n in range(8)] + ["hand", "finger"])
+def test_primitives_cover_the_robot_and_little_more(name: str) -> None:
+    path = asset_path("franka_panda/panda.urdf").parent / "meshes" / "collision" / f"{name}.obj"
+    mesh = trimesh.load(path, force="mesh", process=False)
+    primitives = fit_primitives(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    assert 1 <= len(primitives) <= 6
+    points, _ = trimesh.sample.sample_surface(mesh, 2000, seed=1)
+    slack = 0.03 * float(np.linalg.norm(mesh.extents))  # the spacing of the points that were fitted
+    covered = np.any([inside(primitive, points, slack) for primitive in primitives], axis=0)
+    assert covered.all(), f"{(~covered).sum()} of 2000 points of {name} stick out"
+    hull = trimesh.convex.convex_hull(mesh).volume
+    assert sum(primitive.volume for primitive in primitives) < 2.2 * hull
+
+
+def test_a_box_is_a_box_and_a_ball_a_ball() -> None:
+    box = trimesh.creation.box((0.1, 0.2, 0.3))
+    (found,) = fit_primitives(np.asarray(box.vertices), np.asarray(box.faces))
+    assert found.kind == "box"
+    assert np.allclose(found.size, (0.1, 0.2, 0.3))
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.2)
+    assert fit_primitives(np.asarray(ball.vertices), np.asarray(ball.faces), max_parts=1)[0].kind == "sphere"
+    tube = trimesh.creation.cylinder(0.05, 0.4)
+    (found,) = fit_primitives(np.asarray(tube.vertices), np.asarray(tube.faces))
+    assert (found.kind, found.axis) == ("cylinder", 2)
+    assert np.allclose(found.size, (0.05, 0.4), atol=1e-3)
+
+
+def test_descriptions_are_urdf_that_pybullet_loads(tmp_path: Path) -> None:
+    pybullet = pytest.importorskip("pybullet")
+    client = pybullet.connect(pybullet.DIRECT)
+    try:
+        texts = {"robot": (robot_description("franka_panda/panda.urdf", 1.0), 12)}
+        for kind, size in (
+            ("box", (0.1, 0.2, 0.3)),
+            ("sphere", (0.1,)),
+            ("cylinder", (0.1, 0.3)),
+            ("capsule", (0.1, 0.3)),
+        ):
+            body = Body(name=kind, role="object", shape=Shape(kind=kind, size=size), world_from_body=Pose())
+            texts[kind] = (body_description(body), 0)
+        for name, (text, joints) in texts.items():
+            path = tmp_path / f"{name}.urdf"
+            path.write_text(text)
+            body_index = pybullet.loadURDF(str(path), physicsClientId=client)
+            assert pybullet.getNumJoints(body_index, physicsClientId=client) == joints
+            assert len(pybullet.getVisualShapeData(body_index, physicsClientId=client)) >= 1
+    finally:
+        pybullet.disconnect(client)
+
+
+def test_a_larger_robot_is_described_larger() -> None:
+    small, large = (robot_description("franka_panda/panda.urdf", scale) for scale in (1.0, 2.0))
+    origins = [
+        [[float(v) for v in joint.find("origin").get("xyz").split()] for joint in ET.fromstring(text).findall("joint")]
+        for text in (small, large)
+    ]
+    assert np.allclose(2 * np.array(origins[0]), origins[1], atol=1e-4)
+    assert np.array(origins[0]).max() > 0.3
+    assert small.count("<visual") == large.count("<visual")
+
+
+def test_a_body_of_every_file_is_described() -> None:
+    for shape in (
+        Shape(kind="urdf", size=(0.1, 0.1, 0.1), file="duck_vhacd.urdf"),
+        Shape(kind="mesh", size=(0.1, 0.1, 0.1), file="duck.obj", scale=0.1),
+    ):
+        text = body_description(Body(name="duck", role="object", shape=shape, world_from_body=Pose()))
+        assert "<visual" in text
+        assert "mesh" not in text
+
+
+def test_pngs_of_others_are_refused() -> None:
+    from PIL import Image
+
+    buffer = io.BytesIO()
+    Image.new("RGB", (4, 4)).save(buffer, format="PNG")
+    with pytest.raises(ValueError, match="of the kind 'RGB'"):
+        decode_labels(buffer.getvalue())

@@ -1,0 +1,71 @@
+"""The camera presets see what they promise, for every robot: by projection, without drawing."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from helpers_sim import episode
+
+from demorec.geometry import Pose
+from demorec.rollout import make_world
+from demorec.scene import Camera
+from demorec.tables import CAMERAS, ROBOTS
+
+
+def pixel(camera: Camera, world_from_camera: Pose, point: tuple[float, float, float]) -> tuple[float, float]:
+    """Pinhole projection in OpenCV axes, pixels; fails for a point behind the camera."""
+    x, y, z = world_from_camera.inverse().apply(np.array(point))
+    assert z > camera.near
+    k = camera.intrinsics
+    return float(k[0, 0] * x / z + k[0, 2]), float(k[1, 1] * y / z + k[1, 2])
+
+
+def inside(camera: Camera, place: tuple[float, float], margin: float = 0.0) -> bool:
+    u, v = place[0] / camera.width, place[1] / camera.height
+    return margin <= u <= 1 - margin and margin <= v <= 1 - margin
+
+
+@pytest.fixture(scope="module", params=ROBOTS.names())
+def world(request):
+    prepared = episode(0, robot=request.param, cameras=CAMERAS.names(), variation="none")
+    with make_world(prepared.info) as made:
+        made.reset(prepared.info.scene)
+        yield made
+
+
+def cameras_of(world) -> dict[str, Camera]:
+    return {camera.name: camera for camera in world.scene.cameras}
+
+
+def test_front_sees_every_place_where_objects_go_and_the_hand_above(world):
+    camera = cameras_of(world)["front"]
+    for x, y, z in itertools.product((0.33, 0.67), (-0.30, 0.30), (0.0, 0.06)):
+        assert inside(camera, pixel(camera, camera.mount_from_camera, (x, y, z)), margin=0.02), (x, y, z)
+    assert inside(camera, pixel(camera, camera.mount_from_camera, tuple(world.arm.world_from_tcp().position)))
+
+
+def test_wrist_sees_the_space_between_the_fingers(world):
+    camera = cameras_of(world)["wrist"]
+    body, link = world.mounts()[camera.mount]
+    state = world.client.getLinkState(body, link, computeForwardKinematics=True)
+    pose = Pose(position=np.array(state[4]), quat_xyzw=np.array(state[5])) @ camera.mount_from_camera
+    tcp = world.arm.world_from_tcp()
+    half = world.robot.gripper_max_width / 2
+    for point in ([0, 0, 0], [0, 0.7 * half, 0], [0, -0.7 * half, 0], [0, 0, 0.1]):
+        assert inside(camera, pixel(camera, pose, tuple(tcp.apply(np.array(point))))), point
+    # The hand's own x axis runs down in the picture: what lies ahead of the fingers comes in from below.
+    ahead, behind = (pixel(camera, pose, tuple(tcp.apply(np.array([x, 0, 0.05]))))[1] for x in (0.02, -0.02))
+    assert ahead > behind
+
+
+@pytest.mark.parametrize("name", CAMERAS.names())
+def test_presets_are_usable(name):
+    preset = CAMERAS.load(name)
+    assert preset.summary
+    camera = preset.camera(name, ROBOTS.load("panda"), width=320, height=240)
+    assert 0 < camera.near < camera.far
+    assert math.isclose(float(np.sum(camera.mount_from_camera.quat_xyzw**2)), 1.0)
+    assert camera.intrinsics[0, 0] == camera.intrinsics[1, 1] > 0

@@ -1,0 +1,77 @@
+"""Impossible configs: one clear sentence each, with what is allowed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from demorec.config import GenerateConfig, VideoConfig, load_toml
+from demorec.episode import frame_time_ns
+from demorec.errors import ConfigError
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"task": "pick_plce"}, "Did you mean 'pick_place'"),
+        ({"robot": "pandas"}, "Did you mean 'panda'"),
+        ({"cameras": ("frnt",)}, "Did you mean 'front'"),
+        ({"cameras": ("front", "front")}, "named twice"),
+        ({"cameras": ("front", "none")}, "stands alone"),
+        ({"renderer": "tinny"}, "Did you mean 'tiny'"),
+        ({"fps": 50}, "does not divide"),
+        ({"fps": 0}, "fps is 0"),
+        ({"width": 225}, "even"),
+        ({"height": 0}, "height is 0"),
+        ({"width": 8000, "height": 8000}, "pixels a picture"),
+        ({"seed": -1}, "seed is -1"),
+        ({"max_attempts": 0}, "max-attempts is 0"),
+        ({"video": VideoConfig(crf=99)}, "crf is 99"),
+        ({"video": VideoConfig(gop=0)}, "gop is 0"),
+        ({"video": VideoConfig(codec="jpeg", jpeg_quality=0)}, "quality is 0"),
+    ],
+)
+def test_impossible_values_are_refused(change: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        GenerateConfig(**change).validate()
+
+
+def test_the_defaults_are_possible() -> None:
+    GenerateConfig().validate()
+
+
+def test_no_cameras() -> None:
+    assert GenerateConfig(cameras=("none",)).cameras == ()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("seed = 3\nspeed = 4", "speed"),
+        ("seed = 'three'", "seed"),
+        ("seed = ", "no valid TOML"),
+    ],
+)
+def test_broken_config_files_are_named(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "run.toml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=message):
+        load_toml(path, GenerateConfig)
+
+
+def test_a_missing_config_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="cannot be read"):
+        load_toml(tmp_path / "none.toml", GenerateConfig)
+
+
+def test_a_config_file_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "run.toml"
+    path.write_text('seed = 3\ncameras = ["wrist"]\n[video]\ncodec = "av1"\n')
+    config = load_toml(path, GenerateConfig)
+    assert (config.seed, config.cameras, config.video.codec) == (3, ("wrist",), "av1")
+
+
+def test_frame_times_are_exact_integers() -> None:
+    assert [frame_time_ns(i, 30) for i in (0, 1, 2, 3, 30)] == [0, 33_333_333, 66_666_667, 100_000_000, 1_000_000_000]

@@ -1,0 +1,54 @@
+"""Intervals and tests against SciPy's, cells against counting by hand."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import binomtest
+
+from demorec.evaluate.statistics import Rate, cells, compare, sign_test
+
+
+@given(st.integers(1, 2000).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))))
+def test_the_interval_is_wilsons(counts: tuple[int, int]) -> None:
+    k, n = counts
+    expected = binomtest(k, n).proportion_ci(0.95, method="wilson")
+    assert Rate(successes=k, trials=n).interval == pytest.approx((expected.low, expected.high), abs=1e-9)
+
+
+def test_nothing_tried_is_nothing_known() -> None:
+    assert Rate(successes=0, trials=0).interval == (0.0, 1.0)
+    assert math.isnan(Rate(successes=0, trials=0).value)
+
+
+@given(st.integers(0, 60), st.integers(0, 60))
+def test_mcnemars_exact_test(k: int, m: int) -> None:
+    expected = binomtest(k, k + m).pvalue if k + m else 1.0
+    assert sign_test(k, m) == pytest.approx(expected, abs=1e-9)
+
+
+def test_newcombes_interval_of_a_difference() -> None:
+    """The worked example of Newcombe (1998), table II: 56/70 - 48/80, method 10: 0.0524 to 0.3339."""
+    first = {i: i < 48 for i in range(80)}
+    second = {i: i < 56 for i in range(70)}
+    comparison = compare(first, second)
+    assert comparison.difference == pytest.approx(0.2)
+    assert comparison.interval == pytest.approx((0.0524, 0.3339), abs=5e-5)
+
+
+def test_pairs_are_the_scenes_that_both_tried() -> None:
+    comparison = compare({0: True, 1: True, 2: False, 9: True}, {0: True, 1: False, 2: True, 3: True})
+    assert (comparison.only_first, comparison.only_second) == (1, 1)
+
+
+def test_cells_cut_each_range_in_equal_parts() -> None:
+    factors = [{"x": float(x), "same": 1.0} for x in range(10)]
+    found = cells(factors, [x >= 6 for x in range(10)], parts=3)
+    assert [c.factor for c in found] == ["x"] * 3
+    assert [(c.low, c.high) for c in found] == [(0.0, 3.0), (3.0, 6.0), (6.0, 9.0)]
+    assert [(c.rate.successes, c.rate.trials) for c in found] == [(0, 3), (0, 3), (4, 4)]
+    assert np.sum([c.rate.trials for c in found]) == 10

@@ -1,0 +1,449 @@
+"""What an export writes, option by option, read back without LeRobot; tests/conformance has LeRobot itself."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import av
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from helpers_export import data_table, episode_rows, export, files_of, info, make_run
+from helpers_recording import make_episode, write_episode
+from mcap.reader import make_reader
+
+import demorec.export.writer
+from demorec.config import VideoConfig
+from demorec.errors import ConfigError, ExportError, RecordingError
+from demorec.export import ExportOptions, dataset_digest, dataset_info, is_dataset
+from demorec.export.options import parse_episodes
+from demorec.recording import Recording
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_run(tmp_path_factory.mktemp("run") / "run", (20, 15, 17, 9), failures=(2,))
+
+
+def video_frames(dataset: Path, camera: str) -> Iterator[np.ndarray]:
+    for path in sorted((dataset / "videos" / f"observation.images.{camera}").glob("*/*.mp4")):
+        with av.open(str(path)) as container:
+            for frame in container.decode(video=0):
+                yield frame.to_ndarray(format="rgb24")
+
+
+def recordings(run: Path) -> list[Path]:
+    return sorted((run / "episodes").glob("*.mcap"))
+
+
+def vectors(dataset: Path, name: str) -> np.ndarray:
+    return np.array(data_table(dataset).column(name).to_pylist())
+
+
+def test_a_dataset_holds_what_was_recorded(run: Path, tmp_path: Path) -> None:
+    before = files_of(run)
+    report = export(run, tmp_path / "d")
+    assert files_of(run) == before  # the source is never touched
+    assert (report.num_episodes, report.num_frames, report.skipped_failures) == (4, 61, 1)
+    table = data_table(tmp_path / "d")
+    state, action = vectors(tmp_path / "d", "observation.state"), vectors(tmp_path / "d", "action")
+    frames = [
+        frame
+        for n, length in enumerate((20, 15, 17, 9))
+        for frame in make_episode(num_frames=length, episode_index=n)[1]
+    ]
+    for row, frame in enumerate(frames):
+        observation = frame.observation
+        assert np.array_equal(
+            state[row].astype(np.float32), np.float32([*observation.joint_position[:7], observation.gripper_width])
+        )
+        assert np.array_equal(
+            action[row].astype(np.float32), np.float32([*frame.action.joint_target, frame.action.gripper_target])
+        )
+    assert table.column("index").to_pylist() == list(range(61))
+    assert table.column("episode_index").to_pylist() == [0] * 20 + [1] * 15 + [2] * 17 + [3] * 9
+    assert table.column("timestamp").to_pylist() == [float(np.float32(f.frame_index / 30)) for f in frames]
+    done = (
+        [f.frame_index + 1 in (20,) for f in frames[:20]]
+        + [n == 14 for n in range(15)]
+        + [n == 16 for n in range(17)]
+        + [n == 8 for n in range(9)]
+    )
+    assert table.column("next.done").to_pylist() == done == table.column("next.success").to_pylist()
+    assert table.column("next.reward").to_pylist() == [float(value) for value in done]
+    for camera in ("front", "wrist"):
+        found = video_frames(tmp_path / "d", camera)
+        for path in recordings(run):
+            with Recording(path) as recording:
+                for picture in recording.images(camera):
+                    assert np.array_equal(next(found), picture)
+        assert next(found, None) is None
+
+
+def test_two_exports_are_the_same_to_the_byte(run: Path, tmp_path: Path) -> None:
+    first, second = export(run, tmp_path / "a"), export(run, tmp_path / "b", workers=2)
+    assert files_of(tmp_path / "a") == files_of(tmp_path / "b")
+    assert first.digest == second.digest == dataset_digest(tmp_path / "a")
+
+
+def test_the_digest_depends_on_the_content_alone(run: Path, tmp_path: Path) -> None:
+    whole = export(run, tmp_path / "a").digest
+    split = export(run, tmp_path / "b", video_files_mb=0.005, data_files_mb=0.005).digest
+    assert split == whole == dataset_digest(tmp_path / "b")
+    assert len(list((tmp_path / "b" / "data").glob("*/*.parquet"))) > 1
+    assert export(run, tmp_path / "c", episodes=":3").digest != whole
+    path = next((tmp_path / "a" / "videos").rglob("*.mp4"))
+    data = bytearray(path.read_bytes())
+    data[-20] ^= 1
+    path.write_bytes(data)
+    assert dataset_digest(tmp_path / "a") != whole
+
+
+def test_every_kind_of_file_rolls_over_by_itself(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(demorec.export.writer, "_EPISODE_ROWS_PER_GROUP", 1)
+    out = tmp_path / "d"
+    export(run, out, video_files_mb=0.006, data_files_mb=0.001, files_per_chunk=2)
+    rows = episode_rows(out)
+    assert [row["episode_index"] for row in rows] == [0, 1, 2, 3]
+    places = [(row["data/chunk_index"], row["data/file_index"]) for row in rows]
+    assert places == [(0, 0), (0, 1), (1, 0), (1, 1)]
+    for row in rows:
+        path = out / f"data/chunk-{row['data/chunk_index']:03d}/file-{row['data/file_index']:03d}.parquet"
+        assert set(pq.read_table(path).column("episode_index").to_pylist()) == {row["episode_index"]}
+        path = (
+            out
+            / "meta/episodes/chunk-{meta/episodes/chunk_index:03d}/file-{meta/episodes/file_index:03d}.parquet".format(
+                **row
+            )
+        )
+        assert row["episode_index"] in pq.read_table(path).column("episode_index").to_pylist()
+    assert len({row["meta/episodes/file_index"] for row in rows}) > 1
+    files = {
+        (row["videos/observation.images.front/chunk_index"], row["videos/observation.images.front/file_index"])
+        for row in rows
+    }
+    assert len(files) > 1
+    first = [row for row in rows if row["videos/observation.images.front/from_timestamp"] == 0]
+    assert len(first) == len(files)  # time starts anew in each file
+
+
+def test_an_mp4_file_holds_one_set_of_parameters(tmp_path: Path) -> None:
+    for n, crf in enumerate((23, 23, 35)):
+        write_episode(
+            tmp_path / f"e{n}.mcap", num_frames=8, episode_index=n, cameras=("front",), video=VideoConfig(crf=crf)
+        )
+    out = tmp_path / "d"
+    export(tmp_path, out)
+    rows = episode_rows(out)
+    assert [row["videos/observation.images.front/file_index"] for row in rows] == [0, 0, 1]
+    coding = info(out)["features"]["observation.images.front"]["info"]
+    assert coding["video.crf"] is None  # they differ
+    assert coding["video.g"] == 2
+
+
+@pytest.mark.parametrize("codec", ["h264", "av1"])
+def test_the_coding_is_told_as_it_is(tmp_path: Path, codec: str) -> None:
+    write_episode(tmp_path / "e.mcap", num_frames=8, cameras=("front",), video=VideoConfig(codec=codec, gop=4, crf=33))  # type: ignore[arg-type]
+    export(tmp_path, tmp_path / "d")
+    coding = info(tmp_path / "d")["features"]["observation.images.front"]["info"]
+    assert (coding["video.codec"], coding["video.g"], coding["video.crf"], coding["video.fps"]) == (codec, 4, 33, 30)
+    with av.open(str(next((tmp_path / "d").rglob("*.mp4")))) as container:
+        stream = container.streams.video[0]
+        assert (stream.codec.canonical_name, stream.pix_fmt) == (codec, coding["video.pix_fmt"])
+
+
+def test_jpeg_recordings_are_transcoded_and_it_is_said(tmp_path: Path) -> None:
+    write_episode(tmp_path / "e.mcap", num_frames=8, cameras=("front",), video=VideoConfig(codec="jpeg"))
+    report = export(tmp_path, tmp_path / "d", transcode_codec="av1", transcode_crf=20)
+    assert len(report.transcoded) == 1
+    assert "jpeg" in report.transcoded[0]
+    coding = info(tmp_path / "d")["features"]["observation.images.front"]["info"]
+    assert (coding["video.codec"], coding["video.crf"]) == ("av1", 20)
+    assert "coded anew" in (tmp_path / "d" / "README.md").read_text()
+    with Recording(tmp_path / "e.mcap") as recording:
+        for found, expected in zip(video_frames(tmp_path / "d", "front"), recording.images("front"), strict=True):
+            assert np.abs(found.astype(int) - expected).mean() < 5
+
+
+@pytest.mark.parametrize(("fps", "stride", "transcoded"), [(15, 2, False), (10, 3, True), (5, 6, False)])
+def test_fewer_frames_a_second(run: Path, tmp_path: Path, fps: int, stride: int, transcoded: bool) -> None:
+    out = tmp_path / "d"
+    report = export(run, out, fps=fps)
+    assert bool(report.transcoded) is transcoded  # every other frame is a keyframe
+    assert info(out)["fps"] == fps
+    frames = [make_episode(num_frames=length, episode_index=n)[1] for n, length in enumerate((20, 15, 17, 9))]
+    kept = [
+        (group[0], group[-1])
+        for episode in frames
+        for group in (episode[i : i + stride] for i in range(0, len(episode), stride))
+    ]
+    state, action = vectors(out, "observation.state"), vectors(out, "action")
+    assert len(state) == len(kept)
+    for row, (first, last) in enumerate(kept):
+        assert np.allclose(state[row][:7], first.observation.joint_position[:7], atol=1e-6)
+        assert np.allclose(action[row][:7], last.action.joint_target, atol=1e-6)
+    assert sum(data_table(out).column("next.done").to_pylist()) == 4
+    pictures = list(video_frames(out, "front"))
+    expected = []
+    for path in recordings(run):
+        with Recording(path) as recording:
+            expected += list(recording.images("front"))[::stride]
+    assert len(pictures) == len(expected)
+    difference = max(np.abs(a.astype(int) - b).mean() for a, b in zip(pictures, expected, strict=True))
+    assert difference < 5 if transcoded else difference == 0
+
+
+def test_fps_that_does_not_divide_is_refused(run: Path, tmp_path: Path) -> None:
+    with pytest.raises(ExportError, match="1, 2, 3, 5, 6, 10, 15, 30"):
+        export(run, tmp_path / "d", fps=20)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_failures_only_when_asked_for(run: Path, tmp_path: Path) -> None:
+    report = export(run, tmp_path / "d", include_failures=True)
+    assert (report.num_episodes, report.skipped_failures) == (5, 0)
+    rows = [row["length"] for row in episode_rows(tmp_path / "d")]
+    assert rows == [20, 15, 12, 17, 9]  # the failed attempt stands before the one that succeeded
+    success = data_table(tmp_path / "d").column("next.success").to_pylist()
+    assert sum(success) == 4
+    assert not any(success[35:47])
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("", range(12)),
+        ("0:3", [0, 1, 2]),
+        ("10:", [10, 11]),
+        (":2,5", [0, 1, 5]),
+        ("::4", [0, 4, 8]),
+        ("7", [7]),
+        ("1:9:3", [1, 4, 7]),
+    ],
+)
+def test_episode_ranges(text: str, expected: list[int]) -> None:
+    assert [n for n in range(12) if parse_episodes(text)(n)] == list(expected)
+
+
+@pytest.mark.parametrize("text", ["a", "1:2:0", "-1", ",", "1;2", "1:2:3:4"])
+def test_wrong_episode_ranges(text: str) -> None:
+    with pytest.raises(ConfigError, match="0:100"):
+        ExportOptions(episodes=text).validate()
+
+
+def test_chosen_episodes(run: Path, tmp_path: Path) -> None:
+    export(run, tmp_path / "d", episodes="1,3")
+    assert [row["length"] for row in episode_rows(tmp_path / "d")] == [15, 9]
+    with pytest.raises(ExportError, match="Nothing to export"):
+        export(run, tmp_path / "e", episodes="90:")
+    assert not (tmp_path / "e").exists()
+
+
+def test_recordings_of_several_runs_go_together(run: Path, tmp_path: Path) -> None:
+    other = make_run(tmp_path / "other", (7,))
+    report = export([run, other / "episodes" / "episode_000000.mcap"], tmp_path / "d")
+    assert (report.num_episodes, report.num_frames) == (5, 68)
+    with pytest.raises(ExportError, match="given twice"):
+        export([run, recordings(run)[0]], tmp_path / "e")
+
+
+def test_all_differences_are_told_at_once(run: Path, tmp_path: Path) -> None:
+    write_episode(tmp_path / "slow.mcap", num_frames=8, fps=15)
+    write_episode(tmp_path / "large.mcap", num_frames=8, width=80, video=VideoConfig(codec="av1"))
+    write_episode(tmp_path / "blind.mcap", num_frames=8, cameras=("front",))
+    with pytest.raises(ExportError) as error:
+        export([run, tmp_path / "slow.mcap", tmp_path / "large.mcap", tmp_path / "blind.mcap"], tmp_path / "d")
+    text = str(error.value)
+    for part in (
+        "fps is 15 instead of 30 (slow.mcap)",
+        "size of camera front is 80x48 instead of 64x48 (large.mcap)",
+        "codec of camera wrist is av1 instead of h264 (large.mcap)",
+        "cameras is front instead of front wrist (blind.mcap)",
+    ):
+        assert part in text
+    assert not (tmp_path / "d").exists()
+
+
+def test_a_dataset_in_the_way_stays(run: Path, tmp_path: Path) -> None:
+    out = tmp_path / "d"
+    export(run, out, episodes="0")
+    before = files_of(out)
+    with pytest.raises(ExportError, match=r"--append, --overwrite"):
+        export(run, out)
+    assert files_of(out) == before
+    export(run, out, overwrite=True)
+    assert len(episode_rows(out)) == 4
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["d"]
+
+
+def test_an_empty_folder_is_not_in_the_way(run: Path, tmp_path: Path) -> None:
+    (tmp_path / "d").mkdir()
+    export(run, tmp_path / "d", episodes="0")
+    assert is_dataset(tmp_path / "d")
+
+
+@pytest.mark.parametrize("topic", ["/action", "/camera/wrist/h264"])
+def test_nothing_is_left_behind_when_a_recording_is_damaged(run: Path, tmp_path: Path, topic: str) -> None:
+    shutil.copytree(run, tmp_path / "run")
+    path = recordings(tmp_path / "run")[2]
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    channel = next(number for number, channel in summary.channels.items() if channel.topic == topic)
+    chunk = next(chunk for chunk in summary.chunk_indexes if channel in chunk.message_index_offsets)
+    data = bytearray(path.read_bytes())
+    data[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 255
+    path.write_bytes(data)
+    with pytest.raises(RecordingError, match=path.name):
+        export(tmp_path / "run", tmp_path / "d")
+    assert [item.name for item in tmp_path.iterdir()] == ["run"]
+
+
+def test_append_goes_on_where_the_dataset_ends(run: Path, tmp_path: Path) -> None:
+    whole, grown = tmp_path / "whole", tmp_path / "grown"
+    export(run, whole)
+    export(run, grown, episodes=":2")
+    kept = {
+        name: data
+        for name, data in files_of(grown).items()
+        if name.endswith((".mp4", ".parquet")) and "tasks" not in name
+    }
+    report = export(run, grown, episodes="2:", append=True)
+    assert (report.num_episodes, report.new_episodes, report.num_frames) == (4, 2, 61)
+    assert kept.items() <= files_of(grown).items()  # what was there is there still
+    assert report.digest == dataset_digest(whole)
+    assert data_table(grown).equals(data_table(whole))
+    a, b = (json.loads((folder / "meta/stats.json").read_text()) for folder in (whole, grown))
+    assert a.keys() == b.keys()
+    for name in a:
+        for what in ("min", "max", "mean", "std"):
+            assert np.allclose(a[name][what], b[name][what], rtol=1e-9), (name, what)
+        assert a[name]["count"] == b[name]["count"]
+        if not name.startswith("observation.images"):  # of pictures LeRobot's own rule is used, an average
+            assert all(a[name][q] == b[name][q] for q in ("q01", "q10", "q50", "q90", "q99"))
+    summary = dataset_info(grown)
+    assert (summary.num_successes, summary.num_attempts) == (4, dataset_info(whole).num_attempts + 0)
+    rows = episode_rows(grown)
+    assert [row["data/file_index"] for row in rows] == [0, 0, 1, 1]
+    assert [row["meta/episodes/file_index"] for row in rows] == [0, 0, 1, 1]
+
+
+def test_append_refuses_what_does_not_fit_and_says_all(run: Path, tmp_path: Path) -> None:
+    out = tmp_path / "d"
+    export(run, out, episodes="0", action="ee", privileged=True)
+    before = files_of(out)
+    with pytest.raises(ExportError) as error:
+        export(run, out, append=True, fps=15)
+    text = str(error.value)
+    assert "fps is 30, the recordings give 15" in text
+    assert "observation.environment_state" in text
+    assert "tcp.x" in text
+    assert files_of(out) == before
+
+
+def test_append_leaves_out_what_the_dataset_does_not_have(run: Path, tmp_path: Path) -> None:
+    out = tmp_path / "d"
+    export(run, out, episodes="0")
+    report = export(run, out, episodes="1", append=True, privileged=True)
+    assert report.left_out == ("observation.environment_state",)
+    assert "observation.environment_state" not in info(out)["features"]
+
+
+def test_append_to_a_damaged_dataset_is_refused(run: Path, tmp_path: Path) -> None:
+    out = tmp_path / "d"
+    export(run, out)
+    path = out / "meta" / "info.json"
+    path.write_text(path.read_text().replace('"total_frames": 61', '"total_frames": 60'))
+    with pytest.raises(ExportError, match="not whole"):
+        export(run, out, append=True)
+
+
+def test_append_to_nothing_makes_a_dataset(run: Path, tmp_path: Path) -> None:
+    assert export(run, tmp_path / "d", append=True).new_episodes == 4
+
+
+def test_a_readme_of_the_user_is_kept(run: Path, tmp_path: Path) -> None:
+    out = tmp_path / "d"
+    export(run, out, episodes="0")
+    (out / "README.md").write_text("mine")
+    export(run, out, episodes="1", append=True)
+    assert (out / "README.md").read_text() == "mine"
+    assert "2 scripted demonstrations" in (out / "demorec" / "README.md").read_text()
+
+
+def test_the_sidecar_tells_what_lerobot_cannot_hold(run: Path, tmp_path: Path) -> None:
+    out = tmp_path / "d"
+    export(run, out)
+    row = pq.read_table(out / "demorec/episodes/chunk-000/file-000.parquet").to_pylist()[1]
+    made, frames, outcome = make_episode(num_frames=15, episode_index=1)
+    assert (row["run_episode_index"], row["root_seed"], row["config_digest"]) == (1, 0, made.config_digest)
+    assert row["success"] is True
+    assert row["checks"][0]["value"] == outcome.checks[0].value
+    assert row["phases"][0] == {"name": "approach", "from": 0, "to": 3}
+    assert row["phases"][-1]["to"] == 15
+    assert row["deliberate_miss_frames"] == [n for n, frame in enumerate(frames) if frame.is_deliberate_miss] != []
+    camera = row["cameras"][0]
+    assert camera["name"] == "front"
+    assert camera["intrinsics"] == made.scene.cameras[0].intrinsics.reshape(-1).tolist()
+    assert camera["world_from_camera_start"] == frames[0].images["front"].world_from_camera.vector().tolist()
+    assert json.loads(row["episode_info"])["scene"]["bodies"][1]["name"] == "cube"
+    poses = pq.read_table(out / "demorec/camera_poses/chunk-000/file-000.parquet")
+    assert poses.column_names == ["episode_index", "frame_index", "wrist"]  # the front camera stands still
+    assert poses.num_rows == 61
+    assert poses.column("wrist")[20 + 7].as_py() == frames[7].images["wrist"].world_from_camera.vector().tolist()
+    assert json.loads((out / "demorec/configs.json").read_text()) == {made.config_digest: made.config}
+
+
+def test_the_card_counts_failed_attempts(run: Path, tmp_path: Path) -> None:
+    export(run, tmp_path / "d", license="mit")
+    text = (tmp_path / "d" / "README.md").read_text()
+    assert "4 of 5 attempts" in text
+    assert "1 failed: distance_to_target in phase place" in text
+    assert "license: mit" in text
+    assert (tmp_path / "d" / "demorec" / "thumbnails.jpg").stat().st_size > 1000
+
+
+def test_depth_is_kept_to_the_step_of_its_codes(tmp_path: Path) -> None:
+    write_episode(tmp_path / "e.mcap", num_frames=6, depth=True)
+    export(tmp_path, tmp_path / "d", depth=True)
+    feature = info(tmp_path / "d")["features"]["observation.images.front_depth"]
+    assert feature["info"]["is_depth_map"] is True
+    assert feature["shape"] == [48, 64, 1]
+    with pytest.raises(RecordingError, match="no depth"):
+        export(make_run(tmp_path / "run", (5,)), tmp_path / "e", depth=True)
+
+
+def test_episodes_without_cameras(tmp_path: Path) -> None:
+    write_episode(tmp_path / "e.mcap", num_frames=6, cameras=())
+    export(tmp_path, tmp_path / "d")
+    assert info(tmp_path / "d")["video_path"] is None
+    assert not (tmp_path / "d" / "videos").exists()
+
+
+def test_a_single_frame(tmp_path: Path) -> None:
+    write_episode(tmp_path / "e.mcap", num_frames=1)
+    report = export(tmp_path, tmp_path / "d", privileged=True, action="ee_delta")
+    assert report.num_frames == 1
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"append": True, "overwrite": True}, "exclude"),
+        ({"fps": 0}, "at least 1"),
+        ({"repo_id": "a b"}, "OWNER/NAME"),
+        ({"workers": -1}, "workers"),
+    ],
+)
+def test_impossible_options(options: dict[str, object], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        ExportOptions(**options).validate()  # type: ignore[arg-type]
+
+
+def test_no_recordings(tmp_path: Path) -> None:
+    with pytest.raises(ExportError, match="No finished recordings"):
+        export(tmp_path, tmp_path / "d")
+    with pytest.raises(ExportError, match="No such recording"):
+        export(tmp_path / "nothing", tmp_path / "d")

@@ -1,0 +1,122 @@
+"""Statistics against NumPy: of episodes, of pictures, and of data files in bounded memory."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from numpy.typing import NDArray
+
+from demorec.errors import ExportError
+from demorec.export.data_stats import data_statistics
+from demorec.export.layout import Feature, data_schema
+from demorec.export.stats import QUANTILES, PixelHistogram, Statistics, colour_levels, vector_statistics
+from demorec.export.writer import merge_statistics
+
+
+def check(found: Statistics, column: NDArray[np.generic]) -> None:
+    values = column.astype(np.float64).reshape(len(column), -1)
+    assert found.count == len(values)
+    assert np.array_equal(found.values["min"], values.min(axis=0))
+    assert np.array_equal(found.values["max"], values.max(axis=0))
+    assert np.allclose(found.values["mean"], values.mean(axis=0), rtol=1e-9, atol=1e-12)
+    assert np.allclose(found.values["std"], values.std(axis=0), rtol=1e-9, atol=1e-12)
+    for name, q in QUANTILES.items():
+        assert np.allclose(found.values[name], np.quantile(values, q, axis=0), rtol=1e-12, atol=1e-45), name
+
+
+def columns(rng: np.random.Generator, count: int) -> dict[str, NDArray[np.generic]]:
+    state = rng.normal(size=(count, 6)).astype(np.float32)
+    state[:, 1] = 0.25  # constant
+    state[:, 2] = np.round(state[:, 2])  # many ties
+    state[:, 3] *= np.float32(1e-40)  # denormal
+    state[:, 4] *= np.float32(1e30)
+    state[::2, 5] = -0.0
+    return {
+        "state": state,
+        "reward": rng.random(count).astype(np.float32),
+        "done": rng.random(count) < 0.3,
+        "index": rng.integers(0, 2**31, count),
+    }
+
+
+def write(path: Path, data: dict[str, NDArray[np.generic]], *, row_group: int) -> dict[str, Feature]:
+    features = {
+        "state": Feature(dtype="float32", shape=(6,)),
+        "camera": Feature(dtype="video", shape=(4, 4, 3)),
+        "reward": Feature(dtype="float32", shape=(1,)),
+        "done": Feature(dtype="bool", shape=(1,)),
+        "index": Feature(dtype="int64", shape=(1,)),
+    }
+    schema = data_schema(features)
+    state = pa.FixedSizeListArray.from_arrays(pa.array(data["state"].reshape(-1)), type=schema.field("state").type)
+    arrays = [state, *(pa.array(data[name]) for name in ("reward", "done", "index"))]
+    pq.write_table(pa.Table.from_arrays(arrays, schema=schema), path, row_group_size=row_group)
+    return features
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 100, 2049, 9000])
+def test_statistics_of_files_equal_those_of_numpy(tmp_path: Path, count: int) -> None:
+    rng = np.random.default_rng(count)
+    data = columns(rng, count)
+    cut = count // 3
+    parts = [
+        part
+        for part in ({k: v[:cut] for k, v in data.items()}, {k: v[cut:] for k, v in data.items()})
+        if len(part["index"])
+    ]
+    paths = [tmp_path / f"{number}.parquet" for number in range(len(parts))]
+    for path, part in zip(paths, parts, strict=True):
+        features = write(path, part, row_group=77)
+    found = data_statistics(paths, features)
+    assert set(found) == set(data)
+    for name, column in data.items():
+        check(found[name], column)
+
+
+def test_statistics_of_an_episode_equal_those_of_numpy() -> None:
+    data = columns(np.random.default_rng(0), 221)
+    found = vector_statistics(data)
+    for name, column in data.items():
+        check(found[name], column)
+    assert np.asarray(found["state"].to_json()["q50"]).shape == (6,)
+    assert np.asarray(found["done"].to_json()["q50"]).shape == (1,)
+
+
+def test_negative_integers_are_refused(tmp_path: Path) -> None:
+    data = columns(np.random.default_rng(0), 10)
+    data["index"] = data["index"] - 2**32
+    features = write(tmp_path / "a.parquet", data, row_group=5)
+    with pytest.raises(ExportError, match="integer column"):
+        data_statistics([tmp_path / "a.parquet"], features)
+
+
+def test_statistics_of_pictures_equal_those_of_numpy() -> None:
+    rng = np.random.default_rng(1)
+    pictures = rng.integers(0, 256, (5, 20, 30, 3)).astype(np.uint8)
+    pictures[..., 1] //= 9
+    counts = np.stack([np.bincount(pictures[..., c].ravel(), minlength=256) for c in range(3)])
+    found = PixelHistogram(counts=counts, level_values=colour_levels(), num_pictures=5).statistics()
+    expected = pictures.reshape(-1, 3) / 255
+    for name, q in QUANTILES.items():
+        assert np.allclose(found.values[name], np.quantile(expected, q, axis=0), atol=1e-15)
+    assert np.allclose(found.values["mean"], expected.mean(axis=0), rtol=1e-12)
+    assert np.allclose(found.values["std"], expected.std(axis=0), rtol=1e-12)
+    assert found.to_json()["count"] == [5]
+    assert np.asarray(found.to_json()["mean"]).shape == (3, 1, 1)
+    assert Statistics.from_json(found.to_json()) is not None
+
+
+def test_merged_means_and_deviations_are_exact() -> None:
+    rng = np.random.default_rng(2)
+    a, b = rng.normal(size=(70, 3)), rng.normal(loc=2, size=(30, 3))
+    merged = merge_statistics([vector_statistics({"x": part})["x"] for part in (a, b)])
+    both = np.concatenate([a, b])
+    assert merged.count == 100
+    assert np.allclose(merged.values["mean"], both.mean(axis=0))
+    assert np.allclose(merged.values["std"], both.std(axis=0))
+    assert np.array_equal(merged.values["min"], both.min(axis=0))
+    assert np.array_equal(merged.values["max"], both.max(axis=0))

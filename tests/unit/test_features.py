@@ -1,0 +1,298 @@
+"""Feature vectors against SciPy, one frame against many, and actions integrated back."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers_recording import HOME, PANDA, make_episode
+from scipy.spatial.transform import Rotation
+
+from demorec.episode import EpisodeColumns, frame_time_ns
+from demorec.features import (
+    ACTION,
+    EE_POSE,
+    ENVIRONMENT_STATE,
+    STATE,
+    VELOCITY,
+    ObservationRows,
+    action_names,
+    action_vectors,
+    joint_target_from_increment,
+    observation_names,
+    observation_vectors,
+    pose_from_delta,
+)
+from demorec.geometry import Pose
+from demorec.scene import Body, Goal, RobotPlacement, Scene, Shape
+
+
+def random_pose(rng: np.random.Generator) -> Pose:
+    return Pose(position=rng.normal(size=3), quat_xyzw=Rotation.random(random_state=rng).as_quat())
+
+
+def make_body(
+    rng: np.random.Generator, name: str, size: tuple[float, ...], *, symmetry: int, mass: float = 0.1
+) -> Body:
+    return Body(
+        name=name,
+        role="object",
+        shape=Shape(kind="box" if len(size) == 3 else "sphere", size=size),
+        world_from_body=random_pose(rng),
+        mass=mass,
+        yaw_symmetry=symmetry,
+    )
+
+
+def make_scene(rng: np.random.Generator) -> Scene:
+    return Scene(
+        robot=RobotPlacement(name="panda", world_from_base=random_pose(rng), joint_position=HOME, gripper_width=0.08),
+        bodies=(
+            make_body(rng, "tray", (0.2, 0.1, 0.02), symmetry=2, mass=0.0),
+            make_body(rng, "block", (0.06, 0.04, 0.03), symmetry=2),
+            make_body(rng, "cube", (0.04, 0.04, 0.04), symmetry=4),
+            make_body(rng, "ball", (0.03,), symmetry=0),
+        ),
+        goals=(
+            Goal(object="block", onto="tray", onto_from_goal=random_pose(rng), yaw_symmetry=2),
+            Goal(object="cube", onto="block", onto_from_goal=random_pose(rng), yaw_symmetry=4),
+            Goal(object="ball", onto="", onto_from_goal=random_pose(rng), yaw_symmetry=0),
+        ),
+    )
+
+
+def make_rows(rng: np.random.Generator, scene: Scene, count: int) -> ObservationRows:
+    poses = {body.name: np.array([random_pose(rng).vector() for _ in range(count)]) for body in scene.movable}
+    return ObservationRows(
+        joint_position=rng.normal(size=(count, 9)),
+        joint_velocity=rng.normal(size=(count, 9)),
+        gripper_width=rng.uniform(0, 0.08, size=count),
+        base_from_tcp=np.array([random_pose(rng).vector() for _ in range(count)]),
+        object_poses=poses,
+    )
+
+
+def one_row(rows: ObservationRows, t: int) -> ObservationRows:
+    return ObservationRows(
+        joint_position=rows.joint_position[t : t + 1].copy(),
+        joint_velocity=rows.joint_velocity[t : t + 1].copy(),
+        gripper_width=rows.gripper_width[t : t + 1].copy(),
+        base_from_tcp=rows.base_from_tcp[t : t + 1].copy(),
+        object_poses={name: poses[t : t + 1].copy() for name, poses in rows.object_poses.items()},
+    )
+
+
+def test_one_frame_has_the_same_bits_as_many() -> None:
+    rng = np.random.default_rng(1)
+    scene = make_scene(rng)
+    rows = make_rows(rng, scene, 37)
+    many = observation_vectors(rows, PANDA, scene, privileged=True)
+    for t in range(37):
+        one = observation_vectors(one_row(rows, t), PANDA, scene, privileged=True)
+        for name in many:
+            assert one[name].tobytes() == many[name][t].tobytes(), (name, t)
+
+
+def test_an_observation_and_its_recorded_columns_agree() -> None:
+    info, frames, _ = make_episode(num_frames=5, cameras=())
+    for frame in frames:
+        rows = ObservationRows.of_observation(frame.observation)
+        vectors = observation_vectors(rows, info.robot, info.scene)
+        observation = frame.observation
+        expected = np.array([*observation.joint_position[:7], observation.gripper_width], dtype=np.float32)
+        assert np.array_equal(vectors[STATE][0], expected)
+        speed = observation.joint_velocity
+        assert np.allclose(vectors[VELOCITY][0], [*speed[:7], speed[7] + speed[8]], rtol=1e-6)
+
+
+def test_environment_state_against_scipy() -> None:
+    rng = np.random.default_rng(2)
+    scene = make_scene(rng)
+    rows = make_rows(rng, scene, 8)
+    values = observation_vectors(rows, PANDA, scene, privileged=True)[ENVIRONMENT_STATE]
+    names = observation_names(PANDA, scene, privileged=True)[ENVIRONMENT_STATE]
+    assert len(names) == values.shape[1] == len(set(names))
+
+    def matrix(vector: np.ndarray) -> np.ndarray:
+        result = np.eye(4)
+        result[:3, :3] = Rotation.from_quat(vector[3:]).as_matrix()
+        result[:3, 3] = vector[:3]
+        return result
+
+    def yaw(pose: np.ndarray) -> float:
+        vertical = int(np.argmax(np.abs(pose[2, :3])))
+        axis = pose[:3, (vertical + 1) % 3]
+        return math.atan2(axis[1], axis[0])
+
+    for t in range(8):
+        found = dict(zip(names, values[t].tolist(), strict=True))
+        base = matrix(scene.robot.world_from_base.vector())
+        tcp = matrix(rows.base_from_tcp[t])
+        poses = {name: np.linalg.inv(base) @ matrix(vectors[t]) for name, vectors in rows.object_poses.items()}
+        poses["tray"] = np.linalg.inv(base) @ matrix(scene.body("tray").world_from_body.vector())
+        for goal in scene.goals:
+            thing, n = poses[goal.object], scene.body(goal.object).yaw_symmetry
+            onto = poses[goal.onto] if goal.onto else np.linalg.inv(base)
+            wanted = onto @ matrix(goal.onto_from_goal.vector())
+            for prefix, pose in ((goal.object, thing), (f"{goal.object}.goal", wanted)):
+                in_hand = np.linalg.inv(tcp) @ pose
+                for k, axis in enumerate("xyz"):
+                    assert found[f"{prefix}.{axis}"] == pytest.approx(pose[k, 3], abs=1e-5)
+                    assert found[f"{prefix}.from_tcp.{axis}"] == pytest.approx(pose[k, 3] - tcp[k, 3], abs=1e-5)
+                    assert found[f"{prefix}.from_tcp.hand_{axis}"] == pytest.approx(in_hand[k, 3], abs=1e-5)
+            for key, offset in (
+                ("from_tcp", thing - tcp),
+                ("goal.from_tcp", wanted - tcp),
+                (f"goal.from_{goal.object}", wanted - thing),
+            ):
+                for k, axis in enumerate("xyz"):
+                    near = offset[k, 3] / (abs(offset[k, 3]) + 0.02)
+                    assert found[f"{goal.object}.{key}.near_{axis}"] == pytest.approx(near, abs=1e-5)
+            if n:
+                assert found[f"{goal.object}.yaw.sin{n}"] == pytest.approx(math.sin(n * yaw(thing)), abs=1e-5)
+                relative = n * (yaw(thing) - yaw(tcp))
+                assert found[f"{goal.object}.from_tcp.yaw.cos{n}"] == pytest.approx(math.cos(relative), abs=1e-5)
+                assert found[f"{goal.object}.from_tcp.yaw.sin{n}"] == pytest.approx(math.sin(relative), abs=1e-5)
+                relative = n * (yaw(wanted) - yaw(thing))
+                key = f"{goal.object}.goal.from_{goal.object}.yaw"
+                assert found[f"{key}.cos{n}"] == pytest.approx(math.cos(relative), abs=1e-5)
+                assert found[f"{key}.sin{n}"] == pytest.approx(math.sin(relative), abs=1e-5)
+            else:
+                assert f"{goal.object}.yaw.sin" not in found
+        raw = matrix(values[t][-7:].astype(np.float64))
+        assert np.allclose(raw, poses["ball"], atol=1e-5)  # the last movable body
+
+
+def test_a_symmetric_object_turned_by_its_symmetry_looks_the_same() -> None:
+    rng = np.random.default_rng(3)
+    scene = make_scene(rng)
+    rows = make_rows(rng, scene, 1)
+    turned = Pose(position=np.zeros(3), quat_xyzw=Rotation.from_euler("z", 90, degrees=True).as_quat())
+    upright = Pose.from_yaw((0.3, 0.2, 0.1), 0.4)
+    scene = replace(scene, robot=replace(scene.robot, world_from_base=Pose()))
+    seen = []
+    for pose in (upright, upright @ turned):
+        poses = {**rows.object_poses, "cube": pose.vector()[None]}
+        vectors = observation_vectors(replace(rows, object_poses=poses), PANDA, scene, privileged=True)
+        names = observation_names(PANDA, scene, privileged=True)[ENVIRONMENT_STATE]
+        row = dict(zip(names, vectors[ENVIRONMENT_STATE][0].tolist(), strict=True))
+        seen.append({key: value for key, value in row.items() if ".pose." not in key})
+    assert seen[0].keys() == seen[1].keys()
+    assert all(seen[0][key] == pytest.approx(seen[1][key], abs=1e-6) for key in seen[0])
+
+
+def test_the_tcp_quaternion_keeps_its_sign_through_a_turn_of_the_hand() -> None:
+    rng = np.random.default_rng(4)
+    scene = make_scene(rng)
+    down = Rotation.from_euler("x", 180, degrees=True)
+    quats = []
+    for degrees in range(-170, 171, 5):
+        quat = (Rotation.from_euler("z", degrees, degrees=True) * down).as_quat()
+        quats.append(quat * rng.choice([-1, 1]))  # either sign may be recorded
+    rows = make_rows(rng, scene, len(quats))
+    rows = replace(rows, base_from_tcp=np.concatenate([rows.base_from_tcp[:, :3], np.array(quats)], axis=1))
+    found = observation_vectors(rows, PANDA, scene)[EE_POSE][:, 3:]
+    assert np.abs(np.diff(found, axis=0)).max() < 0.05
+
+
+def columns_of(rng: np.random.Generator, count: int) -> EpisodeColumns:
+    def poses() -> np.ndarray:
+        return np.array([random_pose(rng).vector() for _ in range(count)])
+
+    return EpisodeColumns(
+        time_ns=np.arange(count), joint_position=rng.normal(size=(count, 9)),
+        joint_velocity=np.zeros((count, 9)), joint_effort=np.zeros((count, 9)), gripper_width=np.zeros(count),
+        base_from_tcp=poses(), object_poses={}, contact_force=np.zeros(count),
+        action_joint_target=rng.normal(size=(count, 7)), action_gripper=rng.uniform(0, 0.08, count),
+        action_base_from_tcp=poses(), command_joint_target=np.zeros((count, 7)), command_gripper=np.zeros(count),
+        command_base_from_tcp=poses(), phase=("x",) * count, is_deliberate_miss=np.zeros(count, dtype=bool),
+        world_from_camera={},
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("rows", [slice(None), np.arange(2, 50, 3)])
+def test_increments_sum_up_to_the_absolute_targets(rows: slice | np.ndarray) -> None:
+    rng = np.random.default_rng(5)
+    scene, columns = make_scene(rng), columns_of(rng, 50)
+    target = np.array(scene.robot.joint_position)
+    for action, absolute in zip(
+        action_vectors(columns, scene, "joint_increment", rows),
+        action_vectors(columns, scene, "joint", rows),
+        strict=True,
+    ):
+        target = joint_target_from_increment(target, action)
+        assert np.allclose(target, absolute[:7], atol=1e-5)
+        assert action[-1] == absolute[-1]
+
+
+@pytest.mark.parametrize("rows", [slice(None), np.arange(2, 50, 3)])
+def test_pose_deltas_compose_to_the_absolute_poses(rows: slice | np.ndarray) -> None:
+    rng = np.random.default_rng(6)
+    scene, columns = make_scene(rng), columns_of(rng, 50)
+    pose = Pose(position=columns.base_from_tcp[0, :3], quat_xyzw=columns.base_from_tcp[0, 3:])
+    deltas = action_vectors(columns, scene, "ee_delta", rows)
+    absolutes = action_vectors(columns, scene, "ee", rows)
+    assert deltas.shape[1] == 7
+    assert np.sqrt((deltas[:, 3:6] ** 2).sum(axis=1)).max() <= math.pi + 1e-5
+    for delta, absolute in zip(deltas, absolutes, strict=True):
+        pose = pose_from_delta(pose, delta)
+        assert np.allclose(pose.position, absolute[:3], atol=1e-5)
+        angle = (Rotation.from_quat(pose.quat_xyzw) * Rotation.from_quat(absolute[3:7]).inv()).magnitude()
+        assert angle < 1e-4
+        assert delta[-1] == absolute[-1]
+
+
+@pytest.mark.parametrize("fps", [30, 10])
+def test_increments_lead_back_from_noise_as_the_noise_lets_go(fps: int) -> None:
+    """Where the executed command returns to the clean one by itself, the increments are those of the executed one."""
+    rng = np.random.default_rng(11)
+    count, step = 12, 30 // fps
+    columns = columns_of(rng, count * step)
+    time = np.arange(count * step)
+    noise = 0.7 ** time[:, None] * rng.normal(0, 0.02, 7)
+    shift = 0.7 ** time[:, None] * rng.normal(0, 0.01, 3)
+    poses = columns.action_base_from_tcp
+    # Turned about the vertical by an angle that fades, from the left.
+    turn = Rotation.from_rotvec(np.outer(0.7**time * 0.05, [0.0, 0.0, 1.0]))
+    still = Rotation.from_quat(np.broadcast_to(poses[0, 3:], (len(time), 4)))
+    clean = np.concatenate([poses[:, :3], still.as_quat()], axis=1)
+    executed = np.concatenate([poses[:, :3] + shift, (turn * still).as_quat()], axis=1)
+    columns = replace(
+        columns,
+        time_ns=frame_times(time, 30),
+        command_joint_target=columns.action_joint_target + noise,
+        action_base_from_tcp=clean,
+        command_base_from_tcp=executed,
+    )
+    rows, scene = time[::step], make_scene(rng)
+    joints = action_vectors(columns, scene, "joint_increment", rows)[1:, :7]
+    assert np.allclose(joints, np.diff(columns.command_joint_target[rows], axis=0), atol=1e-6)
+    deltas = action_vectors(columns, scene, "ee_delta", rows)[1:]
+    assert np.allclose(deltas[:, :3], np.diff(executed[rows, :3], axis=0), atol=1e-6)
+    turns = (turn[rows[1:]] * turn[rows[:-1]].inv()).as_rotvec()
+    assert np.allclose(deltas[:, 3:6], turns, atol=1e-6)
+
+
+def frame_times(frames: np.ndarray, fps: int) -> np.ndarray:
+    return np.array([frame_time_ns(int(frame), fps) for frame in frames])
+
+
+@pytest.mark.parametrize("kind", ["joint", "joint_increment", "ee", "ee_delta"])
+def test_every_component_of_an_action_has_a_name(kind: str) -> None:
+    rng = np.random.default_rng(7)
+    vectors = action_vectors(columns_of(rng, 3), make_scene(rng), kind)  # type: ignore[arg-type]
+    names = action_names(PANDA, kind)  # type: ignore[arg-type]
+    assert len(names) == len(set(names)) == vectors.shape[1]
+    assert names[-1] == "gripper.width"
+    assert vectors.dtype == np.float32
+
+
+def test_two_goals_for_one_object_have_names_of_their_own() -> None:
+    rng = np.random.default_rng(8)
+    scene = make_scene(rng)
+    scene = replace(scene, goals=(scene.goals[0], replace(scene.goals[0], onto="")))
+    names = observation_names(PANDA, scene, privileged=True)[ENVIRONMENT_STATE]
+    assert len(names) == len(set(names))
+    assert ACTION not in names

@@ -1,0 +1,178 @@
+"""Our kinematics against PyBullet's own link states, Jacobian and against SciPy's slerp, for every robot."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation, Slerp
+
+from demorec.assets import asset_path
+from demorec.geometry import Pose
+from demorec.kinematics import ArmKinematics
+from demorec.sim.arm import arm_kinematics
+from demorec.sim.client import connect
+from demorec.sim.urdf_file import urdf_file
+from demorec.tables import ROBOTS
+from demorec.urdf import Urdf, quat_from_rpy
+
+
+@pytest.fixture(params=ROBOTS.names())
+def robot(request):
+    spec = ROBOTS.load(request.param)
+    client = connect()
+    with urdf_file(spec.urdf) as path:
+        body = client.loadURDF(path, useFixedBase=True)
+    links = {client.getJointInfo(body, i)[12].decode(): i for i in range(client.getNumJoints(body))}
+    joints = {client.getJointInfo(body, i)[1].decode(): i for i in range(client.getNumJoints(body))}
+    yield spec, client, body, links, joints
+    client.disconnect()
+
+
+def random_positions(spec, count, seed=0):
+    low, high = np.array(spec.position_lower), np.array(spec.position_upper)
+    return np.random.default_rng(seed).uniform(low, high, (count, len(low)))
+
+
+def link_pose(client, body, link):
+    state = client.getLinkState(body, link, computeForwardKinematics=True)
+    return np.array(state[4]), Rotation.from_quat(state[5])
+
+
+def test_forward_kinematics_equals_the_simulators(robot):
+    spec, client, body, links, joints = robot
+    arm = arm_kinematics(spec)
+    for q in random_positions(spec, 50):
+        for name, value in zip(spec.arm_joints, q, strict=True):
+            client.resetJointState(body, joints[name], value)
+        position, rotation = link_pose(client, body, links[spec.tcp_link])
+        pose = arm.forward(q)
+        assert np.abs(pose.position - position).max() < 1e-6
+        assert (Rotation.from_quat(pose.quat_xyzw) * rotation.inv()).magnitude() < 1e-5
+
+
+def test_every_link_of_the_urdf_is_where_the_simulator_has_it(robot):
+    spec, client, body, links, joints = robot
+    urdf = Urdf.load(asset_path(spec.urdf))
+    q = dict(zip(spec.arm_joints, random_positions(spec, 1, seed=3)[0].tolist(), strict=True))
+    q |= dict.fromkeys(spec.gripper_joints, 0.3 * spec.gripper_max_width)
+    for name, value in q.items():
+        client.resetJointState(body, joints[name], value)
+    poses = urdf.link_poses(q)
+    assert set(links) < set(poses)
+    for name, link in links.items():
+        position, rotation = link_pose(client, body, link)
+        assert np.abs(poses[name].position - position).max() < 1e-6, name
+        assert (Rotation.from_quat(poses[name].quat_xyzw) * rotation.inv()).magnitude() < 1e-5, name
+
+
+def test_jacobian_equals_finite_differences(robot):
+    spec, *_ = robot
+    arm = arm_kinematics(spec)
+    step = 1e-6
+    for q in random_positions(spec, 5, seed=1):
+        jacobian = arm.jacobian(q)
+        for joint in range(arm.num_joints):
+            ahead, behind = q.copy(), q.copy()
+            ahead[joint] += step
+            behind[joint] -= step
+            a, b = arm.forward(ahead), arm.forward(behind)
+            turn = Rotation.from_quat(a.quat_xyzw) * Rotation.from_quat(b.quat_xyzw).inv()
+            expected = np.concatenate([a.position - b.position, turn.as_rotvec()]) / (2 * step)
+            assert np.abs(jacobian[:, joint] - expected).max() < 1e-6
+
+
+def test_inverse_kinematics_reaches_the_pose_in_the_simulator(robot):
+    spec, client, body, links, joints = robot
+    arm = arm_kinematics(spec)
+    home = np.array(spec.home_q)
+    solved = 0
+    for q in home + np.random.default_rng(2).uniform(-0.4, 0.4, (40, len(home))):
+        q = np.clip(q, arm.lower + 0.02, arm.upper - 0.02)
+        wanted = arm.forward(q)
+        found = arm.inverse(wanted, start=home, rest=home)
+        if found is None:
+            continue
+        solved += 1
+        assert (found >= arm.lower).all()
+        assert (found <= arm.upper).all()
+        for name, value in zip(spec.arm_joints, found, strict=True):
+            client.resetJointState(body, joints[name], value)
+        position, rotation = link_pose(client, body, links[spec.tcp_link])
+        assert math.dist(position, wanted.position) < 5e-5
+        assert (Rotation.from_quat(wanted.quat_xyzw) * rotation.inv()).magnitude() < 5e-4
+    assert solved >= 38
+
+
+def test_the_null_space_pull_changes_the_elbow_and_not_the_hand(robot):
+    spec, *_ = robot
+    arm = arm_kinematics(spec)
+    home = np.array(spec.home_q)
+    start = home + 0.3
+    wanted = arm.forward(start)
+    pulled = arm.inverse(wanted, start=start, rest=home, null_gain=0.1)
+    still = arm.inverse(wanted, start=start)
+    assert pulled is not None
+    assert still is not None
+    assert np.array_equal(still, start)
+    assert np.linalg.norm(pulled - home) < np.linalg.norm(still - home)
+
+
+def test_out_of_reach_is_none_and_not_a_wrong_answer(robot):
+    spec, *_ = robot
+    arm = arm_kinematics(spec)
+    home = np.array(spec.home_q)
+    pose = Pose(position=np.array([3.0, 0.0, 0.5]), quat_xyzw=np.array([1.0, 0.0, 0.0, 0.0]))
+    assert arm.inverse(pose, start=home, rest=home) is None
+
+
+def test_a_straight_path_is_straight_and_turns_evenly(robot):
+    spec, *_ = robot
+    arm = arm_kinematics(spec)
+    start = np.array(spec.home_q)
+    base_from_start = arm.forward(start)
+    turn = Pose.from_yaw([0.05, 0.15, -0.1], 0.7)
+    base_from_goal = Pose(
+        position=base_from_start.position + turn.position,
+        quat_xyzw=(turn @ Pose(quat_xyzw=base_from_start.quat_xyzw)).quat_xyzw,
+    )
+    goal = arm.inverse(base_from_goal, start=start, rest=start)
+    assert goal is not None
+    fractions = np.linspace(0, 1, 9)
+    path = arm.straight_path(
+        start=start, goal=goal, base_from_start=base_from_start, base_from_goal=base_from_goal, fractions=fractions
+    )
+    assert path is not None
+    slerp = Slerp([0, 1], Rotation.from_quat([base_from_start.quat_xyzw, base_from_goal.quat_xyzw]))
+    for u, q in zip(fractions, path, strict=True):
+        pose = arm.forward(q)
+        line = base_from_start.position + u * (base_from_goal.position - base_from_start.position)
+        assert math.dist(pose.position, line) < 2e-4
+        assert (Rotation.from_quat(pose.quat_xyzw) * slerp(u).inv()).magnitude() < 2e-3
+
+
+def test_roll_pitch_yaw_as_urdf_means_them():
+    rpy = [0.3, -1.1, 2.4]
+    expected = Rotation.from_euler("xyz", rpy).as_quat()
+    found = quat_from_rpy(rpy)
+    assert min(np.abs(found - expected).max(), np.abs(found + expected).max()) < 1e-12
+
+
+def test_a_chain_with_other_joints_is_refused():
+    spec = ROBOTS.load("panda")
+    with pytest.raises(ValueError, match="panda_joint7"):
+        ArmKinematics.from_urdf(
+            asset_path(spec.urdf),
+            arm_joints=spec.arm_joints[:6],
+            tcp_link=spec.tcp_link,
+            lower=spec.position_lower[:6],
+            upper=spec.position_upper[:6],
+        )
+
+
+def test_scale_multiplies_lengths():
+    spec = ROBOTS.load("panda")
+    q = np.array(spec.home_q)
+    small, large = arm_kinematics(spec), arm_kinematics(spec, scale=1.3)
+    assert np.allclose(1.3 * small.forward(q).position, large.forward(q).position, atol=1e-12)

@@ -1,0 +1,213 @@
+from __future__ import annotations
+
+import os
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers_recording import write_episode
+from rerun.chunk import RrdReader
+from scipy.spatial.transform import Rotation
+
+from demorec.assets import asset_path
+from demorec.config import VideoConfig
+from demorec.errors import ConfigError
+from demorec.playback.compare import differences
+from demorec.playback.meshes import MAX_TRIANGLES, urdf_meshes
+from demorec.playback.programs import viewer_environment
+from demorec.playback.robot import joint_columns, robot_model
+from demorec.playback.save import save, save_comparison
+from demorec.playback.sources import find_episodes, select
+from demorec.recording import Recording
+from demorec.urdf import Urdf
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("run") / "episodes" / "episode_000000.mcap"
+    path.parent.mkdir()
+    return write_episode(path, num_frames=20, physics_rate_joints=True, depth=True, segmentation=True)
+
+
+@pytest.fixture(scope="module")
+def saved(recording: Path) -> dict[str, list[Any]]:
+    target = recording.parent / "x.rrd"
+    save(find_episodes([recording])[0], target)
+    return _chunks(target)
+
+
+def _chunks(path: Path) -> dict[str, list[Any]]:
+    entities: dict[str, list[Any]] = {}
+    for chunk in RrdReader(path).stream():
+        entities.setdefault(chunk.entity_path, []).append(chunk)
+    return entities
+
+
+def _column(chunks: list[Any], component: str) -> list[Any]:
+    """(seconds in ns, value) of every row, in order of time."""
+    rows = []
+    for chunk in chunks:
+        batch = chunk.to_record_batch()
+        if component in batch.schema.names and not chunk.is_static:
+            times = batch.column("time").cast("int64").to_pylist()
+            rows += zip(times, batch.column(component).to_pylist(), strict=True)
+    return sorted(rows, key=lambda row: row[0])
+
+
+def test_every_joint_sample_is_plotted_at_its_time(saved: dict[str, list[Any]], recording: Path) -> None:
+    with Recording(recording) as source:
+        samples = list(source.joint_samples())
+        num_frames, joints = source.num_frames, len(source.info.robot.arm_joints)
+    assert len(samples) > 7 * (num_frames - 1)  # the physics' rate
+    rows = _column(saved["/plots/position"], "Scalars:scalars")
+    assert [time for time, _ in rows] == [sample.time_ns for sample in samples]
+    np.testing.assert_array_equal([value for _, value in rows], [s.joint_position[:joints] for s in samples])
+
+
+def test_frames_are_on_both_time_lines(saved: dict[str, list[Any]]) -> None:
+    (chunk,) = [chunk for chunk in saved["/plots/gripper"] if not chunk.is_static]
+    assert sorted(chunk.timeline_names) == ["frame", "time"]
+    assert chunk.to_record_batch().column("frame").to_pylist() == list(range(20))
+
+
+@pytest.mark.parametrize("camera", ["front", "wrist"])
+def test_coded_pictures_are_passed_on_unchanged(saved: dict[str, list[Any]], recording: Path, camera: str) -> None:
+    with Recording(recording) as source:
+        packets = list(source.packets(camera))
+    rows = _column(saved[f"/world/cameras/{camera}"], "VideoStream:sample")
+    assert [(time, bytes(value[0])) for time, value in rows] == [(packet.time_ns, packet.data) for packet in packets]
+
+
+def test_depth_and_segments_are_there(saved: dict[str, list[Any]], recording: Path) -> None:
+    with Recording(recording) as source:
+        metres = next(iter(source.depth("front")))
+    _, value = _column(saved["/world/cameras/front/depth"], "DepthImage:buffer")[0]
+    millimetres = np.frombuffer(bytes(value[0]), dtype=np.uint16).reshape(metres.shape)
+    np.testing.assert_allclose(millimetres / 1000, metres, atol=6e-4)
+    assert metres.max() > 0.4
+    _, labels = _column(saved["/world/cameras/front/segmentation"], "SegmentationImage:buffer")[0]
+    assert len(np.unique(np.frombuffer(bytes(labels[0]), dtype=np.uint16))) == 4  # nothing, table, cube, robot
+
+
+def test_robot_objects_path_and_goal_are_there(saved: dict[str, list[Any]]) -> None:
+    links = [entity for entity in saved if "/world/robot/" in entity and _has(saved[entity], "Mesh3D:vertex_positions")]
+    assert len(links) == 11  # links 0 to 7, hand, two fingers
+    assert len(_column(saved["/world/bodies/cube"], "Transform3D:translation")) == 20
+    assert len(_column(saved["/world/ee_path"], "LineStrips3D:strips")) == 19
+    assert _has(saved["/world/goals/cube"], "Boxes3D:half_sizes")
+
+
+def _has(chunks: list[Any], component: str) -> bool:
+    return any(component in chunk.to_record_batch().schema.names for chunk in chunks)
+
+
+def test_phases_and_events_are_states_and_a_log(saved: dict[str, list[Any]]) -> None:
+    states = [value[0] for _, value in _column(saved["/phase"], "StateChange:state")]
+    assert states == ["approach", "descend", "grasp", "lift", "transport", "place", "retreat"]
+    texts = [value[0] for _, value in _column(saved["/events"], "TextLog:text")]
+    assert "both fingers touch the cube" in texts
+    assert texts[-1] == "success"
+
+
+def test_properties_tell_task_seed_outcome_and_length(saved: dict[str, list[Any]]) -> None:
+    batch = saved["/__properties/episode"][0].to_record_batch()
+    values = {name: batch.column(name).to_pylist()[0] for name in batch.schema.names}
+    assert values["task"] == ["pick_place"]
+    assert values["outcome"] == ["success"]
+    assert values["frames"] == [20]
+    assert values["seed"] == [0]
+
+
+def test_links_move_as_scipy_says() -> None:
+    urdf = Urdf.load(asset_path("franka_panda/panda.urdf"))
+    for name in ("panda_joint2", "panda_finger_joint1"):
+        joint = next(joint for joint in urdf.joints if joint.name == name)
+        position = np.linspace(-1.0, 1.0, 7)
+        translation, quaternion = joint_columns(joint, position)
+        fixed = Rotation.from_quat(joint.parent_from_joint.quat_xyzw)
+        for row, q in enumerate(position):
+            slide = q * np.array(joint.axis) if joint.kind == "prismatic" else np.zeros(3)
+            turn = Rotation.from_rotvec(np.zeros(3) if joint.kind == "prismatic" else q * np.array(joint.axis))
+            np.testing.assert_allclose(
+                translation[row], joint.parent_from_joint.position + fixed.apply(slide), atol=1e-12
+            )
+            np.testing.assert_allclose(
+                Rotation.from_quat(quaternion[row]).as_matrix(), (fixed * turn).as_matrix(), atol=1e-12
+            )
+
+
+def test_meshes_are_small_and_have_their_size() -> None:
+    path = asset_path("franka_panda/panda.urdf")
+    meshes = urdf_meshes(path.read_text(), path.parent)
+    assert max(len(mesh.triangles) for mesh in meshes.values()) < 1.3 * MAX_TRIANGLES
+    hand = meshes["panda_hand"].vertices
+    np.testing.assert_allclose(hand.max(axis=0) - hand.min(axis=0), (0.063, 0.204, 0.092), atol=0.004)
+
+
+def test_the_recorded_description_stands_in_for_a_model_that_is_not_installed(recording: Path) -> None:
+    with Recording(recording) as source:
+        description = source.description()
+    urdf, meshes = robot_model("nowhere/robot.urdf", 1.0, description)
+    assert "panda_hand" in {joint.child for joint in urdf.joints}
+    assert len(meshes) == 11
+    moved = description.replace('xyz="0 0 0.333"', 'xyz="0 0 0.444"')
+    assert moved != description
+    other, _ = robot_model("franka_panda/panda.urdf", 1.0, moved)  # another robot than the installed one
+    assert next(joint for joint in other.joints if joint.name == "panda_joint1").parent_from_joint.position[2] == 0.444
+
+
+@pytest.mark.parametrize("codec", ["jpeg", "av1"])
+def test_other_codecs(tmp_path: Path, codec: str) -> None:
+    path = write_episode(tmp_path / "e.mcap", num_frames=6, video=VideoConfig(codec=codec))  # type: ignore[arg-type]
+    save(find_episodes([path])[0], tmp_path / "x.rrd")
+    chunks = _chunks(tmp_path / "x.rrd")["/world/cameras/front"]
+    component = "EncodedImage:blob" if codec == "jpeg" else "VideoStream:sample"
+    assert len(_column(chunks, component)) == 6
+
+
+def test_a_comparison_measures_the_distance(tmp_path: Path, recording: Path) -> None:
+    other = write_episode(tmp_path / "b.mcap", num_frames=12, episode_index=3)
+    first, second = find_episodes([recording, other])
+    with first.open() as a, second.open() as b:
+        result = differences(a, b)
+        expected = np.abs(a.joint_position[:12] - b.joint_position).max(axis=1)
+    assert len(result["distance"].time_ns) == 12  # as long as both last
+    assert expected.min() > 0.001
+    np.testing.assert_array_equal(result["joints"].values[:, 0], expected)
+    np.testing.assert_allclose(result["distance"].values, 0.0, atol=1e-9)  # the same gripper and cube
+    save_comparison(first, second, tmp_path / "c.rrd")
+    entities = set(_chunks(tmp_path / "c.rrd"))
+    assert {"/a/plots/position", "/b/plots/position", "/differences/distance"} <= entities
+
+
+def test_the_viewer_finds_ffmpeg(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    folder = viewer_environment()["PATH"].split(os.pathsep)[-1]
+    said = subprocess.run([f"{folder}/ffmpeg", "-version"], capture_output=True, text=True, check=True).stdout
+    assert said.startswith("ffmpeg version")
+
+
+def test_episodes_are_chosen_by_number(tmp_path: Path) -> None:
+    folder = tmp_path / "episodes"
+    folder.mkdir()
+    for index in range(5):
+        (folder / f"episode_{index:06d}.mcap").touch()
+    sources = find_episodes([tmp_path])
+    assert len(sources) == 5
+    assert select(sources, "") == sources
+    assert select(sources, "1:3") == sources[1:3]
+    assert select(sources, "4,0:2") == [sources[4], *sources[:2]]
+    for bad in ("5", "2:2", "-1", "x", "0:2,9"):
+        with pytest.raises(ConfigError):
+            select(sources, bad)
+
+
+def test_failures_are_shown_when_asked_for(tmp_path: Path) -> None:
+    (tmp_path / "failed").mkdir()
+    (tmp_path / "failed" / "a.mcap").touch()
+    with pytest.raises(ConfigError, match="--include-failures"):
+        find_episodes([tmp_path])
+    assert len(find_episodes([tmp_path], include_failures=True)) == 1

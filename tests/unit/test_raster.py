@@ -1,0 +1,276 @@
+"""The rasteriser: cached pictures, shadows, textures, light, levels of detail, changes that it must notice."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import helpers_render as scenes
+import numpy as np
+import pytest
+
+from demorec.errors import RenderError
+from demorec.geometry import Pose, look_at
+from demorec.render.raster import RasterRenderer, renderer
+from demorec.render.raster.kernels import antialias, records, shade, still, triangles, vertices
+from demorec.scene import Light, Texture
+
+
+@pytest.fixture
+def client() -> Any:
+    connection = scenes.connect()
+    yield connection
+    connection.disconnect()
+
+
+def picture(client: Any, camera: Any, **changes: Any) -> Any:
+    with RasterRenderer() as raster:
+        raster.setup(scenes.setup(client, camera, **changes))
+        return raster.render()[camera.name]
+
+
+def same(one: Any, two: Any) -> bool:
+    return all(np.array_equal(getattr(one, n), getattr(two, n)) for n in ("color", "depth", "segmentation"))
+
+
+@pytest.mark.parametrize("antialias", [True, False])
+def test_keeping_what_stands_still_changes_no_bit(client: Any, antialias: bool) -> None:
+    bodies = scenes.panda_scene(client)
+    front, _ = scenes.panda_cameras(160, 120)
+    kept, redrawn = RasterRenderer(), RasterRenderer(keep_still=False)
+    setup = scenes.setup(client, front, mounts=scenes.panda_mounts(bodies), antialias=antialias)
+    kept.setup(setup)
+    redrawn.setup(setup)
+    random = np.random.default_rng(7)
+    distinct = set()
+    for _ in range(25):
+        scenes.pose_panda(client, bodies, random.uniform(0, 60))
+        # Cubes that fly, so that shadows wander over table, floor and robot.
+        for cube in ("cube1", "cube2"):
+            quat = random.normal(size=4)
+            client.resetBasePositionAndOrientation(
+                bodies[cube], random.uniform((0.1, -0.4, 0.0), (0.8, 0.4, 0.7)), quat / np.sqrt((quat**2).sum())
+            )
+        one, two = kept.render()["front"], redrawn.render()["front"]
+        assert same(one, two)
+        distinct.add(one.color.tobytes())
+    assert len(distinct) == 25
+
+
+def test_other_scenes_before_change_no_bit(client: Any) -> None:
+    bodies = scenes.panda_scene(client)
+    setup = scenes.setup(client, *scenes.panda_cameras(96, 96), mounts=scenes.panda_mounts(bodies))
+    fresh = RasterRenderer()
+    fresh.setup(setup)
+    expected = fresh.render()
+    used = RasterRenderer()
+    other = scenes.connect()
+    scenes.add(other, "sphere", (0.2,))
+    used.setup(scenes.setup(other, scenes.camera(64, 64)))
+    used.render()
+    used.setup(setup)
+    assert all(same(images, used.render()[name]) for name, images in expected.items())
+    other.disconnect()
+
+
+def test_the_rehearsal_compiles_all_that_scenes_need(client: Any) -> None:
+    bodies = scenes.panda_scene(client)
+    for smooth in (True, False):
+        with RasterRenderer() as raster:
+            raster.setup(
+                scenes.setup(
+                    client, *scenes.panda_cameras(96, 64), mounts=scenes.panda_mounts(bodies), antialias=smooth
+                )
+            )
+            raster.render()
+    kernels = [
+        value
+        for module in (antialias, records, shade, still, triangles, vertices)
+        for value in vars(module).values()
+        if hasattr(value, "signatures")
+    ]
+    used = [kernel for kernel in kernels if kernel.signatures]
+    assert len(used) >= 15
+    # A second signature would be compiled in every worker, outside of the lock.
+    assert {kernel.__name__: len(kernel.signatures) for kernel in used if len(kernel.signatures) > 1} == {}
+
+
+@pytest.mark.parametrize("mass", [0.0, 1.0])
+def test_changed_colours_are_noticed(client: Any, mass: float) -> None:
+    body = scenes.add(client, "box", (0.3, 0.3, 0.3), rgbaColor=[1, 0, 0, 1], mass=mass)
+    raster = RasterRenderer()
+    raster.setup(scenes.setup(client, scenes.camera(64, 64)))
+    red = raster.render()["front"]
+    client.changeVisualShape(body, -1, rgbaColor=[0, 0, 1, 1])
+    blue = raster.render()["front"]
+    seen = red.segmentation == body
+    assert red.color[seen].mean(0).argmax() == 0
+    assert blue.color[seen].mean(0).argmax() == 2
+
+
+def test_what_stood_still_and_was_moved_is_noticed(client: Any) -> None:
+    body = scenes.add(client, "box", (0.2, 0.2, 0.2))
+    raster = RasterRenderer()
+    raster.setup(scenes.setup(client, scenes.camera(64, 64)))
+    before = raster.render()["front"]
+    client.resetBasePositionAndOrientation(body, [0.2, 0.0, 0.0], [0, 0, 0, 1])
+    after = raster.render()["front"]
+    assert not np.array_equal(before.segmentation, after.segmentation)
+    assert same(after, picture(client, scenes.camera(64, 64)))
+
+
+def test_procedural_textures_are_drawn(client: Any) -> None:
+    from demorec.textures import texture_pixels
+
+    texture = Texture(pattern="checker", colors=((1.0, 1.0, 1.0), (0.0, 0.0, 0.0)), scale=2.0)
+    body = scenes.add(client, "box", (0.4, 0.4, 0.4), rgbaColor=[1, 1, 1, 1])
+    plain = picture(client, scenes.camera(128, 128))
+    checked = picture(client, scenes.camera(128, 128), textures={body: texture})
+    top = plain.segmentation == body
+    assert plain.color[top].max() - plain.color[top].min() < 140
+    assert checked.color[top].min() < 10
+    # Half of a checkerboard is black.
+    dark = (checked.color[top].max(-1) < 0.5 * plain.color[top].max(-1)).mean()
+    assert abs(dark - 0.5) < 0.06
+    assert texture_pixels(texture).mean() == pytest.approx(127.5, abs=1)
+
+
+def test_distant_textures_turn_to_their_mean(client: Any) -> None:
+    # Without mip maps a far checkerboard flickers between its colours.
+    texture = Texture(pattern="checker", colors=((1.0, 1.0, 1.0), (0.0, 0.0, 0.0)), scale=128.0)
+    body = scenes.add(client, "box", (1.0, 1.0, 0.02), rgbaColor=[1, 1, 1, 1])
+    camera = scenes.camera(192, 192, mount_from_camera=look_at((2.7, -1.35, 2.25), (0.0, 0.0, 0.0)))
+    origin, direction = scenes.rays(camera, Pose())
+    for smooth in (True, False):
+        seen = picture(client, camera, textures={body: texture}, antialias=smooth)
+        flat = picture(client, camera, antialias=smooth)
+        on_top = np.abs(seen.depth - (0.01 - origin[2]) / direction[..., 2]) < 1e-3
+        inner = on_top & scenes.away_from_borders(on_top.astype(np.int32), 3)
+        assert inner.sum() > 500
+        assert seen.color[inner].std() < 6
+        assert 0.4 < seen.color[inner].mean() / flat.color[inner].mean() < 0.65
+
+
+def test_a_shadow_lies_where_the_light_puts_it(client: Any) -> None:
+    floor = scenes.add(
+        client, "box", (1.0, 1.0, 0.1), Pose(position=np.array([0.0, 0.0, -0.05])), rgbaColor=[0.7, 0.7, 0.7, 1]
+    )
+    height, radius = 0.3, 0.06
+    scenes.add(client, "sphere", (radius,), Pose(position=np.array([0.0, 0.0, height])))
+    light = Light(direction=(0.5, -0.4, 1.0))
+    camera = scenes.camera(320, 240)
+    images = picture(client, camera, light=light)
+    unshadowed = picture(client, camera, light=Light(direction=light.direction, shadow=0.0))
+    origin, direction = scenes.rays(camera, Pose())
+    place = origin + (-origin[2] / direction[..., 2])[..., None] * direction
+    towards = np.array(light.direction) / math.sqrt(0.25 + 0.16 + 1)
+    # Distance of the line from a floor point towards the light to the sphere's centre.
+    offset = np.array([0.0, 0.0, height]) - place
+    distance = np.sqrt(((offset - (offset @ towards)[..., None] * towards) ** 2).sum(-1))
+    on_floor = (images.segmentation == floor) & (np.abs(place[..., :2]) < 0.48).all(-1)
+    on_floor &= scenes.away_from_borders(images.segmentation, 2)
+    ratio = images.color.astype(float).mean(-1) / unshadowed.color.astype(float).mean(-1)
+    core, free = on_floor & (distance < radius - 0.02), on_floor & (distance > radius + 0.02)
+    assert core.sum() > 50
+    assert ratio[core].max() < 0.8
+    # Nowhere else is anything darker: no acne.
+    assert ratio[free].min() > 0.995
+    assert images.color[free].std(0).max() < 2
+
+
+def test_light_changes_pictures_as_told(client: Any) -> None:
+    body = scenes.add(client, "box", (0.4, 0.4, 0.4), rgbaColor=[0.6, 0.6, 0.6, 1])
+    camera = scenes.camera(64, 64)
+    base = picture(client, camera)
+    seen = scenes.away_from_borders(base.segmentation, 1) & (base.segmentation == body)
+
+    def mean(**changes: Any) -> Any:
+        return picture(client, camera, light=Light(**changes)).color[seen].mean(0)
+
+    reference = mean()
+    assert (mean(ambient=0.2) < reference - 20).all()
+    assert (mean(diffuse=0.1) < reference - 10).all()
+    red = mean(color=(1.0, 0.2, 0.2))
+    assert red[0] == pytest.approx(reference[0], abs=1)
+    assert red[1] < reference[1] - 10
+    assert not np.allclose(mean(direction=(-0.5, 0.4, 0.6)), reference, atol=3)
+    with pytest.raises(RenderError, match="direction"):
+        mean(direction=(0.0, 0.0, 0.0))
+
+
+def test_white_is_not_overexposed(client: Any) -> None:
+    body = scenes.add(client, "sphere", (0.2,), rgbaColor=[1, 1, 1, 1])
+    images = picture(client, scenes.camera(128, 128))
+    lit = images.color[images.segmentation == body]
+    assert (lit == 255).mean() < 0.001
+    assert lit.max() > 215
+
+
+def test_antialiasing_softens_edges_and_moves_nothing(client: Any) -> None:
+    bodies = scenes.panda_scene(client)
+    front, _ = scenes.panda_cameras(224, 224)
+    mounts = scenes.panda_mounts(bodies)
+    soft = picture(client, front, mounts=mounts)
+    hard = picture(client, front, mounts=mounts, antialias=False)
+    assert (soft.segmentation == hard.segmentation).mean() > 0.998
+    both = (soft.depth > 0) & (hard.depth > 0) & (soft.segmentation == hard.segmentation)
+    assert np.quantile(np.abs(soft.depth - hard.depth)[both], 0.99) < 1e-3
+    # Colours differ at edges, hardly elsewhere.
+    difference = np.abs(soft.color.astype(int) - hard.color.astype(int)).max(-1)
+    inner = scenes.away_from_borders(hard.segmentation, 2)
+    assert (difference[~inner] > 12).mean() > 0.1
+    assert (difference[inner] > 12).mean() < 0.03
+
+
+def test_exact_draws_all_triangles_and_levels_stay_close(client: Any) -> None:
+    bodies = scenes.panda_scene(client)
+    cameras = scenes.panda_cameras(224, 224)
+    setup = scenes.setup(client, *cameras, mounts=scenes.panda_mounts(bodies))
+    coarse, exact = RasterRenderer(), RasterRenderer(exact=True)
+    coarse.setup(setup)
+    exact.setup(setup)
+    for name, images in exact.render().items():
+        other = coarse.render()[name]
+        assert (images.segmentation == other.segmentation).mean() > 0.99
+        both = images.segmentation == other.segmentation
+        assert np.quantile(np.abs(images.depth - other.depth)[both], 0.99) < 5e-3
+
+
+def test_a_camera_inside_a_mesh_clips_more_than_there_is_room_for(client: Any) -> None:
+    # Thousands of triangles cross the guard planes at once: the buffers must grow, not overflow.
+    body = scenes.add(
+        client, "mesh", (30.0, 30.0, 30.0), fileName=f"{scenes.DATA}/textured_sphere_smooth.obj", mass=1.0
+    )
+    camera = scenes.camera(64, 64, near=0.001, far=100.0)
+    for smooth in (True, False):
+        with RasterRenderer(exact=True) as raster:
+            raster.setup(scenes.setup(client, camera, antialias=smooth))
+            for height in (0.0, 29.99, 30.0005):
+                client.resetBasePositionAndOrientation(body, [0, 0, -height], [0, 0, 0, 1])
+                images = raster.render()["front"]
+                assert np.isfinite(images.depth).all()
+
+
+def test_invisible_shapes_are_left_out(client: Any) -> None:
+    scenes.add(client, "box", (0.3, 0.3, 0.3), rgbaColor=[1, 0, 0, 0])
+    assert (picture(client, scenes.camera(64, 64)).segmentation == -1).all()
+
+
+def test_planes_reach_the_horizon(client: Any) -> None:
+    body = scenes.add(client, "plane", ())
+    camera = scenes.camera(96, 96, far=50.0)
+    images = picture(client, camera)
+    origin, direction = scenes.rays(camera, Pose())
+    depth = -origin[2] / direction[..., 2]
+    expected = (depth > 0) & (depth < 50)
+    assert ((images.segmentation == body) == expected).mean() > 0.999
+    assert np.abs(images.depth - depth)[expected & (depth < 5)].max() < 1e-3
+
+
+def test_an_empty_scene_is_sky(client: Any) -> None:
+    assert (picture(client, scenes.camera(32, 32)).segmentation == -1).all()
+
+
+def test_shadow_maps_suit_the_picture() -> None:
+    assert renderer.shadow_size(96) < renderer.shadow_size(224) < renderer.shadow_size(480)
+    assert all(renderer.shadow_size(height) % 8 == 0 for height in (1, 200, 4000))

@@ -1,0 +1,106 @@
+"""Mesh files: read as they are meant, named when they are broken; decimation and cache keep what they must."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import helpers_render as scenes
+import numpy as np
+import pytest
+import trimesh
+
+from demorec.errors import RenderError
+from demorec.render.raster import RasterRenderer
+from demorec.render.raster.decimate import decimate
+from demorec.render.raster.mesh_cache import cached_mesh
+from demorec.render.raster.mesh_files import load_mesh
+
+
+def test_stl_is_read_as_trimesh_reads_it(tmp_path: Path) -> None:
+    shape = trimesh.creation.icosphere(2, 0.1)
+    for kind in ("stl", "stl_ascii"):
+        path = tmp_path / f"{kind}.stl"
+        shape.export(path, file_type=kind)
+        mesh = load_mesh(path)
+        assert mesh.num_faces == len(shape.faces)
+        assert np.allclose(mesh.points.min(0), shape.bounds[0], atol=1e-6)
+        # Smooth shading although the file has no shared corners: normals of a sphere point outward.
+        corners = mesh.points[mesh.faces]
+        outward = corners / np.sqrt((corners**2).sum(-1, keepdims=True))
+        assert (mesh.normals * outward).sum(-1).min() > 0.98
+
+
+def test_obj_polygons_negative_numbers_and_materials(tmp_path: Path) -> None:
+    (tmp_path / "m.mtl").write_text("newmtl red\nKd 1 0 0\nnewmtl blue\nKd 0 0 1\n")
+    path = tmp_path / "two.obj"
+    path.write_text(
+        "mtllib m.mtl\nv 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv 0 0 1\nusemtl red\nf -5 -4 -3 -2\nusemtl blue\nf 1 2 5\n"
+    )
+    mesh = load_mesh(path)
+    assert mesh.num_faces == 3
+    assert mesh.points[mesh.faces[2]].tolist() == [[0, 0, 0], [1, 0, 0], [0, 0, 1]]
+    assert mesh.colors.tolist() == [[1, 0, 0], [1, 0, 0], [0, 0, 1]]
+    assert np.allclose(mesh.normals[0], [0, 0, 1])
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("a.obj", b"v 0 0 0\nf 1 2 3\n"),
+        ("b.obj", b"v 0 0 zero\n"),
+        ("c.obj", b""),
+        ("d.stl", b"x" * 90),
+        ("e.dae", b"<COLLADA><"),
+        ("f.ply", b"ply"),
+        ("g.obj", b"v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"),
+    ],
+)
+def test_broken_files_are_named(tmp_path: Path, name: str, content: bytes) -> None:
+    path = tmp_path / name
+    path.write_bytes(content)
+    with pytest.raises(RenderError, match=name):
+        load_mesh(path)
+
+
+def test_a_mesh_that_vanished_is_named_with_its_body(tmp_path: Path) -> None:
+    path = tmp_path / "here.obj"
+    path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    client = scenes.connect()
+    body = scenes.add(client, "mesh", (1.0, 1.0, 1.0), fileName=str(path))
+    path.unlink()
+    with RasterRenderer() as raster, pytest.raises(RenderError, match=f"Body {body} .*here.obj"):
+        raster.setup(scenes.setup(client, scenes.camera(32, 32)))
+    client.disconnect()
+
+
+def test_decimation_stays_near_the_surface() -> None:
+    mesh = load_mesh(Path(scenes.DATA) / "franka_panda/meshes/visual/hand.obj")
+    few = decimate(mesh, 512)
+    assert 400 < few.num_faces <= 512
+    distance = trimesh.proximity.closest_point_naive(
+        trimesh.Trimesh(mesh.points, mesh.faces, process=False), few.points[few.faces].mean(1)[:40]
+    )[1]
+    assert np.median(distance) < 1e-3
+    assert np.allclose((few.normals**2).sum(-1), 1, atol=1e-6)
+
+
+def test_the_cache_survives_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DEMOREC_CACHE", str(tmp_path))
+    source = Path(scenes.DATA) / "cube.obj"
+    made: list[int] = []
+
+    def make() -> object:
+        made.append(1)
+        return load_mesh(source)
+
+    first = cached_mesh("key", make)  # type: ignore[arg-type]
+    again = cached_mesh("key", make)  # type: ignore[arg-type]
+    assert len(made) == 1
+    assert np.array_equal(first.points, again.points)
+    assert again.texture == first.texture
+    (file,) = tmp_path.glob("meshes/*/*.npz")
+    whole = file.read_bytes()
+    file.write_bytes(whole[: len(whole) // 2])
+    assert np.array_equal(cached_mesh("key", make).points, first.points)  # type: ignore[arg-type]
+    assert len(made) == 2
+    assert file.read_bytes() != whole[: len(whole) // 2]

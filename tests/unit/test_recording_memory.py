@@ -1,0 +1,65 @@
+"""Reading and writing take as much memory for ten minutes as for one."""
+
+from __future__ import annotations
+
+import tracemalloc
+from collections import deque
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from helpers_recording import make_episode
+
+from demorec.episode import frame_time_ns
+from demorec.recording import EpisodeWriter, Recording
+
+READERS: dict[str, Callable[[Recording], object]] = {
+    "packets": lambda recording: recording.packets("front"),
+    "images": lambda recording: recording.images("front"),
+    "depth": lambda recording: recording.depth("front"),
+    "segmentation": lambda recording: recording.segmentation("front"),
+    "joint_samples": lambda recording: recording.joint_samples(),
+    "events": lambda recording: recording.events(),
+}
+
+
+def write_long(path: Path, num_frames: int) -> None:
+    """The same 60 frames again and again."""
+    info, frames, outcome = make_episode(
+        num_frames=60, width=64, height=64, cameras=("front",), depth=True, segmentation=True
+    )
+    with EpisodeWriter(path, info) as writer:
+        for index in range(num_frames):
+            writer.write(replace(frames[index % 60], frame_index=index, time_ns=frame_time_ns(index, info.fps)))
+        writer.finish(replace(outcome, num_frames=num_frames))
+
+
+def peak_bytes(work: Callable[[], object]) -> int:
+    tracemalloc.start()
+    try:
+        work()
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize(
+    "num_frames", [(90, 360), pytest.param((1800, 18_000), marks=[pytest.mark.slow, pytest.mark.timeout(900)])]
+)
+def test_memory_does_not_grow_with_length(
+    tmp_path: Path, num_frames: tuple[int, int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    peaks: dict[str, list[int]] = {"writing": [], **{name: [] for name in READERS}}
+    for count in (10, *num_frames):  # the first loads and compiles what is loaded and compiled once
+        path = tmp_path / f"{count}.mcap"
+        peaks["writing"].append(peak_bytes(lambda path=path, count=count: write_long(path, count)))
+        with Recording(path) as recording:
+            assert recording.num_frames == count
+            for name, read in READERS.items():
+                peaks[name].append(peak_bytes(lambda read=read, recording=recording: deque(read(recording), maxlen=1)))
+    with capsys.disabled():
+        print(f"\npeak memory of {num_frames[0]} and {num_frames[1]} frames:", end=" ")
+        print(", ".join(f"{name} {short >> 10} and {long >> 10} kB" for name, (_, short, long) in peaks.items()))
+    for name, (_, short, long) in peaks.items():
+        assert long < 1.3 * short + 200_000, name

@@ -1,0 +1,118 @@
+"""The encoder: what it is told, that it does not depend on what the process did before, and that it holds nothing."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers_recording import make_episode
+
+from demorec.config import VideoConfig
+from demorec.errors import RecordingError
+from demorec.recording.video import VideoPacket, decode, is_keyframe, make_encoder
+
+ENCODE = """
+import hashlib, sys
+from helpers_recording import make_episode
+from demorec.config import VideoConfig
+from demorec.recording.video import make_encoder
+_, frames, _ = make_episode(num_frames=40, width=224, height=224, cameras=("front",))
+for codec in ("h264", "av1", "jpeg"):
+    for gop in (2, 30):
+        encoder = make_encoder(video=VideoConfig(codec=codec, gop=gop), width=224, height=224, fps=30)
+        packets = [packet for frame in frames for packet in encoder.encode(frame.images["front"].color)]
+        print(codec, gop, hashlib.sha256(b"".join(packets + encoder.finish())).hexdigest())
+"""
+
+
+def test_packets_do_not_depend_on_what_was_in_the_memory() -> None:
+    """glibc fills fresh memory with a pattern of our choice: an encoder that reads it before setting it gives itself
+    away (x264 with its macroblock tree does)."""
+    results = []
+    for pattern in ("0", "1", "170"):
+        environment = {**os.environ, "MALLOC_PERTURB_": pattern, "PYTHONPATH": str(Path(__file__).parents[1])}
+        done = subprocess.run(
+            [sys.executable, "-c", ENCODE], env=environment, capture_output=True, text=True, timeout=120, check=True
+        )
+        results.append(done.stdout)
+    assert results[0].count("\n") == 6
+    assert results[0] == results[1] == results[2]
+
+
+@pytest.mark.parametrize("codec", ["h264", "av1", "jpeg"])
+def test_the_delay_is_short(codec: str) -> None:
+    """What an encoder holds back is lost in a crash."""
+    _, frames, _ = make_episode(num_frames=40, cameras=("front",))
+    encoder = make_encoder(video=VideoConfig(codec=codec, gop=30), width=64, height=48, fps=30)
+    out = 0
+    for number, frame in enumerate(frames, start=1):
+        out += len(encoder.encode(frame.images["front"].color))
+        assert number - out <= (1 if codec == "av1" else 0)
+    assert out + len(encoder.finish()) == 40
+
+
+def test_broken_video_is_told_in_one_sentence() -> None:
+    _, frames, _ = make_episode(num_frames=4, cameras=("front",))
+    for codec, junk in (("h264", b"\0\0\0\1\x65junk"), ("av1", b"\x12\0junk"), ("jpeg", b"\xff\xd8\xffjunk")):
+        encoder = make_encoder(video=VideoConfig(codec=codec), width=64, height=48, fps=30)
+        data = [packet for frame in frames for packet in encoder.encode(frame.images["front"].color)]
+        data += encoder.finish()
+        data[1] = junk
+        packets = [
+            VideoPacket(frame_index=index, time_ns=0, data=packet, is_keyframe=is_keyframe(codec, packet))
+            for index, packet in enumerate(data)
+        ]
+        with pytest.raises(RecordingError) as caught:
+            list(decode(encoder.settings, packets))
+        assert "\n" not in str(caught.value)
+
+
+def test_another_size_than_the_settings_say() -> None:
+    encoder = make_encoder(video=VideoConfig(codec="jpeg"), width=64, height=48, fps=30)
+    other = make_encoder(video=VideoConfig(codec="jpeg"), width=32, height=32, fps=30)
+    (data,) = other.encode(np.zeros((32, 32, 3), dtype=np.uint8))
+    packet = VideoPacket(frame_index=0, time_ns=0, data=data, is_keyframe=True)
+    with pytest.raises(RecordingError, match="A picture is 32x32 pixels where the metadata says 64x48"):
+        list(decode(encoder.settings, [packet]))
+
+
+def test_packets_do_not_depend_on_the_instructions_of_the_cpu():
+    """x264 without any vector instruction codes the same bits as with all that this machine has."""
+    from fractions import Fraction
+
+    import av
+
+    encoder = make_encoder(video=VideoConfig(), width=224, height=224, fps=30)
+    times, rows, columns = np.mgrid[0:12, 0:224, 0:224].astype(np.float64)
+    waves = 128 + 100 * np.sin(rows / 9 + times / 3) * np.cos(columns / 13 - times / 5)
+    pictures = np.stack([waves, np.roll(waves, 40, axis=2), 255 - waves], axis=-1).astype(np.uint8)
+    packets = [bytes(p) for picture in pictures for p in encoder.encode(picture)]
+    packets += [bytes(p) for p in encoder.finish()]
+
+    def plain(parameters: str) -> list[bytes]:
+        context = av.CodecContext.create(encoder.settings.encoder, "w")
+        context.width, context.height, context.pix_fmt = 224, 224, "yuv420p"
+        context.time_base, context.framerate, context.gop_size = Fraction(1, 30), Fraction(30, 1), encoder.settings.gop
+        context.thread_count = 1
+        settings = encoder.settings
+        context.options = {
+            "g": str(settings.gop),
+            "crf": str(settings.crf),
+            "preset": settings.preset,
+            **settings.options,
+            "x264-params": parameters,
+        }
+        found = []
+        for index, picture in enumerate(pictures):
+            frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
+            frame.pts, frame.time_base = index, context.time_base
+            found += [bytes(p) for p in context.encode(frame)]
+        return found + [bytes(p) for p in context.encode(None)]
+
+    assert plain("cpu-independent=1:asm=0") == packets
+    assert plain("asm=0") != plain(""), "these pictures would not tell"
+    assert len(packets) == len(pictures)

@@ -1,0 +1,179 @@
+"""What the writer refuses, and what it leaves behind when something goes wrong."""
+
+from __future__ import annotations
+
+import resource
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers_recording import make_episode, write_episode
+
+from demorec.config import VideoConfig
+from demorec.episode import Event, Frame, Outcome
+from demorec.errors import RecordingError
+from demorec.recording import EpisodeWriter, Recording, recover
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def write_all(writer: EpisodeWriter, frames: list[Frame], outcome: Outcome | None = None) -> None:
+    for frame in frames:
+        writer.write(frame)
+    if outcome is not None:
+        writer.finish(outcome)
+
+
+def test_nothing_is_overwritten(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    path.write_bytes(b"mine")
+    info, _, _ = make_episode(num_frames=1)
+    with pytest.raises(RecordingError, match="there already"):
+        EpisodeWriter(path, info)
+    assert path.read_bytes() == b"mine"
+    assert names(tmp_path) == ["a.mcap"]
+
+
+def test_an_unfinished_recording_is_not_overwritten(tmp_path: Path) -> None:
+    part = tmp_path / "a.mcap.part"
+    part.write_bytes(b"what a crash left")
+    info, _, _ = make_episode(num_frames=1)
+    with pytest.raises(RecordingError, match="unfinished"):
+        EpisodeWriter(tmp_path / "a.mcap", info)
+    assert part.read_bytes() == b"what a crash left"
+
+
+def test_a_file_that_appears_meanwhile_is_not_overwritten(tmp_path: Path) -> None:
+    info, frames, outcome = make_episode(num_frames=3)
+    path = tmp_path / "a.mcap"
+    with EpisodeWriter(path, info) as writer:
+        write_all(writer, frames)
+        path.write_bytes(b"mine")
+        with pytest.raises(RecordingError, match="there already"):
+            writer.finish(outcome)
+    assert path.read_bytes() == b"mine"
+    recover(tmp_path / "a.mcap.part", tmp_path / "b.mcap")
+    with Recording(tmp_path / "b.mcap") as recording:
+        assert recording.outcome == outcome
+
+
+def test_overwrite(tmp_path: Path) -> None:
+    path = write_episode(tmp_path / "a.mcap", num_frames=3, cameras=())
+    info, frames, outcome = make_episode(num_frames=5, cameras=())
+    with EpisodeWriter(path, info, overwrite=True) as writer:
+        write_all(writer, frames)
+        assert Recording(path).num_frames == 3  # until the new one is complete
+        writer.finish(outcome)
+    assert Recording(path).num_frames == 5
+
+
+def test_the_file_gets_its_name_when_it_is_complete(tmp_path: Path) -> None:
+    info, frames, outcome = make_episode(num_frames=3)
+    path = tmp_path / "a.mcap"
+    with EpisodeWriter(path, info) as writer:
+        write_all(writer, frames)
+        assert names(tmp_path) == ["a.mcap.part"]
+        stats = writer.finish(outcome)
+    assert names(tmp_path) == ["a.mcap"]
+    assert (stats.path, stats.num_frames, stats.num_bytes) == (path, 3, path.stat().st_size)
+    with Recording(path) as recording:
+        for camera in ("front", "wrist"):
+            assert stats.video_bytes[camera] == sum(len(packet.data) for packet in recording.packets(camera))
+
+
+def test_leaving_without_finish_leaves_a_part_that_can_be_recovered(tmp_path: Path) -> None:
+    info, frames, _ = make_episode(num_frames=70)
+    with EpisodeWriter(tmp_path / "a.mcap", info) as writer:
+        write_all(writer, frames)
+    assert names(tmp_path) == ["a.mcap.part"]
+    with pytest.raises(RecordingError, match="never finished"):
+        Recording(tmp_path / "a.mcap.part")
+    assert recover(tmp_path / "a.mcap.part", tmp_path / "a.mcap").num_frames >= 40
+
+
+def test_frames_come_in_order(tmp_path: Path) -> None:
+    info, frames, _ = make_episode(num_frames=3, cameras=())
+    with EpisodeWriter(tmp_path / "a.mcap", info) as writer:
+        writer.write(frames[0])
+        with pytest.raises(RecordingError, match=r"Frame 2 at 66666667 ns came where frame 1 at 33333333 ns was due"):
+            writer.write(frames[2])
+        with pytest.raises(RecordingError, match="Frame 1 at 7 ns"):
+            writer.write(replace(frames[1], time_ns=7))
+
+
+def test_pictures_are_complete(tmp_path: Path) -> None:
+    info, frames, _ = make_episode(num_frames=2, depth=True)
+    with EpisodeWriter(tmp_path / "a.mcap", info) as writer:
+        writer.write(frames[0])
+        wrist = frames[1].images["wrist"]
+        with pytest.raises(RecordingError, match="no picture of the camera 'wrist'"):
+            writer.write(replace(frames[1], images={"front": frames[1].images["front"]}))
+    with EpisodeWriter(tmp_path / "b.mcap", info) as writer:
+        writer.write(frames[0])
+        with pytest.raises(RecordingError, match="depth picture of the camera 'wrist' at frame 1 is missing"):
+            writer.write(replace(frames[1], images={**frames[1].images, "wrist": replace(wrist, depth=None)}))
+    with EpisodeWriter(tmp_path / "c.mcap", info) as writer:
+        writer.write(frames[0])
+        small = replace(wrist, color=np.zeros((24, 32, 3), dtype=np.uint8))
+        with pytest.raises(RecordingError, match=r"colour picture .* has shape \(24, 32, 3\).* of 64x48 pixels"):
+            writer.write(replace(frames[1], images={**frames[1].images, "wrist": small}))
+
+
+def test_the_outcome_has_the_same_length(tmp_path: Path) -> None:
+    info, frames, outcome = make_episode(num_frames=2, cameras=())
+    with EpisodeWriter(tmp_path / "a.mcap", info) as writer:
+        writer.write(frames[0])
+        with pytest.raises(RecordingError, match="The outcome has 2 frames, the recording 1"):
+            writer.finish(outcome)
+
+
+def test_the_name_of_phase_events_is_reserved(tmp_path: Path) -> None:
+    info, frames, _ = make_episode(num_frames=1, cameras=())
+    with (
+        EpisodeWriter(tmp_path / "a.mcap", info) as writer,
+        pytest.raises(RecordingError, match="reserved"),
+    ):
+        writer.write(replace(frames[0], events=(Event(name="phase", message="mine"),)))
+
+
+def test_a_folder_that_is_not_there(tmp_path: Path) -> None:
+    info, _, _ = make_episode(num_frames=1, cameras=())
+    with pytest.raises(RecordingError, match="No such file or directory"):
+        EpisodeWriter(tmp_path / "nowhere" / "a.mcap", info)
+
+
+def test_an_impossible_preset_is_told_in_one_sentence(tmp_path: Path) -> None:
+    info, frames, _ = make_episode(num_frames=1)
+    with (
+        EpisodeWriter(tmp_path / "a.mcap", info, video=VideoConfig(preset="quickest")) as writer,
+        pytest.raises(RecordingError, match=r"libx264 .* preset quickest") as caught,
+    ):
+        writer.write(frames[0])
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_a_full_disk(tmp_path: Path) -> None:
+    info, frames, _ = make_episode(num_frames=31, cameras=())
+    (tmp_path / "a.mcap.part").symlink_to("/dev/full")
+    writer = EpisodeWriter(tmp_path / "a.mcap", info, overwrite=True)
+    with pytest.raises(RecordingError, match="cannot be written") as caught:
+        write_all(writer, frames)
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "a.mcap").exists()
+
+
+def test_a_disk_that_fills_up_in_the_middle(tmp_path: Path) -> None:
+    info, frames, outcome = make_episode(num_frames=60, width=320, height=240)
+    writer = EpisodeWriter(tmp_path / "a.mcap", info, video=VideoConfig(codec="jpeg"))
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, limits[1]))
+    try:
+        with pytest.raises(RecordingError, match=r"cannot be written \(File too large\)"):
+            write_all(writer, frames, outcome)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert names(tmp_path) == ["a.mcap.part"]

@@ -1,0 +1,230 @@
+"""Episodes: aligned, bounded, replayable, and a function of the plan alone."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers_sim import episode, run
+
+from demorec.config import EpisodePlan, GenerateConfig
+from demorec.episode import EpisodeInfo
+from demorec.features import NOISE_LETS_GO
+from demorec.plain import from_json, to_json
+from demorec.rollout import Rollout, make_world, prepare
+
+
+@pytest.fixture(scope="module")
+def ran():
+    prepared = episode(4)
+    frames, outcome = run(prepared)
+    return prepared, frames, outcome
+
+
+def test_an_episode_succeeds_strictly(ran):
+    prepared, frames, outcome = ran
+    assert outcome.success
+    assert outcome.failure_phase == outcome.failure_reason == ""
+    assert outcome.num_frames == len(frames)
+    assert all(check.passed for check in outcome.checks)
+    # The cube's last seen pose, against the goal, without our checks.
+    last = frames[-1].observation.object_poses["red_cube"]
+    goal = prepared.info.scene.goals[0].onto_from_goal
+    assert np.hypot(*(last.position - goal.position)[:2]) < 0.02
+    assert frames[-1].observation.contact_force == 0
+
+
+def test_phases_run_in_order(ran):
+    _, frames, _ = ran
+    phases = list(dict.fromkeys(frame.phase for frame in frames))
+    assert phases == ["approach", "descend", "close", "lift", "transport", "lower", "release", "retreat"]
+    assert [event.name for frame in frames for event in frame.events] == ["grasp", "place"]
+
+
+def test_time_stamps_are_exact_integers(ran):
+    _, frames, _ = ran
+    assert [frame.frame_index for frame in frames] == list(range(len(frames)))
+    assert [frame.time_ns for frame in frames[:4]] == [0, 33_333_333, 66_666_667, 100_000_000]
+
+
+def test_observation_comes_before_the_action(ran):
+    """The joints follow the command of frame t only at frame t + 1."""
+    _, frames, _ = ran
+    commands = np.array([frame.command.joint_target for frame in frames])
+    joints = np.array([frame.observation.joint_position[:7] for frame in frames])
+    follows = np.abs(joints[1:] - commands[:-1]).mean()
+    equal = np.abs(joints - commands).mean()
+    assert follows < 0.5 * equal
+
+
+def test_replaying_the_commands_gives_the_same_bits(ran):
+    prepared, frames, outcome = ran
+    info = from_json(to_json(prepared.info), EpisodeInfo)  # as a recording would hold it
+    with make_world(info) as world:
+        world.reset(info.scene)
+        for frame in frames:
+            seen = world.observe()
+            assert np.array_equal(seen.joint_position, frame.observation.joint_position)
+            assert np.array_equal(seen.joint_effort, frame.observation.joint_effort)
+            assert seen.object_poses["red_cube"] == frame.observation.object_poses["red_cube"]
+            world.apply(frame.command)
+        assert world.state_digest() == outcome.final_state_digest
+
+
+def test_noise_is_on_the_command_only_and_only_in_free_motion(ran):
+    _, frames, _ = ran
+    noise = {phase: [] for phase in {frame.phase for frame in frames}}
+    for frame in frames:
+        noise[frame.phase].append(np.abs(frame.command.joint_target - frame.action.joint_target).max())
+    assert np.mean(noise["approach"]) > 0.005
+    assert np.mean(noise["transport"]) > 0.003
+    # Gated with a ramp: what is left of it dies away within a few frames.
+    for phase in ("close", "lift", "release"):
+        assert max(noise[phase]) < 0.001, phase
+
+
+def test_labels_are_smooth(ran):
+    """The clean action keeps to the velocity limits; noise never enters it."""
+    prepared, frames, _ = ran
+    labels = np.array([frame.action.joint_target for frame in frames])
+    speed = np.abs(np.diff(labels, axis=0)) * prepared.info.fps
+    commands = np.array([frame.command.joint_target for frame in frames])
+    limit = np.array(prepared.info.robot.velocity_limit)
+    assert (speed < limit).all()
+    assert (np.abs(np.diff(commands, axis=0)) * prepared.info.fps <= limit * (1 + 1e-9)).all()
+
+
+def test_no_frame_is_idle(ran):
+    _, frames, _ = ran
+    # Neither the label nor what is executed moves.
+    labels = np.array([[*f.action.joint_target, *f.command.joint_target, f.action.gripper_target] for f in frames])
+    still = np.abs(np.diff(labels, axis=0)).max(axis=1) < 1e-12
+    outside_of_gripping = [
+        s for s, frame in zip(still, frames, strict=False) if frame.phase not in ("close", "release")
+    ]
+    assert sum(outside_of_gripping) <= 0.06 * len(frames)
+
+
+def test_the_expert_goes_on_only_where_it_wanted_to_be(ran):
+    """Noise fades before the hand is lowered: a policy must not learn that nearly there is there."""
+    _, frames, _ = ran
+    for before, after in itertools.pairwise(frames):
+        if (before.phase, after.phase) in (("approach", "descend"), ("transport", "lower")):
+            reached = after.observation.joint_position[:7]
+            assert np.abs(reached - before.action.joint_target).max() < 0.006
+            assert np.abs(before.command.joint_target - before.action.joint_target).max() < 0.006
+
+
+def test_noise_lets_go_at_the_rate_that_increments_expect(ran):
+    """Once no noise is added, the exported increments are the executed ones."""
+    prepared, frames, _ = ran
+    actions = np.array([frame.action.joint_target for frame in frames])
+    commands = np.array([frame.command.joint_target for frame in frames])
+    noise = commands - actions
+    fading = [t for t in range(1, len(frames)) if np.allclose(noise[t], 0.7 * noise[t - 1], rtol=1e-6, atol=1e-12)]
+    moving = [t for t in fading if np.abs(noise[t]).max() > 1e-3]
+    assert len(moving) >= 5
+    executed = np.diff(commands, axis=0)
+    expected = np.diff(actions, axis=0) + NOISE_LETS_GO * (actions - commands)[:-1]
+    assert np.allclose(executed[np.array(fading) - 1], expected[np.array(fading) - 1], atol=1e-9)
+    assert prepared.behaviour.action_noise == 0.02
+
+
+def test_an_episode_depends_on_its_plan_alone():
+    """Alone, after others, in reverse order: the same digest."""
+    plans = [episode(index) for index in (0, 1, 2)]
+    alone = [run(prepared)[1].final_state_digest for prepared in plans]
+    with make_world(plans[0].info) as world:
+        in_order = [run(prepared, world)[1].final_state_digest for prepared in plans]
+        reverse = [run(prepared, world)[1].final_state_digest for prepared in reversed(plans)]
+    assert alone == in_order == reverse[::-1]
+    assert len(set(alone)) == 3
+
+
+def test_pictures_do_not_disturb_the_physics():
+    _, without = run(episode(4, max_episode_seconds=2.0))
+    frames, outcome = run(episode(4, max_episode_seconds=2.0, cameras=("front",), width=32, height=32, renderer="tiny"))
+    assert outcome.final_state_digest == without.final_state_digest
+    assert frames[0].images["front"].color.shape == (32, 32, 3)
+
+
+PRINT_DIGEST = """
+import json, sys
+from helpers_sim import episode, run
+from demorec.plain import to_json
+prepared = episode(4)
+frames, outcome = run(prepared)
+print(json.dumps([outcome.final_state_digest, to_json(prepared.info)]))
+"""
+
+
+@pytest.mark.parametrize("coretype", ["Haswell", "Nehalem"])
+def test_another_process_and_another_blas_kernel_give_the_same_bits(ran, coretype):
+    prepared, _, outcome = ran
+    path = str(Path(__file__).parents[1])
+    env = {**os.environ, "PYTHONPATH": path, "PYTHONHASHSEED": "7", "OPENBLAS_CORETYPE": coretype}
+    result = subprocess.run(
+        [sys.executable, "-c", PRINT_DIGEST], env=env, capture_output=True, text=True, timeout=240, check=False
+    )
+    if result.returncode == -4:
+        pytest.skip(f"this CPU cannot run {coretype} code")
+    assert result.returncode == 0, result.stderr
+    digest, info = json.loads(result.stdout)
+    assert digest == outcome.final_state_digest
+    assert info == to_json(prepared.info)
+
+
+def test_a_stuck_episode_ends_as_a_failure_with_its_phase():
+    frames, outcome = run(episode(4, max_episode_seconds=2.0))
+    assert len(frames) == 60
+    assert not outcome.success
+    assert outcome.failure_reason == "time_limit"
+    assert outcome.failure_phase == frames[-1].phase
+
+
+def test_joint_samples_at_the_physics_rate():
+    frames, _ = run(episode(4, joint_rate="physics", max_episode_seconds=1.0))
+    assert frames[0].joint_samples == ()
+    assert all(len(frame.joint_samples) == 7 for frame in frames[1:])
+    times = [t for frame in frames[1:] for t in (*(s.time_ns for s in frame.joint_samples), frame.time_ns)]
+    assert np.abs(np.diff(times) - 1e9 / 240).max() <= 1
+
+
+@pytest.mark.parametrize("fps", [10, 60])
+def test_other_frame_rates_work_too(fps):
+    frames, outcome = run(episode(0, fps=fps))
+    assert outcome.success
+    assert abs(frames[-1].time_ns / 1e9 - (len(frames) - 1) / fps) < 1e-9
+
+
+def test_info_is_plain_and_complete(ran):
+    prepared, _, _ = ran
+    info = prepared.info
+    assert from_json(to_json(info), EpisodeInfo) == info
+    assert info.config["seed"] == 0
+    assert info.behaviour["action_noise"] == 0.02
+    assert {"demorec", "pybullet", "numpy"} <= set(info.versions)
+    assert "cube" in info.instruction
+
+
+def test_attempts_draw_other_scenes():
+    config = GenerateConfig(cameras=())
+    first, second = (prepare(EpisodePlan(config=config, episode_index=0, attempt=a)).info.scene for a in (0, 1))
+    assert first != second
+
+
+def test_breaking_off_leaves_the_world_usable(ran):
+    prepared, _, outcome = ran
+    with make_world(prepared.info) as world:
+        rollout = Rollout(world, prepared)
+        for frame in rollout:
+            if frame.frame_index == 20:
+                break
+        assert rollout.outcome is None
+        assert run(prepared, world)[1].final_state_digest == outcome.final_state_digest

@@ -1,0 +1,214 @@
+"""Layouts, grasps and checks: each condition of success fails when, and only when, it is broken."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from helpers_sim import episode, run
+
+from demorec.errors import SceneError
+from demorec.geometry import Pose, wrap_angle
+from demorec.rollout import Episode, make_world
+from demorec.scene import Body, Shape
+from demorec.tasks.base import Behaviour
+from demorec.tasks.grasping import grasp_yaws, hand_down, hand_yaw, raised, symmetric_yaws
+from demorec.tasks.sampling import WORKSPACE, Region, Sampler
+
+
+def sampler(seed: int = 0) -> Sampler:
+    return Sampler(np.random.default_rng(seed))
+
+
+def test_points_keep_their_distance_and_stay_inside():
+    draw = sampler()
+    for _ in range(300):
+        first = draw.point(WORKSPACE)
+        second = draw.point(WORKSPACE, away_from=[first], min_distance=0.2)
+        assert WORKSPACE.contains(first)
+        assert WORKSPACE.contains(second)
+        assert math.dist(first, second) >= 0.2
+
+
+def test_a_full_table_is_a_scene_error():
+    with pytest.raises(SceneError, match=r"the tenth cube.*1000 tries"):
+        sampler().point(
+            Region(x=(0.4, 0.5), y=(0.0, 0.1)), away_from=[(0.45, 0.05)], min_distance=0.2, what="the tenth cube"
+        )
+
+
+def test_placements_follow_the_stratified_point_first():
+    draw = Sampler(np.random.default_rng(0), unit_point=(0.5, 0.25))
+    assert draw.point(WORKSPACE) == (0.5, -0.125)
+    assert draw.point(WORKSPACE) != (0.5, -0.125)
+
+
+def test_layouts_cover_the_promised_ranges():
+    scenes = [episode(index).info.scene for index in range(200)]
+    cubes = [scene.body("red_cube") for scene in scenes]
+    positions = np.array([cube.world_from_body.position for cube in cubes])
+    assert positions[:, 0].min() < 0.36
+    assert positions[:, 0].max() > 0.64
+    assert positions[:, 1].min() < -0.24
+    assert positions[:, 1].max() > 0.24
+    sides = np.array([cube.shape.size[0] for cube in cubes])
+    masses = np.array([cube.mass for cube in cubes])
+    frictions = np.array([cube.lateral_friction for cube in cubes])
+    for values, low, high in ((sides, 0.03, 0.06), (masses, 0.02, 0.2), (frictions, 0.4, 1.2)):
+        assert low <= values.min() < low + 0.05 * (high - low)
+        assert high - 0.05 * (high - low) < values.max() <= high
+    targets = np.array([scene.body("green_target").world_from_body.position for scene in scenes])
+    assert np.hypot(*(targets - positions)[:, :2].T).min() >= 0.12
+
+
+def body(size, symmetry=1, kind="box"):
+    shape = Shape(kind=kind, size=size)
+    return Body(name="b", role="object", shape=shape, world_from_body=Pose(), mass=0.1, yaw_symmetry=symmetry)
+
+
+def rolled(degrees):
+    """A turn about x."""
+    half = math.radians(degrees) / 2
+    return Pose(quat_xyzw=np.array([math.sin(half), 0, 0, math.cos(half)]))
+
+
+def shifted(pose, x=0.0, z=0.0):
+    return Pose(position=pose.position + np.array([x, 0.0, z]), quat_xyzw=pose.quat_xyzw)
+
+
+def test_fingers_close_over_faces_that_fit():
+    flat = body((0.12, 0.03, 0.04))
+    yaws = grasp_yaws(flat, Pose.from_yaw([0.5, 0, 0.02], 0.3), 0.0, 0.08)
+    # The fingers move along the hand's y axis: over the 3 cm side (y of the box) the hand's x axis is the box's.
+    assert sorted(round(wrap_angle(yaw - 0.3) % math.pi, 9) for yaw in yaws) == pytest.approx([0, 0], abs=1e-6)
+    assert len(grasp_yaws(body((0.04, 0.04, 0.04)), Pose(), 0.0, 0.08)) == 4
+    assert grasp_yaws(body((0.2, 0.2, 0.04)), Pose(), 0.0, 0.08) == []
+    assert wrap_angle(grasp_yaws(body((0.02, 0.06), 0, "cylinder"), Pose(), 0.7, 0.08)[0]) == pytest.approx(0.7)
+
+
+def test_a_cube_on_its_side_is_grasped_squarely_too():
+    tipped = Pose.from_yaw([0.5, 0, 0.02], 0.4) @ rolled(90)
+    yaws = grasp_yaws(body((0.04, 0.04, 0.04)), tipped, 0.0, 0.08)
+    assert [math.remainder(yaw - 0.4, math.pi / 2) for yaw in yaws] == pytest.approx([0.0] * 4, abs=1e-9)
+
+
+def test_hand_poses():
+    pose = hand_down((0.4, 0.1, 0.2), 0.6)
+    assert hand_yaw(pose) == pytest.approx(0.6)
+    assert pose.rotation[:, 2] == pytest.approx([0, 0, -1])
+    assert raised(pose, 0.1).position == pytest.approx([0.4, 0.1, 0.3])
+    assert len(symmetric_yaws(0.1, 4)) == 4
+
+
+@pytest.fixture(scope="module")
+def finished():
+    """A world in which the episode has just ended well."""
+    prepared = episode(0)
+    with make_world(prepared.info) as world:
+        _, outcome = run(prepared, world)
+        assert outcome.success
+        yield prepared, world
+
+
+BREAKAGES = {
+    "distance_to_goal": lambda pose: shifted(pose, x=0.021),
+    "height_error": lambda pose: shifted(pose, z=0.0041),
+    "tilt": lambda pose: pose @ rolled(5.2),
+}
+
+
+def failed(prepared: Episode, world) -> set[str]:
+    return {check.name for check in prepared.task.evaluate(world) if not check.passed}
+
+
+@pytest.mark.parametrize("name", BREAKAGES)
+def test_a_cube_that_lies_wrong_fails_its_check(finished, name):
+    prepared, world = finished
+    good = world.pose("red_cube")
+    world.set_state(object_poses={"red_cube": good})
+    world.client.performCollisionDetection()
+    assert failed(prepared, world) == set()
+    world.set_state(object_poses={"red_cube": BREAKAGES[name](good)})
+    world.client.performCollisionDetection()
+    assert name in failed(prepared, world)
+    world.set_state(object_poses={"red_cube": good})
+
+
+def test_a_cube_that_floats_moves_or_is_held_fails(finished):
+    prepared, world = finished
+    cube, good = world.body_index("red_cube"), world.pose("red_cube")
+    world.set_state(object_poses={"red_cube": raised(good, 0.003)})
+    world.client.performCollisionDetection()
+    assert failed(prepared, world) == {"on_support"}
+    world.set_state(object_poses={"red_cube": good})
+    world.client.performCollisionDetection()
+    world.client.resetBaseVelocity(cube, [0.011, 0, 0], [0, 0, 0])
+    assert failed(prepared, world) == {"speed"}
+    world.client.resetBaseVelocity(cube, [0, 0, 0], [0, 0, 0.11])
+    assert failed(prepared, world) == {"spin"}
+    world.client.resetBaseVelocity(cube, [0, 0, 0], [0, 0, 0])
+    joints = world.observe().joint_position
+    world.set_state(joint_position=np.concatenate([joints[:7], [0.034, 0.034]]))
+    assert failed(prepared, world) == {"gripper_width"}
+    world.set_state(joint_position=joints, object_poses={"red_cube": raised(world.arm.world_from_tcp(), 0.03)})
+    world.client.performCollisionDetection()
+    assert "touched_by_robot" in failed(prepared, world)
+    world.set_state(object_poses={"red_cube": good})
+
+
+def behave(prepared: Episode, **values: float) -> Episode:
+    return dataclasses.replace(prepared, behaviour=Behaviour(**values))
+
+
+def test_a_deliberate_miss_is_flagged_and_mended():
+    frames, outcome = run(behave(episode(5), miss_x=0.03, miss_y=0.03))
+    assert outcome.success
+    assert outcome.num_retries == 1
+    flagged = {frame.phase for frame in frames if frame.is_deliberate_miss}
+    assert flagged == {"approach", "descend", "close"}
+    unflagged = {frame.phase for frame in frames if not frame.is_deliberate_miss}
+    assert {"recover", "approach", "descend", "close", "lift", "transport"} <= unflagged
+    assert [event.name for frame in frames for event in frame.events] == ["grasp", "miss", "grasp", "place"]
+
+
+def test_without_a_miss_nothing_is_flagged():
+    frames, _ = run(episode(5))
+    assert not any(frame.is_deliberate_miss for frame in frames)
+
+
+def test_perception_error_shifts_the_grasp():
+    clean, _ = run(behave(episode(5), action_noise=0.0))
+    wrong, outcome = run(behave(episode(5), action_noise=0.0, perception_x=0.005))
+    assert outcome.success
+
+    def grasp(frames):
+        return next(frame for frame in frames if frame.phase == "close").action.base_from_tcp_target.position
+
+    assert (grasp(wrong) - grasp(clean))[0] == pytest.approx(0.005, abs=5e-4)
+
+
+def test_an_object_out_of_reach_gives_up_with_its_phase():
+    prepared = episode(0)
+    far = dataclasses.replace(
+        prepared.info.scene.body("red_cube"), world_from_body=Pose(position=np.array([0.8, 0.6, 0.025]))
+    )
+    bodies = tuple(far if b.name == "red_cube" else b for b in prepared.info.scene.bodies)
+    scene = dataclasses.replace(prepared.info.scene, bodies=bodies)
+    frames, outcome = run(dataclasses.replace(prepared, info=dataclasses.replace(prepared.info, scene=scene)))
+    assert not outcome.success
+    assert (outcome.failure_phase, outcome.failure_reason) == ("perceive", "unreachable")
+    assert [event.name for frame in frames for event in frame.events] == ["unreachable"]
+
+
+def test_a_cube_that_slips_is_dropped_and_fails_after_three_tries():
+    prepared = episode(0)
+    slippery = dataclasses.replace(prepared.info.scene.body("red_cube"), lateral_friction=0.0, mass=2.0)
+    bodies = tuple(slippery if b.name == "red_cube" else b for b in prepared.info.scene.bodies)
+    scene = dataclasses.replace(prepared.info.scene, bodies=bodies)
+    _, outcome = run(dataclasses.replace(prepared, info=dataclasses.replace(prepared.info, scene=scene)))
+    assert not outcome.success
+    assert outcome.num_retries == 2
+    assert outcome.failure_phase in ("lift", "close", "transport")
+    assert outcome.failure_reason

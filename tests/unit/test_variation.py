@@ -1,0 +1,258 @@
+"""Variation: presets, ranges, stratified layouts, held-out split; what is drawn is recorded and nothing else moves."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers_sim import episode, run
+from scipy.stats import qmc
+
+from demorec.config import GenerateConfig
+from demorec.errors import ConfigError, SceneError
+from demorec.geometry import Pose
+from demorec.scene import Texture
+from demorec.tables import TASKS
+from demorec.tasks.sampling import WORKSPACE, stratified_point
+from demorec.textures import texture_pixels
+from demorec.variation import LIMITS, PRESETS, Ranges, resolve
+
+
+def cube_starts(count, **config):
+    starts = [episode(index, **config).info.scene.body("red_cube").world_from_body.position for index in range(count)]
+    return np.array(starts)[:, :2]
+
+
+def unit(points):
+    low, high = np.array([WORKSPACE.x[0], WORKSPACE.y[0]]), np.array([WORKSPACE.x[1], WORKSPACE.y[1]])
+    return (points - low) / (high - low)
+
+
+def test_presets_are_complete_and_valid():
+    for ranges in PRESETS.values():
+        ranges.validate()
+        missing = [name for name in LIMITS if getattr(ranges, name) is None and not name.startswith("cube_")]
+        assert missing == []
+    assert set(LIMITS) == set(Ranges.__dataclass_fields__)
+
+
+def test_a_range_of_the_user_wins_over_the_preset():
+    merged = resolve("full", Ranges(speed=(0.9, 0.95)))
+    assert merged.speed == (0.9, 0.95)
+    assert merged.action_noise == PRESETS["full"].action_noise
+    speeds = [episode(i, variation="full", ranges=Ranges(speed=(0.9, 0.95))).behaviour.speed for i in range(20)]
+    assert 0.9 <= min(speeds) < max(speeds) <= 0.95
+    sides = [
+        episode(i, ranges=Ranges(cube_side=(0.04, 0.041))).info.scene.body("red_cube").shape.size[0] for i in range(9)
+    ]
+    assert 0.04 <= min(sides) <= max(sides) <= 0.041
+
+
+@pytest.mark.parametrize(
+    ("ranges", "words"),
+    [
+        (Ranges(speed=(1.5, 0.5)), "speed"),
+        (Ranges(action_noise=(0.0, 3.0)), "0.06"),
+        (Ranges(miss_probability=1.5), "miss_probability"),
+        (Ranges(distractors=(0, 50)), "distractors"),
+    ],
+)
+def test_impossible_ranges_are_one_sentence(ranges, words):
+    with pytest.raises(ConfigError, match=words):
+        GenerateConfig(ranges=ranges).validate()
+
+
+def test_an_unknown_preset_names_the_nearest():
+    with pytest.raises(ConfigError, match="'mild'"):
+        GenerateConfig(variation="milde").validate()  # type: ignore[arg-type]
+
+
+def test_none_varies_nothing_but_the_layout():
+    first, second = episode(0, variation="none"), episode(1, variation="none")
+    assert first.behaviour == second.behaviour
+    assert first.info.scene.light == second.info.scene.light
+    assert first.info.scene.robot == second.info.scene.robot
+    assert first.info.scene.robot.joint_position == first.info.robot.home_q
+    assert first.info.scene.physics == second.info.scene.physics
+    assert first.info.scene.body("table") == second.info.scene.body("table")
+    assert first.info.scene.body("red_cube").world_from_body != second.info.scene.body("red_cube").world_from_body
+    frames, outcome = run(first)
+    assert outcome.success
+    assert all(np.array_equal(f.action.joint_target, f.command.joint_target) for f in frames)
+
+
+def test_full_varies_everything_within_its_ranges_and_records_it():
+    episodes = [episode(i, variation="full", cameras=("front", "wrist")) for i in range(60)]
+    scenes = [prepared.info.scene for prepared in episodes]
+    ranges = PRESETS["full"]
+
+    def spans(name, values, share=0.7):
+        low, high = ranges.range(name)
+        assert low - 1e-9 <= min(values)
+        assert max(values) <= high + 1e-9
+        assert max(values) - min(values) > share * (high - low), name
+
+    spans("speed", [p.info.behaviour["speed"] for p in episodes])
+    spans("approach_height", [p.info.behaviour["approach_height"] for p in episodes])
+    spans("action_noise", [p.info.behaviour["action_noise"] for p in episodes])
+    spans("gravity_offset", [scene.physics.gravity[2] + 9.81 for scene in scenes])
+    spans("table_height", [-scene.robot.world_from_base.position[2] for scene in scenes])
+    spans("light_ambient", [scene.light.ambient for scene in scenes])
+    spans("light_elevation", [math.asin(scene.light.direction[2]) for scene in scenes])
+    spans("damping", [scene.body("red_cube").linear_damping for scene in scenes])
+    counts = {sum(body.role == "distractor" for body in scene.bodies) for scene in scenes}
+    assert counts == {0, 1, 2, 3}
+    misses = sum(p.behaviour.misses for p in episodes)
+    assert 1 <= misses <= 15
+    assert 20 < sum(scene.body("table").texture is not None for scene in scenes) < 50
+    assert all(p.info.behaviour["perception_x"] == 0 for p in episodes)
+    # Red stays the strongest channel of what an instruction calls red.
+    assert all(np.argmax(scene.body("red_cube").rgba[:3]) == 0 for scene in scenes)
+
+
+def test_distractors_keep_away():
+    for index in range(60):
+        scene = episode(index, variation="full").info.scene
+        others = [b for b in scene.bodies if b.role in ("object", "target")]
+        for body in scene.bodies:
+            if body.role == "distractor":
+                here = body.world_from_body.position[:2]
+                assert min(math.dist(here, other.world_from_body.position[:2]) for other in others) >= 0.12
+
+
+def test_looks_do_not_touch_the_physics():
+    """Another preset of looks alone gives the same bits of state."""
+    plain = run(episode(3))[1].final_state_digest
+    looks = Ranges(
+        light_turn=(1.0, 1.0), light_ambient=(0.4, 0.4), surface_color=1.0, texture_probability=1.0, object_shade=0.3
+    )
+    varied = episode(3, ranges=looks)
+    assert varied.info.scene.body("table").texture is not None
+    assert run(varied)[1].final_state_digest == plain
+
+
+def test_a_full_episode_runs_and_repeats():
+    prepared = episode(2, variation="full")
+    _, first = run(prepared)
+    _, second = run(episode(2, variation="full"))
+    assert first.success
+    assert first.final_state_digest == second.final_state_digest
+
+
+def test_calibration_error_is_between_truth_and_record():
+    ranges = Ranges(calibration_position=0.01, calibration_rotation=0.05)
+    prepared = episode(
+        0,
+        ranges=ranges,
+        cameras=("front", "wrist"),
+        width=32,
+        height=32,
+        renderer="tiny",
+        max_episode_seconds=1.0,
+    )
+    exact = episode(0, cameras=("front", "wrist"), width=32, height=32, renderer="tiny", max_episode_seconds=1.0)
+    frames, _ = run(prepared)
+    reference, _ = run(exact)
+    for name in ("front", "wrist"):
+        believed = frames[0].images[name].world_from_camera
+        true = reference[0].images[name].world_from_camera
+        error = true.inverse() @ believed
+        assert 0 < np.abs(error.position).max() <= 0.01
+        assert error != Pose()
+        shift = [prepared.info.behaviour[f"calibration_{name}_{axis}"] for axis in "xyz"]
+        assert np.allclose(error.position, shift, atol=1e-9)
+        # The picture is drawn from where the camera truly is.
+        assert np.array_equal(frames[0].images[name].color, reference[0].images[name].color)
+
+
+@pytest.mark.parametrize("method", ["sobol", "lhs"])
+def test_stratified_layouts_cover_the_table_more_evenly(method):
+    random = qmc.discrepancy(unit(cube_starts(50)))
+    even = qmc.discrepancy(unit(cube_starts(50, sampling=method)))
+    assert even < 0.6 * random
+
+
+def test_stratified_points_are_the_known_sequences():
+    points = np.array([stratified_point("lhs", root_seed=1, episode_index=i, block=10) for i in range(20)])
+    for cube in (points[:10], points[10:]):
+        # Each number's ten values fall into ten different tenths.
+        assert (np.sort(np.floor(cube * 10), axis=0) == np.arange(10)[:, None]).all()
+    assert not np.array_equal(points[:10], points[10:])
+    sobol = np.array([stratified_point("sobol", root_seed=1, episode_index=i, block=10) for i in range(16)])
+    assert (np.sort(np.floor(sobol * 16), axis=0) == np.arange(16)[:, None]).all()
+    assert stratified_point("random", root_seed=1, episode_index=0, block=10) == ()
+
+
+HELD_OUT = (PRESETS["none"].range("held_out_x"), PRESETS["none"].range("held_out_y"))
+
+
+def held_out(point):
+    return all(low <= value <= high for value, (low, high) in zip(point, HELD_OUT, strict=True))
+
+
+@pytest.mark.parametrize("sampling", ["random", "sobol"])
+def test_train_and_eval_layouts_never_overlap(sampling):
+    train = cube_starts(300, split="train", sampling=sampling)
+    evaluation = cube_starts(60, split="eval", sampling=sampling)
+    assert not any(held_out(point) for point in train)
+    assert all(held_out(point) for point in evaluation)
+    assert any(held_out(point) for point in cube_starts(300))
+
+
+def test_train_and_eval_seeds_never_overlap():
+    config = {"cameras": (), "ranges": Ranges(held_out_x=(0.35, 0.65), held_out_y=(-0.25, 0.25))}
+    everywhere = {episode(i, split="eval", **config).info.scene.body("red_cube").mass for i in range(50)}
+    same_seed = {episode(i, split="all", **config).info.scene.body("red_cube").mass for i in range(50)}
+    assert len(everywhere) == 50
+    assert not everywhere & same_seed
+    with pytest.raises(ConfigError, match="seed"):
+        GenerateConfig(seed=2**63).validate()
+
+
+@pytest.mark.parametrize("task", [name for name in TASKS.names() if name != "tutorial"])
+def test_every_task_has_both_splits(task):
+    for index in range(15):
+        train = episode(index, task=task, split="train").info.scene
+        assert not any(held_out(body.world_from_body.position[:2]) for body in train.bodies if body.role == "object"), (
+            task
+        )
+        episode(index, task=task, split="eval")
+
+
+def test_a_held_out_region_off_the_table_is_a_clear_error():
+    ranges = Ranges(held_out_x=(0.0, 0.1), held_out_y=(0.8, 0.9))
+    with pytest.raises(SceneError, match="held_out_x"):
+        episode(0, split="eval", ranges=ranges)
+
+
+@pytest.mark.parametrize("pattern", ["plain", "checker", "stripes", "noise", "wood"])
+def test_textures_are_functions_of_their_fields(pattern):
+    dark, light = (0.2, 0.1, 0.0), (0.8, 0.9, 1.0)
+    texture = Texture(pattern=pattern, colors=(dark, light), scale=4, seed=1)
+    pixels = texture_pixels(texture, 64).astype(int)
+    assert pixels.shape == (64, 64, 3)
+    assert np.array_equal(pixels, texture_pixels(texture, 64))
+    assert (pixels >= [51, 26, 0]).all()
+    assert (pixels <= [204, 230, 255]).all()
+    assert (np.ptp(pixels, axis=(0, 1)) > 80).all() == (pattern != "plain")
+    other = texture_pixels(Texture(pattern=pattern, colors=(dark, light), scale=4, seed=2), 64)
+    assert np.array_equal(pixels, other) == (pattern in ("plain", "checker", "stripes"))
+    if pattern == "checker":
+        assert [tuple(pixels[8, 8]), tuple(pixels[8, 24])] == [(51, 26, 0), (204, 230, 255)]
+        assert np.array_equal(pixels[:16, :16], pixels[16:32, 16:32])
+
+
+def test_a_texture_reaches_the_picture():
+    prepared = episode(7, cameras=("front",), width=64, height=64, renderer="tiny", max_episode_seconds=1.0)
+    texture = Texture(pattern="checker", colors=((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)), scale=8)
+    bodies = tuple(
+        replace(body, texture=texture, rgba=(1.0, 1.0, 1.0, 1.0)) if body.name == "table" else body
+        for body in prepared.info.scene.bodies
+    )
+    scene = replace(prepared.info.scene, bodies=bodies)
+    frames, _ = run(replace(prepared, info=replace(prepared.info, scene=scene)))
+    table = frames[0].images["front"].color[45:60].max(axis=2)
+    assert table.min() < 40
+    assert table.max() > 150

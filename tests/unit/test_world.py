@@ -1,0 +1,214 @@
+"""The world: built from a scene alone, read and placed correctly, deterministic."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from helpers_sim import episode, run
+
+from demorec.episode import Action
+from demorec.errors import ConfigError, SceneError
+from demorec.geometry import Pose
+from demorec.plain import from_json, to_json
+from demorec.scene import Body, Scene, Shape
+from demorec.sim.client import connect
+from demorec.sim.robots.panda import PANDA
+from demorec.sim.world import World
+
+
+@pytest.fixture(scope="module")
+def world():
+    with World(PANDA) as made:
+        yield made
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return episode(0).info.scene
+
+
+def hold(world: World, frames: int) -> None:
+    q = world.arm.target
+    for _ in range(frames):
+        world.apply(Action(joint_target=q, gripper_target=0.08, base_from_tcp_target=world.arm.kinematics.forward(q)))
+
+
+def with_bodies(scene: Scene, *bodies: Body) -> Scene:
+    return dataclasses.replace(scene, bodies=(*scene.bodies, *bodies), goals=())
+
+
+def test_the_scene_alone_is_enough(world, scene):
+    world.reset(scene)
+    first = world.state_digest()
+    world.reset(from_json(to_json(scene), Scene))
+    assert world.state_digest() == first
+
+
+def test_observation_agrees_with_the_simulator(world, scene):
+    world.reset(scene)
+    hold(world, 3)
+    seen = world.observe()
+    position, quat = world.client.getBasePositionAndOrientation(world.body_index("red_cube"))
+    assert seen.object_poses["red_cube"] == Pose(position=np.array(position), quat_xyzw=np.array(quat))
+    assert set(seen.object_poses) == {"red_cube"}
+    state = world.client.getLinkState(
+        world.arm.body, world.mounts()["panda_grasptarget"][1], computeForwardKinematics=1
+    )
+    assert np.abs(seen.base_from_tcp.position - state[4]).max() < 1e-6
+    assert abs(seen.gripper_width - 0.08) < 1e-3
+    assert seen.joint_position.shape == seen.joint_velocity.shape == seen.joint_effort.shape == (9,)
+    # At rest the motors hold the arm's weight, as the inverse dynamics say.
+    at_rest = world.client.calculateInverseDynamics(world.arm.body, seen.joint_position.tolist(), [0.0] * 9, [0.0] * 9)
+    assert np.abs(seen.joint_effort[:7] - at_rest[:7]).max() < 0.01
+    assert np.abs(at_rest[:7]).max() > 10
+
+
+def test_one_command_is_one_frame_of_physics(scene):
+    with World(PANDA, fps=30, sample_joints=True) as world:
+        world.reset(scene)
+        assert world.joint_samples == ()
+        q = world.arm.target + 0.02
+        command = Action(joint_target=q, gripper_target=0.08, base_from_tcp_target=world.arm.kinematics.forward(q))
+        before = world.observe().joint_position
+        world.apply(command)
+        samples = world.joint_samples
+        after = world.observe().joint_position
+        assert [sample.time_ns for sample in samples] == [round(1e9 * k / 240) for k in range(1, 8)]
+        rows = np.array([before, *[sample.joint_position for sample in samples], after])[:, :7]
+        assert (np.diff(rows, axis=0) > 0).all(), "the joints move steadily towards the target"
+        world.apply(command)
+        assert world.joint_samples[0].time_ns == round(1e9 * 9 / 240)
+
+
+def test_set_state_places_everything_exactly(world, scene):
+    world.reset(scene)
+    q = np.concatenate([np.array(PANDA.home_q) + 0.1, [0.01, 0.01]])
+    pose = Pose.from_yaw([0.5, 0.1, 0.3], 0.4)
+    world.set_state(joint_position=q, object_poses={"red_cube": pose})
+    seen = world.observe()
+    assert np.array_equal(seen.joint_position, q)
+    assert np.allclose(seen.object_poses["red_cube"].vector(), pose.vector(), atol=1e-15)
+    assert not seen.joint_velocity.any()
+
+
+def test_set_state_takes_the_speed_away(world, scene):
+    world.reset(scene)
+    lifted = Pose(position=np.array([0.5, 0.1, 0.5]))
+    world.set_state(object_poses={"red_cube": lifted})
+    hold(world, 3)
+    assert world.velocity("red_cube")[0][2] < -0.5
+    world.set_state(object_poses={"red_cube": lifted})
+    assert not world.velocity("red_cube")[0].any()
+
+
+def test_a_body_whose_centre_of_mass_is_off_its_origin_is_where_the_scene_says(world, scene):
+    pose = Pose.from_yaw([0.5, 0.3, 0.4], 0.8)
+    duck = Body(
+        name="duck",
+        role="object",
+        shape=Shape(kind="urdf", file="duck_vhacd.urdf", size=(0.1, 0.1, 0.1)),
+        world_from_body=pose,
+        mass=0.1,
+    )
+    world.reset(with_bodies(scene, duck))
+    # It falls while the world settles, and does not move sideways.
+    assert np.abs(world.pose("duck").position - pose.position)[:2].max() < 1e-6
+    assert world.client.getDynamicsInfo(world.body_index("duck"), -1)[0] == 0.1
+    world.set_state(object_poses={"duck": pose})
+    assert np.allclose(world.pose("duck").vector(), pose.vector(), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("shape", "height"),
+    [
+        (Shape(kind="box", size=(0.04, 0.05, 0.06)), 0.06),
+        (Shape(kind="sphere", size=(0.03,)), 0.06),
+        (Shape(kind="cylinder", size=(0.02, 0.07)), 0.07),
+        (Shape(kind="capsule", size=(0.02, 0.05)), 0.09),
+    ],
+)
+def test_shapes_have_the_size_that_they_say(world, scene, shape, height):
+    body = Body(
+        name="thing", role="object", shape=shape, world_from_body=Pose(position=np.array([0.5, 0.4, 1.0])), mass=0.1
+    )
+    world.reset(with_bodies(scene, body))
+    low, high = world.client.getAABB(world.body_index("thing"))
+    assert abs(high[2] - low[2] - height) < 0.005
+    assert abs(shape.extents[2] - height) < 1e-12
+
+
+def test_a_mark_is_seen_but_not_felt(world, scene):
+    world.reset(scene)
+    mark = scene.body("green_target")
+    above = Pose(position=mark.world_from_body.position + np.array([0.0, 0.0, 0.1]))
+    world.set_state(object_poses={"red_cube": above})
+    hold(world, 40)
+    side = scene.body("red_cube").shape.size[2]
+    assert abs(world.pose("red_cube").position[2] - side / 2) < 5e-4
+
+
+def test_digest_tells_one_bit(world, scene):
+    world.reset(scene)
+    first = world.state_digest()
+    pose = world.pose("red_cube")
+    nudged = Pose(position=np.nextafter(pose.position, 1.0), quat_xyzw=pose.quat_xyzw)
+    world.set_state(object_poses={"red_cube": nudged})
+    assert world.state_digest() != first
+
+
+def test_parameters_of_another_client_do_not_leak():
+    prepared = episode(1)
+    _, expected = run(prepared)
+    vandal = connect()
+    vandal.setPhysicsEngineParameter(
+        contactBreakingThreshold=0.2, enableFileCaching=0, contactERP=0.9, erp=0.9, numSolverIterations=3
+    )
+    _, found = run(prepared)
+    vandal.disconnect()
+    assert found.final_state_digest == expected.final_state_digest
+
+
+def test_wrong_scenes_are_refused_in_one_sentence(world, scene):
+    with pytest.raises(SceneError, match="no_such"):
+        world.reset(
+            with_bodies(
+                scene,
+                Body(
+                    name="b",
+                    role="object",
+                    shape=Shape(kind="urdf", file="no_such.urdf", size=(1.0, 1.0, 1.0)),
+                    world_from_body=Pose(),
+                ),
+            )
+        )
+    with pytest.raises(SceneError, match="one name"):
+        world.reset(with_bodies(scene, scene.body("red_cube")))
+    with pytest.raises(SceneError, match="other_arm"):
+        world.reset(dataclasses.replace(scene, robot=dataclasses.replace(scene.robot, name="other_arm")))
+    with World(PANDA, fps=70) as odd, pytest.raises(ConfigError, match="70"):
+        odd.reset(scene)
+
+
+def test_broken_model_file_is_a_scene_error(world, scene, tmp_path, monkeypatch):
+    broken = tmp_path / "broken.urdf"
+    broken.write_text("<robot name='x'><link")
+    monkeypatch.setattr("demorec.sim.urdf_file.asset_path", lambda name: broken)
+    body = Body(
+        name="b", role="object", shape=Shape(kind="urdf", file="x", size=(1.0, 1.0, 1.0)), world_from_body=Pose()
+    )
+    with pytest.raises(SceneError, match="'b'"):
+        world.reset(with_bodies(scene, body))
+
+
+def test_close_twice_is_harmless():
+    world = World(PANDA)
+    world.close()
+    world.close()
+
+
+def test_connecting_prints_nothing(capfd):
+    connect().disconnect()
+    captured = capfd.readouterr()
+    assert captured.out == captured.err == ""

@@ -1,0 +1,39 @@
+"""A layout of your own around demorec's streams: the wrist camera large, the gripper's curves below it.
+
+python viewers/rerun/own_layout.py recordings/cubes/episodes/episode_000000.mcap wrist.rrd
+rerun wrist.rrd
+"""
+
+import sys
+from pathlib import Path
+
+import rerun.blueprint as rrb
+
+from demorec.playback.paths import Paths
+from demorec.playback.scene import log_episode, new_recording
+from demorec.playback.sources import find_episodes
+
+
+def main(path: Path, target: Path, camera: str = "wrist") -> None:
+    paths = Paths()
+    layout = rrb.Blueprint(
+        rrb.Vertical(
+            rrb.Spatial2DView(origin=paths.camera(camera), contents=["$origin"], name=camera),
+            rrb.TimeSeriesView(
+                origin="/", contents=[paths.curves("gripper"), paths.curves("gripper target")], name="opening (m)"
+            ),
+            rrb.TimeSeriesView(origin=paths.curves("force"), name="contact force (N)"),
+            row_shares=[4, 1, 1],
+        ),
+        collapse_panels=True,
+    )
+    with find_episodes([path])[0].open() as episode:
+        stream = new_recording(episode)
+        stream.save(target, default_blueprint=layout)
+        log_episode(stream, episode)
+        stream.disconnect()
+    print(f"{episode.name}, {episode.num_frames} frames: {target}")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), Path(sys.argv[2]), *sys.argv[3:])
