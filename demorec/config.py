@@ -29,11 +29,11 @@ class VideoConfig:
     gop: int = 2
     """Pictures from one keyframe to the next: 2 is LeRobot's convention for fast random access."""
     crf: int | None = None
-    """Constant rate factor, smaller is better; default 23 for h264, 30 for av1."""
+    """Constant rate factor, smaller is better (auto: 23 for h264, 30 for av1)."""
     preset: str | None = None
-    """Encoder preset; default veryfast for h264, 12 for av1."""
+    """Encoder preset (auto: veryfast for h264, 12 for av1)."""
     jpeg_quality: int = 90
-    """1..100."""
+    """Of --codec jpeg, 1 to 100, larger is better."""
 
     def validate(self) -> None:
         """Raise ConfigError for impossible values."""
@@ -78,7 +78,7 @@ class GenerateConfig:
     variation: Preset = "mild"
     """How much episodes differ beside their layout: none; mild adds action noise with clean labels; full all."""
     ranges: Ranges = field(default_factory=Ranges)
-    """Single ranges in place of the preset's."""
+    """Single ranges in place of those of --variation (auto: as --variation says)."""
     sampling: Literal["random", "sobol", "lhs"] = "random"
     """How layouts cover the table: independently, or evenly by a Sobol sequence or Latin hypercubes."""
     sampling_block: int = 50

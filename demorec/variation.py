@@ -25,11 +25,11 @@ class Ranges:
     """Ranges of everything that varies from episode to episode; left out: as the preset says."""
 
     cube_side: Range | None = None
-    """Side of cubes, m; default: each task's own range."""
+    """Side of cubes, m (auto: each task's own range)."""
     cube_mass: Range | None = None
-    """Mass of cubes, kg; default: each task's own range."""
+    """Mass of cubes, kg (auto: each task's own range)."""
     cube_friction: Range | None = None
-    """Friction of cubes; default: each task's own range."""
+    """Friction of cubes (auto: each task's own range)."""
     held_out_x: Range | None = None
     """x of the rectangle that --split train avoids and --split eval starts in, m."""
     held_out_y: Range | None = None

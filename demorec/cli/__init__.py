@@ -69,6 +69,32 @@ def _optional_value(
     )
 
 
+@_flag_types.primitive_rule
+def _optional_range(
+    info: tyro.constructors.PrimitiveTypeInfo,
+) -> tyro.constructors.PrimitiveConstructorSpec[Any] | None:
+    """`--cube-mass LOW HIGH` with auto for None, where tyro would show `--cube-mass {None}|{FLOAT FLOAT}`."""
+    kinds = [kind for kind in get_args(info.type) if kind is not NoneType]
+    if NoneType not in get_args(info.type) or kinds not in ([tuple[int, int]], [tuple[float, float]]):
+        return None
+    kind = get_args(kinds[0])[0]
+
+    def parse(words: list[str]) -> tuple[Any, ...] | None:
+        if words == ["auto"]:
+            return None
+        if len(words) != 2:
+            raise ValueError("two numbers are needed, LOW and HIGH, or auto")
+        return tuple(kind(word) for word in words)
+
+    return tyro.constructors.PrimitiveConstructorSpec(
+        nargs=(1, 2),
+        metavar="LOW HIGH",
+        instance_from_str=parse,
+        is_instance=lambda value: value is None or (isinstance(value, tuple) and len(value) == 2),
+        str_from_instance=lambda value: ["auto"] if value is None else [str(number) for number in value],
+    )
+
+
 def main(argv: Sequence[str] | None = None) -> None:
     """Entry point of `demorec`."""
     args = list(sys.argv[1:] if argv is None else argv)

@@ -42,7 +42,7 @@ class Generate:
     check: bool = True
     """Check run, recordings and dataset at the end, without decoding pictures (demorec check decodes them)."""
     dry_run: bool = False
-    """Make one pilot episode in a temporary folder and tell what the whole run would take."""
+    """Make a few pilot episodes in a temporary folder and tell what the whole run would take."""
     view: bool = False
     """Show the episodes in Rerun while they are made."""
     episodes: Annotated[GenerateConfig, arg(name="episode")] = field(default_factory=GenerateConfig)

@@ -52,6 +52,8 @@ def test_impossible_requests_end_with_one_sentence_and_leave_nothing(capsys, tmp
     [
         (["--num-epsodes", "3"], ["Unrecognized options: --num-epsodes", "Perhaps you meant", "--num-episodes INT"]),
         (["--width", "wide"], ["Error parsing --width"]),
+        (["--cube-mass", "0.1"], ["Error parsing --cube-mass: two numbers are needed, LOW and HIGH, or auto"]),
+        (["--cube-mass", "0.1", "0.2", "0.3"], ["Error parsing --cube-mass"]),
         (["--executor", "slurm"], ["invalid choice 'slurm'", "local", "ray"]),
     ],
 )
@@ -117,6 +119,16 @@ def test_flags_of_the_file_can_be_taken_back(monkeypatch, tmp_path):
     assert (command.episodes.depth, command.options.export, command.episodes.cameras) == (False, True, ())
 
 
+def test_ranges_take_two_numbers_or_auto(monkeypatch, tmp_path):
+    file = tmp_path / "run.toml"
+    file.write_text("cube_mass = [0.1, 0.2]\ncube_side = [0.03, 0.04]\n")
+    args = ["--cube-mass", "auto", "--distractors", "1", "3", "--gravity-offset", "-1", "2"]
+    command = parsed(monkeypatch, ["--config", str(file), *args])
+    ranges = command.episodes.ranges
+    assert (ranges.cube_mass, ranges.cube_side, ranges.distractors) == (None, (0.03, 0.04), (1, 3))
+    assert ranges.gravity_offset == (-1.0, 2.0)
+
+
 def test_underscores_and_equals_signs_work_too(monkeypatch):
     command = parsed(monkeypatch, ["--num_episodes=3", "--repo_id=me/cubes", "--joint-rate=physics"])
     assert (command.options.num_episodes, command.options.repo_id) == (3, "me/cubes")
@@ -143,9 +155,11 @@ def test_help_has_examples_and_every_option(capsys):
         "--codec",
         "--executor",
         "--no-export",
+        "--cube-mass LOW HIGH",
+        "--distractors LOW HIGH",
     ):
         assert flag in out
-    assert "{None}|INT" not in out
+    assert "{None}" not in out
 
 
 @pytest.mark.parametrize(
