@@ -273,7 +273,7 @@ class Expert:
         name = goal.object
         self.phase = "transport"
         wanted = self._place_pose(goal)
-        height = max(self.tcp_target().position[2], wanted.position[2] + TRANSPORT_HEIGHT)
+        height = self._transport_height(wanted)
         if self.tcp_target().position[2] < height - 1e-3:
             here = self.tcp_target()
             yield from self.move(raised(here, height - here.position[2]), speed=LIFT_SPEED)
@@ -312,6 +312,10 @@ class Expert:
         if failed:
             self.note(f"misplaced_{failed[0]}", f"{name} lies badly: {', '.join(failed)}", trouble=True)
         return not failed
+
+    def _transport_height(self, place: Pose) -> float:
+        """Height of the TCP, m, on the way to a place: never lower than now."""
+        return float(max(self.tcp_target().position[2], place.position[2] + TRANSPORT_HEIGHT))
 
     def _is_full(self) -> bool:
         return self.world.arm.gripper_width() > LOST_WIDTH
@@ -370,7 +374,7 @@ class Expert:
         for yaw in yaws:
             down = hand_down((0.0, 0.0, 0.0), yaw)
             place = hand_down(centre - down.apply(hand_from_object), yaw)
-            if self.reaches(place) and self.reaches(raised(place, TRANSPORT_HEIGHT)):
+            if self.reaches(place) and self.reaches(raised(place, self._transport_height(place) - place.position[2])):
                 return place
         self.note("unreachable", f"the goal of {goal.object} is out of reach", trouble=True)
         raise GaveUp(self.phase, "unreachable")
