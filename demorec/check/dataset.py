@@ -339,6 +339,8 @@ def dataset_action_lag(dataset: Dataset) -> Measurement | None:
         action, state = rows[ACTION].astype(np.float64), rows[STATE].astype(np.float64)
         arm = len(info.robot.arm_joints)
         is_joint = kind in ("joint", "joint_increment")
+        if not is_joint and EE_POSE not in rows:
+            continue
         width = arm if is_joint else 3
         reached = state[:, :arm] if is_joint else rows[EE_POSE].astype(np.float64)[:, :3]
         start = np.array(info.scene.robot.joint_position) if is_joint else reached[0]

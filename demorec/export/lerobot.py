@@ -165,6 +165,7 @@ class _Export:
             "demorec": version("demorec"),
             "action": options.action,
             "privileged": options.privileged,
+            "features": options.features,
             "include_failures": options.include_failures,
             "episodes": options.episodes,
             "fps": options.fps,

@@ -10,7 +10,7 @@ from typing import Literal
 
 from demorec.config import VideoConfig
 from demorec.errors import ConfigError
-from demorec.features import ActionKind
+from demorec.features import ACTION, STATE, ActionKind
 
 Progress = Callable[[int, int], None]
 """Called after every recording with (how many are done, how many there are)."""
@@ -31,6 +31,9 @@ class ExportOptions:
     ee (absolute TCP pose), ee_delta (its change). The gripper's opening is always absolute."""
     privileged: bool = False
     """Add observation.environment_state: poses and sizes that no sensor of a real robot gives."""
+    features: tuple[str, ...] = ()
+    """Names of the features to have, the others are left out; all by default. observation.state, action, timestamp and
+    the indices stay whatever is named. LeRobot reads every column for every item: fewer make training faster."""
     depth: bool = False
     """Add depth videos (12 bit, as LeRobot 0.6 has them) of recordings that have depth."""
     fps: int | None = None
@@ -64,6 +67,10 @@ class ExportOptions:
     def transcode(self) -> VideoConfig:
         """How pictures are coded that cannot be taken as they are."""
         return VideoConfig(codec=self.transcode_codec, crf=self.transcode_crf)
+
+    def takes(self, feature: str) -> bool:
+        """Whether the dataset shall have a feature, if the recordings give it."""
+        return not self.features or feature in self.features or feature in (STATE, ACTION)
 
     def validate(self) -> None:
         """Raise ConfigError for impossible values and combinations."""

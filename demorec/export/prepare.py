@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.errors import ExportError
+from demorec.errors import ConfigError, ExportError
 from demorec.export.depth import DEPTH_SUFFIX, depth_info, depth_video
 from demorec.export.layout import AUTOMATIC_FEATURES, IMAGE_PREFIX, Feature
 from demorec.export.options import ExportOptions
@@ -17,6 +17,7 @@ from demorec.export.transcode import coded_videos, dataset_settings, video_info
 from demorec.export.writer import EpisodeData
 from demorec.features import (
     ACTION,
+    ENVIRONMENT_STATE,
     ObservationRows,
     action_names,
     action_vectors,
@@ -24,6 +25,7 @@ from demorec.features import (
     observation_vectors,
 )
 from demorec.recording import Recording
+from demorec.registry import nearest_match
 
 REWARD, DONE, SUCCESS = "next.reward", "next.done", "next.success"
 
@@ -59,7 +61,12 @@ def frame_stride(recording_fps: int, fps: int | None) -> int:
 
 
 def dataset_features(recording: Recording, options: ExportOptions) -> dict[str, Feature]:
-    """Every feature that recordings like this one give, in the order of the dataset."""
+    """The features that recordings like this one give with these options, in the order of the dataset.
+
+    Raises:
+        ConfigError: `options.features` names one that they do not give.
+        ExportError: The wanted fps does not divide that of the recording.
+    """
     info = recording.info
     stride = frame_stride(info.fps, options.fps)
     features = {
@@ -75,7 +82,22 @@ def dataset_features(recording: Recording, options: ExportOptions) -> dict[str, 
             features[IMAGE_PREFIX + camera + DEPTH_SUFFIX] = _camera_feature((height, width, 1), described)
     names = action_names(info.robot, options.action)
     features[ACTION] = Feature(dtype="float32", shape=(len(names),), names=names)
-    return {**features, **_SCALARS, **AUTOMATIC_FEATURES}
+    return _chosen({**features, **_SCALARS, **AUTOMATIC_FEATURES}, options)
+
+
+def _chosen(offered: dict[str, Feature], options: ExportOptions) -> dict[str, Feature]:
+    """Those of the offered features that the dataset shall have."""
+    for name in options.features:
+        if name == ENVIRONMENT_STATE and name not in offered:
+            raise ConfigError(f"The feature {name} is named in --features, but only --privileged adds it.")
+        if name not in offered:
+            raise ConfigError(
+                f"Unknown feature {name!r}.{nearest_match(name, offered)} The recordings and these options give: "
+                f"{', '.join(offered)}."
+            )
+    return {
+        name: feature for name, feature in offered.items() if name in AUTOMATIC_FEATURES or options.takes(name)
+    }
 
 
 def _camera_feature(shape: tuple[int, int, int], info: dict[str, object]) -> Feature:
@@ -99,6 +121,7 @@ def prepare_episode(recording: Recording, options: ExportOptions) -> PreparedEpi
     columns = recording.columns()
     rows = np.arange(0, recording.num_frames, stride)
     action_rows = np.minimum(rows + stride - 1, recording.num_frames - 1)
+    wanted = dataset_features(recording, options)
     features: dict[str, NDArray[np.generic]] = dict(
         observation_vectors(
             ObservationRows.of_columns(columns, rows), info.robot, info.scene, privileged=options.privileged
@@ -111,23 +134,24 @@ def prepare_episode(recording: Recording, options: ExportOptions) -> PreparedEpi
     features[DONE] = is_last
     features[SUCCESS] = is_last & success
     videos, pixels = {}, {}
-    coded = coded_videos(recording, options.transcode, rows)
-    for camera in recording.cameras:
+    cameras = [camera for camera in recording.cameras if IMAGE_PREFIX + camera in wanted]
+    for camera, video in coded_videos(recording, cameras, options.transcode, rows).items():
         key = IMAGE_PREFIX + camera
-        videos[key] = coded[camera]
+        videos[key] = video
         statistics = recording.pixel_statistics(camera)
         pixels[key] = PixelHistogram(
             counts=statistics.counts, level_values=colour_levels(), num_pictures=statistics.num_images
         )
-        if options.depth:
+    for camera in recording.cameras:
+        key = IMAGE_PREFIX + camera + DEPTH_SUFFIX
+        if key in wanted:
             pictures = (picture for index, picture in enumerate(recording.depth(camera)) if index % stride == 0)
-            videos[key + DEPTH_SUFFIX], pixels[key + DEPTH_SUFFIX] = depth_video(pictures, fps=info.fps // stride)
-    described = {name: feature.info or {} for name, feature in dataset_features(recording, options).items()}
+            videos[key], pixels[key] = depth_video(pictures, fps=info.fps // stride)
     data = EpisodeData(
         task=info.instruction,
-        columns=features,
+        columns={name: values for name, values in features.items() if name in wanted},
         videos=videos,
-        video_info={key: described[key] for key in videos},
+        video_info={key: wanted[key].info or {} for key in videos},
         pixels=pixels,
     )
     return PreparedEpisode(data=data, record=EpisodeRecord.of(recording, columns, rows))

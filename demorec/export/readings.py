@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
 
-from demorec.export.layout import Feature
+from demorec.export.layout import IMAGE_PREFIX, Feature
 from demorec.export.options import ExportOptions, Progress, parse_episodes
 from demorec.export.prepare import PreparedEpisode, dataset_features, frame_stride, prepare_episode
 from demorec.export.sidecar import AttemptRecord
@@ -61,12 +61,14 @@ def read(source: Source, options: ExportOptions) -> Reading | None:
         attempt = AttemptRecord.of(recording)
         stride = frame_stride(info.fps, options.fps)
         is_wanted = source.is_chosen and (attempt.success or options.include_failures)
-        reasons = {name: reason_to_transcode(recording.video_settings(name), stride) for name in recording.cameras}
+        features = dataset_features(recording, options)
+        cameras = [name for name in recording.cameras if IMAGE_PREFIX + name in features]
+        reasons = {name: reason_to_transcode(recording.video_settings(name), stride) for name in cameras}
         return Reading(
             path=source.path,
             attempt=attempt,
             profile=Profile.of(recording, options),
-            features=dataset_features(recording, options),
+            features=features,
             fps=info.fps // stride,
             robot=info.robot.name,
             transcoded=tuple(f"{camera}, {reason}" for camera, reason in reasons.items() if reason),

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from demorec.errors import ExportError
+from demorec.export.layout import IMAGE_PREFIX
 from demorec.export.options import ExportOptions
-from demorec.features import observation_names
+from demorec.features import ENVIRONMENT_STATE, observation_names
 from demorec.plain import digest
 from demorec.recording import Recording
 
@@ -72,13 +73,14 @@ class Profile:
         """That of a recording, as far as it matters for these options."""
         info = recording.info
         traits = [("fps", str(info.fps)), ("robot", f"{info.robot.name} ({digest(info.robot)})")]
-        traits.append(("cameras", " ".join(recording.cameras) or "none"))
-        for camera in info.scene.cameras:
-            settings = recording.video_settings(camera.name)
-            traits.append((f"size of camera {camera.name}", f"{settings.width}x{settings.height}"))
-            traits.append((f"codec of camera {camera.name}", settings.codec))
-        if options.privileged:
-            names = observation_names(info.robot, info.scene, privileged=True)["observation.environment_state"]
+        cameras = [name for name in recording.cameras if options.takes(IMAGE_PREFIX + name)]
+        traits.append(("cameras", " ".join(cameras) or "none"))
+        for camera in cameras:
+            settings = recording.video_settings(camera)
+            traits.append((f"size of camera {camera}", f"{settings.width}x{settings.height}"))
+            traits.append((f"codec of camera {camera}", settings.codec))
+        if options.privileged and options.takes(ENVIRONMENT_STATE):
+            names = observation_names(info.robot, info.scene, privileged=True)[ENVIRONMENT_STATE]
             traits.append(("objects and goals", " ".join(dict.fromkeys(name.partition(".")[0] for name in names))))
             traits.append(("components of the environment state", f"{len(names)} ({digest(list(names))})"))
         return cls(traits=tuple(traits))

@@ -50,10 +50,12 @@ def dataset_settings(settings: VideoSettings, video: VideoConfig, *, stride: int
     )
 
 
-def coded_videos(recording: Recording, video: VideoConfig, rows: NDArray[np.intp]) -> dict[str, CodedVideo]:
+def coded_videos(
+    recording: Recording, cameras: Sequence[str], video: VideoConfig, rows: NDArray[np.intp]
+) -> dict[str, CodedVideo]:
     """Camera -> its pictures for the frames `rows`: the recorded packets wherever that is possible."""
     stride = int(rows[1] - rows[0]) if len(rows) > 1 else 1
-    reasons = {name: reason_to_transcode(recording.video_settings(name), stride) for name in recording.cameras}
+    reasons = {name: reason_to_transcode(recording.video_settings(name), stride) for name in cameras}
     recorded = {} if all(reasons.values()) else recording.packets_of_all_cameras()
     videos = {}
     for camera, reason in reasons.items():

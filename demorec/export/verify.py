@@ -143,7 +143,8 @@ def _wrong_pictures(item: Any, recording: Recording, camera: str, moment: int, s
         if np.abs(found - _recorded_picture(recording, camera, moment * stride)).mean() > limit:
             wrong.append(key)
     if key + DEPTH_SUFFIX in item:
-        found = item[key + DEPTH_SUFFIX].numpy().reshape(-1, item[key].shape[-1]) / 1000  # LeRobot gives millimetres
+        found = item[key + DEPTH_SUFFIX].numpy()
+        found = found.reshape(found.shape[-2:]) / 1000  # LeRobot gives millimetres
         recorded = next(islice(recording.depth(camera), moment * stride, None))
         if np.abs(found - code_values()[quantised(recorded)]).max() > _DEPTH_TOLERANCE:
             wrong.append(key + DEPTH_SUFFIX)

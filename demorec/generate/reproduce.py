@@ -128,6 +128,7 @@ def _read_dataset(source: Path) -> Original:
             export=ExportOptions(
                 action=made_with["action"],
                 privileged=made_with["privileged"],
+                features=tuple(made_with.get("features", ())),
                 include_failures=made_with["include_failures"],
                 episodes=made_with["episodes"],
                 fps=made_with["fps"],

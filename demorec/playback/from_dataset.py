@@ -14,9 +14,11 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 from rerun.experimental import LeRobotReader
 
+from demorec.assets import asset_path
 from demorec.episode import Check, EpisodeInfo, Outcome, frame_time_ns
 from demorec.errors import RecordingError
 from demorec.geometry import Array
+from demorec.kinematics import ArmKinematics
 from demorec.plain import from_json
 from demorec.playback.episode import Curves, Episode, Video, VideoBatch
 
@@ -56,6 +58,7 @@ def open_dataset_episode(root: Path, episode_index: int) -> Iterator[Episode]:
     time_ns = np.array([frame_time_ns(index, fps) for index in range(num_frames)], dtype=np.int64)
     num_arm, num_fingers = len(info.robot.arm_joints), len(info.robot.gripper_joints)
     state = data["observation.state"]
+    base_from_tcp = data["observation.ee_pose"] if "observation.ee_pose" in data else _tcp_poses(info, state)
     fingers = np.repeat(state[:, num_arm:] / num_fingers, num_fingers, axis=1)
     yield Episode(
         name=f"episode_{episode_index:06d}",
@@ -67,12 +70,12 @@ def open_dataset_episode(root: Path, episode_index: int) -> Iterator[Episode]:
         robot_description=None,
         time_ns=time_ns,
         joint_position=np.concatenate([state[:, :num_arm], fingers], axis=1),
-        base_from_tcp=data["observation.ee_pose"],
+        base_from_tcp=base_from_tcp,
         object_poses={},
         end_poses={item["name"]: np.array(item["world_from_object_end"]) for item in row["objects"]},
         world_from_camera=_camera_poses(root, episode_index),
         phase=_phases(row, num_frames),
-        curves=_curves(info, data, time_ns, with_targets=export.get("action") == "joint"),
+        curves=_curves(info, data, base_from_tcp, time_ns, with_targets=export.get("action") == "joint"),
         videos=_videos(root, episode_index, time_ns, features["features"]),
     )
 
@@ -105,6 +108,20 @@ def _data(root: Path, episode_index: int, columns: list[str]) -> dict[str, Array
     return result
 
 
+def _tcp_poses(info: EpisodeInfo, state: Array) -> Array:
+    """(T, 7) from the joints, of a dataset that leaves observation.ee_pose out."""
+    robot = info.robot
+    arm = ArmKinematics.from_urdf(
+        asset_path(robot.urdf),
+        arm_joints=robot.arm_joints,
+        tcp_link=robot.tcp_link,
+        lower=robot.position_lower,
+        upper=robot.position_upper,
+        scale=info.scene.robot.scale,
+    )
+    return np.array([arm.forward(row).vector() for row in state[:, : arm.num_joints]])
+
+
 def _outcome(row: dict[str, Any], num_frames: int) -> Outcome:
     return Outcome(
         success=row["success"],
@@ -134,10 +151,15 @@ def _camera_poses(root: Path, episode_index: int) -> dict[str, Array]:
 
 
 def _curves(
-    info: EpisodeInfo, data: dict[str, Array], time_ns: NDArray[np.int64], *, with_targets: bool
+    info: EpisodeInfo,
+    data: dict[str, Array],
+    base_from_tcp: Array,
+    time_ns: NDArray[np.int64],
+    *,
+    with_targets: bool,
 ) -> dict[str, Curves]:
     joints = info.robot.arm_joints
-    state, velocity, action = data["observation.state"], data["observation.velocity"], data["action"]
+    state, velocity, action = data["observation.state"], data.get("observation.velocity"), data["action"]
     number = len(joints)
 
     def curves(values: Array, names: tuple[str, ...]) -> Curves:
@@ -145,11 +167,12 @@ def _curves(
 
     result = {
         "position": curves(state[:, :number], joints),
-        "velocity": curves(velocity[:, :number], joints),
         "gripper": curves(state[:, number:], ("opening",)),
         "gripper target": curves(action[:, -1:], ("target",)),
-        "ee": curves(data["observation.ee_pose"][:, :3], ("x", "y", "z")),
+        "ee": curves(base_from_tcp[:, :3], ("x", "y", "z")),
     }
+    if velocity is not None:
+        result["velocity"] = curves(velocity[:, :number], joints)
     if with_targets:
         result["target"] = curves(action[:, :number], joints)
     return result

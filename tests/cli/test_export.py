@@ -46,6 +46,7 @@ def test_options_reach_the_export(run: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "code", "message"),
     [
+        (("--features", "observation.stat"), 2, "'observation.state'"),
         (("--fps", "7"), 1, "does not divide"),
         (("--append", "--overwrite"), 2, "exclude each other"),
         (("--episodes", "x"), 2, "0:100"),

@@ -5,14 +5,17 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from demorec.cli import generate_dataset_main, main
 from demorec.config import EpisodePlan, GenerateConfig, deciding_versions
+from demorec.export import ExportOptions, dataset_digest, export_lerobot
 from demorec.generate.export_step import export_run
 from demorec.generate.options import RunOptions
 from demorec.generate.run import NoProgress, RunResult, generate
 from demorec.generate.run_file import load_run_file
+from demorec.recording import Recording
 
 CONFIG = GenerateConfig(seed=11, width=48, height=32)
 NUM_EPISODES = 3
@@ -82,6 +85,24 @@ def test_reproduce_makes_runs_and_datasets_again_and_sees_a_difference(tmp_path,
     (source / "run.json").write_text(text.replace(first, "0" * len(first)))
     assert reproduce(source, tmp_path / "copy") == 1
     assert "Different: 0 (attempt 0)" in capsys.readouterr().err
+
+
+def test_a_dataset_of_few_features_is_made_again_and_can_be_shown(tmp_path, reference):
+    from demorec.playback.from_dataset import open_dataset_episode
+
+    few = ExportOptions(features=("observation.images.wrist",), action="ee_delta", verify=False)
+    export_lerobot([reference.folder], tmp_path / "few", few)
+    assert reproduce(tmp_path / "few", tmp_path / "copy") == 0
+    assert dataset_digest(tmp_path / "copy" / "dataset") == dataset_digest(tmp_path / "few")
+    with (
+        Recording(reference.folder / "episodes" / "episode_000001.mcap") as recording,
+        open_dataset_episode(tmp_path / "few", 1) as shown,
+    ):
+        recorded = recording.columns().base_from_tcp
+        # The simulator's pose against that of the joints, which the dataset has as float32.
+        assert np.allclose(shown.base_from_tcp[:, :3], recorded[:, :3], atol=1e-5)
+        assert "velocity" not in shown.curves
+        assert tuple(shown.videos) == ("wrist",)
 
 
 def reproduce(source: Path, out: Path) -> int:

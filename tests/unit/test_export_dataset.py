@@ -351,6 +351,59 @@ def test_append_leaves_out_what_the_dataset_does_not_have(run: Path, tmp_path: P
     assert "observation.environment_state" not in info(out)["features"]
 
 
+ALWAYS = {"observation.state", "action", "timestamp", "frame_index", "episode_index", "index", "task_index"}
+
+
+@pytest.mark.parametrize(
+    "chosen",
+    [
+        ("observation.environment_state",),
+        ("action", "observation.images.wrist", "next.done"),
+        ("observation.images.front_depth", "observation.velocity"),
+    ],
+)
+def test_only_the_chosen_features(tmp_path: Path, chosen: tuple[str, ...]) -> None:
+    run = make_run(tmp_path / "run", (5, 4), depth=True)
+    whole, few = tmp_path / "whole", tmp_path / "few"
+    export(run, whole, privileged=True, depth=True)
+    report = export(run, few, privileged=True, depth=True, features=chosen)
+    wanted = ALWAYS | set(chosen)
+    assert info(few)["features"] == {k: v for k, v in info(whole)["features"].items() if k in wanted}
+    numbers = [name for name in data_table(whole).column_names if name in wanted]
+    assert data_table(few).equals(data_table(whole).select(numbers).replace_schema_metadata(None))
+    assert json.loads((few / "meta/stats.json").read_text()).keys() == wanted
+    videos = {path.name for path in (few / "videos").glob("*")}
+    assert videos == {name for name in chosen if name.startswith("observation.images.")}
+    for name in videos:
+        mp4 = f"videos/{name}/chunk-000/file-000.mp4"
+        assert (few / mp4).read_bytes() == (whole / mp4).read_bytes()
+    assert report.digest == dataset_digest(few) != dataset_digest(whole)
+    card = (few / "README.md").read_text()
+    assert all(f"| `{name}` |" in card for name in wanted)
+    assert "observation.ee_pose" not in card
+
+
+def test_recordings_may_differ_in_what_is_left_out(run: Path, tmp_path: Path) -> None:
+    other = make_run(tmp_path / "other", (6,), width=80, height=48)
+    with pytest.raises(ExportError, match="size of camera front is 80x48"):
+        export([run, other], tmp_path / "d")
+    assert export([run, other], tmp_path / "d", features=("observation.velocity",)).num_episodes == 5
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("observation.velocty", "Did you mean 'observation.velocity'"),
+        ("observation.environment_state", "--privileged"),
+        ("observation.images.side", "observation.images.front, observation.images.wrist"),
+    ],
+)
+def test_a_feature_that_there_is_not(run: Path, tmp_path: Path, name: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        export(run, tmp_path / "d", features=(name,))
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_append_to_a_damaged_dataset_is_refused(run: Path, tmp_path: Path) -> None:
     out = tmp_path / "d"
     export(run, out)
