@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import functools
+import logging
+from dataclasses import replace
 
 import numpy as np
 import rerun as rr
@@ -11,6 +13,7 @@ from numpy.typing import NDArray
 
 from demorec.assets import asset_path
 from demorec.episode import EpisodeInfo
+from demorec.errors import DemorecError
 from demorec.geometry import Array, Pose
 from demorec.playback.episode import Episode
 from demorec.playback.meshes import Mesh, joined, mesh_file, of_trimesh, sphere_mesh, urdf_meshes
@@ -18,9 +21,15 @@ from demorec.playback.paths import Paths
 from demorec.playback.robot import as_mesh3d
 from demorec.playback.style import GOAL
 from demorec.playback.times import indexes
-from demorec.scene import Body, Goal, Rgba, Texture
+from demorec.scene import Body, Goal, Rgba, Shape, Texture
 from demorec.textures import texture_pixels
 from demorec.urdf import Urdf
+
+log = logging.getLogger(__name__)
+
+_OWN_COLOR: Rgba = (1.0, 1.0, 1.0, 1.0)
+_SAME_SIZE = 0.1
+"""How far a model's extents may be from those of the recorded scene, as a part of the largest."""
 
 
 def log_bodies(recording: rr.RecordingStream, paths: Paths, episode: Episode, tint: Rgba | None = None) -> None:
@@ -28,8 +37,7 @@ def log_bodies(recording: rr.RecordingStream, paths: Paths, episode: Episode, ti
 
     An object whose way the source does not know is drawn at its start and, as a wire frame, at its end.
 
-    Raises:
-        RecordingError, SceneError: The model of a body cannot be read.
+    A body whose model is not installed here, or is another one, is drawn as the recording describes it.
     """
     scene = episode.info.scene
     times = indexes(episode.time_ns, episode.time_ns)
@@ -37,7 +45,7 @@ def log_bodies(recording: rr.RecordingStream, paths: Paths, episode: Episode, ti
         entity = paths.body(body.name)
         if tint is not None and body.role in ("support", "fixture"):
             continue  # the other episode's table, which would lie in the same place
-        recording.log(entity, _visible(body, tint), static=True)
+        recording.log(entity, _visible(body, episode, tint), static=True)
         poses = episode.object_poses.get(body.name)
         if poses is not None:
             columns = rr.Transform3D.columns(translation=poses[:, :3], quaternion=poses[:, 3:])
@@ -65,33 +73,57 @@ def _transform(pose: Array) -> rr.Transform3D:
     return rr.Transform3D(translation=pose[:3], quaternion=pose[3:])
 
 
-def _visible(body: Body, tint: Rgba | None) -> rr.Mesh3D:
+def _visible(body: Body, episode: Episode, tint: Rgba | None) -> rr.Mesh3D:
     if body.shape.kind == "box" and body.texture is not None:
         return _textured_box(np.array(body.shape.size), body.texture)
     color = body.rgba
     if body.texture is not None:
         first, second = body.texture.colors
         color = (*((a + b) / 2 for a, b in zip(first, second, strict=True)), 1.0)  # type: ignore[assignment]
-    return as_mesh3d(_body_mesh(body).placed(Pose(), np.ones(3), color), tint)
+    if body.shape.kind not in ("mesh", "urdf"):
+        return as_mesh3d(_primitive_mesh(body.shape).placed(Pose(), np.ones(3), color), tint)
+    mesh = _installed_mesh(body.shape)
+    if mesh is not None:
+        if color != _OWN_COLOR:  # instead of the model's own colours, as in the simulator
+            mesh = replace(mesh, colors=np.full_like(mesh.colors, 255))
+        return as_mesh3d(mesh.placed(Pose(), np.ones(3), color), tint)
+    description = episode.body_description(body.name)
+    if description is not None:  # in the body's colours already
+        return as_mesh3d(joined(list(urdf_meshes(description, None).values())), tint)
+    return as_mesh3d(_unit_mesh("box").placed(Pose(), np.array(body.shape.extents), color), tint)
 
 
-def _body_mesh(body: Body) -> Mesh:
-    shape = body.shape
-    match shape.kind:
-        case "box" | "sphere" | "cylinder":
-            return _unit_mesh(shape.kind).placed(Pose(), np.array(shape.extents), (1.0, 1.0, 1.0, 1.0))
-        case "capsule":
-            capsule = trimesh.creation.capsule(radius=shape.size[0], height=shape.size[1], count=[32, 32])
-            capsule.apply_translation((0.0, 0.0, -capsule.bounds.mean(axis=0)[2]))
-            return of_trimesh(capsule)
-        case "mesh":
-            return mesh_file(asset_path(shape.file)).placed(Pose(), np.full(3, shape.scale), (1.0, 1.0, 1.0, 1.0))
-        case "urdf":
-            path = asset_path(shape.file)
-            text = path.read_text()
-            poses = Urdf.parse(text, scale=shape.scale).link_poses({})
-            links = urdf_meshes(text, path.parent, shape.scale)
-            return joined([mesh.placed(poses[link], np.ones(3), (1.0, 1.0, 1.0, 1.0)) for link, mesh in links.items()])
+def _primitive_mesh(shape: Shape) -> Mesh:
+    if shape.kind == "capsule":
+        capsule = trimesh.creation.capsule(radius=shape.size[0], height=shape.size[1], count=[32, 32])
+        capsule.apply_translation((0.0, 0.0, -capsule.bounds.mean(axis=0)[2]))
+        return of_trimesh(capsule)
+    return _unit_mesh(shape.kind).placed(Pose(), np.array(shape.extents), _OWN_COLOR)
+
+
+@functools.lru_cache(maxsize=64)
+def _installed_mesh(shape: Shape) -> Mesh | None:
+    """The model file of a mesh or urdf in the body's frame; None, and a word about it, when it cannot be used."""
+    try:
+        mesh = _model_mesh(shape)
+    except (DemorecError, OSError, ValueError) as error:
+        log.warning("An object is drawn as the recording describes it: its model is not installed here (%s)", error)
+        return None
+    extents = mesh.vertices.max(axis=0) - mesh.vertices.min(axis=0)
+    if np.abs(extents - shape.extents).max() > _SAME_SIZE * max(shape.extents):
+        log.warning("An object is drawn as the recording describes it: the model %s has another size", shape.file)
+        return None
+    return mesh
+
+
+def _model_mesh(shape: Shape) -> Mesh:
+    path = asset_path(shape.file)
+    if shape.kind == "mesh":
+        return mesh_file(path).placed(shape.body_from_mesh, np.full(3, shape.scale), _OWN_COLOR)
+    text = path.read_text()
+    poses = Urdf.parse(text, scale=shape.scale).link_poses({})
+    links = urdf_meshes(text, path.parent, shape.scale)
+    return joined([mesh.placed(poses[link], np.ones(3), _OWN_COLOR) for link, mesh in links.items()])
 
 
 @functools.cache

@@ -61,6 +61,7 @@ class Episode:
         info: Scene, robot, cameras, seed.
         outcome: How it ended, None when nobody knows.
         robot_description: URDF of primitives, for where the original model is not installed.
+        body_description: The same of the body of a name, None where the source has none.
         time_ns: (T,) of the frames, since the start.
         joint_position: (T, n_joints) rad, fingers m.
         base_from_tcp: (T, 7).
@@ -84,6 +85,7 @@ class Episode:
     info: EpisodeInfo
     outcome: Outcome | None
     robot_description: str | None
+    body_description: Callable[[str], str | None] = lambda _: None
     time_ns: NDArray[np.int64]
     joint_position: Array
     base_from_tcp: Array

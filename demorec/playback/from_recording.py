@@ -14,6 +14,7 @@ import numpy as np
 from demorec.episode import EpisodeColumns
 from demorec.playback.episode import Curves, Episode, Video, VideoBatch
 from demorec.recording import Recording
+from demorec.recording.channels import description_topic
 
 _PICTURES_AT_ONCE = 256
 
@@ -35,6 +36,7 @@ def open_recording(path: Path, *, group: str) -> Iterator[Episode]:
             info=info,
             outcome=recording.outcome,
             robot_description=recording.description(),
+            body_description=partial(_body_description, recording),
             time_ns=columns.time_ns,
             joint_position=columns.joint_position,
             base_from_tcp=columns.base_from_tcp,
@@ -55,6 +57,10 @@ def open_recording(path: Path, *, group: str) -> Iterator[Episode]:
             },
             segment_names=recording.segment_names(),
         )
+
+
+def _body_description(recording: Recording, body: str) -> str | None:
+    return recording.description(body) if description_topic(body) in recording.topics else None
 
 
 def _batches(recording: Recording, camera: str) -> Iterator[VideoBatch]:

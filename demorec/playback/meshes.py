@@ -30,7 +30,7 @@ MAX_TRIANGLES = 2500
 """Of one mesh file."""
 _CREASE = np.radians(35.0)
 """Edges sharper than this stay sharp when a surface is shaded."""
-_CACHE_VERSION = b"1"
+_CACHE_VERSION = b"2"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -186,7 +186,9 @@ def _read_mesh_file(path: Path) -> Mesh:
     loaded = trimesh.load(path, process=False)
     parts: list[Any] = list(loaded.geometry.values()) if isinstance(loaded, trimesh.Scene) else [loaded]
     total = sum(len(part.faces) for part in parts)
-    colored = path.suffix.lower() != ".obj" or path.with_suffix(".mtl").is_file()
+    is_obj = path.suffix.lower() == ".obj"
+    # As in PyBullet: a texture, or several materials, colour an OBJ file; a single material does not.
+    colored = not is_obj or len(parts) > 1 or _texture(parts[0]) is not None
     keep = min(1.0, MAX_TRIANGLES / total)
     return joined([_simplified(part, keep, _color(part) if colored else None) for part in parts if len(part.faces)])
 
@@ -202,7 +204,17 @@ def _simplified(part: Any, keep: float, rgba: NDArray[np.uint8] | None) -> Mesh:
     return of_trimesh(bare, rgba)
 
 
+def _texture(part: Any) -> Any:
+    return getattr(getattr(part.visual, "material", None), "image", None)
+
+
 def _color(part: Any) -> NDArray[np.uint8] | None:
+    """The part's colour, RGBA; of a texture its mean over the middles of the part's triangles."""
+    if _texture(part) is not None:
+        middles = part.visual.uv[part.faces].mean(axis=1)
+        colors = trimesh.visual.uv_to_color(middles, _texture(part)).astype(np.float64)
+        mean: NDArray[np.float64] = np.average(colors, axis=0, weights=part.area_faces)
+        return np.rint(mean).astype(np.uint8)
     color = getattr(getattr(part.visual, "material", None), "diffuse", None)
     if color is None:
         color = getattr(part.visual, "main_color", None)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import functools
+import logging
 from collections.abc import Mapping
 
 import numpy as np
 import rerun as rr
 
 from demorec.assets import asset_path
-from demorec.errors import MissingDependencyError, SceneError
+from demorec.errors import DemorecError
 from demorec.geometry import Array, quat_multiply
 from demorec.playback.episode import Episode
 from demorec.playback.meshes import Mesh, urdf_meshes
@@ -17,6 +18,8 @@ from demorec.playback.paths import Paths
 from demorec.playback.times import indexes
 from demorec.scene import Rgba
 from demorec.urdf import Urdf, UrdfJoint
+
+log = logging.getLogger(__name__)
 
 _SAME_PLACE = 1e-3
 """How far joints of the installed model may be from those of the recorded description, metres."""
@@ -85,24 +88,28 @@ def joint_columns(joint: UrdfJoint, position: Array) -> tuple[Array, Array]:
 def robot_model(urdf: str, scale: float, description: str | None) -> tuple[Urdf, Mapping[str, Mesh]]:
     """The joint tree and the links' meshes: the installed model, or else the recorded description.
 
-    The installed model is used when its joints are where the recording has them.
+    The installed model is used when all of it is there and its joints are where the recording has them.
 
     Raises:
-        SceneError, MissingDependencyError: The model is not installed and there is no description.
+        SceneError, MissingDependencyError, RecordingError: The model is not installed and there is no description.
     """
     recorded = None if description is None else Urdf.parse(description)
     try:
         path = asset_path(urdf)
         text = path.read_text()
         installed = Urdf.parse(text, scale=scale)
-    except (SceneError, MissingDependencyError, OSError, ValueError):
+        meshes = urdf_meshes(text, path.parent, scale)
+    except (DemorecError, OSError, ValueError) as error:
         if recorded is None:
             raise
+        reason = f"its model is not installed here ({error})"
     else:
         if recorded is None or _same_joints(installed, recorded):
-            return installed, urdf_meshes(text, path.parent, scale)
+            return installed, meshes
+        reason = f"the model installed here has other joints ({urdf})"
     assert description is not None
     assert recorded is not None
+    log.warning("The robot is drawn as the boxes and cylinders of the recording: %s", reason)
     return recorded, urdf_meshes(description, None)
 
 

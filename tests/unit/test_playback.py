@@ -1,26 +1,32 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from helpers_recording import write_episode
+from helpers_recording import make_episode, write_episode
 from rerun.chunk import RrdReader
 from scipy.spatial.transform import Rotation
 
+from demorec import assets
 from demorec.assets import asset_path
 from demorec.config import VideoConfig
 from demorec.errors import ConfigError
+from demorec.geometry import Pose
+from demorec.playback import bodies
 from demorec.playback.compare import differences
 from demorec.playback.meshes import MAX_TRIANGLES, urdf_meshes
 from demorec.playback.programs import viewer_environment
 from demorec.playback.robot import joint_columns, robot_model
 from demorec.playback.save import save, save_comparison
 from demorec.playback.sources import find_episodes, select
-from demorec.recording import Recording
+from demorec.recording import EpisodeWriter, Recording
+from demorec.scene import Body, Shape
 from demorec.urdf import Urdf
 
 
@@ -156,6 +162,102 @@ def test_the_recorded_description_stands_in_for_a_model_that_is_not_installed(re
     assert moved != description
     other, _ = robot_model("franka_panda/panda.urdf", 1.0, moved)  # another robot than the installed one
     assert next(joint for joint in other.joints if joint.name == "panda_joint1").parent_from_joint.position[2] == 0.444
+
+
+DUCK = Body(
+    name="duck",
+    role="object",
+    shape=Shape(
+        kind="mesh", file="duck.obj", scale=0.04, size=(0.066, 0.046, 0.062), origin=(-0.1344, 0.87, 0.037), y_up=True
+    ),
+    world_from_body=Pose(position=np.array([0.5, 0.1, 0.031])),
+)
+BRICK = Body(
+    name="brick",
+    role="object",
+    shape=Shape(kind="urdf", file="lego/lego.urdf", size=(0.032, 0.032, 0.023)),
+    world_from_body=Pose(position=np.array([0.5, -0.1, 0.012])),
+    rgba=(0.2, 0.4, 1.0, 1.0),
+)
+
+
+@pytest.fixture
+def with_models(tmp_path: Path) -> Path:
+    """A recording with a mesh and a URDF beside the table and the cube."""
+    info, frames, outcome = make_episode(num_frames=3, cameras=())
+    info = replace(info, scene=replace(info.scene, bodies=(*info.scene.bodies, DUCK, BRICK)))
+    with EpisodeWriter(tmp_path / "e.mcap", info) as writer:
+        for frame in frames:
+            writer.write(frame)
+        writer.finish(outcome)
+    return tmp_path / "e.mcap"
+
+
+def _drawn(path: Path, tmp_path: Path) -> dict[str, list[Any]]:
+    robot_model.cache_clear()
+    bodies._installed_mesh.cache_clear()
+    try:
+        save(find_episodes([path])[0], tmp_path / "x.rrd")
+    finally:
+        robot_model.cache_clear()
+        bodies._installed_mesh.cache_clear()
+    return _chunks(tmp_path / "x.rrd")
+
+
+def _mesh_of(chunks: list[Any]) -> tuple[np.ndarray, set[int]]:
+    """Vertices (N, 3) and the colours, 0xRRGGBBAA."""
+    (batch,) = [b for c in chunks if "Mesh3D:vertex_positions" in (b := c.to_record_batch()).schema.names]
+    vertices = np.array(batch.column("Mesh3D:vertex_positions").to_pylist()[0])
+    return vertices, set(batch.column("Mesh3D:vertex_colors").to_pylist()[0])
+
+
+def test_models_are_drawn_in_their_place_and_colour(with_models: Path, tmp_path: Path) -> None:
+    drawn = _drawn(with_models, tmp_path)
+    for body in (DUCK, BRICK):
+        vertices, _ = _mesh_of(drawn[f"/world/bodies/{body.name}"])
+        half = np.array(body.shape.size) / 2
+        np.testing.assert_allclose(vertices.max(axis=0), half, atol=0.001)
+        np.testing.assert_allclose(vertices.min(axis=0), -half, atol=0.001)
+    assert _mesh_of(drawn["/world/bodies/brick"])[1] == {0x3366FFFF}
+    (duck_color,) = _mesh_of(drawn["/world/bodies/duck"])[1]
+    red, green, blue = duck_color >> 24, duck_color >> 16 & 255, duck_color >> 8 & 255
+    assert min(red, green) > 180 > 60 > blue, "the duck is yellow"
+
+
+@pytest.mark.parametrize("lost", ["all", "meshes"])
+def test_a_recording_shows_everything_where_the_models_are_not_installed(
+    with_models: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, lost: str
+) -> None:
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    if lost == "meshes":
+        for name in ("franka_panda/panda.urdf", "lego/lego.urdf"):
+            (elsewhere / name).parent.mkdir()
+            shutil.copy(asset_path(name), elsewhere / name)
+    installed = _drawn(with_models, tmp_path)
+    monkeypatch.setattr(assets, "data_folder", lambda: elsewhere)
+    drawn = _drawn(with_models, tmp_path)
+    said = caplog.text
+    assert "The robot is drawn as the boxes and cylinders of the recording" in said
+    assert said.count("An object is drawn as the recording describes it") == 2
+    links = {entity for entity in drawn if "/robot/" in entity and _has(drawn[entity], "Mesh3D:vertex_positions")}
+    assert {link.rpartition("/")[2] for link in links} >= {f"panda_link{n}" for n in range(8)} | {"panda_hand"}
+    for entity in [*sorted(links), "/world/bodies/duck", "/world/bodies/brick"]:
+        (vertices, _), (real, _) = _mesh_of(drawn[entity]), _mesh_of(installed[entity])
+        np.testing.assert_allclose(vertices.max(axis=0), real.max(axis=0), atol=0.03)
+        np.testing.assert_allclose(vertices.min(axis=0), real.min(axis=0), atol=0.03)
+        assert not np.array_equal(vertices, real)
+    assert _mesh_of(drawn["/world/bodies/brick"])[1] == {0x3366FFFF}
+
+
+def test_a_model_of_another_size_is_not_taken_for_the_recorded_one(
+    with_models: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(bodies, "_model_mesh", lambda shape: bodies._unit_mesh("box"))
+    drawn = _drawn(with_models, tmp_path)
+    assert "duck.obj has another size" in caplog.text
+    vertices, _ = _mesh_of(drawn["/world/bodies/duck"])
+    np.testing.assert_allclose(np.ptp(vertices, axis=0), DUCK.shape.size, atol=0.01)
 
 
 @pytest.mark.parametrize("codec", ["jpeg", "av1"])
