@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from demorec.errors import ExportError
@@ -72,7 +72,9 @@ class Profile:
     def of(cls, recording: Recording, options: ExportOptions) -> Profile:
         """That of a recording, as far as it matters for these options."""
         info = recording.info
-        traits = [("fps", str(info.fps)), ("robot", f"{info.robot.name} ({digest(info.robot)})")]
+        # A scaled arm (the tutorial's) has the same joints and limits; its lengths stay with each episode's sidecar.
+        robot = replace(info.robot, gripper_max_width=0.0, finger_depth=0.0, palm_clearance=0.0)
+        traits = [("fps", str(info.fps)), ("robot", f"{info.robot.name} ({digest(robot)})")]
         cameras = [name for name in recording.cameras if options.takes(IMAGE_PREFIX + name)]
         traits.append(("cameras", " ".join(cameras) or "none"))
         for camera in cameras:

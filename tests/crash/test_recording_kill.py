@@ -1,7 +1,7 @@
 """`kill -9` at any moment of writing loses at most the last second of the episode.
 
-Each child writes an endless episode and notes in a pipe how many frames it has handed to the recorder; it is killed
-at a random moment, and what `recover` keeps is compared with what it had written.
+Each child writes a long episode and notes in a pipe how many frames it has handed to the recorder; it is killed
+after a random number of them, a few milliseconds later, and what `recover` keeps is compared with what it had written.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from demorec.errors import RecordingError
 from demorec.recording import EpisodeWriter, Recording, recover
 
 FPS = 30
+MOST_FRAMES = 300
 
 
 def write_until_killed(path: Path, info: EpisodeInfo, frames: list[Frame], video: VideoConfig, notes: int) -> None:
@@ -37,8 +38,8 @@ def write_until_killed(path: Path, info: EpisodeInfo, frames: list[Frame], video
             time.sleep(0.0005)
 
 
-def kill_while(write: Callable[[int], None], seconds: float) -> int:
-    """Run `write` in a child, kill it `seconds` after its start, and return how many frames it had written."""
+def kill_while(write: Callable[[int], None], *, after: int, seconds: float) -> int:
+    """Run `write` in a child, kill it `seconds` after it noted `after` frames, and return how many it had written."""
     read_end, write_end = os.pipe()
     child = os.fork()
     if child == 0:
@@ -48,14 +49,18 @@ def kill_while(write: Callable[[int], None], seconds: float) -> int:
         finally:
             os._exit(0)
     os.close(write_end)
+    written = -1  # the first note says that it has started
     try:
-        assert os.read(read_end, 1) == b"r"
+        while written < after:
+            noted = os.read(read_end, after - written)
+            assert noted, "the child ended by itself"
+            written += len(noted)
         time.sleep(seconds)
     finally:
         os.kill(child, signal.SIGKILL)
         os.waitpid(child, 0)
     with os.fdopen(read_end, "rb") as notes:
-        return len(notes.read())
+        return written + len(notes.read())
 
 
 @pytest.mark.parametrize(
@@ -64,14 +69,15 @@ def kill_while(write: Callable[[int], None], seconds: float) -> int:
 )
 def test_kill_at_random_moments(tmp_path: Path, codec: str, kills: int, capsys: pytest.CaptureFixture[str]) -> None:
     rng = random.Random(5)
-    info, frames, _ = make_episode(num_frames=600, fps=FPS)
+    info, frames, _ = make_episode(num_frames=2 * MOST_FRAMES, fps=FPS)
     write_episode(tmp_path / "warm.mcap", num_frames=2)  # what is compiled or loaded once is not what is killed
     lost, kept_nothing, written_total = [], 0, 0
     for number in range(kills):
         part = tmp_path / f"{number}.mcap.part"
         written = kill_while(
             partial(write_until_killed, part.with_suffix(""), info, frames, VideoConfig(codec=codec)),
-            rng.uniform(0.0, 0.8),
+            after=rng.randrange(MOST_FRAMES),
+            seconds=rng.uniform(0.0, 0.01),  # anywhere within the writing of a frame
         )
         written_total += written
         assert not part.with_suffix("").exists()

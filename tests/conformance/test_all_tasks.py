@@ -1,0 +1,44 @@
+"""One dataset over all tasks together."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers_check import checked, simulate_run
+
+from demorec.cli import main
+from demorec.recording import Recording
+from demorec.tables import TASKS
+
+
+@pytest.mark.slow
+def test_all_tasks_go_into_one_dataset(tmp_path: Path) -> None:
+    runs = [
+        simulate_run(tmp_path / task, 1, task=task, seed=31, cameras=("front", "wrist"), width=128, height=128)
+        for task in TASKS.names()
+    ]
+    out = tmp_path / "all"
+    with pytest.raises(SystemExit) as ended:
+        main(["export", "lerobot", *map(str, runs), "--out", str(out)])
+    assert not ended.value.code
+
+    lerobot = importlib.import_module("lerobot.datasets.lerobot_dataset")
+    dataset = lerobot.LeRobotDataset("local/all", root=out)
+    assert dataset.num_episodes == len(runs) == len(TASKS.names())
+    row = 0
+    for run in runs:
+        (path,) = (run / "episodes").glob("*.mcap")
+        with Recording(path) as recording:
+            columns, instruction = recording.columns(), recording.info.instruction
+        item = dataset[row]
+        assert item["task"] == instruction
+        expected = np.float32([*columns.joint_position[0, :7], columns.gripper_width[0]])
+        assert np.array_equal(item["observation.state"].numpy(), expected)
+        row += len(columns.time_ns)
+    assert row == dataset.num_frames
+    assert len(dataset.meta.tasks) == len({dataset[i]["task"] for i in dataset.meta.episodes["dataset_from_index"]})
+
+    assert [r for r in checked(out, "dataset").results if r.level in ("warn", "fail")] == []
