@@ -38,10 +38,18 @@ def write_whole(path: Path, write: Callable[[Path], object]) -> None:
 
 @contextlib.contextmanager
 def folder_lock(folder: Path) -> Iterator[None]:
-    """Hold a lock between processes for as long as the context lasts; the system frees it if the process dies."""
+    """Hold a lock between processes for as long as the context lasts; the system frees it if the process dies.
+
+    A folder that cannot be written to is not locked: nothing will be kept in it.
+    """
     import fcntl
 
-    with (folder / "lock").open("w") as file:
+    try:
+        file = (folder / "lock").open("w")
+    except OSError:
+        yield
+        return
+    with file:
         fcntl.flock(file, fcntl.LOCK_EX)
         try:
             yield

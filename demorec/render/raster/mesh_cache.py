@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from demorec.render.raster.cache import cache_folder, write_whole
+from demorec.render.raster.cache import cache_folder, folder_lock, write_whole
 from demorec.render.raster.mesh import Mesh
 
 log = logging.getLogger(__name__)
@@ -31,12 +31,19 @@ def cached_mesh(key: str, make: Callable[[], Mesh]) -> Mesh:
     """The mesh that `make` makes, from the cache when it was made before under this key.
 
     A file that cannot be read, whatever the reason, is made anew; a folder that cannot be written to costs time only.
+    Of several processes that ask at once, one makes it and the others wait.
     """
     name = hashlib.sha256(key.encode()).hexdigest()[:32]
     path = cache_folder("meshes", _version()) / f"{name}.npz"
     mesh = _read(path)
     if mesh is not None:
         return mesh
+    with folder_lock(path.parent):
+        mesh = _read(path)
+        return mesh if mesh is not None else _make(path, make)
+
+
+def _make(path: Path, make: Callable[[], Mesh]) -> Mesh:
     mesh = make()
     arrays = {"points": mesh.points, "faces": mesh.faces, "normals": mesh.normals, "colors": mesh.colors}
     if mesh.uv is not None:

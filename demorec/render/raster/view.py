@@ -22,7 +22,8 @@ from demorec.render.raster.kernels.records import flag_owners, set_up_records
 from demorec.render.raster.kernels.shade import shade_rows
 from demorec.render.raster.kernels.still import clear_queued, gather_still, list_tiles, restore_samples, shade_still
 from demorec.render.raster.kernels.triangles import draw_instances
-from demorec.render.raster.kernels.vertices import project_instances, transform_vertices
+from demorec.render.raster.kernels.vertices import aim_camera, project_instances, transform_vertices
+from demorec.render.raster.mesh import Floats
 from demorec.render.raster.stage import Stage
 from demorec.scene import Camera, Light
 
@@ -99,7 +100,6 @@ class View:
         self.camera = camera
         self._batch = batch
         self._stage = stage
-        self._light = light
         self._samples = 2 if antialias else 1
         self._want_depth, self._want_segments = depth, segmentation
         self._keep_still = keep_still
@@ -127,7 +127,8 @@ class View:
         k = camera.intrinsics
         self._lens = np.array([2 * k[0, 0] / w, 2 * k[1, 1] / h])
         self._focal = float(k[0, 0])
-        self._sky = np.zeros(layout.SKY_SIZE, dtype=np.float32)
+        self._clip_from_world = np.zeros((3, 4))
+        self._sky = _sky_table(light)
 
     def _make_records(self, count: int) -> None:
         self._corners = np.zeros((count, 3), dtype=np.int32)
@@ -138,8 +139,9 @@ class View:
 
     def draw(self, world_from_camera: Pose) -> CameraImages:
         """The picture of the stage's present state."""
-        self._aim(world_from_camera)
-        images = self._draw_changes(world_from_camera) if self._keep_still else self._draw_all()
+        pose = world_from_camera.vector()
+        self._aim(pose)
+        images = self._draw_changes(pose) if self._keep_still else self._draw_all()
         return CameraImages(
             color=images.color,
             depth=images.depth if self._want_depth else None,
@@ -147,33 +149,22 @@ class View:
             world_from_camera=world_from_camera,
         )
 
-    def _aim(self, world_from_camera: Pose) -> None:
+    def _aim(self, pose: Floats) -> None:
         """Matrices of the camera and of every instance, and the sky's rays."""
-        rotation, eye = world_from_camera.rotation, world_from_camera.position
-        clip = np.zeros((3, 4))
-        for row, axis, factor in ((0, 0, self._lens[0]), (1, 1, self._lens[1]), (2, 2, 1.0)):
-            clip[row, :3] = rotation[:, axis] * factor
-            clip[row, 3] = -float((rotation[:, axis] * eye).sum()) * factor
+        stage, camera = self._stage, self.camera
+        aim_camera(pose, self._lens, self._focal, camera.width, camera.height, self._clip_from_world, self._sky)
         project_instances(
-            self._stage.world_from_shape,
-            self._stage.centre,
-            self._stage.radius,
-            clip,
-            eye,
-            self.camera.near,
-            self.camera.far,
+            stage.world_from_shape,
+            stage.centre,
+            stage.radius,
+            self._clip_from_world,
+            pose,
+            camera.near,
+            camera.far,
             self._clip_from_shape,
             self._eye_in_shape,
             self._visible,
         )
-        right, down, forward = rotation[:, 0], rotation[:, 1], rotation[:, 2]
-        x, y = 0.5 - self.camera.width / 2, 0.5 - self.camera.height / 2
-        sky = 255 * np.asarray(self._light.sky_color, dtype=np.float64)
-        self._sky[layout.SKY_ORIGIN : layout.SKY_STEP_X] = forward + (right * x + down * y) / self._focal
-        self._sky[layout.SKY_STEP_X : layout.SKY_STEP_Y] = right / self._focal
-        self._sky[layout.SKY_STEP_Y : layout.SKY_HORIZON] = down / self._focal
-        self._sky[layout.SKY_HORIZON : layout.SKY_ZENITH] = sky + 0.35 * (250 - sky) * (sky < 250)
-        self._sky[layout.SKY_ZENITH :] = sky * 0.9
 
     def _new_images(self) -> _Images:
         h, w = self.camera.height, self.camera.width
@@ -255,6 +246,7 @@ class View:
         lowest = layout.BACKGROUND if everything else first
         heights = stage.heights if still is None else stage.still_heights
         edge_count = mixed_count = 0
+        self._flags[first:last] = 0
         if self._samples == 2:
             edge_count, mixed_count = resolve(
                 left,
@@ -269,10 +261,9 @@ class View:
                 0,
                 self._mixed,
                 self._want_depth or self._want_segments,
+                self._flags,
             )
-            self._flags[first:last] = 1
         else:
-            self._flags[first:last] = 0
             flag_owners(left, right, first, self._ids, self._flags)
         set_up_records(
             first,
@@ -368,9 +359,9 @@ class View:
         self._finish_edges(images, *counts, self._stage.heights)
         return images
 
-    def _draw_changes(self, world_from_camera: Pose) -> _Images:
+    def _draw_changes(self, pose: Floats) -> _Images:
         stage = self._stage
-        key = (world_from_camera.vector().tobytes(), stage.still_version)
+        key = (pose.tobytes(), stage.still_version)
         while True:
             if self._still is None or self._still.key != key:
                 self._still = self._draw_still(key)
@@ -469,3 +460,12 @@ class View:
             tile_pixels=tile_pixels[:count].copy(),
             gathered=gathered,
         )
+
+
+def _sky_table(light: Light) -> Floats32:
+    """See kernels.layout; the rays are those of no camera yet."""
+    table = np.zeros(layout.SKY_SIZE, dtype=np.float32)
+    sky = 255 * np.asarray(light.sky_color, dtype=np.float64)
+    table[layout.SKY_HORIZON : layout.SKY_ZENITH] = sky + 0.35 * (250 - sky) * (sky < 250)
+    table[layout.SKY_ZENITH :] = sky * 0.9
+    return table

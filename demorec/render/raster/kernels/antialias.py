@@ -30,7 +30,19 @@ def halve_extents(sample_left, sample_right, left, right, pixel_ids):
 
 @kernel
 def resolve(
-    left, right, first_record, ids, values, record_face, face_table, pixel_ids, edges, edge_count, mixed, want_mixed
+    left,
+    right,
+    first_record,
+    ids,
+    values,
+    record_face,
+    face_table,
+    pixel_ids,
+    edges,
+    edge_count,
+    mixed,
+    want_mixed,
+    flags,
 ):
     """Sort the pixels inside the extents: one surface, background, standing still, or an edge.
 
@@ -40,12 +52,14 @@ def resolve(
         pixel_ids: (H, W) result: record, BACKGROUND, STILL or EDGE.
         edges: Appended from `edge_count` on: y * W + x of pixels to be shaded sample by sample.
         mixed: Likewise, of all pixels whose samples differ (when `want_mixed`).
+        flags: Set of each record from `first_record` on that owns a sample.
 
     Returns:
         Numbers of entries in `edges` and in `mixed`.
     """
     width = pixel_ids.shape[1]
     mixed_count = 0
+    lowest = max(first_record, 0)
     for y in range(pixel_ids.shape[0]):
         for x in range(left[y], right[y]):
             a = ids[2 * y, 2 * x]
@@ -54,10 +68,15 @@ def resolve(
             d = ids[2 * y + 1, 2 * x + 1]
             if a == b and a == c and a == d:
                 pixel_ids[y, x] = a if a >= first_record else STILL
+                if a >= lowest:
+                    flags[a] = 1
                 continue
             if max(a, b, c, d) < first_record:
                 pixel_ids[y, x] = STILL
                 continue
+            for record in (a, b, c, d):
+                if record >= lowest:
+                    flags[record] = 1
             if want_mixed:
                 mixed[mixed_count] = y * width + x
                 mixed_count += 1

@@ -27,13 +27,14 @@ index = np.uintp  # an unsigned index spares the test for negative ones
 
 @functools.cache
 def compiled_folder() -> Path:
-    """Cache of the compiled code, one folder for each state of the sources, numba and kind of CPU.
+    """Cache of the compiled code, one folder for each state and place of the sources, numba and kind of CPU.
 
-    numba looks at the modification time of a kernel's own file, not at the files of the functions inlined into it.
+    numba compiles again when a kernel's own file has moved or has another modification time, but not when the files of
+    the functions inlined into it have changed: the folder stands for all of that, so that it is complete or empty.
     """
     digest = hashlib.sha256(f"{numba.__version__} {llvmlite.binding.get_host_cpu_name()}".encode())
     for path in sorted(Path(__file__).parent.glob("*.py")):
-        digest.update(path.name.encode() + path.read_bytes())
+        digest.update(f"{path} {path.stat().st_mtime_ns} ".encode() + path.read_bytes())
     return cache_folder("compiled", digest.hexdigest()[:16])
 
 

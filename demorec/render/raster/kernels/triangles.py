@@ -20,18 +20,26 @@ GUARD = 16.0
 """Triangles that reach farther than this many half pictures from the middle are clipped: beyond, the edge functions
 would leave the whole numbers that float64 holds."""
 SHIFT = at.TILE_SHIFT
+STRIP = 16
+"""Samples of a row that are tested at once. Fewer, and the compiler would unroll the loop instead of making vector code
+of it."""
+NARROW = 3 * STRIP
+"""Triangles narrower than this are tested sample by sample: less work than finding where each of their rows ends."""
 
 
 @inlined
 def fill_triangle(x0, y0, v0, x1, y1, v1, x2, y2, v2, area, width, height, values, ids, record, with_ids, left, right):
-    """Draw one triangle of positive area where its value is greater than what is there; returns whether it hit.
+    """Draw one triangle of positive area where its value is greater than what is there.
 
     Args:
         x0 .. y2: Corners, 1/256 sample, whole numbers in float64.
         v0, v1, v2: Value at the corners (inverse depth, height), linear over the picture.
         values, ids: (height * width,) greatest value so far, and the record it came from.
         with_ids: Whether ids, left and right are kept.
-        left, right: (height,) extents of what was drawn in each row, widened.
+        left, right: (height,) extents of what was drawn in each row, widened (to the corners, where narrow).
+
+    Returns:
+        Whether it may own a sample.
     """
     y_first = max(0, math.ceil((min(y0, y1, y2) - 128.0) / 256.0))
     y_last = min(height - 1, math.floor((max(y0, y1, y2) - 128.0) / 256.0))
@@ -72,34 +80,55 @@ def fill_triangle(x0, y0, v0, x1, y1, v1, x2, y2, v2, area, width, height, value
     b0 *= 256.0
     b1 *= 256.0
     b2 *= 256.0
-    hit = False
     span = x_last - x_first
-    if span < 4:
+    strips = span // STRIP + 1
+    # What lies beyond the row's end is read and written back: within the picture, that is.
+    if span < NARROW and y_last * width + x_first + strips * STRIP <= width * height:
+        limit = i4(span)
+        number = i4(record)
+        nearer_count = i4(0)
         for row in range(y_first, y_last + 1):
             if with_ids:
                 left[index(row)] = min(left[index(row)], i4(x_first))
                 right[index(row)] = max(right[index(row)], i4(x_last + 1))
+            start = row * width + x_first
             c0 = e0
             c1 = e1
             c2 = e2
             value = f4(row_value)
-            for k in range(span + 1):
-                if c0 >= 0.0 and c1 >= 0.0 and c2 >= 0.0:
-                    here = value + value_step * f4(k)
-                    q = index(row * width + x_first + k)
-                    hit = True
-                    if here > values[q]:
-                        values[q] = here
-                        if with_ids:
-                            ids[q] = record
-                c0 += a0
-                c1 += a1
-                c2 += a2
+            for strip in range(strips):
+                base = strip * STRIP
+                if with_ids:
+                    for k in range(STRIP):
+                        q = index(start + base + k)
+                        there = values[q]
+                        id_there = ids[q]
+                        column = i4(base + k)
+                        here = value + value_step * f4(column)
+                        j = f8(i4(k))
+                        inside = (c0 + a0 * j >= 0.0) & (c1 + a1 * j >= 0.0) & (c2 + a2 * j >= 0.0) & (column <= limit)
+                        nearer = inside & (here > there)
+                        values[q] = here if nearer else there
+                        ids[q] = number if nearer else id_there
+                        nearer_count += i4(nearer)
+                else:
+                    for k in range(STRIP):
+                        q = index(start + base + k)
+                        there = values[q]
+                        column = i4(base + k)
+                        here = value + value_step * f4(column)
+                        j = f8(i4(k))
+                        inside = (c0 + a0 * j >= 0.0) & (c1 + a1 * j >= 0.0) & (c2 + a2 * j >= 0.0) & (column <= limit)
+                        values[q] = here if inside & (here > there) else there
+                c0 += a0 * f8(STRIP)
+                c1 += a1 * f8(STRIP)
+                c2 += a2 * f8(STRIP)
             e0 += b0
             e1 += b1
             e2 += b2
             row_value += step_y
-        return hit
+        return nearer_count > 0
+    hit = False
     for row in range(y_first, y_last + 1):
         # Ends of the row's span: the quotients of exact whole numbers round to the right side.
         low = 0.0

@@ -61,16 +61,47 @@ def place_instances(
 
 
 @kernel
+def aim_camera(pose, lens, focal, width, height, clip_from_world, sky):
+    """Matrix of a camera, and the rays of its picture.
+
+    Args:
+        pose: (7,) world_from_camera, position and quaternion xyzw, OpenCV axes.
+        lens: (2,) focal lengths in half pictures.
+        focal: In pixels.
+        width, height: Pixels.
+        clip_from_world: (3, 4) result, rows x, y (picture between -w and w, y down), w = depth.
+        sky: Result: origin and steps of the rays (see layout); the colours stay.
+    """
+    x = pose[3]
+    y = pose[4]
+    z = pose[5]
+    w = pose[6]
+    right = (1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w))
+    down = (2 * (x * y - z * w), 1 - 2 * (x * x + z * z), 2 * (y * z + x * w))
+    forward = (2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y))
+    for row, axis, factor in ((0, right, lens[0]), (1, down, lens[1]), (2, forward, 1.0)):
+        for i in range(3):
+            clip_from_world[row, i] = axis[i] * factor
+        clip_from_world[row, 3] = -(axis[0] * pose[0] + axis[1] * pose[1] + axis[2] * pose[2]) * factor
+    left = 0.5 - width / 2
+    top = 0.5 - height / 2
+    for i in range(3):
+        sky[at.SKY_ORIGIN + i] = f4(forward[i] + (right[i] * left + down[i] * top) / focal)
+        sky[at.SKY_STEP_X + i] = f4(right[i] / focal)
+        sky[at.SKY_STEP_Y + i] = f4(down[i] / focal)
+
+
+@kernel
 def project_instances(
-    world_from_shape, centre, radius, clip_from_world, eye, near, far, clip_from_shape, eye_in_shape, visible
+    world_from_shape, centre, radius, clip_from_world, pose, near, far, clip_from_shape, eye_in_shape, visible
 ):
     """Matrices of every instance for one camera, and whether its bounding sphere can be seen.
 
     Args:
         world_from_shape: (n, 3, 4).
         centre, radius: (n, 3), (n,) bounding spheres in the shapes' frames.
-        clip_from_world: (3, 4), rows x, y (picture between -w and w, y down), w = depth.
-        eye: (3,) world.
+        clip_from_world: (3, 4), see `aim_camera`.
+        pose: (7,) world_from_camera, of which the position counts.
         near, far: Metres.
         clip_from_shape: (n, 3, 4) result.
         eye_in_shape: (n, 3) result.
@@ -87,7 +118,7 @@ def project_instances(
                 c[i, j] = p[i, 0] * m[0, j] + p[i, 1] * m[1, j] + p[i, 2] * m[2, j]
             c[i, 3] += p[i, 3]
             eye_in_shape[k, i] = (
-                m[0, i] * (eye[0] - m[0, 3]) + m[1, i] * (eye[1] - m[1, 3]) + m[2, i] * (eye[2] - m[2, 3])
+                m[0, i] * (pose[0] - m[0, 3]) + m[1, i] * (pose[1] - m[1, 3]) + m[2, i] * (pose[2] - m[2, 3])
             )
         x = c[0, 0] * centre[k, 0] + c[0, 1] * centre[k, 1] + c[0, 2] * centre[k, 2] + c[0, 3]
         y = c[1, 0] * centre[k, 0] + c[1, 1] * centre[k, 1] + c[1, 2] * centre[k, 2] + c[1, 3]
