@@ -1,20 +1,23 @@
 """The main job from scene to dataset: workers, executors, and the same job done the way people do it today.
 
-    python benchmarks/generate.py                                   a small sample
-    python benchmarks/generate.py --episodes 20 --rounds 3 --json generate.json
+    python benchmarks/generate.py                                   a small sample of everything below `--only`
+    python benchmarks/generate.py --episodes 12 --rounds 3 --only "demorec 1 worker" "today default"
+    python benchmarks/generate.py --scaling --episodes 12           one worker, two, two of Ray: what they cost beside
     python benchmarks/generate.py --memory 10 200                   peak memory at two lengths of a run
+    python benchmarks/generate.py --driver 1000 100000              run.json at two lengths of a run
 
 "Today" is PyBullet's TinyRenderer and `LeRobotDataset.add_frame` / `save_episode`, with LeRobot's defaults (AV1) and
 with streaming encoding; scenes, expert and picture sizes are ours, so that only the pipeline differs. Each variant
 is a process of its own and each round runs all of them one after the other; CPU time counts all processes that
-belong to a variant, so that ratios hold on a busy machine as well. Start-up is part of it; give more episodes to
-see less of it.
+belong to a variant, so that ratios hold on a busy machine as well. "All" has the start-up in it (imports, compiled
+code, the first episode), "steady" is what one more episode costs.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import statistics
 import subprocess
 import sys
@@ -22,11 +25,14 @@ import tempfile
 import threading
 import time
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import psutil
+
+from demorec.config import EpisodePlan
+from demorec.generate.run_file import Attempt
 
 OURS = ("demorec 1 worker", "demorec 2 workers", "demorec ray 2")
 TODAY = ("today default", "today streaming", "today default x2", "today streaming x2")
@@ -41,15 +47,24 @@ class Sample:
     episodes: int
     frames: int
     peak_bytes: int
-    steady: tuple[float, ...] = ()  # CPU seconds of each attempt of ours, as its worker measured them
+    steady: tuple[float, ...]  # CPU seconds of each episode, as the process that made it measured them
+    beside: float = 0.0  # CPU seconds an episode outside the workers, once they work
 
 
 class Meter:
-    """CPU seconds and memory of a process and all its descendants, sampled while they live."""
+    """CPU seconds and memory of a process and all its descendants, sampled while they live.
 
-    def __init__(self, pid: int) -> None:
+    Args:
+        pid: Of the process.
+        episodes: Folder whose files tell how many episodes are finished, to separate start-up from work.
+    """
+
+    def __init__(self, pid: int, episodes: Path | None = None) -> None:
         self._root = psutil.Process(pid)
+        self._episodes = episodes
         self._seen: dict[tuple[int, float], float] = {}
+        self._workers: set[tuple[int, float]] = set()
+        self._beside: dict[int, float] = {}  # finished episodes -> CPU seconds outside the workers at that moment
         self.peak_bytes = 0
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._watch, daemon=True)
@@ -64,12 +79,16 @@ class Meter:
                 continue
             for process in family:
                 try:
-                    times = process.cpu_times()
-                    self._seen[process.pid, process.create_time()] = times.user + times.system
+                    times, key = process.cpu_times(), (process.pid, process.create_time())
+                    self._seen[key] = times.user + times.system
                     total += process.memory_info().rss
+                    if is_worker(" ".join(process.cmdline())):
+                        self._workers.add(key)
                 except psutil.Error:
                     continue
             self.peak_bytes = max(self.peak_bytes, total)
+            finished = len(list(self._episodes.glob("*"))) if self._episodes is not None else 0
+            self._beside.setdefault(finished, sum(s for key, s in self._seen.items() if key not in self._workers))
 
     def stop(self) -> float:
         """CPU seconds of all that was seen."""
@@ -77,11 +96,25 @@ class Meter:
         self._thread.join()
         return sum(self._seen.values())
 
+    def beside(self) -> float:
+        """CPU seconds an episode outside the workers, from the first finished episode to the last."""
+        counts = sorted(count for count in self._beside if count)
+        if len(counts) < 2:
+            return 0.0
+        return (self._beside[counts[-1]] - self._beside[counts[0]]) / (counts[-1] - counts[0])
+
+
+def is_worker(command: str) -> bool:
+    """Whether a process of ours, of Python or of Ray carries out attempts."""
+    return "spawn_main" in command or "default_worker.py" in command or command.startswith(("ray::_att", "ray::IDLE"))
+
 
 def ours(name: str, episodes: int, folder: Path, args: argparse.Namespace) -> list[list[str]]:
     command = [sys.executable, "-c", "from demorec.cli import generate_dataset_main as main; main()"]
     command += ["--out", str(folder), "--num-episodes", str(episodes), "--no-check", "--seed", str(args.seed)]
-    command += ["--width", str(args.size), "--height", str(args.size)]
+    command += ["--width", str(args.size), "--height", str(args.size), "--cameras", *args.cameras]
+    if args.scaling:
+        command.append("--no-export")
     if name == "demorec ray 2":
         return [[*command, "--executor", "ray", "--workers", "2"]]
     return [[*command, "--workers", name.split()[1]]]
@@ -93,6 +126,7 @@ def today(name: str, episodes: int, folder: Path, args: argparse.Namespace) -> l
     return [
         [sys.executable, __file__, "--be-today", str(folder / f"shard{shard}"), "--first", str(first)]
         + ["--episodes", str(last - first), "--size", str(args.size), "--seed", str(args.seed)]
+        + ["--cameras", *args.cameras]
         + (["--streaming"] if "streaming" in name else [])
         for shard in range(shards)
         for first, last in [(episodes * shard // shards, episodes * (shard + 1) // shards)]
@@ -109,27 +143,33 @@ def run_variant(name: str, episodes: int, args: argparse.Namespace) -> Sample:
             subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
             for command in commands
         ]
-        meters = [Meter(process.pid) for process in processes]
+        meters = [Meter(process.pid, folder / "episodes") for process in processes]
         errors = [process.communicate()[1] for process in processes]
         wall = time.perf_counter() - start
         cpu = sum(meter.stop() for meter in meters)
         if any(process.returncode for process in processes):
             sys.exit(f"{name} failed:\n{''.join(errors)[-2000:]}")
-        dataset = [folder / "dataset"] if name in OURS else sorted(folder.glob("shard*"))
-        infos = [json.loads((root / "meta/info.json").read_text()) for root in dataset]
+        made = our_episodes(folder) if name in OURS else todays_episodes(folder)
         return Sample(
             cpu_seconds=cpu,
             wall_seconds=wall,
-            episodes=sum(info["total_episodes"] for info in infos),
-            frames=sum(info["total_frames"] for info in infos),
+            episodes=len(made),
+            frames=sum(frames for frames, _ in made),
             peak_bytes=sum(meter.peak_bytes for meter in meters),
-            steady=attempt_seconds(folder) if name in OURS else (),
+            steady=tuple(seconds for _, seconds in made),
+            beside=meters[0].beside(),
         )
 
 
-def attempt_seconds(folder: Path) -> tuple[float, ...]:
-    lines = json.loads((folder / "run.json").read_text())["episodes"]
-    return tuple(sum(line["seconds"].values()) for line in lines)
+def our_episodes(folder: Path) -> list[tuple[int, float]]:
+    """Frames and CPU seconds of each episode, its share of the export included."""
+    run = json.loads((folder / "run.json").read_text())
+    export = (run["export"] or {}).get("seconds", 0.0) / len(run["episodes"])
+    return [(line["num_frames"], sum(line["seconds"].values()) + export) for line in run["episodes"]]
+
+
+def todays_episodes(folder: Path) -> list[tuple[int, float]]:
+    return [(n, seconds) for path in sorted(folder.glob("shard*.json")) for n, seconds in json.loads(path.read_text())]
 
 
 def be_today(args: argparse.Namespace) -> None:
@@ -137,10 +177,12 @@ def be_today(args: argparse.Namespace) -> None:
     import numpy as np
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    from demorec.config import EpisodePlan, GenerateConfig
+    from demorec.config import GenerateConfig
     from demorec.rollout import Rollout, make_renderer, make_world, prepare
 
-    config = GenerateConfig(renderer="tiny", width=args.size, height=args.size, seed=args.seed)
+    config = GenerateConfig(
+        renderer="tiny", width=args.size, height=args.size, seed=args.seed, cameras=tuple(args.cameras)
+    )
     features: dict[str, Any] = {
         key: {"dtype": "float32", "shape": (8,), "names": [f"{key}.{i}" for i in range(8)]}
         for key in ("observation.state", "action")
@@ -156,10 +198,13 @@ def be_today(args: argparse.Namespace) -> None:
     )
     first = prepare(EpisodePlan(config=config, episode_index=args.first))
     with make_world(first.info) as world, make_renderer(first.info) as renderer:
+        made = []
         for index in range(args.first, args.first + args.episodes):
+            before, num_frames = os.times(), 0
             episode = prepare(EpisodePlan(config=config, episode_index=index))
             rollout = Rollout(world, episode, renderer)
             for frame in rollout:
+                num_frames += 1
                 state = np.append(frame.observation.joint_position[:7], frame.observation.gripper_width)
                 action = np.append(frame.action.joint_target, frame.action.gripper_target)
                 dataset.add_frame(
@@ -174,11 +219,15 @@ def be_today(args: argparse.Namespace) -> None:
                 dataset.save_episode()
             else:
                 dataset.clear_episode_buffer()
+            # The encoders of LeRobot are threads of this process or children that it waits for.
+            made.append((num_frames, sum(os.times()[:4]) - sum(before[:4])))
     dataset.finalize()
+    args.be_today.with_suffix(".json").write_text(json.dumps(made))
 
 
 def compare(args: argparse.Namespace) -> dict[str, Any]:
-    variants = [name for name in (*OURS, *TODAY) if not args.only or name in args.only]
+    everybody = OURS if args.scaling else (*OURS, *TODAY)
+    variants = [name for name in everybody if not args.only or name in args.only]
     samples: dict[str, list[Sample]] = {name: [] for name in variants}
     for number in range(args.rounds):
         for name in variants if number % 2 == 0 else reversed(variants):
@@ -189,29 +238,47 @@ def compare(args: argparse.Namespace) -> dict[str, Any]:
     for name, of_name in samples.items():
         cpu = statistics.median(s.cpu_seconds / s.episodes for s in of_name)
         wall = statistics.median(s.wall_seconds / s.episodes for s in of_name)
+        steady = statistics.median(seconds for s in of_name for seconds in s.steady)
         rows[name] = {
             "cpu_s_per_episode": cpu,
-            "episodes_per_hour_and_core": 3600 / cpu,
-            "frames_per_s_and_core": statistics.median(s.frames / s.cpu_seconds for s in of_name),
             "wall_s_per_episode": wall,
             "peak_mb": max(s.peak_bytes for s in of_name) / 1e6,
-            "steady_cpu_s_per_episode": statistics.median(x for s in of_name for x in s.steady)
-            if name in OURS
-            else cpu,
+            "steady_cpu_s_per_episode": steady,
+            "steady_episodes_per_hour_and_core": 3600 / steady,
+            "steady_frames_per_s_and_core": sum(s.frames for s in of_name) / sum(s.episodes for s in of_name) / steady,
+            "cpu_s_beside_per_episode": statistics.median(s.beside for s in of_name),
         }
-    head = f"{'':22}{'CPU s/ep':>9}{'ep/h/core':>11}{'frames/s/core':>15}{'wall s/ep':>11}{'MB':>7}{'steady':>8}"
-    print(f"{head}{'ratio':>8}")
     base = rows.get("demorec 1 worker")
+    print(f"{'':22}{'steady CPU s/ep':>16}{'ep/h/core':>11}{'frames/s/core':>15}{'ratio':>8}", end="")
+    print(f"{'all CPU s/ep':>14}{'ratio':>8}{'wall s/ep':>11}{'MB':>7}")
     for name, row in rows.items():
-        ratio = "" if base is None else f"{row['cpu_s_per_episode'] / base['cpu_s_per_episode']:8.2f}"
+        of_base = [
+            "" if base is None else f"{row[key] / base[key]:.2f}"
+            for key in ("steady_cpu_s_per_episode", "cpu_s_per_episode")
+        ]
         print(
-            f"{name:<22}{row['cpu_s_per_episode']:9.2f}{row['episodes_per_hour_and_core']:11.0f}"
-            f"{row['frames_per_s_and_core']:15.1f}{row['wall_s_per_episode']:11.2f}{row['peak_mb']:7.0f}"
-            f"{row['steady_cpu_s_per_episode']:8.2f}{ratio}"
+            f"{name:<22}{row['steady_cpu_s_per_episode']:16.2f}{row['steady_episodes_per_hour_and_core']:11.0f}"
+            f"{row['steady_frames_per_s_and_core']:15.1f}{of_base[0]:>8}{row['cpu_s_per_episode']:14.2f}{of_base[1]:>8}"
+            f"{row['wall_s_per_episode']:11.2f}{row['peak_mb']:7.0f}",
+            flush=True,
         )
-    if base is not None:
-        print("steady: median CPU seconds of an attempt, without start-up and export")
-        print("ratio: all CPU seconds an episode in units of demorec with one worker")
+    return rows
+
+
+def scaling(args: argparse.Namespace) -> dict[str, Any]:
+    """What an episode costs in all processes once they work: the same attempts, and what is beside them."""
+    rows = compare(args)
+    costs = {name: row["steady_cpu_s_per_episode"] + row["cpu_s_beside_per_episode"] for name, row in rows.items()}
+    for name, row in rows.items():
+        print(
+            f"{name:<22}attempts {row['steady_cpu_s_per_episode']:.3f} + beside {row['cpu_s_beside_per_episode']:.4f} "
+            f"= {costs[name]:.3f} CPU s an episode"
+        )
+    one, two, ray = (costs.get(name) for name in OURS)
+    if one and two:
+        print(f"parallel efficiency with 2 workers: {one / two:.3f}")
+    if two and ray:
+        print(f"overhead of Ray against 2 local workers: {100 * (ray / two - 1):.1f} %")
     return rows
 
 
@@ -241,15 +308,72 @@ def memory(args: argparse.Namespace) -> dict[str, Any]:
     return rows
 
 
+def make_nothing(plan: EpisodePlan, folder: Path) -> Attempt:
+    """A maker that only reports: what is left is the driver's work."""
+    index = plan.episode_index
+    return Attempt(
+        episode_index=index,
+        attempt=plan.attempt,
+        seed=plan.config.seed,
+        success=True,
+        file="",
+        sha256=f"{index:064x}",
+        digest=f"{index:064x}",
+        num_frames=219,
+        num_bytes=720_000,
+        seconds={"simulation": 0.123456789, "rendering": 0.123456789, "recording": 0.123456789},
+    )
+
+
+def driver(args: argparse.Namespace) -> dict[str, Any]:
+    """What an episode costs the driver, and what run.json costs it at several lengths of a run."""
+    from demorec.config import GenerateConfig
+    from demorec.generate.options import RunOptions
+    from demorec.generate.run import generate
+    from demorec.generate.run_file import load_run_file, save_run_file
+
+    config = GenerateConfig(cameras=())
+    rows: dict[str, Any] = {}
+    with tempfile.TemporaryDirectory(prefix="demorec-bench-") as temporary:
+        options = RunOptions(out=Path(temporary) / "run", num_episodes=min(args.driver), workers=2)
+        start = time.process_time()
+        run = generate(config, options, maker="generate:make_nothing").run
+        rows["report_s"] = (time.process_time() - start) / run.num_episodes
+        print(
+            f"driver: {1000 * rows['report_s']:.2f} ms of CPU an episode, of {run.num_episodes} that cost nothing else"
+        )
+        for count in args.driver:
+            plans = (EpisodePlan(config=config, episode_index=index) for index in range(count))
+            run = replace(run, num_episodes=count, attempts=tuple(make_nothing(plan, Path()) for plan in plans))
+            start = time.process_time()
+            save_run_file(run, Path(temporary))
+            saved = time.process_time()
+            load_run_file(Path(temporary))
+            rows[str(count)] = {
+                "save_s": saved - start,
+                "load_s": time.process_time() - saved,
+                "run_json_mb": (Path(temporary) / "run.json").stat().st_size / 1e6,
+            }
+            told = ", ".join(f"{name} {value:.2f}" for name, value in rows[str(count)].items())
+            print(
+                f"{count:8} episodes: {told}, this process {psutil.Process().memory_info().rss / 1e6:.0f} MB",
+                flush=True,
+            )
+    return rows
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--episodes", type=int, default=6, help="of ours in each round")
     parser.add_argument("--today-episodes", type=int, default=2, help="of today's way in each round (x2: at least 2)")
     parser.add_argument("--rounds", type=int, default=1)
     parser.add_argument("--size", type=int, default=224, help="of the pictures of both cameras")
+    parser.add_argument("--cameras", nargs="+", default=["front", "wrist"])
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", nargs="*", default=[], choices=[*OURS, *TODAY], help="only these variants")
+    parser.add_argument("--scaling", action="store_true", help="ours only, without export: efficiency and overhead")
     parser.add_argument("--memory", nargs="*", type=int, default=None, help="lengths of runs, instead of comparing")
+    parser.add_argument("--driver", nargs="*", type=int, default=None, help="lengths of runs, for run.json alone")
     parser.add_argument("--json", type=Path, help="also write the figures here")
     parser.add_argument("--be-today", type=Path, help=argparse.SUPPRESS)
     parser.add_argument("--first", type=int, default=0, help=argparse.SUPPRESS)
@@ -258,7 +382,8 @@ def main() -> None:
     if args.be_today:
         be_today(args)
         return
-    found = compare(args) if args.memory is None else memory(args)
+    stages = [(memory, args.memory), (driver, args.driver), (scaling, args.scaling), (compare, True)]
+    found = next(stage for stage, asked in stages if asked)(args)
     if args.json:
         args.json.write_text(json.dumps(found, indent=2))
 

@@ -135,12 +135,13 @@ def print_result(result: RunResult, export: ExportRecord | None, checked: CheckS
         target = folder / DATASET
         dataset_bytes = sum(path.stat().st_size for path in target.rglob("*") if path.is_file())
         rows.append(("dataset", f"{megabytes(dataset_bytes)} in {target} (repo id {export.repo_id})"))
-    rows.append(("CPU seconds", _seconds(attempts, export)))
+    if seconds := _seconds(attempts, export):
+        rows.append(("CPU seconds", seconds))
     if result.made:
         wall = result.session.wall_seconds
         rate = sum(a.success for a in result.made) / wall * 60
         rows.append(
-            ("this session", f"{wall:.1f} s with {result.session.workers} workers, {rate:.1f} episodes a minute")
+            ("this session", f"{wall:.1f} s with {_workers(result.session.workers)}, {rate:.1f} episodes a minute")
         )
     leftovers = sum(1 for path in (folder / UNFINISHED).rglob("*") if path.is_file())
     if leftovers:
@@ -175,6 +176,10 @@ def megabytes(count: float) -> str:
     return f"{count / 1e3:.1f} kB"
 
 
+def _workers(count: int) -> str:
+    return f"{count} worker" if count == 1 else f"{count} workers"
+
+
 def _failures(run: RunFile) -> str:
     causes = Counter(f"{a.phase}: {a.reason}" for a in run.failures)
     if not causes:
@@ -197,7 +202,7 @@ def print_estimate(estimate: Estimate, options: RunOptions) -> None:
     each = sum(estimate.cpu_seconds.values())
     stages = ", ".join(f"{stage} {seconds:.2f}" for stage, seconds in estimate.cpu_seconds.items())
     cores = available_cores()
-    workers = f"{estimate.workers} workers"
+    workers = _workers(estimate.workers)
     if options.executor == "local" and estimate.workers > cores:
         workers += f" on {cores} cores: at least {duration(estimate.seconds * estimate.workers / cores)}"
     rows = [

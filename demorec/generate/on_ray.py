@@ -8,6 +8,7 @@ the bound and the words are those of the local executor.
 from __future__ import annotations
 
 import logging
+import socket
 import time
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,8 @@ _QUEUED_PER_WORKER = 0.25
 """Attempts submitted beyond those that can run: Ray hands a freed CPU the next one without asking the driver."""
 _STORE_BYTES = 100 << 20
 """Object store of a cluster of our own: only lines of run.json pass through it."""
+_KNOCK_S = 10.0
+"""How long a cluster may take to answer the first time."""
 _RECOUNT_S = 5.0
 """How often the cluster is asked for its size."""
 
@@ -163,6 +166,7 @@ def _attempt(maker: str, plan: EpisodePlan, folder: str) -> Report:
 
 def _connect(address: str, cores: int) -> None:
     options: dict[str, Any] = {"logging_level": logging.ERROR, "log_to_driver": False}
+    _knock(address)
     try:
         if address == "local":
             ray.init(
@@ -170,8 +174,25 @@ def _connect(address: str, cores: int) -> None:
             )
         else:
             ray.init(address=address, **options)
-    except (ConnectionError, ValueError, RuntimeError) as error:
-        raise ConfigError(f"The Ray cluster at {address!r} cannot be reached: {_last_line(error)}") from error
+    except Exception as error:  # Ray raises a bare Exception when a node of its own does not come up in time
+        ray.shutdown()
+        place = "on this machine cannot be started" if address == "local" else f"at {address!r} cannot be reached"
+        raise ConfigError(f"The Ray cluster {place}: {_last_line(error)}") from error
+
+
+def _knock(address: str) -> None:
+    """See whether anybody listens at HOST:PORT: Ray itself would try for minutes before it gives up."""
+    host, _, port = address.rpartition(":")
+    if not host or "/" in host or not port.isdecimal():
+        return  # "local", "auto", ray://...: Ray knows where to look
+    try:
+        with socket.create_connection((host.strip("[]"), int(port)), timeout=_KNOCK_S):
+            pass
+    except (OSError, OverflowError) as error:
+        raise ConfigError(
+            f"The Ray cluster at {address!r} cannot be reached ({error}): give the address that `ray start --head` "
+            "has printed, or --address auto on a machine of the cluster."
+        ) from error
 
 
 def _last_line(error: BaseException) -> str:

@@ -1,4 +1,4 @@
-"""The Ray executor on a real cluster of two nodes: the same run as locally, also when a node or a worker is lost."""
+"""The Ray executor on a real cluster of two nodes: the same run as locally, also when nodes and workers are killed."""
 
 from __future__ import annotations
 
@@ -15,11 +15,14 @@ from helpers_generate import Remembers, expected_attempts, inspect, run_fake
 
 from demorec.config import GenerateConfig
 from demorec.errors import ConfigError, GenerationError
+from demorec.generate import on_ray
 from demorec.generate.options import RunOptions
 from demorec.generate.run import NoProgress, RunResult, generate
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 NUM_EPISODES = 60
+REAL = GenerateConfig(seed=5, cameras=("wrist",), width=32, height=32)
+NUM_REAL = 20
 
 
 def run_on_ray(out: Path, *, maker: str, progress: NoProgress | None = None, **options: float) -> RunResult:
@@ -38,21 +41,32 @@ def reference(tmp_path_factory) -> str:
     return result.run.digest
 
 
-@pytest.fixture
-def cluster(monkeypatch) -> Iterator[object]:
-    """Two nodes with one CPU each."""
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[object]:
+    """Two nodes with one CPU each, for all tests; no process of it is left behind."""
     import ray
     from ray.cluster_utils import Cluster
 
-    # The nodes' workers import the stand-in makers and the package under test as this process does.
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(Path(__file__).parents[1]), *sys.path]))
-    monkeypatch.setenv("RAY_raylet_start_wait_time_s", "300")  # a busy machine is no failure
-    nodes = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
-    nodes.add_node(num_cpus=1)
-    ray.init(address=nodes.address, log_to_driver=False)
-    yield nodes
-    ray.shutdown()
-    nodes.shutdown()
+    with pytest.MonkeyPatch.context() as patch:
+        # The nodes' workers import the stand-in makers and the package under test as this process does.
+        patch.setenv("PYTHONPATH", os.pathsep.join([str(Path(__file__).parents[1]), *sys.path]))
+        patch.setenv("RAY_worker_niceness", "0")  # 15 by default, which starves beside other tests
+        nodes = Cluster()
+        add_node(nodes, include_dashboard=False)
+        add_node(nodes)
+        ray.init(address=nodes.address, log_to_driver=False)
+        family = psutil.Process().children(recursive=True)
+        yield nodes
+        family += psutil.Process().children(recursive=True)
+        ray.shutdown()
+        nodes.shutdown()
+        _, alive = psutil.wait_procs(set(family), timeout=60)
+        assert not alive
+
+
+def add_node(cluster, **options: object) -> object:
+    """One more node, with one CPU and no services that these tests have no use for. Returns when it is ready."""
+    return cluster.add_node(num_cpus=1, include_log_monitor=False, no_monitor=True, **options)
 
 
 def when_finished(out: Path, count: int, act: Callable[[], None]) -> threading.Thread:
@@ -68,9 +82,36 @@ def when_finished(out: Path, count: int, act: Callable[[], None]) -> threading.T
     return thread
 
 
-def ray_workers() -> list[psutil.Process]:
-    """Processes that carry out tasks now."""
-    return [p for p in psutil.process_iter(["cmdline"]) if (p.info["cmdline"] or [""])[0].startswith("ray::_attempt")]
+class Killer:
+    """SIGKILL for workers and a node, each when so many episodes of a run are there."""
+
+    def __init__(self, out: Path) -> None:
+        self.workers: list[int] = []
+        self.nodes = 0
+        self._out = out
+        self._threads: list[threading.Thread] = []
+
+    def worker_at(self, *counts: int) -> None:
+        self._threads += [when_finished(self._out, count, self._kill_worker) for count in counts]
+
+    def node_at(self, count: int, cluster, node: object) -> None:
+        def kill() -> None:
+            cluster.remove_node(node, allow_graceful=False)
+            self.nodes += 1
+
+        self._threads.append(when_finished(self._out, count, kill))
+
+    def join(self) -> None:
+        for thread in self._threads:
+            thread.join(timeout=60)
+
+    def _kill_worker(self) -> None:
+        """One that carries out a task now."""
+        for process in psutil.process_iter(["cmdline"]):
+            if (process.info["cmdline"] or [""])[0].startswith("ray::_attempt") and process.pid not in self.workers:
+                process.kill()
+                self.workers.append(process.pid)
+                return
 
 
 def test_two_nodes_make_the_same_run(tmp_path, cluster, reference):
@@ -82,33 +123,41 @@ def test_two_nodes_make_the_same_run(tmp_path, cluster, reference):
     assert {name.split("-")[2] for name in seen} == {"1"}
 
 
-def test_a_node_that_goes_away_changes_nothing(tmp_path, cluster, reference):
-    heard = Remembers()
-    out = tmp_path / "run"
-    (node,) = cluster.worker_nodes
-    thread = when_finished(out, 10, lambda: cluster.remove_node(node, allow_graceful=False))
-    result = run_on_ray(out, maker="make_quickly", progress=heard)
-    thread.join(timeout=60)
-    assert not cluster.worker_nodes
+def test_a_node_that_is_killed_changes_nothing(tmp_path, cluster, reference):
+    heard, killer = Remembers(), Killer(tmp_path / "run")
+    killer.node_at(10, cluster, add_node(cluster))
+    result = run_on_ray(tmp_path / "run", maker="make_quickly", progress=heard)
+    killer.join()
+    assert killer.nodes == 1
     assert result.run.digest == reference
     assert {(a.episode_index, a.attempt): a.success for a in result.run.attempts} == expected_attempts(NUM_EPISODES)
 
 
 def test_killed_workers_are_made_up_for(tmp_path, cluster, reference):
-    out = tmp_path / "run"
-    killed = []
-
-    def kill_one() -> None:
-        for process in ray_workers()[:1]:
-            process.kill()
-            killed.append(process.pid)
-
-    threads = [when_finished(out, count, kill_one) for count in (5, 15, 25)]
-    result = run_on_ray(out, maker="make_quickly")
-    for thread in threads:
-        thread.join(timeout=60)
-    assert len(killed) >= 2
+    killer = Killer(tmp_path / "run")
+    killer.worker_at(5, 15, 25, 35)
+    result = run_on_ray(tmp_path / "run", maker="make_quickly")
+    killer.join()
+    assert len(killer.workers) >= 3
     assert result.run.digest == reference
+
+
+def test_the_real_job_is_the_same_in_every_way(tmp_path, cluster):
+    """One worker in order, two in reversed order, and Ray on two nodes with workers and a third node killed."""
+    one = generate(REAL, RunOptions(out=tmp_path / "one", num_episodes=NUM_REAL, workers=1))
+    backwards = list(reversed(range(NUM_REAL)))
+    two = generate(REAL, RunOptions(out=tmp_path / "two", num_episodes=NUM_REAL, workers=2), episodes=backwards)
+    killer = Killer(tmp_path / "ray")
+    killer.node_at(6, cluster, add_node(cluster))
+    killer.worker_at(3, 9, 13)
+    ray = generate(REAL, RunOptions(out=tmp_path / "ray", num_episodes=NUM_REAL, executor="ray"))
+    killer.join()
+    assert killer.nodes == 1
+    assert len(killer.workers) >= 2
+    assert len(one.run.successes) == NUM_REAL
+    assert {one.run.digest, two.run.digest, ray.run.digest} == {one.run.digest}
+    for other in (two, ray):
+        assert [a.sha256 for a in other.run.attempts] == [a.sha256 for a in one.run.attempts]
 
 
 def test_a_run_begun_on_ray_goes_on_without_it(tmp_path, cluster, reference):
@@ -123,11 +172,7 @@ def test_too_large_workers_are_refused(tmp_path, cluster):
         run_on_ray(tmp_path / "run", maker="make", gpus_per_worker=1.0)
 
 
-def test_an_unreachable_cluster_is_told(tmp_path):
-    with pytest.raises(ConfigError, match="cannot be reached"):
-        generate(
-            GenerateConfig(cameras=()),
-            RunOptions(out=tmp_path / "run", num_episodes=2, executor="ray", address="auto"),
-            maker="helpers_makers:make",
-            inspect=inspect,
-        )
+@pytest.mark.parametrize("address", ["127.0.0.1:1", "nowhere.invalid:6379", "127.0.0.1:99999"])
+def test_an_unreachable_cluster_is_told_at_once(tmp_path, address):
+    with pytest.raises(ConfigError, match=r"cannot be reached .* give the address that `ray start --head` has printed"):
+        on_ray._connect(address, 1)
