@@ -32,6 +32,8 @@ def _exactly[T](kind: type[T], accepted: type | tuple[type, ...]) -> Callable[[o
     """A hook that takes no value of another type, where cattrs would convert ("false" to True, 224.5 to 224)."""
 
     def hook(value: object, _: object) -> T:
+        if type(value) is kind:  # nearly always; the abstract types below are slow
+            return value
         if not isinstance(value, accepted) or (isinstance(value, bool) and kind is not bool):
             raise ValueError(f"{value!r} is no {_TYPE_WORDS[kind]}")
         return kind(value)  # type: ignore[call-arg]

@@ -8,15 +8,66 @@ temporal delimiters (AV1-ISOBMFF, section 2.4).
 from __future__ import annotations
 
 import struct
+from itertools import accumulate, pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from demorec.errors import ExportError
+from demorec.recording.video import is_keyframe
 
 _AV1_SEQUENCE_HEADER = 1
 _AV1_TEMPORAL_DELIMITER = 2
-_LARGE = 8192
+_H264_IDR = 5
 _PARAMETER_SETS = {"h264": (7, 8), "hevc": (32, 33, 34)}
+
+
+def mp4_samples(
+    codec: str, data: bytes, lengths: NDArray[np.int64]
+) -> tuple[bytes, NDArray[np.int64], NDArray[np.bool_]]:
+    """Access units back to back, as an mp4 file stores them; their lengths there; which ones are keyframes.
+
+    Raises:
+        ExportError: One of them is none.
+    """
+    if codec == "h264":
+        found = _h264_samples(data, lengths)
+        if found is not None:
+            return found
+    ends = [0, *accumulate(lengths.tolist())]
+    units = [data[a:b] for a, b in pairwise(ends)]
+    samples = [mp4_sample(codec, unit) for unit in units]
+    sizes = np.array([len(sample) for sample in samples], dtype=np.int64)
+    return b"".join(samples), sizes, np.array([is_keyframe(codec, unit) for unit in units], dtype=np.bool_)
+
+
+def _h264_samples(data: bytes, lengths: NDArray[np.int64]) -> tuple[bytes, NDArray[np.int64], NDArray[np.bool_]] | None:
+    """All of an episode at once; None for what encoders do not write, which one access unit at a time sorts out."""
+    values = np.frombuffer(data, dtype=np.uint8)
+    ends = np.cumsum(lengths)
+    begins = ends - lengths
+    zeros = np.flatnonzero(values[:-3] == 0)
+    codes = zeros[(values[zeros + 1] == 0) & (values[zeros + 2] == 1)]
+    unit = np.searchsorted(begins, codes, side="right") - 1
+    if not len(codes) or len(np.unique(unit)) != len(lengths):
+        return None
+    first = np.searchsorted(codes, begins)
+    gap = codes[first] - begins
+    starts, stops = codes + 3, np.minimum(np.append(codes[1:], len(values)), ends[unit])
+    if gap.max() > 1 or values[begins].any() or (starts >= stops).any():
+        return None
+    # A NAL unit never ends in a zero byte, so zeros before a start code belong to that start code.
+    while (padded := values[stops - 1] == 0).any():
+        stops = stops - padded
+    sizes = stops - starts
+    if sizes.min() < 1:
+        return None
+    heads = sizes.astype(">u4").tobytes()
+    parts: list[bytes] = []
+    for number, (start, stop) in enumerate(zip(starts.tolist(), stops.tolist(), strict=True)):
+        parts += (heads[4 * number : 4 * number + 4], data[start:stop])
+    is_idr = (values[starts] & 31) == _H264_IDR
+    return b"".join(parts), np.add.reduceat(sizes + 4, first), np.logical_or.reduceat(is_idr, first)
 
 
 def mp4_sample(codec: str, access_unit: bytes) -> bytes:
@@ -57,15 +108,7 @@ def parameter_sets(codec: str, access_unit: bytes) -> bytes:
 
 
 def _nal_units(access_unit: bytes) -> list[bytes]:
-    # A NAL unit never ends in a zero byte, so zeros before a start code belong to that start code.
-    if len(access_unit) < _LARGE:
-        before, *pieces = access_unit.split(b"\x00\x00\x01")
-    else:  # NumPy finds the start codes several times quicker, once its calls are paid for
-        values = np.frombuffer(access_unit, dtype=np.uint8)
-        zeros = np.flatnonzero(values[:-3] == 0)
-        codes = zeros[(values[zeros + 1] == 0) & (values[zeros + 2] == 1)].tolist()
-        before = access_unit[: codes[0]] if codes else access_unit
-        pieces = [access_unit[a + 3 : b] for a, b in zip(codes, [*codes[1:], len(access_unit)], strict=True)]
+    before, *pieces = access_unit.split(b"\x00\x00\x01")
     if before.strip(b"\x00") or not pieces:
         raise ExportError("A video packet does not begin with a start code: it is no Annex B stream.")
     return [nal for piece in pieces if (nal := piece.rstrip(b"\x00"))]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from dataclasses import replace
 from fractions import Fraction
 from typing import Any, cast
 
@@ -17,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.errors import ExportError
-from demorec.export.mp4 import CodedPicture, CodedVideo
+from demorec.export.mp4 import CodedVideo
 from demorec.export.stats import PixelHistogram
 from demorec.geometry import Array
 
@@ -63,9 +64,11 @@ def depth_video(pictures: Iterable[NDArray[np.float32]], *, fps: int) -> tuple[C
     if context is None:
         raise ExportError("There are no depth pictures to code.")
     packets += context.encode(None)
-    coded = [CodedPicture(data=bytes(packet), is_keyframe=packet.is_keyframe) for packet in packets]
+    data = [bytes(packet) for packet in packets]
+    video = CodedVideo.of_access_units("hevc", width, height, b"".join(data), [len(unit) for unit in data])
+    video = replace(video, is_keyframe=np.array([packet.is_keyframe for packet in packets], dtype=np.bool_))
     histogram = PixelHistogram(counts=counts[np.newaxis], level_values=code_values(), num_pictures=number)
-    return CodedVideo(codec="hevc", width=width, height=height, pictures=coded), histogram
+    return video, histogram
 
 
 def _encoder(width: int, height: int, fps: int) -> av.VideoCodecContext:

@@ -16,63 +16,57 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import IO, Protocol
+from typing import IO
 
 import av
 import numpy as np
+from numpy.typing import NDArray
 
 from demorec.errors import ExportError
-from demorec.export.bitstream import mp4_sample, parameter_sets
+from demorec.export.bitstream import mp4_samples, parameter_sets
 
 _DEMUXERS = {"h264": "h264", "hevc": "hevc", "av1": "obu"}
 _MATRIX = struct.pack(">9i", 0x10000, 0, 0, 0, 0x10000, 0, 0, 0, 0x40000000)
 _MOVIE_TIMESCALE = 1000
 
 
-class Picture(Protocol):
-    """One access unit and whether decoding can start there; the packets of a recording are such."""
-
-    @property
-    def data(self) -> bytes:
-        """The bytes."""
-
-    @property
-    def is_keyframe(self) -> bool:
-        """Whether it can be decoded by itself."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class CodedPicture:
-    """A picture that was coded here."""
-
-    data: bytes
-    is_keyframe: bool
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CodedVideo:
-    """The pictures of one camera in one episode.
+    """The T pictures of one camera in one episode.
 
     Attributes:
         codec: "h264", "hevc" or "av1".
-        pictures: In order; the first is a keyframe.
+        first: The first picture as it was coded, a keyframe.
+        samples: All pictures back to back, as an mp4 file stores them.
+        sizes: (T,) int64, bytes of each in `samples`.
+        is_keyframe: (T,) bool, which ones can be decoded by themselves.
     """
 
     codec: str
     width: int
     height: int
-    pictures: Sequence[Picture]
+    first: bytes
+    samples: bytes
+    sizes: NDArray[np.int64]
+    is_keyframe: NDArray[np.bool_]
 
-    @property
-    def num_bytes(self) -> int:
-        """Size of all pictures."""
-        return sum(len(picture.data) for picture in self.pictures)
+    @classmethod
+    def of_access_units(
+        cls, codec: str, width: int, height: int, data: bytes, lengths: Sequence[int] | NDArray[np.int64]
+    ) -> CodedVideo:
+        """From pictures back to back, as they were coded, and the length of each; ExportError if that is none."""
+        unit_lengths = np.asarray(lengths, dtype=np.int64)
+        samples, sizes, is_key = mp4_samples(codec, data, unit_lengths)
+        first = data[: int(unit_lengths[0])] if len(unit_lengths) else b""
+        return cls(
+            codec=codec, width=width, height=height, first=first, samples=samples, sizes=sizes, is_keyframe=is_key
+        )
 
     def parameter_sets(self) -> bytes:
         """Of the first picture; ExportError if that is no keyframe that stands alone."""
-        if not self.pictures or not self.pictures[0].is_keyframe:
+        if not len(self.is_keyframe) or not self.is_keyframe[0]:
             raise ExportError(f"The {self.codec} video does not start with a keyframe.")
-        return parameter_sets(self.codec, self.pictures[0].data)
+        return parameter_sets(self.codec, self.first)
 
 
 class Mp4Writer:
@@ -88,8 +82,7 @@ class Mp4Writer:
         self._path = path
         self._fps = fps
         self._size = (first.width, first.height)
-        self._codec = first.codec
-        self._sample_entry = _sample_entry(first.codec, first.pictures[0].data)
+        self._sample_entry = _sample_entry(first.codec, first.first)
         self._sizes = array("I")
         self._keyframes = array("I")
         self._chunks: list[tuple[int, int]] = []  # (samples, bytes) of each episode
@@ -99,17 +92,13 @@ class Mp4Writer:
 
     def add(self, video: CodedVideo) -> str:
         """Append the pictures of an episode; return the SHA-256 (hex) of their bytes in the file."""
-        samples = [mp4_sample(self._codec, picture.data) for picture in video.pictures]
-        block = b"".join(samples)
-        self._body.write(block)
-        self._sizes.extend(map(len, samples))
-        self._keyframes.extend(
-            number for number, picture in enumerate(video.pictures, start=self.num_frames + 1) if picture.is_keyframe
-        )
-        self._chunks.append((len(samples), len(block)))
-        self.num_frames += len(samples)
-        self.num_bytes += len(block)
-        return hashlib.sha256(block).hexdigest()
+        self._body.write(video.samples)
+        self._sizes.extend(video.sizes.tolist())
+        self._keyframes.extend((np.flatnonzero(video.is_keyframe) + self.num_frames + 1).tolist())
+        self._chunks.append((len(video.sizes), len(video.samples)))
+        self.num_frames += len(video.sizes)
+        self.num_bytes += len(video.samples)
+        return hashlib.sha256(video.samples).hexdigest()
 
     def close(self) -> None:
         """Write index and pictures into the final file; harmless when called twice."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,9 @@ class RollingParquet:
         position: Of the file that is being written, or of the next one.
         schema: Of the tables.
         num_bytes: Size of the finished files.
+
+    Args:
+        repeating: Columns that are worth a dictionary; all by default.
     """
 
     def __init__(
@@ -33,6 +37,7 @@ class RollingParquet:
         chunks_size: int,
         start: FilePosition,
         compression: str = "snappy",
+        repeating: Sequence[str] | None = None,
     ) -> None:
         self.position = start
         self.num_bytes = 0
@@ -42,6 +47,8 @@ class RollingParquet:
         self._limit = limit_mb * MEBIBYTE
         self._chunks_size = chunks_size
         self._compression = compression
+        # A dictionary of numbers that hardly repeat costs time and makes the file larger.
+        self._dictionary = True if repeating is None else list(repeating)
         self._rows = 0
         self._sink: Any = None
         self._writer: Any = None
@@ -62,7 +69,9 @@ class RollingParquet:
             self._path = self._root / self.position.path(self._template)
             self._path.parent.mkdir(parents=True, exist_ok=True)
             self._sink = pa.OSFile(str(self._path), "wb")
-            self._writer = pq.ParquetWriter(self._sink, self.schema, compression=self._compression, use_dictionary=True)
+            self._writer = pq.ParquetWriter(
+                self._sink, self.schema, compression=self._compression, use_dictionary=self._dictionary
+            )
             self._rows = 0
         self._writer.write_table(table, row_group_size=max(1, table.num_rows))
         self._rows += table.num_rows

@@ -95,9 +95,7 @@ def _chosen(offered: dict[str, Feature], options: ExportOptions) -> dict[str, Fe
                 f"Unknown feature {name!r}.{nearest_match(name, offered)} The recordings and these options give: "
                 f"{', '.join(offered)}."
             )
-    return {
-        name: feature for name, feature in offered.items() if name in AUTOMATIC_FEATURES or options.takes(name)
-    }
+    return {name: feature for name, feature in offered.items() if name in AUTOMATIC_FEATURES or options.takes(name)}
 
 
 def _camera_feature(shape: tuple[int, int, int], info: dict[str, object]) -> Feature:

@@ -12,7 +12,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from itertools import groupby
 from pathlib import Path
@@ -283,7 +283,9 @@ class SidecarWriter:
         self._attempt_rows: list[dict[str, Any]] = []
         self._configs: dict[str, Any] = dict(start.configs or {})
 
-    def _table(self, template: str, schema: pa.Schema, start: FilePosition) -> RollingParquet:
+    def _table(
+        self, template: str, schema: pa.Schema, start: FilePosition, repeating: Sequence[str] | None = None
+    ) -> RollingParquet:
         return RollingParquet(
             self._root,
             template,
@@ -292,6 +294,7 @@ class SidecarWriter:
             limit_mb=self._limit_mb,
             chunks_size=self._chunks_size,
             compression="zstd",
+            repeating=repeating,
         )
 
     def __enter__(self) -> SidecarWriter:
@@ -325,7 +328,9 @@ class SidecarWriter:
             schema = pa.schema(
                 [("episode_index", pa.int64()), ("frame_index", pa.int64()), *((name, _POSE) for name in poses)]
             )
-            self._camera_poses = self._table(SIDECAR_CAMERAS_PATH, schema, self._start.camera_poses)
+            self._camera_poses = self._table(
+                SIDECAR_CAMERAS_PATH, schema, self._start.camera_poses, repeating=["episode_index"]
+            )
         frames = len(next(iter(poses.values())))
         arrays = [pa.array(np.full(frames, episode_index)), pa.array(np.arange(frames))]
         arrays += [vector_array(poses[name], _POSE) for name in self._camera_poses.schema.names[2:]]

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from demorec.config import VideoConfig
 from demorec.errors import ExportError
-from demorec.export.mp4 import CodedPicture, CodedVideo, Picture
+from demorec.export.mp4 import CodedVideo
 from demorec.recording import Recording, VideoSettings
-from demorec.recording.video import is_keyframe, make_encoder
+from demorec.recording.video import make_encoder
 
 
 def reason_to_transcode(settings: VideoSettings, stride: int) -> str:
@@ -56,28 +56,29 @@ def coded_videos(
     """Camera -> its pictures for the frames `rows`: the recorded packets wherever that is possible."""
     stride = int(rows[1] - rows[0]) if len(rows) > 1 else 1
     reasons = {name: reason_to_transcode(recording.video_settings(name), stride) for name in cameras}
-    recorded = {} if all(reasons.values()) else recording.packets_of_all_cameras()
+    recorded = recording.coded_pictures([camera for camera, reason in reasons.items() if not reason])
     videos = {}
     for camera, reason in reasons.items():
         settings = recording.video_settings(camera)
-        pictures: Sequence[Picture]
+        size = settings.width, settings.height
         if reason:
-            codec, pictures = _transcoded(recording, camera, video, rows, settings.fps // stride)
-        else:
-            codec, packets = settings.codec, recorded[camera]
-            pictures = packets if stride == 1 else [packets[row] for row in rows]
-            if stride > 1 and not all(picture.is_keyframe for picture in pictures):
-                raise ExportError(
-                    f"The recording says that every {_ordinal(settings.gop)} picture of camera {camera} is a keyframe, "
-                    f"but it is not so: {recording.path}"
-                )
-        videos[camera] = CodedVideo(codec=codec, width=settings.width, height=settings.height, pictures=pictures)
+            codec, units = _transcoded(recording, camera, video, rows, settings.fps // stride)
+            videos[camera] = CodedVideo.of_access_units(codec, *size, b"".join(units), [len(unit) for unit in units])
+            continue
+        pictures = recorded[camera] if stride == 1 else recorded[camera].select(rows)
+        coded = CodedVideo.of_access_units(settings.codec, *size, pictures.joined(), pictures.lengths)
+        if stride > 1 and not coded.is_keyframe.all():
+            raise ExportError(
+                f"The recording says that every {_ordinal(settings.gop)} picture of camera {camera} is a keyframe, "
+                f"but it is not so: {recording.path}"
+            )
+        videos[camera] = coded
     return videos
 
 
 def _transcoded(
     recording: Recording, camera: str, video: VideoConfig, rows: NDArray[np.intp], fps: int
-) -> tuple[str, list[CodedPicture]]:
+) -> tuple[str, list[bytes]]:
     settings = recording.video_settings(camera)
     encoder = make_encoder(video=video, width=settings.width, height=settings.height, fps=fps)
     codec = encoder.settings.codec
@@ -87,7 +88,7 @@ def _transcoded(
         if index in wanted:
             packets += encoder.encode(picture)
     packets += encoder.finish()
-    return codec, [CodedPicture(data=data, is_keyframe=is_keyframe(codec, data)) for data in packets]
+    return codec, packets
 
 
 def video_info(settings: VideoSettings) -> dict[str, Any]:

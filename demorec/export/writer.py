@@ -116,7 +116,15 @@ class DatasetWriter:
         self._tasks = {task: index for index, task in enumerate(self._start.tasks)}
         self.num_episodes = self._start.num_episodes
         self.num_frames = self._start.num_frames
-        self._data = RollingParquet(root, DATA_PATH, self._schema, start=self._start.data, **_sizes(info))
+        strings = [name for name in self._schema.names if name not in self._numeric]
+        self._data = RollingParquet(
+            root,
+            DATA_PATH,
+            self._schema,
+            start=self._start.data,
+            repeating=["episode_index", "task_index", *strings],
+            **_sizes(info),
+        )
         self._episodes = RollingParquet(
             root, EPISODES_PATH, self._episode_schema(), start=self._start.episodes, **_sizes(info)
         )
@@ -182,12 +190,12 @@ class DatasetWriter:
         )
 
     def _add_video(self, key: str, video: CodedVideo, frames: int) -> tuple[dict[str, int | float], str]:
-        if len(video.pictures) != frames:
-            raise ExportError(f"{key} has {len(video.pictures)} pictures for {frames} frames.")
+        if len(video.sizes) != frames:
+            raise ExportError(f"{key} has {len(video.sizes)} pictures for {frames} frames.")
         file = self._videos.get(key)
         fps = self._info.fps
         if file is not None and (
-            file.num_bytes + video.num_bytes >= self._info.video_files_size_in_mb * MEBIBYTE
+            file.num_bytes + len(video.samples) >= self._info.video_files_size_in_mb * MEBIBYTE
             or (file.num_frames + frames) / fps > _MAX_SECONDS_PER_VIDEO
             or file.parameter_sets != video.parameter_sets()
         ):

@@ -117,6 +117,15 @@ def _slot_bytes(offsets: Sequence[int]) -> NDArray[np.intp]:
     return (np.array(offsets, dtype=np.intp)[:, None] + np.arange(8)).reshape(-1)
 
 
+def _runs(positions: NDArray[np.intp]) -> list[tuple[int, int]]:
+    """(first, last + 1) of the stretches without a gap in ascending positions."""
+    if not len(positions):
+        return []
+    cuts = np.flatnonzero(np.diff(positions) != 1) + 1
+    firsts, lasts = positions[[0, *cuts]], positions[[*(cuts - 1), -1]]
+    return [(int(a), int(b) + 1) for a, b in zip(firsts, lasts, strict=True)]
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Layout:
     """A message of constant length whose stamps and float64 values change.
@@ -157,16 +166,24 @@ class Layout:
         if any(len(message) != length for message in messages):
             found = next(len(message) for message in messages if len(message) != length)
             raise ValueError(f"a message of {found} bytes where {length} were expected")
-        if not messages:
-            return np.empty((0, self.num_values))
-        rows = np.frombuffer(b"".join(messages), dtype=np.uint8).reshape(len(messages), length)
-        fixed = np.ones(length, dtype=bool)
-        fixed[self.time_bytes] = False
-        fixed[self.value_bytes] = False
-        if not np.array_equal(rows[:, fixed], np.broadcast_to(self.constant[fixed], (len(rows), int(fixed.sum())))):
+        return self.decode_rows(np.frombuffer(b"".join(messages), dtype=np.uint8).reshape(len(messages), length))
+
+    def decode_rows(self, rows: NDArray[np.uint8]) -> Array:
+        """(N, K) values of messages of the right length, given as (N, L) bytes; ValueError as `decode`."""
+        values = np.empty((len(rows), self.num_values))
+        rest = rows.copy()
+        column = 0
+        for first, last in _runs(self.value_bytes):
+            count = (last - first) // 8
+            values[:, column : column + count] = np.ascontiguousarray(rows[:, first:last]).view("<f8")
+            rest[:, first:last] = 0
+            column += count
+        for first, last in _runs(self.time_bytes):
+            rest[:, first:last] = 0
+        # The slots of the constant are zero, so what is left must be the constant.
+        if not (rest == self.constant).all():
             raise ValueError("a message with other names or lengths than the episode's metadata")
-        values = np.ascontiguousarray(rows[:, self.value_bytes]).view("<f8")
-        return np.asarray(values.reshape(len(messages), self.num_values), dtype=np.float64)
+        return values
 
 
 class CdrReader:

@@ -15,15 +15,12 @@ from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
-import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import (
     Attachment,
     AttachmentIndex,
     Channel,
-    Chunk,
-    ChunkIndex,
     Footer,
     McapRecord,
     Metadata,
@@ -33,13 +30,11 @@ from mcap.records import (
 )
 
 from demorec.errors import RecordingError
+from demorec.recording.chunks import MAX_RECORD_BYTES, RECORD_HEAD, Block, ChunkPlace, blocks_of, chunk_content
 
 MAGIC = b"\x89MCAP0\r\n"
-_RECORD_HEAD = struct.Struct("<BQ")
 _MESSAGE_HEAD = struct.Struct("<HIQQ")
-_FOOTER_BYTES = _RECORD_HEAD.size + 20
-MAX_RECORD_BYTES = 1 << 30
-"""No recording has larger records; a damaged length must not fill the memory."""
+_FOOTER_BYTES = RECORD_HEAD.size + 20
 
 
 class Message(NamedTuple):
@@ -124,15 +119,16 @@ class Container:
     def _parse_summary(self, summary: bytes) -> None:
         channels: dict[int, Channel] = {}
         self.schemas: dict[int, Schema] = {}
-        self._chunks: list[ChunkIndex] = []
+        self._chunks: list[ChunkPlace] = []
         self._metadata: dict[str, MetadataIndex] = {}
         self._attachments: dict[str, AttachmentIndex] = {}
         counts: dict[int, int] = {}
         position = 0
         while position < len(summary):
-            opcode, length = _RECORD_HEAD.unpack_from(summary, position)
-            position += _RECORD_HEAD.size
-            stream = ReadDataStream(BytesIO(summary[position : position + length]))
+            opcode, length = RECORD_HEAD.unpack_from(summary, position)
+            position += RECORD_HEAD.size
+            content = summary[position : position + length]
+            stream = ReadDataStream(BytesIO(content))
             position += length
             if opcode == Opcode.CHANNEL:
                 channel = Channel.read(stream)
@@ -141,7 +137,7 @@ class Container:
                 schema = Schema.read(stream)
                 self.schemas[schema.id] = schema
             elif opcode == Opcode.CHUNK_INDEX:
-                self._chunks.append(ChunkIndex.read(stream))
+                self._chunks.append(ChunkPlace.read(content))
             elif opcode == Opcode.METADATA_INDEX:
                 metadata = MetadataIndex.read(stream)
                 self._metadata[metadata.name] = metadata
@@ -150,7 +146,7 @@ class Container:
                 self._attachments[attachment.name] = attachment
             elif opcode == Opcode.STATISTICS:
                 counts = dict(Statistics.read(stream).channel_message_counts)
-        self._chunks.sort(key=lambda chunk: chunk.chunk_start_offset)
+        self._chunks.sort(key=lambda chunk: chunk.start)
         self._topics = {channel.id: channel.topic for channel in channels.values()}
         self.channels = {channel.topic: channel for channel in channels.values()}
         self.counts = {channel.topic: counts.get(channel.id, 0) for channel in channels.values()}
@@ -164,12 +160,17 @@ class Container:
             raise RecordingError(f"The recording is damaged or cut off: {self.path}")
         return data
 
-    def _record_at[R: McapRecord](self, offset: int, length: int, opcode: Opcode, kind: type[R]) -> R:
+    def _content_at(self, offset: int, length: int, opcode: Opcode) -> memoryview:
         data = self._read_at(offset, length)
-        found, content_length = _RECORD_HEAD.unpack_from(data)
-        if found != opcode or content_length != length - _RECORD_HEAD.size:
-            raise RecordingError(f"The recording is damaged: no {kind.__name__} where its index says: {self.path}")
-        record: R = kind.read(ReadDataStream(BytesIO(data[_RECORD_HEAD.size :])))
+        found, content_length = RECORD_HEAD.unpack_from(data)
+        if found != opcode or content_length != length - RECORD_HEAD.size:
+            raise RecordingError(
+                f"The recording is damaged: no {opcode.name.capitalize()} where its index says: {self.path}"
+            )
+        return memoryview(data)[RECORD_HEAD.size :]
+
+    def _record_at[R: McapRecord](self, offset: int, length: int, opcode: Opcode, kind: type[R]) -> R:
+        record: R = kind.read(ReadDataStream(BytesIO(self._content_at(offset, length, opcode))))
         return record
 
     def metadata(self, name: str) -> dict[str, str] | None:
@@ -196,7 +197,7 @@ class Container:
         index = self._attachments[name]
         with damage_as_recording_error(self.path):
             data = self._read_at(index.offset, index.length)
-            content, stored = data[_RECORD_HEAD.size : -4], int.from_bytes(data[-4:], "little")
+            content, stored = data[RECORD_HEAD.size : -4], int.from_bytes(data[-4:], "little")
             if zlib.crc32(content) != stored:
                 raise RecordingError(
                     f"The recording is damaged: the attachment {name!r} fails its checksum: {self.path}"
@@ -208,40 +209,29 @@ class Container:
         """Messages of some topics in the order of the file; chunks without them are not read."""
         wanted = {self.channels[topic].id: topic for topic in topics if topic in self.channels}
         for index in self._chunks:
-            if wanted.keys().isdisjoint(index.message_index_offsets):
+            if wanted.keys().isdisjoint(index.channels):
                 continue
             with damage_as_recording_error(self.path):
                 found = list(_messages_of(self._chunk_content(index), wanted))
             yield from found
 
-    def _chunk_content(self, index: ChunkIndex) -> bytes:
-        chunk = self._record_at(index.chunk_start_offset, index.chunk_length, Opcode.CHUNK, Chunk)
-        if chunk.uncompressed_size != index.uncompressed_size:
-            raise RecordingError(f"The recording is damaged: a chunk differs from its index: {self.path}")
-        return _uncompressed(chunk)
+    def blocks(self, topics: Collection[str]) -> dict[str, Block]:
+        """topic -> all its messages; the chunks that hold any of them are in memory together."""
+        wanted = {topic: self.channels[topic].id if topic in self.channels else -1 for topic in topics}
+        places = [place for place in self._chunks if not place.channels.isdisjoint(wanted.values())]
+        with damage_as_recording_error(self.path):
+            return blocks_of([self._chunk_content(place) for place in places], wanted)
 
-
-def _uncompressed(chunk: Chunk) -> bytes:
-    """The records of a chunk; ValueError or ZstdError when it is damaged."""
-    if chunk.uncompressed_size > MAX_RECORD_BYTES:
-        raise ValueError(f"a chunk of {chunk.uncompressed_size} bytes")
-    if chunk.compression == "zstd":
-        data = zstandard.decompress(chunk.data, max_output_size=chunk.uncompressed_size)
-    elif chunk.compression == "":
-        data = chunk.data
-    else:
-        raise ValueError(f"a chunk compressed with {chunk.compression!r}, expected zstd")
-    if len(data) != chunk.uncompressed_size or zlib.crc32(data) != chunk.uncompressed_crc:
-        raise ValueError("a chunk fails its checksum")
-    return data
+    def _chunk_content(self, place: ChunkPlace) -> bytes:
+        return chunk_content(self._content_at(place.start, place.length, Opcode.CHUNK), place.uncompressed_size)
 
 
 def _records_of(content: bytes) -> Iterator[tuple[int, bytes]]:
     """(opcode, content) of the records in a chunk."""
     position = 0
     while position < len(content):
-        opcode, length = _RECORD_HEAD.unpack_from(content, position)
-        position += _RECORD_HEAD.size
+        opcode, length = RECORD_HEAD.unpack_from(content, position)
+        position += RECORD_HEAD.size
         if position + length > len(content):
             raise ValueError("a record that reaches beyond its chunk")
         yield opcode, content[position : position + length]
@@ -252,8 +242,8 @@ def _messages_of(content: bytes, wanted: dict[int, str]) -> Iterator[Message]:
     # Every record of a chunk comes through here: those that are not wanted are stepped over, not copied.
     position, end = 0, len(content)
     while position < end:
-        opcode, length = _RECORD_HEAD.unpack_from(content, position)
-        start = position + _RECORD_HEAD.size
+        opcode, length = RECORD_HEAD.unpack_from(content, position)
+        start = position + RECORD_HEAD.size
         position = start + length
         if position > end:
             raise ValueError("a record that reaches beyond its chunk")
@@ -297,11 +287,11 @@ def salvage(path: Path) -> Iterator[SalvagedMessage | SalvagedMetadata | str | N
         schemas: dict[int, str] = {}
         channels: dict[int, Channel] = {}
         while True:
-            head = file.read(_RECORD_HEAD.size)
-            if len(head) < _RECORD_HEAD.size:
+            head = file.read(RECORD_HEAD.size)
+            if len(head) < RECORD_HEAD.size:
                 yield "the end is missing"
                 return
-            opcode, length = _RECORD_HEAD.unpack(head)
+            opcode, length = RECORD_HEAD.unpack(head)
             if length > min(size - file.tell(), MAX_RECORD_BYTES):
                 yield "a record is cut off"
                 return
@@ -333,7 +323,7 @@ def _salvaged(
         channel = Channel.read(stream)
         channels[channel.id] = channel
     elif opcode == Opcode.CHUNK:
-        for inner, record_content in _records_of(_uncompressed(Chunk.read(stream))):
+        for inner, record_content in _records_of(chunk_content(content)):
             yield from _salvaged(inner, record_content, schemas, channels)
     elif opcode == Opcode.MESSAGE:
         channel_id, _, log_time, _ = _MESSAGE_HEAD.unpack_from(content)

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from demorec.episode import Event
 from demorec.geometry import Array, Pose
 from demorec.recording.cdr import CdrReader, CdrWriter
+from demorec.recording.chunks import Block
 from demorec.recording.pixels import PixelStatistics
 from demorec.scene import Camera
 
@@ -119,17 +120,49 @@ _U32 = struct.Struct("<I")
 
 def read_compressed_image(data: bytes) -> bytes:
     """The coded picture of a `compressed_image`."""
-    # By hand, since every picture of an export comes through here: encapsulation (4 bytes) and stamp (8), then two
-    # strings and the octets, each after its length, which starts at a multiple of four.
+    start = _compressed_image_start(data)
+    (length,) = _U32.unpack_from(data, start - 4)
+    picture = data[start : start + length]
+    if len(picture) != length:
+        raise ValueError("a picture that is cut off")
+    return picture
+
+
+def _compressed_image_start(data: bytes) -> int:
+    """Where the picture begins in a message, its length in the four bytes before."""
+    # Encapsulation (4 bytes) and stamp (8), then two strings and the octets, each after its length, which starts at a
+    # multiple of four.
     position = 12
     for _ in range(2):
         (length,) = _U32.unpack_from(data, position)
         position = (position + 4 + length + 3) & ~3
-    (length,) = _U32.unpack_from(data, position)
-    picture = data[position + 4 : position + 4 + length]
-    if len(picture) != length:
+    return position + 4
+
+
+def coded_pictures(block: Block, codec: str) -> Block:
+    """The coded pictures alone, given the messages of a camera; ValueError for what is no picture."""
+    if codec == "av1":
+        return _one_by_one(block, read_protobuf_video)
+    if not len(block):
+        return block
+    start = _compressed_image_start(next(iter(block.messages())))
+    heads = block.heads(start)
+    constant = np.ones(start, dtype=np.bool_)
+    constant[4:12] = constant[-4:] = False  # stamp, length of the picture
+    if not (heads[:, constant] == heads[0, constant]).all():
+        return _one_by_one(block, read_compressed_image)
+    lengths = np.ascontiguousarray(heads[:, -4:]).view("<u4").reshape(-1).astype(np.int64)
+    if (lengths > block.lengths - start).any():
         raise ValueError("a picture that is cut off")
-    return picture
+    return replace(block, starts=block.starts + start, lengths=lengths)
+
+
+def _one_by_one(block: Block, read: Callable[[bytes], bytes]) -> Block:
+    pictures = [read(message) for message in block.messages()]
+    lengths = np.array([len(picture) for picture in pictures], dtype=np.int64)
+    return Block(
+        content=b"".join(pictures), time_ns=block.time_ns, starts=np.cumsum(lengths) - lengths, lengths=lengths
+    )
 
 
 def protobuf_video(time_ns: int, frame_id: str, video_format: str, data: bytes) -> bytes:

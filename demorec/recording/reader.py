@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -18,6 +18,7 @@ from demorec.errors import RecordingError
 from demorec.geometry import Array
 from demorec.plain import to_json, to_plain
 from demorec.recording import channels, messages, metadata
+from demorec.recording.chunks import Block
 from demorec.recording.container import Container, damage_as_recording_error
 from demorec.recording.depth import decode_depth
 from demorec.recording.labels import decode_labels, from_labels
@@ -116,39 +117,35 @@ class Recording:
             )
         return self._cameras[camera]
 
-    def _frame_times(self) -> list[int]:
-        return [frame_time_ns(index, self.info.fps) for index in range(self.num_frames)]
+    def _frame_times(self) -> NDArray[np.int64]:
+        """(T,) `frame_time_ns` of every frame."""
+        fps = self.info.fps
+        return (np.arange(self.num_frames, dtype=np.int64) * 2_000_000_000 + fps) // (2 * fps)
 
     def columns(self) -> EpisodeColumns:
         """All numbers, one row a frame, to the bit as they were written."""
         streams = {stream.topic: stream for stream in channels.state_streams(self.info)}
-        data: dict[str, list[bytes]] = {topic: [] for topic in streams}
-        times: dict[str, list[int]] = {topic: [] for topic in streams}
-        changes: dict[str, list[tuple[int, bytes]]] = {channels.PHASE: [], channels.DELIBERATE_MISS: []}
-        expected = self._frame_times()
-        is_frame = frozenset(expected)
-        for message in self._container.messages((*streams, *changes)):
-            if message.topic in changes:
-                changes[message.topic].append((message.time_ns, message.data))
-            elif message.topic != channels.JOINT_STATES or message.time_ns in is_frame:
-                data[message.topic].append(message.data)
-                times[message.topic].append(message.time_ns)
+        times = self._frame_times()
+        blocks = self._container.blocks((*streams, channels.PHASE, channels.DELIBERATE_MISS))
+        joint_states = blocks[channels.JOINT_STATES]  # there may be more of these between the frames
+        blocks[channels.JOINT_STATES] = joint_states.select(np.isin(joint_states.time_ns, times))
         rows: dict[str, Array] = {}
         with damage_as_recording_error(self.path):
             for topic, stream in streams.items():
-                if times[topic] != expected:
+                block = blocks[topic]
+                if not np.array_equal(block.time_ns, times):
                     raise RecordingError(
-                        f"The recording has {len(times[topic])} messages on {topic} at other times than its "
-                        f"{len(expected)} frames: {self.path}"
+                        f"The recording has {len(block)} messages on {topic} at other times than its "
+                        f"{len(times)} frames: {self.path}"
                     )
-                rows[topic] = stream.layout.decode(data[topic])
-            phases = [(time, messages.read_string(raw)) for time, raw in changes[channels.PHASE]]
-            misses = [(time, messages.read_boolean(raw)) for time, raw in changes[channels.DELIBERATE_MISS]]
+                rows[topic] = stream.layout.decode_rows(block.rows(len(stream.layout.constant)))
+            phases = _held(blocks[channels.PHASE], messages.read_string, times, "")
+            misses = _held(blocks[channels.DELIBERATE_MISS], messages.read_boolean, times, False)
         joints = rows[channels.JOINT_STATES].reshape(self.num_frames, 3, len(self.info.robot.joint_names))
         gripper, action, command = (rows[topic] for topic in (channels.GRIPPER, channels.ACTION, channels.COMMAND))
         num_arm = len(self.info.robot.arm_joints)
         return EpisodeColumns(
-            time_ns=np.array(expected, dtype=np.int64),
+            time_ns=times,
             joint_position=joints[:, 0].copy(),
             joint_velocity=joints[:, 1].copy(),
             joint_effort=joints[:, 2].copy(),
@@ -162,8 +159,8 @@ class Recording:
             command_joint_target=command[:, :num_arm].copy(),
             command_gripper=command[:, num_arm].copy(),
             command_base_from_tcp=rows[channels.COMMAND + channels.EE_POSE],
-            phase=tuple(_held(phases, expected, "")),
-            is_deliberate_miss=np.array(list(_held(misses, expected, False)), dtype=np.bool_),
+            phase=tuple(phases),
+            is_deliberate_miss=np.array(misses, dtype=np.bool_),
             world_from_camera={name: rows[channels.camera_topic(name, "pose")] for name in self.cameras},
         )
 
@@ -200,34 +197,30 @@ class Recording:
         for index, (time_ns, data) in enumerate(self._pictures(channels.video_topic(camera, codec), read)):
             yield VideoPacket(frame_index=index, time_ns=time_ns, data=data, is_keyframe=is_keyframe(codec, data))
 
-    def packets_of_all_cameras(self) -> dict[str, list[VideoPacket]]:
-        """camera -> what `packets` gives, in one pass over the file; all of them are in memory then."""
-        codecs = {camera: self.video_settings(camera).codec for camera in self.cameras}
-        cameras = {channels.video_topic(camera, codec): camera for camera, codec in codecs.items()}
+    def coded_pictures(self, cameras: Sequence[str]) -> dict[str, Block]:
+        """camera -> its coded pictures, one a frame, all read in one pass; they are in memory together."""
+        codecs = {camera: self.video_settings(camera).codec for camera in cameras}
+        topics = {camera: channels.video_topic(camera, codec) for camera, codec in codecs.items()}
+        found = self._container.blocks(tuple(topics.values()))
         times = self._frame_times()
-        found: dict[str, list[VideoPacket]] = {camera: [] for camera in self.cameras}
-        with damage_as_recording_error(self.path):
-            for message in self._container.messages(tuple(cameras)):
-                camera = cameras[message.topic]
-                codec, index = codecs[camera], len(found[camera])
-                if index >= self.num_frames or message.time_ns != times[index]:
-                    raise RecordingError(
-                        f"Picture {index} of {message.topic} is at {message.time_ns} ns, not at its frame's time: "
-                        f"{self.path}"
-                    )
-                read = messages.read_protobuf_video if codec == "av1" else messages.read_compressed_image
-                data = read(message.data)
-                packet = VideoPacket(
-                    frame_index=index, time_ns=message.time_ns, data=data, is_keyframe=is_keyframe(codec, data)
-                )
-                found[camera].append(packet)
-        for camera, packets in found.items():
-            if len(packets) != self.num_frames:
+        pictures = {}
+        for camera, topic in topics.items():
+            block = found[topic]
+            known = block.time_ns[: self.num_frames]
+            wrong = np.flatnonzero(known != times[: len(known)])
+            if len(wrong) or len(block) > self.num_frames:
+                index = int(wrong[0]) if len(wrong) else self.num_frames
                 raise RecordingError(
-                    f"The recording has {self.num_frames} frames, but {len(packets)} pictures of camera {camera}: "
+                    f"Picture {index} of {topic} is at {block.time_ns[index]} ns, not at its frame's time: {self.path}"
+                )
+            if len(block) != self.num_frames:
+                raise RecordingError(
+                    f"The recording has {self.num_frames} frames, but {len(block)} pictures of camera {camera}: "
                     f"{self.path}"
                 )
-        return found
+            with damage_as_recording_error(self.path):
+                pictures[camera] = messages.coded_pictures(block, codecs[camera])
+        return pictures
 
     def depth(self, camera: str) -> Iterator[NDArray[np.float32]]:
         """Depth pictures, (H, W) float32 metres in steps of a millimetre, 0 where nothing was hit, one a frame."""
@@ -327,11 +320,8 @@ def _column_bytes(columns: EpisodeColumns) -> Iterator[tuple[str, bytes]]:
             yield field.name, value.tobytes() if isinstance(value, np.ndarray) else "\n".join(value).encode()
 
 
-def _held[V](changes: list[tuple[int, V]], times: list[int], first: V) -> Iterator[V]:
-    """The value that holds at each time, given the values at the times when it changed."""
-    position, value = 0, first
-    for time in times:
-        while position < len(changes) and changes[position][0] <= time:
-            value = changes[position][1]
-            position += 1
-        yield value
+def _held[V](block: Block, read: Callable[[bytes], V], times: NDArray[np.int64], first: V) -> list[V]:
+    """The value that holds at each time, given the messages that tell its changes."""
+    values = [first, *map(read, block.messages())]
+    numbers = np.searchsorted(np.maximum.accumulate(block.time_ns), times, side="right")
+    return [values[number] for number in numbers.tolist()]

@@ -12,10 +12,10 @@ import pytest
 
 from demorec.config import VideoConfig
 from demorec.errors import ExportError
-from demorec.export.bitstream import mp4_sample, parameter_sets
+from demorec.export.bitstream import parameter_sets
 from demorec.export.depth import code_values, depth_video, quantised
-from demorec.export.mp4 import CodedPicture, CodedVideo, Mp4Writer
-from demorec.recording import VideoPacket
+from demorec.export.mp4 import CodedVideo, Mp4Writer
+from demorec.recording import VideoPacket, VideoSettings
 from demorec.recording.video import decode, is_keyframe, make_encoder
 
 WIDTH, HEIGHT = 64, 48
@@ -27,19 +27,30 @@ def pictures(count: int, seed: int = 0) -> list[np.ndarray]:
     return [np.roll(base, 3 * index, axis=1) for index in range(count)]
 
 
+def encoded(
+    codec: str, count: int, *, fps: int = 30, seed: int = 0, crf: int | None = None
+) -> tuple[VideoSettings, list[bytes]]:
+    encoder = make_encoder(video=VideoConfig(codec=codec, crf=crf), width=WIDTH, height=HEIGHT, fps=fps)  # type: ignore[arg-type]
+    packets = [packet for picture in pictures(count, seed) for packet in encoder.encode(picture)] + encoder.finish()
+    return encoder.settings, packets
+
+
 def coded(
     codec: str, count: int, *, fps: int = 30, seed: int = 0, crf: int | None = None
 ) -> tuple[CodedVideo, list[np.ndarray]]:
     """A video and what a decoder makes of its packets."""
-    encoder = make_encoder(video=VideoConfig(codec=codec, crf=crf), width=WIDTH, height=HEIGHT, fps=fps)  # type: ignore[arg-type]
-    packets = [packet for picture in pictures(count, seed) for packet in encoder.encode(picture)] + encoder.finish()
+    settings, packets = encoded(codec, count, fps=fps, seed=seed, crf=crf)
     video_packets = [
         VideoPacket(frame_index=i, time_ns=i, data=data, is_keyframe=is_keyframe(codec, data))
         for i, data in enumerate(packets)
     ]
-    decoded = list(decode(encoder.settings, video_packets))
-    parts = [CodedPicture(data=packet.data, is_keyframe=packet.is_keyframe) for packet in video_packets]
-    return CodedVideo(codec=codec, width=WIDTH, height=HEIGHT, pictures=parts), decoded
+    decoded = list(decode(settings, video_packets))
+    return video_of(codec, packets), decoded
+
+
+def video_of(codec: str, packets: list[bytes]) -> CodedVideo:
+    lengths = [len(packet) for packet in packets]
+    return CodedVideo.of_access_units(codec, WIDTH, HEIGHT, b"".join(packets), lengths)
 
 
 @pytest.mark.parametrize(("codec", "fps"), [("h264", 30), ("h264", 7), ("h264", 240), ("av1", 30), ("av1", 15)])
@@ -80,24 +91,76 @@ def test_the_index_is_in_front_and_seeking_finds_keyframes(tmp_path: Path) -> No
         assert np.array_equal(frame.to_ndarray(format="rgb24"), expected[number])
 
 
-def test_the_packets_are_what_ffmpeg_would_write(tmp_path: Path) -> None:
-    """Against libav's own muxer: the same samples for every codec."""
-    depth, _ = depth_video([np.full((HEIGHT, WIDTH), 0.5 + n / 10, dtype=np.float32) for n in range(4)], fps=30)
-    for video in (coded("h264", 6)[0], coded("av1", 6)[0], depth):
-        demuxer = {"h264": "h264", "av1": "obu", "hevc": "hevc"}[video.codec]
-        buffer = io.BytesIO()
-        source = av.open(io.BytesIO(video.pictures[0].data), format=demuxer)
-        with av.open(buffer, "w", format="mp4") as target:
-            stream = target.add_stream_from_template(source.streams.video[0], opaque=True)
-            for number, picture in enumerate(video.pictures):
-                packet = av.Packet(picture.data)
-                packet.pts = packet.dts = number
-                packet.duration, packet.time_base, packet.stream = 1, Fraction(1, 30), stream
-                packet.is_keyframe = picture.is_keyframe
-                target.mux_one(packet)
-        buffer.seek(0)
-        expected = [bytes(packet) for packet in av.open(buffer).demux(video=0) if packet.size]
-        assert [mp4_sample(video.codec, picture.data) for picture in video.pictures] == expected
+def samples_of(video: CodedVideo) -> list[bytes]:
+    ends = np.cumsum(video.sizes).tolist()
+    assert ends[-1] == len(video.samples)
+    return [video.samples[a:b] for a, b in zip([0, *ends], ends, strict=False)]
+
+
+@pytest.mark.parametrize("codec", ["h264", "av1", "hevc"])
+def test_the_packets_are_what_ffmpeg_would_write(codec: str) -> None:
+    """Against libav's own muxer: the same samples, and the keyframes that its parser finds."""
+    units = hevc_units(4) if codec == "hevc" else encoded(codec, 6)[1]
+    video = video_of(codec, units)
+    demuxer = {"h264": "h264", "av1": "obu", "hevc": "hevc"}[codec]
+    buffer = io.BytesIO()
+    source = av.open(io.BytesIO(units[0]), format=demuxer)
+    with av.open(buffer, "w", format="mp4") as target:
+        stream = target.add_stream_from_template(source.streams.video[0], opaque=True)
+        for number, unit in enumerate(units):
+            packet = av.Packet(unit)
+            packet.pts = packet.dts = number
+            packet.duration, packet.time_base, packet.stream = 1, Fraction(1, 30), stream
+            target.mux_one(packet)
+    buffer.seek(0)
+    expected = [bytes(packet) for packet in av.open(buffer).demux(video=0) if packet.size]
+    assert samples_of(video) == expected
+    if codec == "h264":
+        parsed = av.open(io.BytesIO(b"".join(units)), format=demuxer).demux(video=0)
+        assert video.is_keyframe.tolist() == [packet.is_keyframe for packet in parsed if packet.size]
+
+
+def hevc_units(count: int) -> list[bytes]:
+    context = av.CodecContext.create("libx265", "w")
+    context.width, context.height, context.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+    context.time_base, context.framerate = Fraction(1, 30), Fraction(30)
+    context.options = {"x265-params": "bframes=0:repeat-headers=1:log-level=none"}
+    frames = [av.VideoFrame.from_ndarray(picture, format="rgb24") for picture in pictures(count)]
+    packets = [packet for frame in frames for packet in context.encode(frame.reformat(format="yuv420p"))]
+    return [bytes(packet) for packet in packets + context.encode(None)]
+
+
+NAL = {"idr": b"\x65\x88\x84", "slice": b"\x41\x9a\x02", "sps": b"\x67\x42\x1e", "sei": b"\x06\x05\x01\x80"}
+LONG, SHORT = b"\x00\x00\x00\x01", b"\x00\x00\x01"
+
+
+@pytest.mark.parametrize(
+    ("units", "expected", "keyframes"),
+    [
+        ([(LONG, "sps", SHORT, "idr"), (SHORT, "slice")], [("sps", "idr"), ("slice",)], [True, False]),
+        ([(LONG, "sei", LONG, "slice"), (LONG, "slice", SHORT, "slice")], [("sei", "slice"), ("slice",) * 2], [0, 0]),
+        # Zeros beyond need: after a unit, and more than one in front of the first start code.
+        ([(SHORT, "idr", b"\0\0\0"), (SHORT, "slice", b"\0")], [("idr",), ("slice",)], [1, 0]),
+        ([(b"\0\0\0", SHORT, "idr"), (SHORT, "slice")], [("idr",), ("slice",)], [1, 0]),
+    ],
+)
+def test_every_way_to_put_start_codes(
+    units: list[tuple[str | bytes, ...]], expected: list[tuple[str, ...]], keyframes: list[int]
+) -> None:
+    """By hand, from ITU-T H.264 annex B: byte_stream_nal_unit with leading_zero_8bits and trailing_zero_8bits."""
+    coded_units = [b"".join(NAL.get(part, part) for part in unit) for unit in units]  # type: ignore[call-overload]
+    video = video_of("h264", coded_units)
+    wanted = [b"".join(len(NAL[name]).to_bytes(4, "big") + NAL[name] for name in names) for names in expected]
+    assert samples_of(video) == wanted
+    assert video.is_keyframe.tolist() == [bool(value) for value in keyframes]
+
+
+@pytest.mark.parametrize("unit", [b"", b"no video at all", b"\x01" + NAL["slice"], NAL["slice"] + SHORT + NAL["slice"]])
+def test_a_packet_without_its_start_code_is_refused(unit: bytes) -> None:
+    """Also where the packet before ends in what would make one together."""
+    for before in (SHORT + NAL["idr"], SHORT + NAL["idr"] + b"\0\0"):
+        with pytest.raises(ExportError, match="start code"):
+            video_of("h264", [before, unit])
 
 
 def test_parameter_sets_tell_settings_apart() -> None:
@@ -108,9 +171,8 @@ def test_parameter_sets_tell_settings_apart() -> None:
 
 
 def test_a_video_that_does_not_start_with_a_keyframe_is_refused() -> None:
-    video, _ = coded("h264", 4)
-    assert not video.pictures[1].is_keyframe
-    cut = CodedVideo(codec="h264", width=WIDTH, height=HEIGHT, pictures=video.pictures[1:])
+    _, units = encoded("h264", 4)
+    cut = video_of("h264", units[1:])
     with pytest.raises(ExportError, match="keyframe"):
         cut.parameter_sets()
     with pytest.raises(ExportError, match="start code"):
