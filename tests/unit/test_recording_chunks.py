@@ -1,0 +1,109 @@
+"""Whole topics at once, against the mcap library's own reader; and chunks that are not what they seem."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers_recording import write_episode
+from mcap.reader import make_reader
+from mcap.records import ChunkIndex
+from mcap.stream_reader import StreamReader
+
+from demorec.config import VideoConfig
+from demorec.recording import Recording
+from demorec.recording.chunks import ChunkPlace, blocks_of
+from demorec.recording.container import Container
+from demorec.recording.messages import PictureMessages, coded_pictures
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_episode(tmp_path_factory.mktemp("chunks") / "e.mcap", num_frames=70)
+
+
+def test_blocks_are_what_the_mcap_library_reads(path: Path) -> None:
+    expected: dict[str, list[tuple[int, bytes]]] = {}
+    with path.open("rb") as file:
+        for _, channel, message in make_reader(file).iter_messages(log_time_order=False):
+            expected.setdefault(channel.topic, []).append((message.log_time, message.data))
+    container = Container(path)
+    blocks = container.blocks([*expected, "/nothing"])
+    container.close()
+    assert len(blocks.pop("/nothing")) == 0
+    assert len(expected["/joint_states"]) >= 70
+    for topic, block in blocks.items():
+        assert list(zip(block.time_ns.tolist(), block.messages(), strict=True)) == expected[topic], topic
+
+
+def test_places_are_what_the_mcap_library_reads(path: Path) -> None:
+    with path.open("rb") as file:
+        indexes = [record for record in StreamReader(file).records if isinstance(record, ChunkIndex)]
+    container = Container(path)
+    assert container._chunks == [
+        ChunkPlace(
+            start=index.chunk_start_offset,
+            length=index.chunk_length,
+            channels=frozenset(index.message_index_offsets),
+            uncompressed_size=index.uncompressed_size,
+        )
+        for index in sorted(indexes, key=lambda index: index.chunk_start_offset)
+    ]
+    assert len(indexes) > 2
+    container.close()
+
+
+def message(channel: int, time_ns: int, data: bytes) -> bytes:
+    """A Message record (MCAP specification): channel, sequence, log time, publish time, data."""
+    content = struct.pack("<HIQQ", channel, 0, time_ns, time_ns) + data
+    return struct.pack("<BQ", 5, len(content)) + content
+
+
+def test_records_of_other_kinds_are_stepped_over() -> None:
+    other = struct.pack("<BQ", 3, 4) + b"\5\5\5\5"
+    contents = [other + message(1, 10, b"ab") + other, b"", message(2, 11, b"") + message(1, 12, b"cde")]
+    blocks = blocks_of(contents, {"/one": 1, "/two": 2, "/three": 3})
+    assert [list(blocks[topic].messages()) for topic in ("/one", "/two", "/three")] == [[b"ab", b"cde"], [b""], []]
+    assert blocks["/one"].time_ns.tolist() == [10, 12]
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        message(1, 0, b"abc")[:-1],
+        message(1, 0, b"abc") + b"\5",
+        struct.pack("<BQ", 5, 2**62) + bytes(40),
+        struct.pack("<BQ", 5, 21) + bytes(21),
+        message(1, 0, b"abc") + struct.pack("<BQ", 5, 0),
+    ],
+)
+def test_records_that_do_not_fill_their_chunk_are_refused(content: bytes) -> None:
+    with pytest.raises((ValueError, struct.error)):
+        blocks_of([content], {"/one": 1})
+
+
+@pytest.mark.parametrize("codec", ["h264", "av1", "jpeg"])
+def test_coded_pictures_are_the_packets(tmp_path: Path, codec: str) -> None:
+    path = write_episode(tmp_path / "e.mcap", num_frames=9, video=VideoConfig(codec=codec))  # type: ignore[arg-type]
+    with Recording(path) as recording:
+        for camera, block in recording.coded_pictures(recording.cameras).items():
+            packets = list(recording.packets(camera))
+            assert list(block.messages()) == [packet.data for packet in packets]
+            assert block.joined() == b"".join(packet.data for packet in packets)
+
+
+def test_pictures_of_several_formats_and_cut_off_ones() -> None:
+    made = [PictureMessages("a", "h264").compressed_image(0, b"one")]
+    made += [PictureMessages("a longer frame", "jpeg").compressed_image(7, b"three")]
+    for messages in (made, made[:1] * 2):
+        block = blocks_of([b"".join(message(1, 0, data) for data in messages)], {"/x": 1})["/x"]
+        assert list(coded_pictures(block, "h264").messages()) == (
+            [b"one", b"three"] if messages is made else [b"one"] * 2
+        )
+        for cut in (1, len(messages[-1]) - 3):
+            short = replace(block, lengths=block.lengths - np.array([0, cut]))
+            with pytest.raises((ValueError, struct.error)):
+                coded_pictures(short, "h264")
