@@ -8,10 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from demorec.episode import Action, EpisodeInfo, Frame
+from demorec.episode import Action, EpisodeInfo, Frame, Observation
 from demorec.geometry import Array, Pose
 from demorec.recording import messages
 from demorec.recording.cdr import CdrWriter, Layout
@@ -53,6 +54,21 @@ def camera_topic(camera: str, stream: str) -> str:
     return f"/camera/{camera}/{stream}"
 
 
+class Numbers(NamedTuple):
+    """The numbers of a frame; they wait for the rest of their second, and must not be changed meanwhile."""
+
+    observation: Observation
+    action: Action
+    command: Action
+    world_from_camera: dict[str, Pose]
+
+    @classmethod
+    def of(cls, frame: Frame) -> Numbers:
+        """Those of a frame, without its pictures."""
+        poses = {name: image.world_from_camera for name, image in frame.images.items()}
+        return cls(frame.observation, frame.action, frame.command, poses)
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StateStream:
     """One stream of numbers.
@@ -68,8 +84,13 @@ class StateStream:
     topic: str
     schema: str
     layout: Layout
-    parts: Callable[[Frame], Sequence[Array]]
+    parts: Callable[[Numbers], Sequence[Array]]
     arrange: Callable[[Array], Array] | None = None
+
+    def rows(self, numbers: Sequence[Numbers]) -> Array:
+        """All pieces of N frames, (N, ...)."""
+        pieces = [piece for frame in numbers for piece in self.parts(frame)]
+        return np.concatenate(pieces).reshape(len(numbers), -1)
 
     def encode(self, time_ns: Sequence[int], values: Array) -> list[bytes]:
         """One message for each row of all pieces (N, ...)."""
@@ -84,34 +105,34 @@ def state_streams(info: EpisodeInfo) -> Iterator[StateStream]:
     base = info.robot.base_link
     yield _joints(JOINT_STATES, info.robot.joint_names, _joint_state_parts)
     yield _joints(GRIPPER, (GRIPPER_JOINT,), _gripper_values(len(info.robot.gripper_joints)))
-    yield _joints(ACTION, arm_and_gripper, lambda frame: _targets(frame.action))
-    yield _joints(COMMAND, arm_and_gripper, lambda frame: _targets(frame.command))
-    yield _pose(EE_POSE, base, lambda frame: frame.observation.base_from_tcp)
-    yield _pose(ACTION + EE_POSE, base, lambda frame: frame.action.base_from_tcp_target)
-    yield _pose(COMMAND + EE_POSE, base, lambda frame: frame.command.base_from_tcp_target)
+    yield _joints(ACTION, arm_and_gripper, lambda numbers: _targets(numbers.action), _with_zeros)
+    yield _joints(COMMAND, arm_and_gripper, lambda numbers: _targets(numbers.command), _with_zeros)
+    yield _pose(EE_POSE, base, lambda numbers: numbers.observation.base_from_tcp)
+    yield _pose(ACTION + EE_POSE, base, lambda numbers: numbers.action.base_from_tcp_target)
+    yield _pose(COMMAND + EE_POSE, base, lambda numbers: numbers.command.base_from_tcp_target)
     for body in info.scene.movable:
         yield _pose(object_topic(body.name), WORLD, _object_pose(body.name))
     for camera in info.scene.cameras:
         yield _pose(camera_topic(camera.name, "pose"), WORLD, _camera_pose(camera.name))
 
 
-def _object_pose(name: str) -> Callable[[Frame], Pose]:
-    return lambda frame: frame.observation.object_poses[name]
+def _object_pose(name: str) -> Callable[[Numbers], Pose]:
+    return lambda numbers: numbers.observation.object_poses[name]
 
 
-def _camera_pose(name: str) -> Callable[[Frame], Pose]:
-    return lambda frame: frame.images[name].world_from_camera
+def _camera_pose(name: str) -> Callable[[Numbers], Pose]:
+    return lambda numbers: numbers.world_from_camera[name]
 
 
-def _joint_state_parts(frame: Frame) -> Sequence[Array]:
-    observation = frame.observation
+def _joint_state_parts(numbers: Numbers) -> Sequence[Array]:
+    observation = numbers.observation
     return observation.joint_position, observation.joint_velocity, observation.joint_effort
 
 
-def _gripper_values(num_fingers: int) -> Callable[[Frame], Sequence[Array]]:
+def _gripper_values(num_fingers: int) -> Callable[[Numbers], Sequence[Array]]:
     # The opening's velocity is the sum of the fingers' velocities; the force on them stands in for the effort.
-    def values(frame: Frame) -> Sequence[Array]:
-        observation = frame.observation
+    def values(numbers: Numbers) -> Sequence[Array]:
+        observation = numbers.observation
         velocity = sum(observation.joint_velocity[-num_fingers:].tolist())
         return (np.array((observation.gripper_width, velocity, observation.contact_force)),)
 
@@ -119,11 +140,12 @@ def _gripper_values(num_fingers: int) -> Callable[[Frame], Sequence[Array]]:
 
 
 def _targets(action: Action) -> Sequence[Array]:
+    return action.joint_target, np.array((action.gripper_target,))
+
+
+def _with_zeros(targets: Array) -> Array:
     # No velocity or effort is commanded; zeros, since a viewer makes an empty plot of an empty array.
-    num_arm = len(action.joint_target)
-    rest = np.zeros(2 * num_arm + 3)
-    rest[0] = action.gripper_target
-    return action.joint_target, rest
+    return np.concatenate((targets, np.zeros((len(targets), 2 * targets.shape[1]))), axis=1)
 
 
 def tf_stream(frames: FrameTree) -> StateStream:
@@ -135,7 +157,11 @@ def tf_stream(frames: FrameTree) -> StateStream:
         message.text(child)
         message.value_slot(7)
     return StateStream(
-        topic=TF, schema=messages.TRANSFORMS, layout=message.layout(), parts=frames.parts, arrange=frames.arrange
+        topic=TF,
+        schema=messages.TRANSFORMS,
+        layout=message.layout(),
+        parts=lambda numbers: frames.parts(numbers.observation),
+        arrange=frames.arrange,
     )
 
 
@@ -157,7 +183,12 @@ def said_once(info: EpisodeInfo, frames: FrameTree, *, has_labels: bool) -> Iter
         yield LABELS, messages.LABEL_INFO, messages.label_info(list(zip(numbers, names, strict=True)))
 
 
-def _joints(topic: str, names: Sequence[str], parts: Callable[[Frame], Sequence[Array]]) -> StateStream:
+def _joints(
+    topic: str,
+    names: Sequence[str],
+    parts: Callable[[Numbers], Sequence[Array]],
+    arrange: Callable[[Array], Array] | None = None,
+) -> StateStream:
     message = CdrWriter()
     message.header("")
     message.u32(len(names))
@@ -166,10 +197,10 @@ def _joints(topic: str, names: Sequence[str], parts: Callable[[Frame], Sequence[
     for _ in range(3):  # position, velocity, effort
         message.u32(len(names))
         message.value_slot(len(names))
-    return StateStream(topic=topic, schema=messages.JOINT_STATE, layout=message.layout(), parts=parts)
+    return StateStream(topic=topic, schema=messages.JOINT_STATE, layout=message.layout(), parts=parts, arrange=arrange)
 
 
-def _pose(topic: str, frame_id: str, pose: Callable[[Frame], Pose]) -> StateStream:
+def _pose(topic: str, frame_id: str, pose: Callable[[Numbers], Pose]) -> StateStream:
     message = CdrWriter()
     message.header(frame_id)
     message.value_slot(7)
@@ -177,7 +208,7 @@ def _pose(topic: str, frame_id: str, pose: Callable[[Frame], Pose]) -> StateStre
         topic=topic,
         schema=messages.POSE,
         layout=message.layout(),
-        parts=lambda frame: (pose(frame).position, pose(frame).quat_xyzw),
+        parts=lambda numbers: ((found := pose(numbers)).position, found.quat_xyzw),
     )
 
 

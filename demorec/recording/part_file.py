@@ -114,11 +114,15 @@ class PartFile:
 
     def log(self, topic: str, schema: str, data: bytes, time_ns: int, *, latched: bool = False) -> None:
         """Add a message; every topic has one type."""
+        self.logger(topic, schema, latched=latched)(data, log_time=time_ns)
+
+    def logger(self, topic: str, schema: str, *, latched: bool = False) -> Callable[..., None]:
+        """What adds messages to a topic, for many of them: called with the data and, by name, log_time."""
         log = self._log.get(topic)
         if log is None:
             channel = self._channels[topic] = self._open_channel(topic, schema, latched)
             log = self._log[topic] = channel.base.log  # without the wrapper, which looks for JSON in every message
-        log(data, log_time=time_ns)
+        return log
 
     def _open_channel(self, topic: str, schema: str, latched: bool) -> foxglove.Channel:
         if schema == messages.PROTOBUF_VIDEO:

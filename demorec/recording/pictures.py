@@ -63,8 +63,10 @@ class CameraRecorder:
             raise RecordingError(f"Frame {frame.frame_index} has no picture of the camera {name!r}.")
         others: list[Message] = []
         self._check(frame.frame_index, "colour", images.color, True)
-        self._check(frame.frame_index, "depth", images.depth, self.streams.depth)
-        self._check(frame.frame_index, "segmentation", images.segmentation, self.streams.segmentation)
+        if images.depth is not None or self.streams.depth:
+            self._check(frame.frame_index, "depth", images.depth, self.streams.depth)
+        if images.segmentation is not None or self.streams.segmentation:
+            self._check(frame.frame_index, "segmentation", images.segmentation, self.streams.segmentation)
         self._pixels.add(images.color)
         self._take(self._encoder.encode(images.color))
         if images.depth is not None:

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from demorec.assets import asset_path
-from demorec.episode import EpisodeInfo, Frame
+from demorec.episode import EpisodeInfo, Observation
 from demorec.geometry import Array, Pose, quat_multiply
 from demorec.urdf import Urdf, UrdfJoint, joint_motion
 
@@ -59,11 +59,11 @@ class FrameTree:
             *((camera.mount, camera_frame(camera.name), camera.mount_from_camera) for camera in info.scene.cameras),
         )
 
-    def parts(self, frame: Frame) -> list[Array]:
-        """What `arrange` needs of a frame."""
-        result = [frame.observation.joint_position]
+    def parts(self, observation: Observation) -> list[Array]:
+        """What `arrange` needs of an observation."""
+        result = [observation.joint_position]
         for name in self._objects:
-            pose = frame.observation.object_poses[name]
+            pose = observation.object_poses[name]
             result += [pose.position, pose.quat_xyzw]
         return result
 

@@ -9,17 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from operator import itemgetter
+from itertools import islice
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 
 from demorec.config import VideoConfig
 from demorec.episode import EpisodeInfo, Event, Frame, JointSample, Outcome, frame_time_ns
 from demorec.errors import RecordingError
-from demorec.geometry import Array
 from demorec.recording import channels, messages, metadata
 from demorec.recording.part_file import PartFile
 from demorec.recording.pictures import CameraRecorder
@@ -43,21 +42,20 @@ class WriteStats:
     video_bytes: Mapping[str, int]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Pending:
+class _Pending(NamedTuple):
     """A frame that waits to be written, without its pictures.
 
     Attributes:
         time_ns: When.
-        values: Of all streams that have one message a frame, one after the other.
+        numbers: What the streams that have one message a frame are made of.
         joint_samples: Joint states since the frame before.
-        changes: (time_ns, topic, type, message) of events and of what is written only when it changes.
+        changes: (topic, type, message) of events and of what is written only when it changes.
     """
 
     time_ns: int
-    values: Array
+    numbers: channels.Numbers
     joint_samples: tuple[JointSample, ...]
-    changes: list[tuple[int, str, str, bytes]]
+    changes: list[tuple[str, str, bytes]]
 
 
 class EpisodeWriter:
@@ -82,7 +80,6 @@ class EpisodeWriter:
         self._video = video or VideoConfig()
         self._tree = FrameTree(info)
         self._streams = [*channels.state_streams(info), channels.tf_stream(self._tree)]
-        self._columns: list[slice] = []  # of `_Pending.values`, one for each stream; known from the first frame on
         self._cameras: dict[str, CameraRecorder] = {}
         self._pending: list[_Pending] = []
         self._num_frames = 0
@@ -118,7 +115,7 @@ class EpisodeWriter:
         self._pending.append(
             _Pending(
                 time_ns=frame.time_ns,
-                values=np.concatenate([piece for stream in self._streams for piece in stream.parts(frame)]),
+                numbers=channels.Numbers.of(frame),
                 joint_samples=frame.joint_samples,
                 changes=self._changes(frame),
             )
@@ -136,12 +133,6 @@ class EpisodeWriter:
             self._cameras[camera.name] = CameraRecorder(
                 camera, first.images[camera.name], video=self._video, fps=self._info.fps
             )
-        start = 0
-        for stream in self._streams if first is not None else ():
-            assert first is not None
-            stop = start + sum(len(piece) for piece in stream.parts(first))
-            self._columns.append(slice(start, stop))
-            start = stop
         streams = {name: camera.streams for name, camera in self._cameras.items()}
         self._file.metadata(metadata.EPISODE, metadata.episode_metadata(self._info, streams))
         has_labels = any(camera.segmentation for camera in streams.values())
@@ -156,15 +147,17 @@ class EpisodeWriter:
         if not frames:
             return
         time_ns = [frame.time_ns for frame in frames]
-        values = np.array([frame.values for frame in frames])
-        rows = self._sample_messages(frames)
-        for stream, columns in zip(self._streams, self._columns, strict=True):
-            encoded = stream.encode(time_ns, values[:, columns])
-            rows += [(time, stream.topic, stream.schema, row) for time, row in zip(time_ns, encoded, strict=True)]
-        rows += [row for frame in frames for row in frame.changes]
-        rows.sort(key=itemgetter(0))  # by time; a stable sort, so streams stay in their order
-        for time, topic, schema, data in rows:
-            self._file.log(topic, schema, data, time)
+        numbers = [frame.numbers for frame in frames]
+        logs = [self._file.logger(stream.topic, stream.schema) for stream in self._streams]
+        encoded = [stream.encode(time_ns, stream.rows(numbers)) for stream in self._streams]
+        samples = iter(self._sample_messages(frames))
+        for time, frame, *rows in zip(time_ns, frames, *encoded, strict=True):
+            for sample, data in islice(samples, len(frame.joint_samples)):
+                logs[0](data, log_time=sample)
+            for log, data in zip(logs, rows, strict=True):
+                log(data, log_time=time)
+            for topic, schema, data in frame.changes:
+                self._file.log(topic, schema, data, time)
         self._file.flush()
         if self._cameras:
             pictures = (camera.take_messages(time_ns) for camera in self._cameras.values())
@@ -175,32 +168,32 @@ class EpisodeWriter:
         del self._pending[: len(frames)]
         self._num_written += len(frames)
 
-    def _sample_messages(self, frames: list[_Pending]) -> list[tuple[int, str, str, bytes]]:
-        """Joint states between the frames."""
+    def _sample_messages(self, frames: list[_Pending]) -> list[tuple[int, bytes]]:
+        """Joint states between the frames: when, and the message."""
         samples = [sample for frame in frames for sample in frame.joint_samples]
         if not samples:
             return []
-        joints = self._streams[0]
         times = [sample.time_ns for sample in samples]
         values = np.array([(s.joint_position, s.joint_velocity, s.joint_effort) for s in samples])
-        data = joints.encode(times, values.reshape(len(samples), -1))
-        return [(time, joints.topic, joints.schema, message) for time, message in zip(times, data, strict=True)]
+        data = self._streams[0].encode(times, values.reshape(len(samples), -1))
+        return list(zip(times, data, strict=True))
 
-    def _changes(self, frame: Frame) -> list[tuple[int, str, str, bytes]]:
+    def _changes(self, frame: Frame) -> list[tuple[str, str, bytes]]:
+        if frame.phase == self._phase and frame.is_deliberate_miss == self._is_miss and not frame.events:
+            return []  # nearly always
         result = []
-        time = frame.time_ns
         if any(event.name == channels.PHASE_EVENT for event in frame.events):
             raise RecordingError(f"Frame {frame.frame_index} has an event {channels.PHASE_EVENT!r}, a reserved name.")
         events = list(frame.events)
         if frame.phase != self._phase:
             self._phase = frame.phase
             events.insert(0, Event(name=channels.PHASE_EVENT, message=frame.phase))
-            result.append((time, channels.PHASE, messages.STRING, messages.string(frame.phase)))
+            result.append((channels.PHASE, messages.STRING, messages.string(frame.phase)))
         if frame.is_deliberate_miss != self._is_miss:
             self._is_miss = frame.is_deliberate_miss
             data = messages.boolean(frame.is_deliberate_miss)
-            result.append((time, channels.DELIBERATE_MISS, messages.BOOL, data))
-        return result + [(time, channels.EVENTS, messages.LOG, messages.log(time, event)) for event in events]
+            result.append((channels.DELIBERATE_MISS, messages.BOOL, data))
+        return result + [(channels.EVENTS, messages.LOG, messages.log(frame.time_ns, event)) for event in events]
 
     def finish(self, outcome: Outcome) -> WriteStats:
         """Write the rest, make the file durable and give it its name.
