@@ -82,7 +82,8 @@ class EglRenderer:
         """Take over a freshly built scene; RenderError when the plugin or a shape cannot be loaded."""
         require_numpy(setup.client)
         check_setup(setup)
-        if self._client is None:
+        first = self._client is None
+        if first:
             client = type(setup.client)(setup.client.DIRECT)
             self._plugin = client.loadPlugin(_plugin_path(), "_eglRendererPlugin")
             if self._plugin < 0:
@@ -91,6 +92,8 @@ class EglRenderer:
             self._client = client
         self._setup = setup
         self._mirror = SceneMirror(self._client, setup)
+        if first:
+            self.render()  # the plugin's first picture differs from all later ones in some pixels
 
     def render(self) -> dict[str, CameraImages]:
         """Camera name -> images of the present state."""

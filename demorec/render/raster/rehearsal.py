@@ -8,6 +8,7 @@ import numpy as np
 
 from demorec.geometry import look_at
 from demorec.render.raster.batch import make_batch
+from demorec.render.raster.canvas import Canvas
 from demorec.render.raster.mesh import Mesh
 from demorec.render.raster.primitives import box, sphere
 from demorec.render.raster.shapes import Instance, Model
@@ -61,8 +62,7 @@ def rehearse() -> None:
     batch = make_batch(instances, [None, None], specular=light.specular)
     for antialias in (True, False):
         for keep_still in (True, False):
-            view = View(
-                camera, batch, stage, light, antialias=antialias, depth=True, segmentation=True, keep_still=keep_still
-            )
+            canvas = Canvas(camera, batch, stage, light, antialias=antialias, depth=True, segmentation=True)
+            view = View(canvas, stage, keep_still=keep_still)
             stage.update()
             view.draw(camera.mount_from_camera)

@@ -11,6 +11,7 @@ from demorec.episode import CameraImages
 from demorec.render import RenderSetup
 from demorec.render.raster.batch import Batch, make_batch
 from demorec.render.raster.cache import folder_lock
+from demorec.render.raster.canvas import Canvas
 from demorec.render.raster.kernels.jit import compiled_folder
 from demorec.render.raster.shapes import Instance, ModelStore, VisualShapes, read_instances, visual_shapes
 from demorec.render.raster.stage import Stage
@@ -87,18 +88,16 @@ class RasterRenderer:
             levels = tuple(None if self._exact else self._level(instance, camera) for instance in instances)
             if levels not in batches:
                 batches[levels] = make_batch(instances, levels, specular=setup.light.specular)
-            self._views.append(
-                View(
-                    camera,
-                    batches[levels],
-                    self._stage,
-                    setup.light,
-                    antialias=setup.antialias,
-                    depth=setup.depth,
-                    segmentation=setup.segmentation,
-                    keep_still=self._keep_still and camera.mount == "world",
-                )
+            canvas = Canvas(
+                camera,
+                batches[levels],
+                self._stage,
+                setup.light,
+                antialias=setup.antialias,
+                depth=setup.depth,
+                segmentation=setup.segmentation,
             )
+            self._views.append(View(canvas, self._stage, keep_still=self._keep_still and camera.mount == "world"))
 
     def _level(self, instance: Instance, camera: Camera) -> int | None:
         """How many faces an instance keeps for a camera."""
