@@ -128,14 +128,14 @@ def _view_3d(episode: Episode, roots: list[Paths], name: str) -> rrb.Spatial3DVi
 
 
 def _eye(episode: Episode) -> tuple[Array, Array]:
-    """Where the 3D view looks from and to: at the middle of the gripper's way, past the robot's shoulder."""
+    """Where the 3D view looks from and to: at the gripper's way from the side, far enough to see the front camera."""
     base = episode.info.scene.robot.world_from_base
     points = base.apply(episode.base_from_tcp[:, :3])
     middle = (points.min(axis=0) + points.max(axis=0)) / 2 if len(points) else base.apply((0.5, 0.0, 0.2))
-    target = 0.6 * middle + 0.4 * base.apply((0.0, 0.0, 0.3))
+    target = 0.6 * middle + 0.4 * base.apply((0.3, 0.0, 0.4))
     side = base.rotation[:, 1]
     forward = base.rotation[:, 0]
-    return target + 0.45 * forward - 1.15 * side + (0.0, 0.0, 0.55), target
+    return target + 0.2 * forward - 1.4 * side + (0.0, 0.0, 0.55), target
 
 
 def _camera_views(episode: Episode, paths: Paths) -> list[rrb.View | rrb.Container]:

@@ -110,7 +110,7 @@ class HeadlessViewer:
             try:
                 client = ViewerClient.connect(f"rerun+http://127.0.0.1:{self._port}/proxy")
                 state = client.get_state()
-            except (OSError, RuntimeError, ValueError):
+            except (OSError, RuntimeError, ValueError):  # TimeoutError is an OSError
                 time.sleep(0.2)
                 continue
             loaded = [recording for recording in state.recordings if recording.timelines]
@@ -139,18 +139,30 @@ class HeadlessViewer:
         deadline = time.monotonic() + _SETTLE_SECONDS
         while same < 3 and time.monotonic() < deadline:
             time.sleep(0.4)
-            now = self.client.take_screenshot()
+            now = self._picture()
             before, same = now, same + 1 if now == before else 0
+
+    def _picture(self, *view: Any) -> bytes:
+        """PNG of the window or of one view; the client waits for some seconds only, too short for a busy machine."""
+        deadline = time.monotonic() + _START_SECONDS
+        while True:
+            try:
+                return bytes(self.client.take_screenshot(*view))
+            except TimeoutError as error:
+                if time.monotonic() > deadline:
+                    raise RecordingError(
+                        f"Rerun's viewer has not drawn a picture within {_START_SECONDS:.0f} s: is the machine busy?"
+                    ) from error
 
     def save_picture(self, target: Path) -> None:
         """The whole window as PNG."""
-        target.write_bytes(self.client.take_screenshot())
+        target.write_bytes(self._picture())
 
     def view_picture(self, name: str) -> bytes:
         """One view as PNG; KeyError when no view has that name."""
         for view in self.client.get_state().views:
             if view.name == name:
-                return bytes(self.client.take_screenshot(view.view_id))
+                return self._picture(view.view_id)
         raise KeyError(name)
 
     def reports(self) -> list[Report]:
