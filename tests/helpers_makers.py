@@ -9,6 +9,7 @@ import errno
 import hashlib
 import json
 import os
+import resource
 import signal
 import time
 from pathlib import Path
@@ -93,6 +94,21 @@ def fill_the_disk(plan: EpisodePlan, folder: Path) -> Attempt:
             raise OSError(errno.ENOSPC, "No space left on device")
         except OSError as error:
             raise RuntimeError("the writer failed") from error
+    return make(plan, folder)
+
+
+def write_too_much(plan: EpisodePlan, folder: Path) -> Attempt:
+    """Episode 2 is larger than the limit of this process (ulimit -f) allows a file to be."""
+    if plan.episode_index == 2:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
+        (folder / "unfinished" / "large.part").write_bytes(bytes(2000))
+    return make(plan, folder)
+
+
+def break_the_disk(plan: EpisodePlan, folder: Path) -> Attempt:
+    """The disk cannot write episode 2, however often it is tried."""
+    if plan.episode_index == 2:
+        raise OSError(errno.EIO, "Input/output error")
     return make(plan, folder)
 
 

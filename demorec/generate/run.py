@@ -32,7 +32,14 @@ MAX_LOSSES = 5
 GRACE_S = 3.0
 """How long current episodes may go on after the first Ctrl-C."""
 _POLL_S = 0.2
-_FULL = {errno.ENOSPC: "the disk is full", errno.EDQUOT: "the quota is used up", errno.EROFS: "it is read-only"}
+_REFUSED = {
+    errno.ENOSPC: "the disk is full",
+    errno.EDQUOT: "the quota is used up",
+    errno.EROFS: "it is read-only",
+    errno.EFBIG: "a recording is larger than files may be there (ulimit -f)",
+    errno.EACCES: "permission is denied",
+    errno.EPERM: "permission is denied",
+}
 
 
 class Progress(Protocol):
@@ -195,7 +202,7 @@ class _Driver:
             if isinstance(report, Made):
                 self._made(report)
             elif isinstance(report, Lost):
-                self._again(report.plan, report.reason)
+                self._again(report.plan, report.reason, "try fewer --workers or a machine with more memory")
             else:
                 self._raised(report)
 
@@ -204,31 +211,37 @@ class _Driver:
         self._folder.add(report.attempt, peak_worker_bytes=report.peak_bytes)
         self._progress.ended(report.attempt)
 
-    def _again(self, plan: EpisodePlan, reason: str) -> None:
+    def _again(self, plan: EpisodePlan, reason: str, advice: str) -> None:
         key = (plan.episode_index, plan.attempt)
         self._losses[key] = self._losses.get(key, 0) + 1
         self._folder.lost_workers += 1
         if self._losses[key] >= MAX_LOSSES:
             raise GenerationError(
                 f"Episode {plan.episode_index} failed to be made {MAX_LOSSES} times, the last time because {reason}: "
-                f"try fewer --workers or a machine with more memory. {self._folder.kept}"
+                f"{advice}. {self._folder.kept}"
             )
         self._progress.says(f"Episode {plan.episode_index} is made again: {reason}.")
         self._schedule.give_back(plan)
 
     def _raised(self, report: Raised) -> None:
         self._folder.check_alive()
-        if report.errno in _FULL:
+        if report.errno in _REFUSED:
             raise GenerationError(
-                f"The output folder cannot take another episode: {_FULL[report.errno]}; mend that and run the same "
+                f"The output folder cannot take another episode: {_REFUSED[report.errno]}; mend that and run the same "
                 f"command again. {self._folder.kept}"
             )
-        if report.errno is not None and not report.exit_code:
-            self._again(report.plan, report.message)
+        if report.errno is not None and report.exit_code != ConfigError.exit_code:
+            self._again(
+                report.plan,
+                report.message.rstrip("."),
+                "see whether the storage of the output folder is sound, then run the same command again",
+            )
             return
         if report.exit_code:
             wrong = ConfigError if report.exit_code == ConfigError.exit_code else GenerationError
-            raise wrong(f"Episode {report.plan.episode_index} cannot be made: {report.message} {self._folder.kept}")
+            raise wrong(
+                f"Episode {report.plan.episode_index} cannot be made: {report.message.rstrip('.')}. {self._folder.kept}"
+            )
         place = self._folder.path / UNFINISHED / f"error_episode_{report.plan.episode_index:06d}.txt"
         place.write_text(report.traceback)
         raise GenerationError(

@@ -7,6 +7,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import psutil
@@ -51,17 +52,31 @@ def cluster() -> Iterator[object]:
         # The nodes' workers import the stand-in makers and the package under test as this process does.
         patch.setenv("PYTHONPATH", os.pathsep.join([str(Path(__file__).parents[1]), *sys.path]))
         patch.setenv("RAY_worker_niceness", "0")  # 15 by default, which starves beside other tests
+        # Nodes as of Ray without its dashboard: its agent takes seconds to start, and after 15 s a node gives up.
+        patch.setattr(ray._private.utils, "get_dashboard_dependency_error", lambda: "left out")
         nodes = Cluster()
         add_node(nodes, include_dashboard=False)
         add_node(nodes)
         ray.init(address=nodes.address, log_to_driver=False)
-        family = psutil.Process().children(recursive=True)
+        family = processes_of_ray()
+        assert family
         yield nodes
-        family += psutil.Process().children(recursive=True)
+        family |= processes_of_ray()
         ray.shutdown()
         nodes.shutdown()
-        _, alive = psutil.wait_procs(set(family), timeout=60)
+        _, alive = psutil.wait_procs(family, timeout=60)
         assert not alive
+
+
+def processes_of_ray() -> set[psutil.Process]:
+    """Those that descend from this process: nodes, their services, workers."""
+    found = set()
+    for process in psutil.Process().children(recursive=True):
+        with suppress(psutil.Error):
+            command = " ".join(process.cmdline())
+            if "/ray/" in command or command.startswith("ray::"):
+                found.add(process)
+    return found
 
 
 def add_node(cluster, **options: object) -> object:

@@ -224,6 +224,8 @@ def test_a_bad_moment_of_the_file_system_is_survived(tmp_path, reference):
     ("maker", "error", "message"),
     [
         ("fill_the_disk", GenerationError, "the disk is full; mend that and run the same command again"),
+        ("write_too_much", GenerationError, r"larger than files may be there \(ulimit -f\); mend that"),
+        ("break_the_disk", GenerationError, r"failed to be made 5 times.*Input/output error: see whether the storage"),
         ("raise_a_bug", GenerationError, r"Episode 2 raised LocalError: the cube is a sphere \(the traceback is in"),
         ("raise_ours", GenerationError, r"Episode \d cannot be made: No OpenGL library was found."),
     ],
