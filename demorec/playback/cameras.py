@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from demorec.playback.episode import Episode, Video
 from demorec.playback.paths import Paths
-from demorec.playback.style import FRUSTUM
+from demorec.playback.style import FRUSTUM, segment_colors
 from demorec.playback.times import indexes
 from demorec.scene import Camera
 
@@ -32,9 +32,10 @@ def log_cameras(recording: rr.RecordingStream, paths: Paths, episode: Episode) -
         if camera.name in episode.segmentation:
             _send_segmentation(recording, paths.segmentation(camera.name), episode, episode.segmentation[camera.name])
     if episode.segmentation:
-        numbers = _compact(episode)
-        names = [(number, episode.segment_names[value]) for value, number in numbers.items() if number > 0]
-        recording.log(paths.world, rr.AnnotationContext(names), static=True)
+        names = {number: episode.segment_names[value] for value, number in _compact(episode).items() if number > 0}
+        colors = segment_colors(names.values())
+        labels = [rr.AnnotationInfo(number, name, colors[name]) for number, name in names.items()]
+        recording.log(paths.world, rr.AnnotationContext(labels), static=True)
 
 
 def _log_pinhole(recording: rr.RecordingStream, paths: Paths, episode: Episode, camera: Camera) -> None:

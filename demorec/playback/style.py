@@ -52,3 +52,19 @@ def dimmed(colors: Iterable[Color]) -> list[Color]:
 def phase_colors(phases: Iterable[str]) -> dict[str, Color]:
     """Phase -> colour."""
     return {name: PHASES[index % len(PHASES)] for index, name in enumerate(dict.fromkeys(phases))}
+
+
+def segment_colors(names: Iterable[str]) -> dict[str, Color]:
+    """Segment -> colour: bodies in the colours of the curves, the robot's links (ROBOT/LINK) in greys."""
+    colors: dict[str, Color] = {}
+    num_bodies = num_links = 0
+    for name in names:
+        if "/" in name:
+            # Steps of the golden ratio: links that hang together get greys that lie apart.
+            grey = round(70 + 160 * (num_links * 0.618034 % 1))
+            colors[name] = (grey, grey, min(255, grey + 15))
+            num_links += 1
+        else:
+            colors[name] = SERIES[num_bodies % len(SERIES)]
+            num_bodies += 1
+    return colors

@@ -25,6 +25,7 @@ from demorec.playback.programs import viewer_environment
 from demorec.playback.robot import joint_columns, robot_model
 from demorec.playback.save import save, save_comparison
 from demorec.playback.sources import find_episodes, select
+from demorec.playback.style import segment_colors
 from demorec.recording import EpisodeWriter, Recording
 from demorec.scene import Body, Shape
 from demorec.urdf import Urdf
@@ -95,6 +96,16 @@ def test_depth_and_segments_are_there(saved: dict[str, list[Any]], recording: Pa
     assert metres.max() > 0.4
     _, labels = _column(saved["/world/cameras/front/segmentation"], "SegmentationImage:buffer")[0]
     assert len(np.unique(np.frombuffer(bytes(labels[0]), dtype=np.uint16))) == 4  # nothing, table, cube, robot
+
+
+def test_segments_are_told_apart_by_their_colours() -> None:
+    names = ["table", "cube", *(f"panda/link{number}" for number in range(11))]
+    colors = segment_colors(names)
+    assert list(colors) == names
+    for number in range(10):
+        assert abs(colors[f"panda/link{number}"][0] - colors[f"panda/link{number + 1}"][0]) > 50
+    assert max(max(color) - min(color) for name, color in colors.items() if "/" in name) <= 15
+    assert all(max(colors[body]) - min(colors[body]) > 100 for body in ("table", "cube"))
 
 
 def test_robot_objects_path_and_goal_are_there(saved: dict[str, list[Any]]) -> None:
