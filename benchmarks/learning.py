@@ -285,27 +285,42 @@ def measure(name: str, args: argparse.Namespace) -> dict[str, Any]:
         "high": high,
         "by_seed": [r.successes for r in results],
         "train_cpu_seconds": float(np.mean([s["cpu_seconds"] for s in seconds])),
+        "curve": seconds[0]["curve"],
     }
 
 
 def plot(rows: list[dict[str, Any]], path: Path) -> None:
-    """Success of every variant with its interval, as a picture."""
+    """Success of every variant with its interval, and the training loss of its first seed, as a picture."""
     import matplotlib as mpl
 
     mpl.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, axes = plt.subplots(figsize=(7.5, 0.6 + 0.36 * len(rows)), layout="constrained")
-    for place, row in enumerate(reversed(rows)):
+    height = max(2.6, 0.8 + 0.42 * len(rows))
+    figure, (bars, curves) = plt.subplots(1, 2, figsize=(10, height), width_ratios=(3, 2), layout="constrained")
+    for place, row in enumerate(rows):
         rate = 100 * row["success"] / row["trials"]
-        axes.barh(place, rate, color="#4c78a8", height=0.62)
-        axes.plot([100 * row["low"], 100 * row["high"]], [place, place], color="black", linewidth=1.2)
-        axes.text(1, place, row["about"], va="center", color="white" if rate > 55 else "black", fontsize=8)
-    axes.set_yticks(range(len(rows)), [f"{row['variant']}  n={row['trials']}" for row in reversed(rows)], fontsize=8)
-    axes.set_xlim(0, 100)
-    axes.set_xlabel("strict success in closed loop, % (line: 95 % interval)")
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
+        bars.barh(len(rows) - 1 - place, rate, color=f"C{place % 10}", height=0.62)
+        interval = [100 * row["low"], 100 * row["high"]]
+        bars.plot(interval, [len(rows) - 1 - place] * 2, color="black", linewidth=1.2)
+        curve = row["curve"]
+        curves.plot(
+            [point["cpu_seconds"] / 60 for point in curve],
+            [point["loss"] for point in curve],
+            color=f"C{place % 10}",
+            label=row["variant"],
+        )
+    labels = [f"{row['variant']}\n{row['success']} of {row['trials']}" for row in reversed(rows)]
+    bars.set_yticks(range(len(rows)), labels, fontsize=8)
+    bars.set_xlim(0, 100)
+    bars.set_xlabel("strict success in closed loop, % (line: 95 % interval)")
+    curves.set_yscale("log")
+    curves.set_xlabel("training, CPU minutes")
+    curves.set_ylabel("loss (L1, normalised actions)")
+    curves.legend(fontsize=7)
+    for axes in (bars, curves):
+        for side in ("top", "right"):
+            axes.spines[side].set_visible(False)
     figure.savefig(path, dpi=110)
 
 
@@ -325,7 +340,7 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--out", type=Path, default=Path("outputs/learning"))
-    parser.add_argument("--plot", type=Path, help="also draw the table into this PNG")
+    parser.add_argument("--plot", type=Path, help="also draw the table and the training curves into this PNG")
     args = parser.parse_args()
     torch.set_num_threads(1)
     args.out.mkdir(parents=True, exist_ok=True)
