@@ -80,8 +80,21 @@ def processes_of_ray() -> set[psutil.Process]:
 
 
 def add_node(cluster, **options: object) -> object:
-    """One more node, with one CPU and no services that these tests have no use for. Returns when it is ready."""
-    return cluster.add_node(num_cpus=1, include_log_monitor=False, no_monitor=True, **options)
+    """One more node, with one CPU and no services that these tests have no use for. Returns when it is ready.
+
+    A node gives up when its services need over 15 s to start, so a busy machine gets five tries.
+    """
+    for tries_left in reversed(range(5)):
+        before = processes_of_ray()
+        try:
+            return cluster.add_node(num_cpus=1, include_log_monitor=False, no_monitor=True, **options)
+        except Exception:  # Ray has no narrower one for this
+            for process in processes_of_ray() - before:
+                with suppress(psutil.Error):
+                    process.kill()
+            if not tries_left:
+                raise
+    raise AssertionError("unreachable")
 
 
 def when_finished(out: Path, count: int, act: Callable[[], None]) -> threading.Thread:
