@@ -46,7 +46,7 @@ class Tutorial(Task):
         [1, 0, 0.1]; a red cube_small.urdf scaled by 1.5 lies at [1, 1, 0.1]. The steps are the tutorial's: open the
         hand, go 25 cm above the cube with the hand down, close, hold by a fixed constraint, carry to 80 cm above
         the table, open, release.
-    Randomised: the cube's place (an arc of 0.5 rad and 8 cm about the tutorial's point), yaw and the arm's initial
+    Randomised: the cube's place (an arc of 0.5 rad, 8 cm wide, within the tutorial's point), yaw, the arm's initial
         joints; nothing with `--fixed`.
     Success: the cube lies on the table, at rest (1 cm/s, 0.1 rad/s), on a face (5 degrees), not touched, the
         gripper open.
@@ -72,7 +72,7 @@ class Tutorial(Task):
             spread = 0.0
         else:
             angle += sampler.placement(-0.25, 0.25)
-            radius = sampler.placement(0.92, 1.0)
+            radius = sampler.placement(0.90, 0.98)  # 1.0 is beyond the reach of the iiwa
             yaw = sampler.yaw()
         # Turned towards the side on which cube and table lie.
         joints = (robot.home_q[0] + 2.0, *robot.home_q[1:])
