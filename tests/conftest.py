@@ -3,9 +3,20 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+
+import pytest
 
 # Heavy libraries read these once, at import; tests run in several processes on few cores.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
 os.environ.setdefault("HF_DATASETS_OFFLINE", "1")
+from demorec.recording.scheduling import ordinary_scheduling
+
+
+@pytest.fixture(autouse=True)
+def _no_real_time_threads() -> Iterator[None]:
+    """LeRobot's own AV1 encoding, run by root, would leave the test process with real-time priority."""
+    with ordinary_scheduling():
+        yield

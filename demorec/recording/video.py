@@ -21,6 +21,7 @@ from PIL import Image
 
 from demorec.config import VideoConfig
 from demorec.errors import RecordingError
+from demorec.recording.scheduling import ordinary_scheduling
 
 Rgb = NDArray[np.uint8]
 
@@ -132,7 +133,8 @@ class _StreamEncoder:
                 "preset": self.settings.preset,
                 **options,
             }
-            context.open()
+            with ordinary_scheduling():
+                context.open()
         except (av.FFmpegError, ValueError) as error:
             raise RecordingError(
                 f"The video encoder {encoder} does not start with {width}x{height} pixels, crf {self.settings.crf}, "

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from helpers_recording import make_episode
 
 from demorec.config import VideoConfig
 from demorec.errors import RecordingError
+from demorec.recording.scheduling import ordinary_scheduling
 from demorec.recording.video import VideoPacket, decode, is_keyframe, make_encoder
 
 ENCODE = """
@@ -116,3 +118,27 @@ def test_packets_do_not_depend_on_the_instructions_of_the_cpu():
     assert plain("cpu-independent=1:asm=0") == packets
     assert plain("asm=0") != plain(""), "these pictures would not tell"
     assert len(packets) == len(pictures)
+
+
+@pytest.mark.parametrize("codec", ["h264", "av1"])
+def test_an_encoder_leaves_the_scheduling_alone(codec: str) -> None:
+    policy = os.sched_getscheduler(0)
+    encoder = make_encoder(video=VideoConfig(codec=codec), width=96, height=64, fps=30)
+    threads = [int(task.name) for task in Path("/proc/self/task").iterdir()]
+    assert {os.sched_getscheduler(thread) for thread in threads} == {policy}
+    encoder.encode(np.zeros((64, 96, 3), np.uint8))
+    encoder.finish()
+    assert os.sched_getscheduler(0) == policy
+
+
+def test_scheduling_is_given_back() -> None:
+    stop = threading.Event()
+    with ordinary_scheduling():
+        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+        late = threading.Thread(target=stop.wait)
+        late.start()
+        assert os.sched_getscheduler(late.native_id or 0) == os.SCHED_BATCH
+    policies = [os.sched_getscheduler(0), os.sched_getscheduler(late.native_id or 0)]
+    stop.set()
+    late.join()
+    assert policies == [os.SCHED_OTHER, os.SCHED_OTHER]
