@@ -14,9 +14,12 @@ from numpy.typing import NDArray
 from demorec.export.layout import MEBIBYTE, FilePosition
 from demorec.export.staging import sync_file
 
+_ROWS_PER_GROUP = 4096
+"""Tables are collected up to so many rows: a row group costs a writer and a reader far more than its rows."""
+
 
 class RollingParquet:
-    """Writes tables into numbered files; one table is never split.
+    """Writes tables into numbered files; one table is never split over two of them.
 
     Attributes:
         position: Of the file that is being written, or of the next one.
@@ -50,6 +53,9 @@ class RollingParquet:
         # A dictionary of numbers that hardly repeat costs time and makes the file larger.
         self._dictionary = True if repeating is None else list(repeating)
         self._rows = 0
+        self._waiting: list[pa.Table] = []
+        self._waiting_rows = 0
+        self._waiting_bytes = 0
         self._sink: Any = None
         self._writer: Any = None
         self._path = Path()
@@ -57,14 +63,14 @@ class RollingParquet:
     def make_room(self, rows: int) -> FilePosition:
         """Begin the next file if these rows would not fit into this one; return where they will be."""
         if self._writer is not None:
-            size = self._sink.tell()
+            size = self._sink.tell() + self._waiting_bytes
             if size * (1 + rows / max(1, self._rows)) >= self._limit:
                 self._finish_file()
                 self.position = self.position.next(self._chunks_size)
         return self.position
 
     def write(self, table: pa.Table) -> None:
-        """Append a table as one row group."""
+        """Append a table."""
         if self._writer is None:
             self._path = self._root / self.position.path(self._template)
             self._path.parent.mkdir(parents=True, exist_ok=True)
@@ -73,8 +79,18 @@ class RollingParquet:
                 self._sink, self.schema, compression=self._compression, use_dictionary=self._dictionary
             )
             self._rows = 0
-        self._writer.write_table(table, row_group_size=max(1, table.num_rows))
+        self._waiting.append(table)
+        self._waiting_rows += table.num_rows
+        self._waiting_bytes += table.nbytes
         self._rows += table.num_rows
+        if self._waiting_rows >= _ROWS_PER_GROUP:
+            self._write_group()
+
+    def _write_group(self) -> None:
+        if self._waiting:
+            table = pa.concat_tables(self._waiting)
+            self._writer.write_table(table, row_group_size=max(1, table.num_rows))
+            self._waiting, self._waiting_rows, self._waiting_bytes = [], 0, 0
 
     def close(self) -> None:
         """Finish the last file and make it durable; harmless when called twice."""
@@ -82,11 +98,12 @@ class RollingParquet:
             self._finish_file()
 
     def _finish_file(self) -> None:
-        writer, self._writer = self._writer, None
         try:
-            writer.close()
+            self._write_group()
+            self._writer.close()
             self.num_bytes += self._sink.tell()
         finally:
+            self._writer = None
             self._sink.close()
         sync_file(self._path)
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -145,6 +146,14 @@ class Layout:
         """K."""
         return len(self.value_bytes) // 8
 
+    @cached_property
+    def _value_runs(self) -> list[tuple[int, int]]:
+        return _runs(self.value_bytes)
+
+    @cached_property
+    def _time_runs(self) -> list[tuple[int, int]]:
+        return _runs(self.time_bytes)
+
     def encode(self, time_ns: NDArray[np.int64], values: Array) -> list[bytes]:
         """One message for each row of `values` (N, K), stamped with `time_ns` (N,)."""
         count, length = len(time_ns), len(self.constant)
@@ -173,12 +182,12 @@ class Layout:
         values = np.empty((len(rows), self.num_values))
         rest = rows.copy()
         column = 0
-        for first, last in _runs(self.value_bytes):
+        for first, last in self._value_runs:
             count = (last - first) // 8
             values[:, column : column + count] = np.ascontiguousarray(rows[:, first:last]).view("<f8")
             rest[:, first:last] = 0
             column += count
-        for first, last in _runs(self.time_bytes):
+        for first, last in self._time_runs:
             rest[:, first:last] = 0
         # The slots of the constant are zero, so what is left must be the constant.
         if not (rest == self.constant).all():

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -189,6 +190,22 @@ def _joints(
     parts: Callable[[Numbers], Sequence[Array]],
     arrange: Callable[[Array], Array] | None = None,
 ) -> StateStream:
+    layout = _joints_layout(tuple(names))
+    return StateStream(topic=topic, schema=messages.JOINT_STATE, layout=layout, parts=parts, arrange=arrange)
+
+
+def _pose(topic: str, frame_id: str, pose: Callable[[Numbers], Pose]) -> StateStream:
+    return StateStream(
+        topic=topic,
+        schema=messages.POSE,
+        layout=_pose_layout(frame_id),
+        parts=lambda numbers: ((found := pose(numbers)).position, found.quat_xyzw),
+    )
+
+
+# The recordings of a run have the same few layouts, and an export opens many.
+@lru_cache(maxsize=64)
+def _joints_layout(names: tuple[str, ...]) -> Layout:
     message = CdrWriter()
     message.header("")
     message.u32(len(names))
@@ -197,19 +214,15 @@ def _joints(
     for _ in range(3):  # position, velocity, effort
         message.u32(len(names))
         message.value_slot(len(names))
-    return StateStream(topic=topic, schema=messages.JOINT_STATE, layout=message.layout(), parts=parts, arrange=arrange)
+    return message.layout()
 
 
-def _pose(topic: str, frame_id: str, pose: Callable[[Numbers], Pose]) -> StateStream:
+@lru_cache(maxsize=64)
+def _pose_layout(frame_id: str) -> Layout:
     message = CdrWriter()
     message.header(frame_id)
     message.value_slot(7)
-    return StateStream(
-        topic=topic,
-        schema=messages.POSE,
-        layout=message.layout(),
-        parts=lambda numbers: ((found := pose(numbers)).position, found.quat_xyzw),
-    )
+    return message.layout()
 
 
 PHASE_EVENT = "phase"

@@ -11,6 +11,7 @@ import zlib
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
@@ -128,24 +129,23 @@ class Container:
             opcode, length = RECORD_HEAD.unpack_from(summary, position)
             position += RECORD_HEAD.size
             content = summary[position : position + length]
-            stream = ReadDataStream(BytesIO(content))
             position += length
             if opcode == Opcode.CHANNEL:
-                channel = Channel.read(stream)
+                channel = _read_channel(content)
                 channels[channel.id] = channel
             elif opcode == Opcode.SCHEMA:
-                schema = Schema.read(stream)
+                schema = _read_schema(content)
                 self.schemas[schema.id] = schema
             elif opcode == Opcode.CHUNK_INDEX:
                 self._chunks.append(ChunkPlace.read(content))
             elif opcode == Opcode.METADATA_INDEX:
-                metadata = MetadataIndex.read(stream)
+                metadata = _read(content, MetadataIndex)
                 self._metadata[metadata.name] = metadata
             elif opcode == Opcode.ATTACHMENT_INDEX:
-                attachment = AttachmentIndex.read(stream)
+                attachment = _read(content, AttachmentIndex)
                 self._attachments[attachment.name] = attachment
             elif opcode == Opcode.STATISTICS:
-                counts = dict(Statistics.read(stream).channel_message_counts)
+                counts = dict(_read(content, Statistics).channel_message_counts)
         self._chunks.sort(key=lambda chunk: chunk.start)
         self._topics = {channel.id: channel.topic for channel in channels.values()}
         self.channels = {channel.topic: channel for channel in channels.values()}
@@ -170,8 +170,7 @@ class Container:
         return memoryview(data)[RECORD_HEAD.size :]
 
     def _record_at[R: McapRecord](self, offset: int, length: int, opcode: Opcode, kind: type[R]) -> R:
-        record: R = kind.read(ReadDataStream(BytesIO(self._content_at(offset, length, opcode))))
-        return record
+        return _read(self._content_at(offset, length, opcode), kind)
 
     def metadata(self, name: str) -> dict[str, str] | None:
         """A metadata record, or None; the caller checks its seal."""
@@ -224,6 +223,22 @@ class Container:
 
     def _chunk_content(self, place: ChunkPlace) -> bytes:
         return chunk_content(self._content_at(place.start, place.length, Opcode.CHUNK), place.uncompressed_size)
+
+
+def _read[R: McapRecord](content: bytes | memoryview, kind: type[R]) -> R:
+    record: R = kind.read(ReadDataStream(BytesIO(content)))
+    return record
+
+
+# These are the same bytes in every recording of a run, and an export opens many.
+@lru_cache(maxsize=1024)
+def _read_channel(content: bytes) -> Channel:
+    return _read(content, Channel)
+
+
+@lru_cache(maxsize=256)
+def _read_schema(content: bytes) -> Schema:
+    return _read(content, Schema)
 
 
 def _records_of(content: bytes) -> Iterator[tuple[int, bytes]]:
