@@ -14,7 +14,7 @@ from tqdm import tqdm
 from demorec.generate.estimate import Estimate
 from demorec.generate.options import RunOptions, available_cores
 from demorec.generate.run import RunResult
-from demorec.generate.run_file import DATASET, EPISODES, UNFINISHED, Attempt, ExportRecord, RunFile
+from demorec.generate.run_file import DATASET, EPISODES, STARTING, UNFINISHED, Attempt, ExportRecord, RunFile
 
 _WORTH_PROCESSES = 50
 """Recordings from which on several processes check faster than one."""
@@ -191,7 +191,7 @@ def _seconds(attempts: tuple[Attempt, ...], export: ExportRecord | None) -> str:
     stages: Counter[str] = Counter()
     for attempt in attempts:
         stages.update(attempt.seconds)
-    shown = [f"{stage} {seconds:.1f}" for stage, seconds in stages.items()]
+    shown = [f"{stage} {stages[stage]:.1f}" for stage in sorted(stages, key=lambda stage: stage != STARTING)]
     if export is not None:
         shown.append(f"export {export.seconds:.1f}")
     return ", ".join(shown)

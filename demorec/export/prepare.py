@@ -102,8 +102,8 @@ def _camera_feature(shape: tuple[int, int, int], info: dict[str, object]) -> Fea
     return Feature(dtype="video", shape=shape, names=("height", "width", "channels"), info=info)
 
 
-def prepare_episode(recording: Recording, options: ExportOptions) -> PreparedEpisode:
-    """Read a recording into memory, as the dataset wants it.
+def prepare_episode(recording: Recording, options: ExportOptions, *, code_depth: bool = True) -> PreparedEpisode:
+    """Read a recording into memory, as the dataset wants it; depth videos, which must be coded, only with `code_depth`.
 
     With frames left out, an observation is that of the first frame of its group and an action the last one of it:
     where the robot shall be when the next observation is taken.
@@ -140,7 +140,7 @@ def prepare_episode(recording: Recording, options: ExportOptions) -> PreparedEpi
         pixels[key] = PixelHistogram(
             counts=statistics.counts, level_values=colour_levels(), num_pictures=statistics.num_images
         )
-    for camera in recording.cameras:
+    for camera in recording.cameras if code_depth else ():
         key = IMAGE_PREFIX + camera + DEPTH_SUFFIX
         if key in wanted:
             pictures = (picture for index, picture in enumerate(recording.depth(camera)) if index % stride == 0)

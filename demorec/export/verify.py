@@ -11,7 +11,7 @@ import os
 import tempfile
 from collections.abc import Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import islice
 from multiprocessing import get_context
 from pathlib import Path
@@ -98,7 +98,7 @@ def _verify(root: Path, samples: tuple[Sample, ...], options: ExportOptions) -> 
 
 
 def _compare_episode(dataset: Any, sample: Sample, recording: Recording, options: ExportOptions, number: int) -> int:
-    expected = prepare_episode(recording, replace(options, depth=False)).data
+    expected = prepare_episode(recording, options, code_depth=False).data
     stride = frame_stride(recording.info.fps, options.fps)
     first = int(dataset.meta.episodes[sample.episode_index]["dataset_from_index"])
     # The last frame, where offsets add up, and one more that differs from episode to episode.

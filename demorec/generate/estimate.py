@@ -13,7 +13,7 @@ from demorec.errors import ConfigError, GenerationError
 from demorec.generate.executor import MAKE_EPISODE, Made, Raised
 from demorec.generate.local import LocalExecutor
 from demorec.generate.options import RunOptions, available_cores
-from demorec.generate.run_file import EPISODES, FAILED, UNFINISHED
+from demorec.generate.run_file import EPISODES, FAILED, STARTING, UNFINISHED
 
 _MEASURED = 2
 """Attempts with pictures: the first of a worker compiles, loads and fills caches, the second is what counts."""
@@ -32,7 +32,7 @@ class Estimate:
         successes: How many of them succeeded.
         num_frames: Of the measured attempt.
         cpu_seconds: stage -> CPU seconds of the measured attempt.
-        start_seconds: CPU seconds that the first attempt of a worker takes longer.
+        start_seconds: CPU seconds that a worker needs before its first frame.
         num_bytes: Of the measured attempt's recording.
         peak_worker_bytes: Memory of a worker.
         num_episodes, workers: Of the run.
@@ -88,7 +88,7 @@ def estimate(config: GenerateConfig, options: RunOptions, *, maker: str = MAKE_E
         successes=sum(report.attempt.success for report in tried),
         num_frames=measured[-1].attempt.num_frames,
         cpu_seconds=seconds,
-        start_seconds=max(0.0, sum(measured[0].attempt.seconds.values()) - sum(seconds.values())),
+        start_seconds=measured[0].attempt.seconds.get(STARTING, 0.0),
         num_bytes=measured[-1].attempt.num_bytes,
         peak_worker_bytes=max(report.peak_bytes for report in measured),
         num_episodes=options.num_episodes,

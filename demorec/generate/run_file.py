@@ -21,6 +21,8 @@ from demorec.plain import digest, from_plain, to_plain
 RUN_NAME = "run.json"
 RUN_FORMAT = 1
 EPISODES, FAILED, UNFINISHED, DATASET = "episodes", "failed", "unfinished", "dataset"
+STARTING = "starting"
+"""What a worker does before its first frame, once: it compiles, or loads, and fills caches that later episodes find."""
 
 
 class DamagedRunFileError(ConfigError):
@@ -41,7 +43,8 @@ class Attempt:
         digest: Of its content (states, actions, packets, metadata that matter).
         num_frames, num_bytes: Of the recording.
         phase, reason: Of the failure; "" on success.
-        seconds: stage -> CPU seconds: "simulation", "rendering", "recording". Not part of any digest.
+        seconds: stage -> CPU seconds: "simulation", "rendering", "recording", and "starting" for the first
+            attempt of a worker. Not part of any digest.
     """
 
     episode_index: int

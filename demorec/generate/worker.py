@@ -19,7 +19,7 @@ from demorec.config import EpisodePlan
 from demorec.episode import CameraImages, EpisodeInfo
 from demorec.errors import SceneError
 from demorec.generate.recordings import inspect_recording
-from demorec.generate.run_file import EPISODES, FAILED, UNFINISHED, Attempt, recording_name, sync_folder
+from demorec.generate.run_file import EPISODES, FAILED, STARTING, UNFINISHED, Attempt, recording_name, sync_folder
 from demorec.recording import EpisodeWriter
 from demorec.render import Renderer, RenderSetup
 from demorec.rollout import Rollout, make_renderer, make_world, prepare
@@ -27,6 +27,7 @@ from demorec.sim.world import World
 
 SIMULATION, RENDERING, RECORDING = "simulation", "rendering", "recording"
 STAGES = (SIMULATION, RENDERING, RECORDING)
+"""Of every attempt; the first one of a worker also has STARTING."""
 
 
 def make_episode(plan: EpisodePlan, folder: Path) -> Attempt:
@@ -58,17 +59,23 @@ def make_episode(plan: EpisodePlan, folder: Path) -> Attempt:
 
 
 def _record(plan: EpisodePlan, path: Path, seconds: dict[str, float]) -> None:
-    with _measured(seconds, SIMULATION):
+    before_first_frame = SIMULATION if _workshop.is_warm else STARTING
+    with _measured(seconds, before_first_frame):
         episode = prepare(plan)
         world, renderer = _workshop.equip(episode.info)
     rollout = Rollout(world, episode, _Stopwatch(renderer, seconds) if renderer else None)
     with EpisodeWriter(path, episode.info, video=plan.config.video) as recording:
         frames = iter(rollout)
+        stage = before_first_frame
         while True:
             rendering_before = seconds[RENDERING]
-            with _measured(seconds, SIMULATION):
+            with _measured(seconds, stage):
                 frame = next(frames, None)
-            seconds[SIMULATION] -= seconds[RENDERING] - rendering_before
+            if stage == STARTING:
+                seconds[RENDERING] = rendering_before
+            else:
+                seconds[stage] -= seconds[RENDERING] - rendering_before
+            stage = SIMULATION
             if frame is None:
                 break
             with _measured(seconds, RECORDING):
@@ -86,6 +93,11 @@ class _Workshop:
         self._renderer: AbstractContextManager[Renderer | None] | None = None
         self._entered: Renderer | None = None
         self._key: object = None
+
+    @property
+    def is_warm(self) -> bool:
+        """Whether this process has made an episode before."""
+        return self._world is not None
 
     def equip(self, info: EpisodeInfo) -> tuple[World, Renderer | None]:
         """A world and a renderer for episodes like this one; the present ones where they fit."""
@@ -159,7 +171,7 @@ def _measured(seconds: dict[str, float], stage: str) -> Iterator[None]:
     try:
         yield
     finally:
-        seconds[stage] += time.process_time() - start
+        seconds[stage] = seconds.get(stage, 0.0) + time.process_time() - start
 
 
 def _without_scene(plan: EpisodePlan, reason: str, seconds: dict[str, float]) -> Attempt:

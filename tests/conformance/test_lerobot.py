@@ -185,6 +185,13 @@ def test_depth_is_read_as_metres(tmp_path: Path) -> None:
     assert found.meta.stats["observation.images.front_depth"]["min"].reshape(-1)[0] == pytest.approx(values[0])
 
 
+def test_depth_without_its_colour_is_verified(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "run", (6, 5), depth=True)
+    report = export(run, tmp_path / "d", depth=True, features=("observation.images.front_depth",), verify=True)
+    assert report.verified_frames == 4
+    assert open_dataset(tmp_path / "d").meta.camera_keys == ["observation.images.front_depth"]
+
+
 # ------------------------------------------------------------------------------------------- LeRobot's own tools, slow
 
 
