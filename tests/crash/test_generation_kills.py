@@ -17,7 +17,7 @@ from demorec.generate.run_file import load_run_file
 
 pytestmark = pytest.mark.slow
 NUM_EPISODES = 60
-NUM_KILLS = 32
+NUM_KILLS = 40
 
 
 def command(out: Path, *more: str, workers: int = 2) -> list[str]:
