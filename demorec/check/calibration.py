@@ -85,7 +85,7 @@ def _scale(camera: Camera) -> float:
     group="calibration",
     measures="distance between where bodies are in the picture and where their poses project to, of its height",
     unit="%",
-    warn=3.0,
+    warn=3.5,
     fail=5.0,
     needs_pictures=True,
 )
