@@ -25,6 +25,9 @@ NEUTRAL_COLORS: tuple[Rgba, ...] = (
 
 DISTRACTOR_REGION = Region(x=(WORKSPACE.x[0] - 0.03, WORKSPACE.x[1] + 0.06), y=(-0.33, 0.33), max_radius=0.85)
 DISTRACTOR_GAP = 0.12
+"""Between the middles of a distractor and of what the task is about, metres."""
+DISTRACTOR_MARGIN = 0.045
+"""Between the middle of a distractor and the outline of any of these (trays are large): half its diagonal and 1 cm."""
 
 
 def draw_behaviour(ranges: Ranges, rng: np.random.Generator) -> Behaviour:
@@ -93,16 +96,28 @@ def _lower_table(scene: Scene, drop: float) -> Scene:
 
 def _with_distractors(scene: Scene, count: int, rng: np.random.Generator) -> Scene:
     sampler = Sampler(rng)
-    taken = [
-        _footprint(body.world_from_body) for body in scene.bodies if body.role in ("object", "target", "distractor")
-    ]
+    others = [body for body in scene.bodies if body.role in ("object", "target", "distractor")]
+    taken = [_footprint(body.world_from_body) for body in others]
     taken += [_footprint(_world_from_goal(scene, index)) for index in range(len(scene.goals))]
     bodies = list(scene.bodies)
     for index in range(count):
-        point = sampler.point(DISTRACTOR_REGION, away_from=taken, min_distance=DISTRACTOR_GAP, what="a distractor")
+        point = sampler.point(
+            DISTRACTOR_REGION,
+            away_from=taken,
+            min_distance=DISTRACTOR_GAP,
+            accept=lambda point: all(_from_outline(body, point) >= DISTRACTOR_MARGIN for body in others),
+            what="a distractor",
+        )
         taken.append(point)
         bodies.append(_distractor(f"distractor_{index}", point, sampler))
     return replace(scene, bodies=tuple(bodies))
+
+
+def _from_outline(body: Body, point: tuple[float, float]) -> float:
+    """Metres from a body's bounding rectangle, seen from above, to a point; 0 within it."""
+    x, y, _ = body.world_from_body.inverse().apply(np.array([*point, 0.0]))
+    width, depth, _ = body.shape.extents
+    return math.hypot(max(0.0, abs(x) - width / 2), max(0.0, abs(y) - depth / 2))
 
 
 def _footprint(pose: Pose) -> tuple[float, float]:

@@ -122,6 +122,27 @@ def test_distractors_keep_away():
                 assert min(math.dist(here, other.world_from_body.position[:2]) for other in others) >= 0.12
 
 
+@pytest.mark.parametrize("task", ["place_in_tray", "sort_by_color"])
+def test_distractors_do_not_stand_in_a_tray(task):
+    """Points all over a distractor lie outside the rectangle of every tray."""
+    count = 0
+    for index in range(60):
+        scene = episode(index, task=task, variation="full").info.scene
+        trays = [body for body in scene.bodies if body.role == "target"]
+        assert trays
+        for body in scene.bodies:
+            if body.role != "distractor":
+                continue
+            grid = np.stack(np.meshgrid(*[np.linspace(-0.5, 0.5, 9)] * 2, [0.0]), axis=-1).reshape(-1, 3)
+            points = body.world_from_body.matrix() @ np.c_[grid * body.shape.extents, np.ones(len(grid))].T
+            for tray in trays:
+                x, y, _, _ = np.abs(np.linalg.inv(tray.world_from_body.matrix()) @ points)
+                width, depth, _ = tray.shape.extents
+                assert ((x > width / 2) | (y > depth / 2)).all()
+                count += 1
+    assert count > 60
+
+
 def test_looks_do_not_touch_the_physics():
     """Another preset of looks alone gives the same bits of state."""
     plain = run(episode(3))[1].final_state_digest
