@@ -6,6 +6,7 @@ python benchmarks/pictures.py --out docs/images
 from __future__ import annotations
 
 import argparse
+import textwrap
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from demorec.tables import TASKS
 
 Picture = NDArray[np.uint8]
 WIDTH, HEIGHT = 320, 240
+CAPTION_LETTERS = 48
 CARRYING = {"lift", "transport", "hold"}
 
 
@@ -31,15 +33,17 @@ def grasp_and_end(config: GenerateConfig, index: int) -> tuple[Picture, Picture,
 
 
 def sheet(rows: list[list[tuple[Picture, str]]]) -> Image.Image:
-    """Rows of captioned pictures."""
-    line = 18
+    """Rows of captioned pictures; long captions take several lines."""
+    lines = max(len(textwrap.wrap(caption, CAPTION_LETTERS)) for row in rows for _, caption in row)
+    line = 3 + 15 * lines
     columns = max(len(row) for row in rows)
     canvas = Image.new("RGB", (columns * WIDTH, len(rows) * (HEIGHT + line)), "white")
     draw, font = ImageDraw.Draw(canvas), ImageFont.load_default(size=12)
     for y, row in enumerate(rows):
         for x, (picture, caption) in enumerate(row):
             canvas.paste(Image.fromarray(picture), (x * WIDTH, y * (HEIGHT + line)))
-            draw.text((x * WIDTH + 4, y * (HEIGHT + line) + HEIGHT + 2), caption, fill="black", font=font)
+            text = textwrap.fill(caption, CAPTION_LETTERS)
+            draw.text((x * WIDTH + 4, y * (HEIGHT + line) + HEIGHT + 2), text, fill="black", font=font, spacing=2)
     return canvas
 
 
@@ -63,7 +67,7 @@ def main() -> None:
     cells: list[list[tuple[Picture, str]]] = []
     for task in TASKS.names():
         held, end, instruction = grasp_and_end(config(task, "mild"), 0)
-        cells.append([(held, f"{task}: {instruction}"[:50]), (end, f"{task}, end")])
+        cells.append([(held, f"{task}: {instruction}"), (end, f"{task}, end")])
     pairs = [left + right for left, right in zip(cells[0::2], cells[1::2], strict=True)]
     sheet(pairs).save(args.out / "tasks.jpg", quality=88)
     looks = [(grasp_and_end(config("pick_place", "full"), index)[0], f"look {index}") for index in range(16)]
