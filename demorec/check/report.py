@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Literal
 
@@ -14,6 +13,7 @@ from demorec.check.dataset import Dataset
 from demorec.check.episode import RecordedEpisode
 from demorec.check.run import RUN_NAME, RunFolder
 from demorec.errors import ConfigError, DemorecError
+from demorec.processes import SPAWN
 from demorec.tables import CHECKS
 
 _SEVERITY: dict[Level, int] = {"skip": 0, "pass": 0, "warn": 1, "fail": 2}
@@ -114,7 +114,7 @@ def check_subjects(subjects: Sequence[Subject], options: CheckOptions) -> Iterat
             yield check_subject(subject, options)
         return
     # Spawned: forked children would share decoders and libraries in the middle of something.
-    with ProcessPoolExecutor(max_workers=min(options.workers, len(subjects)), mp_context=get_context("spawn")) as pool:
+    with ProcessPoolExecutor(max_workers=min(options.workers, len(subjects)), mp_context=SPAWN) as pool:
         yield from pool.map(check_subject, subjects, [options] * len(subjects))
 
 

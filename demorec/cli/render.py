@@ -6,7 +6,6 @@ import sys
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
-from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -14,6 +13,7 @@ from tyro.conf import Positional, arg
 
 from demorec.config import VideoConfig
 from demorec.errors import ConfigError
+from demorec.processes import SPAWN
 
 if TYPE_CHECKING:
     from demorec.rerender import RerenderOptions, RerenderReport
@@ -161,7 +161,7 @@ def _rendered(
             yield rerender(source, target, options, overwrite=overwrite)
         return
     # Spawned, as renderers and decoders do not survive a fork.
-    with ProcessPoolExecutor(max_workers=workers, mp_context=get_context("spawn")) as pool:
+    with ProcessPoolExecutor(max_workers=workers, mp_context=SPAWN) as pool:
         futures = [pool.submit(rerender, source, target, options, overwrite=overwrite) for source, target in jobs]
         try:
             for future in futures:

@@ -7,7 +7,6 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass
-from multiprocessing import get_context
 from pathlib import Path
 
 from demorec.export.layout import IMAGE_PREFIX, Feature
@@ -16,6 +15,7 @@ from demorec.export.prepare import PreparedEpisode, dataset_features, frame_stri
 from demorec.export.sidecar import AttemptRecord
 from demorec.export.sources import Profile, Source
 from demorec.export.transcode import reason_to_transcode
+from demorec.processes import SPAWN
 from demorec.recording import Recording
 
 _BYTES_THAT_PAY = 1 << 30
@@ -96,7 +96,7 @@ def _workers_that_pay(sources: Sequence[Source], options: ExportOptions) -> int:
 
 def _in_processes(sources: Sequence[Source], options: ExportOptions, workers: int) -> Iterator[Reading | None]:
     waiting: deque[Future[Reading | None]] = deque()
-    with ProcessPoolExecutor(max_workers=workers, mp_context=get_context("spawn")) as pool:
+    with ProcessPoolExecutor(max_workers=workers, mp_context=SPAWN) as pool:
         try:
             for source in sources:
                 waiting.append(pool.submit(read, source, options))

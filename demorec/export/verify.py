@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass
 from itertools import islice
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +25,7 @@ from demorec.export.layout import IMAGE_PREFIX
 from demorec.export.options import ExportOptions
 from demorec.export.prepare import frame_stride, prepare_episode
 from demorec.export.transcode import reason_to_transcode
+from demorec.processes import SPAWN
 from demorec.recording import Recording
 from demorec.recording.video import decode
 
@@ -52,7 +52,7 @@ class Verifier:
     def __init__(self) -> None:
         self._cache = tempfile.TemporaryDirectory(prefix="demorec-verify-")
         self._pool = ProcessPoolExecutor(
-            max_workers=1, mp_context=get_context("spawn"), initializer=_prepare_process, initargs=(self._cache.name,)
+            max_workers=1, mp_context=SPAWN, initializer=_prepare_process, initargs=(self._cache.name,)
         )
         self._loading: Future[None] = self._pool.submit(_load_lerobot)
 

@@ -22,8 +22,7 @@ from types import FrameType
 
 from demorec.config import EpisodePlan
 from demorec.generate.executor import SINGLE_THREADED, Lost, Report, attempt_episode
-
-_spawn = multiprocessing.get_context("spawn")
+from demorec.processes import SPAWN
 
 
 class _Interrupted(BaseException):
@@ -129,8 +128,8 @@ class LocalExecutor:
         self.close()
 
     def _start(self) -> _Worker:
-        ours, theirs = _spawn.Pipe()
-        process = _spawn.Process(
+        ours, theirs = SPAWN.Pipe()
+        process = SPAWN.Process(
             target=_worker_main, args=(theirs, self._maker, self._folder), name="demorec-worker", daemon=True
         )
         with _environment(SINGLE_THREADED), _blocked(signal.SIGINT):

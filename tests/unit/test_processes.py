@@ -1,0 +1,47 @@
+"""Our processes do not run the user's script again, and find what they carry out by name."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+SCRIPT = """
+import sys
+from concurrent.futures import ProcessPoolExecutor
+from math import sqrt
+
+from demorec.processes import SPAWN
+
+print("script")
+with ProcessPoolExecutor(max_workers=2, mp_context=SPAWN) as pool:
+    print(list(pool.map(sqrt, [4.0, 9.0])))
+process = SPAWN.Process(target=print, args=("child",))
+process.start()
+process.join()
+assert process.exitcode == 0
+assert sys.modules["__main__"].__file__ == __file__
+print("end")
+"""
+
+
+def told(*command: str, cwd: Path) -> list[str]:
+    done = subprocess.run([sys.executable, *command], cwd=cwd, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines()
+
+
+def test_a_script_needs_no_main_guard(tmp_path):
+    (tmp_path / "script.py").write_text(SCRIPT)
+    expected = ["[2.0, 3.0]", "child", "end", "script"]
+    assert sorted(told("script.py", cwd=tmp_path)) == expected
+    assert sorted(told("-m", "script", cwd=tmp_path)) == expected
+
+
+def test_python_itself_would_run_the_script_again(tmp_path):
+    """Else the test above would prove nothing."""
+    plain = "from multiprocessing import get_context; SPAWN = get_context('spawn')"
+    (tmp_path / "script.py").write_text(SCRIPT.replace("from demorec.processes import SPAWN", plain))
+    done = subprocess.run([sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode != 0
+    assert "bootstrapping phase" in done.stderr
