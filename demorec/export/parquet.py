@@ -15,7 +15,8 @@ from demorec.export.layout import MEBIBYTE, FilePosition
 from demorec.export.staging import sync_file
 
 _ROWS_PER_GROUP = 4096
-"""Tables are collected up to so many rows: a row group costs a writer and a reader far more than its rows."""
+_BYTES_PER_GROUP = 2 * MEBIBYTE
+"""Tables are collected up to so many rows or bytes: a row group costs a writer and a reader far more than its rows."""
 
 
 class RollingParquet:
@@ -83,7 +84,7 @@ class RollingParquet:
         self._waiting_rows += table.num_rows
         self._waiting_bytes += table.nbytes
         self._rows += table.num_rows
-        if self._waiting_rows >= _ROWS_PER_GROUP:
+        if self._waiting_rows >= _ROWS_PER_GROUP or self._waiting_bytes >= _BYTES_PER_GROUP:
             self._write_group()
 
     def _write_group(self) -> None:
