@@ -150,7 +150,7 @@ def projected_size(episode: RecordedEpisode) -> Measurement | None:
 @check(
     group="alignment",
     measures="lag between pictures and poses, frames",
-    warn=0.45,
+    warn=0.5,
     fail=0.7,
     needs_pictures=True,
 )

@@ -40,7 +40,7 @@ from demorec.scene import Goal, Scene
 CONFIGS_PATH = f"{SIDECAR_DIR}/configs.json"
 EXPORT_PATH = f"{SIDECAR_DIR}/export.json"
 
-_ROWS_PER_GROUP = 100
+_ROWS_PER_TABLE = 100
 _POSE = pa.list_(pa.float64(), 7)
 _VECTOR = pa.list_(pa.float64())
 
@@ -313,14 +313,14 @@ class SidecarWriter:
         self.add_attempt(record.attempt, in_dataset=True)
         if record.moving_cameras:
             self._add_camera_poses(episode_index, record.moving_cameras)
-        if len(self._episode_rows) >= _ROWS_PER_GROUP:
+        if len(self._episode_rows) >= _ROWS_PER_TABLE:
             self._flush_episodes()
 
     def add_attempt(self, attempt: AttemptRecord, *, in_dataset: bool) -> None:
         """An attempt that was seen, whether or not it is in the dataset."""
         row = {item.name: getattr(attempt, item.name) for item in fields(attempt)}
         self._attempt_rows.append({**row, "in_dataset": in_dataset})
-        if len(self._attempt_rows) >= _ROWS_PER_GROUP:
+        if len(self._attempt_rows) >= _ROWS_PER_TABLE:
             self._flush_attempts()
 
     def _add_camera_poses(self, episode_index: int, poses: Mapping[str, Array]) -> None:

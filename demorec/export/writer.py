@@ -39,7 +39,7 @@ from demorec.export.parquet import RollingParquet, nested_array, vector_array
 from demorec.export.staging import sync_file
 from demorec.export.stats import NAMES, PixelHistogram, Statistics, vector_statistics
 
-_EPISODE_ROWS_PER_GROUP = 100
+_EPISODES_PER_TABLE = 100
 _MAX_SECONDS_PER_VIDEO = 900.0
 """LeRobot compares timestamps as float32, whose step is 6e-5 s beyond 512 s and 1.2e-4 s beyond 1024 s, with a
 tolerance of 1e-4 s: a new mp4 file is begun before that, except for a single episode that is longer."""
@@ -181,7 +181,7 @@ class DatasetWriter:
             statistics[key] = pixels.statistics()
         self._rows.append(row)
         self._row_statistics.append(statistics)
-        if len(self._rows) >= _EPISODE_ROWS_PER_GROUP:
+        if len(self._rows) >= _EPISODES_PER_TABLE:
             self._write_episode_rows()
         self.num_frames += frames
         self.num_episodes += 1

@@ -45,7 +45,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def dataset(run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("dataset") / "d"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(demorec.export.writer, "_EPISODE_ROWS_PER_GROUP", 2)
+        patch.setattr(demorec.export.writer, "_EPISODES_PER_TABLE", 2)
         export(run, out, privileged=True, video_files_mb=0.006, data_files_mb=0.03, files_per_chunk=2)
     for folder in ("data", "meta/episodes", "videos/observation.images.front", "videos/observation.images.wrist"):
         assert len(list((out / folder).rglob("file-*"))) > 1, folder

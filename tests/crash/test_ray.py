@@ -196,6 +196,7 @@ def test_a_run_begun_on_ray_goes_on_without_it(tmp_path, cluster, reference):
 
 
 def test_too_large_workers_are_refused(tmp_path, cluster):
+    # A node that an earlier test killed may still be counted.
     with pytest.raises(ConfigError, match=r"has \d CPUs and 0 GPUs, too few for one worker with 1 CPUs and 1 GPUs"):
         run_on_ray(tmp_path / "run", maker="make", gpus_per_worker=1.0)
 

@@ -103,7 +103,7 @@ def test_the_digest_depends_on_the_content_alone(run: Path, tmp_path: Path) -> N
 
 
 def test_every_kind_of_file_rolls_over_by_itself(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(demorec.export.writer, "_EPISODE_ROWS_PER_GROUP", 1)
+    monkeypatch.setattr(demorec.export.writer, "_EPISODES_PER_TABLE", 1)
     out = tmp_path / "d"
     export(run, out, video_files_mb=0.006, data_files_mb=0.001, files_per_chunk=2)
     rows = episode_rows(out)
