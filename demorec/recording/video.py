@@ -28,6 +28,13 @@ Rgb = NDArray[np.uint8]
 # SVT-AV1 tells its settings on standard error unless this says "errors only"; it reads it when it starts.
 os.environ.setdefault("SVT_LOG", "1")
 
+# Code points of ITU-T H.273, the same in H.264 and AV1: sRGB pictures through the matrix that libswscale uses by itself
+# (BT.601, 16 to 235). Without them a player guesses, and many guess BT.709: (200, 30, 30) then shows as (214, 45, 28).
+_LIMITED_RANGE = 1
+_PRIMARIES_BT709 = 1
+_TRANSFER_SRGB = 13
+_MATRIX_BT601 = 6
+
 
 @dataclass(frozen=True, kw_only=True)
 class VideoSettings:
@@ -125,6 +132,8 @@ class _StreamEncoder:
             context.width, context.height, context.pix_fmt = width, height, self.settings.pix_fmt
             self._time_base = Fraction(1, fps)
             context.time_base, context.framerate = self._time_base, Fraction(fps, 1)
+            context.color_range, context.colorspace = _LIMITED_RANGE, _MATRIX_BT601
+            context.color_primaries, context.color_trc = _PRIMARIES_BT709, _TRANSFER_SRGB
             context.gop_size = video.gop
             context.thread_count = 1
             context.options = {

@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
-from helpers_recording import write_episode
+from helpers_recording import make_episode, write_episode
 from helpers_viewer import chromium, need_chromium, need_vulkan, num_colors, pixels
 
 from demorec.cli import run_command
 from demorec.cli.view import View
+from demorec.config import VideoConfig
 from demorec.playback import live as live_module
 from demorec.playback.live import LiveViewer
 from demorec.playback.save import save, save_each
 from demorec.playback.sources import find_episodes
 from demorec.playback.viewer import HeadlessViewer, serve_web
+from demorec.recording import EpisodeWriter
 
 
 def view(*args: object) -> int:
@@ -103,6 +107,25 @@ def test_the_viewer_shows_a_run(run_folder: Path, tmp_path: Path) -> None:
         after = pixels(viewer.view_picture("front camera"))
     assert before.shape == after.shape
     assert np.abs(before.astype(int) - after).mean() > 1.0, "the video stands still"
+
+
+@pytest.mark.viewer
+@pytest.mark.parametrize("codec", ["av1", "jpeg"])
+def test_the_viewer_shows_the_colours_that_were_recorded(codec: Literal["av1", "jpeg"], tmp_path: Path) -> None:
+    """H.264 is left out: Rerun 0.41 takes it for BT.709 whatever the stream says."""
+    need_vulkan()
+    colours = np.array([[200, 30, 30], [30, 200, 30], [30, 30, 200], [200, 200, 40]], dtype=np.uint8)
+    picture = np.repeat(np.repeat(colours[np.newaxis], 80, axis=1), 240, axis=0)
+    info, frames, outcome = make_episode(num_frames=30, cameras=("front",), width=320, height=240)
+    with EpisodeWriter(tmp_path / "episode_000000.mcap", info, video=VideoConfig(codec=codec)) as writer:
+        for frame in frames:
+            writer.write(replace(frame, images={"front": replace(frame.images["front"], color=picture)}))
+        writer.finish(outcome)
+    with HeadlessViewer(*save_each(find_episodes([tmp_path]), tmp_path)) as viewer:
+        viewer.seek(0.5)
+        shown = pixels(viewer.view_picture("front camera"))
+    height, width = shown.shape[:2]
+    np.testing.assert_allclose(shown[height // 2, width // 8 :: width // 4][:4], colours, atol=4)
 
 
 @pytest.mark.viewer

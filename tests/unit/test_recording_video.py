@@ -99,6 +99,7 @@ def test_packets_do_not_depend_on_the_instructions_of_the_cpu():
         context = av.CodecContext.create(encoder.settings.encoder, "w")
         context.width, context.height, context.pix_fmt = 224, 224, "yuv420p"
         context.time_base, context.framerate, context.gop_size = Fraction(1, 30), Fraction(30, 1), encoder.settings.gop
+        context.color_range, context.color_primaries, context.color_trc, context.colorspace = 1, 1, 13, 6
         context.thread_count = 1
         settings = encoder.settings
         context.options = {
@@ -118,6 +119,28 @@ def test_packets_do_not_depend_on_the_instructions_of_the_cpu():
     assert plain("cpu-independent=1:asm=0") == packets
     assert plain("asm=0") != plain(""), "these pictures would not tell"
     assert len(packets) == len(pictures)
+
+
+@pytest.mark.parametrize(("codec", "decoder"), [("h264", "h264"), ("av1", "libdav1d")])
+def test_a_stream_says_how_its_colours_are_meant(codec: str, decoder: str) -> None:
+    """And it is true: the luma and chroma in it give the picture back by the matrix and range that it names."""
+    import av
+
+    colours = np.array([[200, 30, 30], [30, 200, 30], [30, 30, 200], [200, 200, 40]], dtype=np.uint8)
+    picture = np.repeat(np.repeat(colours[np.newaxis], 32, axis=1), 64, axis=0)
+    encoder = make_encoder(video=VideoConfig(codec=codec, crf=5), width=128, height=64, fps=30)
+    packets = [*encoder.encode(picture), *encoder.finish()]
+    context = av.CodecContext.create(decoder, "r")
+    frames = [frame for packet in packets for frame in context.decode(av.Packet(packet))] + context.decode(None)
+    # Code points of ITU-T H.273: limited range, primaries of BT.709, transfer of sRGB, matrix of BT.601.
+    assert (context.color_range, context.color_primaries, context.color_trc, context.colorspace) == (1, 1, 13, 6)
+    planes = frames[0].to_ndarray().astype(float)  # 64 rows of luma, then 16 of U and 16 of V
+    luma = (planes[32, 16::32] - 16) / 219
+    blue, red = ((planes[row].reshape(2, 64)[0, 8::16] - 128) / 224 for row in (72, 88))
+    # ITU-R BT.601: Y = 0.299 R + 0.587 G + 0.114 B, Pb = (B - Y) / 1.772, Pr = (R - Y) / 1.402
+    r, b = luma + 1.402 * red, luma + 1.772 * blue
+    shown = 255 * np.stack([r, (luma - 0.299 * r - 0.114 * b) / 0.587, b], axis=-1)
+    np.testing.assert_allclose(shown, colours, atol=4)
 
 
 @pytest.mark.parametrize("codec", ["h264", "av1"])
