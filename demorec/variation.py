@@ -62,7 +62,7 @@ class Ranges:
     miss_probability: float | None = None
     """Of a deliberate first miss with recovery."""
     miss_distance: Range | None = None
-    """How far a deliberate miss is off, m."""
+    """How far a deliberate miss is off, m; farther where the fingers would touch the object."""
     perception_error: float | None = None
     """Standard deviation of perceived object positions, m; spoils the labels."""
     perception_yaw: float | None = None
@@ -222,7 +222,7 @@ _FULL = replace(
     approach_height=(0.08, 0.18),
     lift_height=(0.10, 0.20),
     grasp_offset=(-0.005, 0.005),
-    action_noise=(0.01, 0.04),
+    action_noise=(0.01, 0.025),
     miss_probability=0.1,
     camera_position=0.03,
     camera_rotation=0.04,

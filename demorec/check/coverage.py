@@ -19,6 +19,8 @@ MIN_EPISODES = 30
 """With fewer, gaps are chance."""
 _MIN_VALUES = 10
 """A quantity with fewer distinct values was not drawn from a range."""
+_MAX_SHARE = 1 / 8
+"""A value that more of the episodes share was chosen and not drawn."""
 _SIZE, _MARGIN, _PLOT = 360, 24, 84
 
 
@@ -48,9 +50,13 @@ def _values(scene: Scene) -> dict[str, float]:
         values[f"{label} size"] = max(body.shape.extents)
         if body.mass > 0:
             values[f"{label} mass"] = body.mass
-        goal_position = world_from_goal(scene, goal)
         goal_label = "goal" if len(scene.goals) == 1 else f"goal {number + 1}"
-        values[f"{goal_label} x"], values[f"{goal_label} y"] = float(goal_position[0]), float(goal_position[1])
+        # On a body, apart from where that body is: which of two trays it is, is a choice and not a range with a gap.
+        if goal.onto:
+            place = scene.body(goal.onto).world_from_body.position
+            values[f"{goal_label}'s support x"], values[f"{goal_label}'s support y"] = float(place[0]), float(place[1])
+        position = goal.onto_from_goal.position
+        values[f"{goal_label} x"], values[f"{goal_label} y"] = float(position[0]), float(position[1])
     return values
 
 
@@ -69,10 +75,19 @@ def largest_gap(infos: Sequence[EpisodeInfo]) -> Measurement | None:
         return Measurement(value=1.0, detail="no start place, yaw or size differs between the episodes")
     gaps = {}
     for name, values in columns.items():
-        ordered = np.sort(values)
-        gaps[name] = float(np.diff(ordered).max() / max(ordered[-1] - ordered[0], 1e-12))
+        ordered = np.sort(_drawn(values))
+        if len(ordered) >= MIN_EPISODES:
+            gaps[name] = float(np.diff(ordered).max() / max(ordered[-1] - ordered[0], 1e-12))
+    if not gaps:
+        return None
     name = max(gaps, key=lambda key: gaps[key])
     return Measurement(value=gaps[name], detail=f"{name}, {len(infos)} episodes, {len(columns)} quantities")
+
+
+def _drawn(values: Array) -> Array:
+    """Those that come from a range: not one of a few that very many episodes share (a slot in a tray)."""
+    unique, counts = np.unique(values, return_counts=True)
+    return values[~np.isin(values, unique[counts > _MAX_SHARE * len(values)])]
 
 
 def start_vector(scene: Scene) -> Array:

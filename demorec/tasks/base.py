@@ -28,7 +28,8 @@ class Behaviour:
         approach_height, lift_height: Above the grasp, metres.
         grasp_offset: Shift of the grasp along the fingers' faces, metres.
         action_noise: Standard deviation of the exploration noise on the executed joint targets, rad.
-        miss_x, miss_y: Deliberate error of the first grasp, metres; 0 for none.
+        miss_x, miss_y: Deliberate error of the first grasp in the hand's frame, metres, x along the fingers' faces; 0
+            for none.
         perception_x, perception_y: Error of every perceived object position, metres.
         perception_yaw: Error of every perceived object yaw, rad.
     """

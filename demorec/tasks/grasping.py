@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
 from demorec.geometry import Array, Pose, wrap_angle
 from demorec.scene import Body
+
+FINGER_HALF_WIDTH = 0.011
+"""Half the breadth of a finger along the hand's x axis, metres (Franka hand: 21 mm)."""
+_HAND_HALF_LENGTH = 0.07
+"""From the TCP to the outer sides of the open fingers, along the hand's y axis, metres."""
+_GAP = 0.005
 
 
 def hand_down(position: Sequence[float] | Array, yaw: float) -> Pose:
@@ -55,3 +61,45 @@ def grasp_yaws(body: Body, pose: Pose, now: float, open_width: float) -> list[fl
         # The fingers move along the hand's y axis, a quarter turn from its x axis.
         yaws += symmetric_yaws(angle + math.pi / 2, 2)
     return yaws
+
+
+def grasps_beside(
+    grasp: Pose, body: Body, pose: Pose, *, x: float, y: float, others: Iterable[tuple[Body, Pose]], finger_depth: float
+) -> list[Pose]:
+    """Where the open fingers go down beside a body, touching nothing: a grasp that misses.
+
+    Args:
+        grasp: `world_from_tcp` of the good grasp.
+        body, pose: What is missed, and its pose in the world.
+        x, y: Shift in the hand's frame, metres. x is made longer where the fingers would touch the body; the side
+            that it points to comes first in the result, if nothing else stands there.
+        others: All the other bodies and their poses.
+        finger_depth: How far the finger tips reach beyond the TCP, metres.
+    """
+    hand_x, hand_y = grasp.rotation[:, 0], grasp.rotation[:, 1]
+    needed = _half_extent(body, pose, hand_x) + FINGER_HALF_WIDTH + _GAP
+    tips = grasp.position[2] - finger_depth
+    up = np.array([0.0, 0.0, 1.0])
+    in_the_way = [
+        (other, at) for other, at in others if other.collides and at.position[2] + _half_extent(other, at, up) > tips
+    ]
+    found = []
+    for side in (1.0, -1.0):
+        shift = side * math.copysign(max(abs(x), needed), x) * hand_x + y * hand_y
+        missed = Pose(position=grasp.position + shift, quat_xyzw=grasp.quat_xyzw)
+        if all(_stands_clear(missed, other, at) for other, at in in_the_way):
+            found.append(missed)
+    return found
+
+
+def _stands_clear(hand: Pose, body: Body, pose: Pose) -> bool:
+    """Whether a body's upright bounding cylinder stays clear of the open fingers, seen from above."""
+    x, y, _ = hand.inverse().apply(pose.position)
+    radius = math.hypot(*(_half_extent(body, pose, np.eye(3)[axis]) for axis in (0, 1)))
+    beside = max(abs(x) - FINGER_HALF_WIDTH, 0.0), max(abs(y) - _HAND_HALF_LENGTH, 0.0)
+    return math.hypot(*beside) > radius + _GAP
+
+
+def _half_extent(body: Body, pose: Pose, direction: Array) -> float:
+    """Half the extent of a body's bounding box along a unit vector of the world, metres."""
+    return float(np.abs(direction @ pose.rotation) @ np.array(body.shape.extents)) / 2

@@ -20,7 +20,8 @@ from demorec.scene import Body, Goal, yaw_of
 from demorec.sim.world import World
 from demorec.tasks.base import Behaviour, Step
 from demorec.tasks.checks import goal_pose, on_support, placement_checks, resting_half_height
-from demorec.tasks.grasping import grasp_yaws, hand_down, hand_yaw, raised, symmetric_yaws
+from demorec.tasks.conditions import steady_width
+from demorec.tasks.grasping import grasp_yaws, grasps_beside, hand_down, hand_yaw, raised, symmetric_yaws
 
 MAX_TRIES = 3
 FREE_SPEED, DESCEND_SPEED, LIFT_SPEED, TOUCH_DOWN_SPEED = 0.6, 0.25, 0.3, 0.08
@@ -128,6 +129,9 @@ class Expert:
         goal = self._base_from_world @ world_from_tcp
         return self.arm.inverse(goal, start=self.joint_target, rest=self.rest_for(world_from_tcp)) is not None
 
+    def _reaches_from_above(self, world_from_tcp: Pose, above_by: float) -> bool:
+        return self.reaches(world_from_tcp) and self.reaches(raised(world_from_tcp, above_by))
+
     def move(
         self,
         world_from_tcp: Pose,
@@ -211,8 +215,13 @@ class Expert:
             GaveUp: Out of reach at every yaw.
         """
         pose = self.world.pose(name)
-        for grasp in (self._perturbed(grasp) for grasp in self._grasps(self.world.body(name), pose)):
-            if self.reaches(grasp) and self.reaches(raised(grasp, above_by)):
+        grasps = [self._perturbed(grasp) for grasp in self._grasps(self.world.body(name), pose)]
+        if self._missing:
+            beside = [missed for grasp in grasps for missed in self._grasps_beside(name, grasp)]
+            self._missing = self._has_missed = any(self._reaches_from_above(missed, above_by) for missed in beside)
+            grasps = beside if self._missing else grasps
+        for grasp in grasps:
+            if self._reaches_from_above(grasp, above_by):
                 self.note("grasp", f"grasp {name} at yaw {hand_yaw(grasp):.4f} rad")
                 return grasp
         self.note("unreachable", f"{name} at {np.round(pose.position, 3).tolist()} is out of reach", trouble=True)
@@ -258,7 +267,6 @@ class Expert:
         if held:
             return True
         deliberate, self._missing = self._missing, False
-        self._has_missed = True
         self.note("miss", f"missed {name}" + (" on purpose" if deliberate else ""), trouble=not deliberate)
         yield from self._recover(raised(grasp, above_by))
         return False
@@ -287,7 +295,7 @@ class Expert:
             yield from self.move(raised(wanted, 0.015), speed=LIFT_SPEED, settle=False)
             yield from self.move(
                 raised(wanted, -0.004),
-                speed=TOUCH_DOWN_SPEED,
+                speed=TOUCH_DOWN_SPEED / max(1.0, self.behaviour.speed),  # nobody hurries here
                 until=lambda: on_support(world, name, goal.onto),
             )
         if not self._is_full():
@@ -343,15 +351,27 @@ class Expert:
         yaws = sorted(grasp_yaws(body, pose, now, self.open_width), key=lambda yaw: abs(wrap_angle(yaw - now)))
         return [hand_down((pose.position[0], pose.position[1], z), yaw) for yaw in yaws]
 
+    def _grasps_beside(self, name: str, grasp: Pose) -> list[Pose]:
+        """Where a grasp of an object misses it, as the behaviour wants it, and touches nothing else."""
+        world, behaviour = self.world, self.behaviour
+        others = [(body, world.pose(body.name)) for body in world.scene.bodies if body.name != name]
+        return grasps_beside(
+            grasp,
+            world.body(name),
+            world.pose(name),
+            x=behaviour.miss_x,
+            y=behaviour.miss_y,
+            others=others,
+            finger_depth=world.robot.finger_depth,
+        )
+
     def _perturbed(self, grasp: Pose) -> Pose:
-        """A grasp with the behaviour's offset, perception error and deliberate miss."""
+        """A grasp with the behaviour's offset and perception error."""
         behaviour = self.behaviour
         yaw = hand_yaw(grasp)
         shift = np.array([behaviour.perception_x, behaviour.perception_y, 0.0])
         # The hand's x axis runs along the fingers' faces: a shift that way still grasps.
         shift = shift + behaviour.grasp_offset * np.array([math.cos(yaw), math.sin(yaw), 0.0])
-        if self._missing:
-            shift = shift + np.array([behaviour.miss_x, behaviour.miss_y, 0.0])
         return hand_down(grasp.position + shift, yaw + behaviour.perception_yaw)
 
     def _place_pose(self, goal: Goal, *, keep_yaw: bool = False) -> Pose:
@@ -378,18 +398,3 @@ class Expert:
                 return place
         self.note("unreachable", f"the goal of {goal.object} is out of reach", trouble=True)
         raise GaveUp(self.phase, "unreachable")
-
-
-def steady_width(world: World, *, tolerance: float = 0.006, seconds: float = 0.06) -> Callable[[], bool]:
-    """A condition that holds once the opening has changed by less than `tolerance` (m/s) for some time."""
-    last, steady = math.inf, 0
-    needed = max(1, round(seconds * world.fps))
-
-    def done() -> bool:
-        nonlocal last, steady
-        width = world.arm.gripper_width()
-        steady = steady + 1 if abs(width - last) * world.fps < tolerance else 0
-        last = width
-        return steady >= needed
-
-    return done

@@ -24,10 +24,11 @@ from demorec.tasks.checks import (
     gripper_open_check,
     tilt_of,
 )
+from demorec.tasks.conditions import lasting, steady_width
 from demorec.tasks.furniture import COLORS
 from demorec.tasks.grasping import raised
 from demorec.tasks.sampling import Sampler, wording
-from demorec.tasks.skills import Expert, steady_width
+from demorec.tasks.skills import Expert
 
 ROBOT_SCALE = 1.3
 BASE = (1.0, 0.0, 0.1)
@@ -149,7 +150,9 @@ class Tutorial(Task):
         release = expert.reachable_place(RELEASE_POINT)
         yield from expert.move(release, speed=0.5)
         expert.phase = "release"
-        yield from expert.set_gripper(open_width, max_seconds=MAX_FALL_SECONDS, done=lambda: self._rests(world))
+        yield from expert.set_gripper(
+            open_width, max_seconds=MAX_FALL_SECONDS, done=lasting(lambda: self._rests(world), steps=5)
+        )
 
     def evaluate(self, world: World) -> tuple[Check, ...]:
         """The cube lies on the table."""

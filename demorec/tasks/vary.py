@@ -35,7 +35,9 @@ def draw_behaviour(ranges: Ranges, rng: np.random.Generator) -> Behaviour:
     speed, approach, lift = (ranges.draw(name, rng) for name in ("speed", "approach_height", "lift_height"))
     offset, noise = ranges.draw("grasp_offset", rng), ranges.draw("action_noise", rng)
     misses = float(rng.uniform()) < ranges.number("miss_probability")
-    distance, direction = ranges.draw("miss_distance", rng), float(rng.uniform(-math.pi, math.pi))
+    # To either side along the fingers' faces, up to 0.4 rad askew: across them a finger would land on the object.
+    distance, side = ranges.draw("miss_distance", rng), float(rng.uniform(-1.0, 1.0))
+    askew = 0.8 * abs(side) - 0.4
     error_x, error_y, error_yaw = (float(v) for v in rng.normal(0.0, 1.0, 3))
     return Behaviour(
         speed=speed,
@@ -43,8 +45,8 @@ def draw_behaviour(ranges: Ranges, rng: np.random.Generator) -> Behaviour:
         lift_height=lift,
         grasp_offset=offset,
         action_noise=noise,
-        miss_x=distance * math.cos(direction) if misses else 0.0,
-        miss_y=distance * math.sin(direction) if misses else 0.0,
+        miss_x=math.copysign(distance * math.cos(askew), side) if misses else 0.0,
+        miss_y=distance * math.sin(askew) if misses else 0.0,
         perception_x=error_x * ranges.number("perception_error"),
         perception_y=error_y * ranges.number("perception_error"),
         perception_yaw=error_yaw * ranges.number("perception_yaw"),

@@ -17,6 +17,7 @@ from demorec.episode import EpisodeInfo
 from demorec.export.lerobot import export_lerobot
 from demorec.export.options import ExportOptions
 from demorec.rollout import prepare
+from demorec.tables import TASKS
 
 
 @pytest.fixture(scope="session")
@@ -113,6 +114,15 @@ def test_coverage(tmp_path: Path) -> None:
     assert largest_gap(infos[:10]) is None  # too few to judge
     drawn = draw_coverage(infos, tmp_path / "coverage.png")
     assert drawn.path.stat().st_size > 1000
+
+
+@pytest.mark.parametrize("task", TASKS.names())
+def test_what_is_chosen_from_a_few_is_no_gap(task: str) -> None:
+    """Which tray, which slot in it: 40 episodes of every task are judged to cover their ranges."""
+    plans = [EpisodePlan(config=GenerateConfig(task=task, cameras=(), seed=9), episode_index=i) for i in range(40)]
+    found = largest_gap([prepare(plan).info for plan in plans])
+    assert found is not None
+    assert found.value < 0.35, found.detail
 
 
 # ------------------------------------------------------------------------------------------------- datasets

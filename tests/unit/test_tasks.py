@@ -14,7 +14,7 @@ from demorec.geometry import Pose, wrap_angle
 from demorec.rollout import Episode, make_world
 from demorec.scene import Body, Shape
 from demorec.tasks.base import Behaviour
-from demorec.tasks.grasping import grasp_yaws, hand_down, hand_yaw, raised, symmetric_yaws
+from demorec.tasks.grasping import grasp_yaws, grasps_beside, hand_down, hand_yaw, raised, symmetric_yaws
 from demorec.tasks.sampling import WORKSPACE, Region, Sampler
 
 
@@ -171,6 +171,54 @@ def test_a_deliberate_miss_is_flagged_and_mended():
     unflagged = {frame.phase for frame in frames if not frame.is_deliberate_miss}
     assert {"recover", "approach", "descend", "close", "lift", "transport"} <= unflagged
     assert [event.name for frame in frames for event in frame.events] == ["grasp", "miss", "grasp", "place"]
+
+
+@pytest.mark.parametrize("index", range(6))
+def test_a_deliberate_miss_touches_nothing(index):
+    """Fast, with cubes of all sizes: no finger lands on the cube, and no opening finger pushes it."""
+    frames, outcome = run(behave(episode(index), speed=1.5, miss_x=0.03 * (-1) ** index, miss_y=0.012))
+    assert outcome.success
+    last = max(frame.frame_index for frame in frames if frame.is_deliberate_miss)
+    before = frames[0].observation.object_poses["red_cube"]
+    opened = next(f for f in frames[last:] if f.phase != "close" and f.observation.gripper_width > 0.078)
+    assert max(frame.observation.contact_force for frame in frames[: opened.frame_index]) < 1.0
+    moved = opened.observation.object_poses["red_cube"].position - before.position
+    assert np.abs(moved).max() < 2e-4
+
+
+def cube_at(x, y, *, side=0.04, yaw=0.0):
+    return body((side, side, side)), Pose.from_yaw([x, y, side / 2], yaw)
+
+
+def test_a_miss_goes_to_the_free_side():
+    cube, pose = cube_at(0.5, 0.1)
+    grasp = hand_down((0.5, 0.1, 0.02), 0.0)
+
+    def sides(*others):
+        found = grasps_beside(grasp, cube, pose, x=-0.05, y=0.0, others=others, finger_depth=0.007)
+        return [round(float(miss.position[0]) - 0.5, 6) for miss in found]
+
+    assert sides() == [-0.05, 0.05]  # the wanted side first
+    assert sides(cube_at(0.43, 0.1)) == [0.05]
+    assert sides(cube_at(0.43, 0.1), cube_at(0.57, 0.1)) == []
+    assert sides(cube_at(0.43, 0.24), cube_at(0.57, -0.04)) == [-0.05, 0.05]  # beyond the fingers
+    assert sides((body((0.3, 0.3, 0.02)), Pose.from_yaw([0.5, 0.1, 0.0], 0.0))) == [
+        -0.05,
+        0.05,
+    ]  # below the finger tips
+    assert sides((body((0.3, 0.3, 0.03)), Pose.from_yaw([0.5, 0.1, 0.0], 0.0))) == []
+    mark = dataclasses.replace(body((0.3, 0.3, 0.03)), collides=False)
+    assert sides((mark, Pose.from_yaw([0.5, 0.1, 0.0], 0.0))) == [-0.05, 0.05]
+
+
+@pytest.mark.parametrize(("side", "yaw", "needed"), [(0.06, 0.0, 0.030), (0.03, 0.0, 0.015), (0.04, 0.6, 0.0278)])
+def test_a_miss_is_as_far_as_the_fingers_need(side, yaw, needed):
+    """`needed` is half the cube seen along the hand's x axis: side / 2 (cos yaw + sin yaw)."""
+    cube, pose = cube_at(0.5, 0.1, side=side, yaw=yaw)
+    grasp = hand_down((0.5, 0.1, side / 2), 0.0)
+    near, _ = grasps_beside(grasp, cube, pose, x=0.02, y=0.0, others=(), finger_depth=0.007)
+    assert near.position[0] - 0.5 == pytest.approx(max(0.02, needed + 0.0105), abs=0.006)
+    assert near.position[0] - 0.5 > needed + 0.0105
 
 
 def test_without_a_miss_nothing_is_flagged():
