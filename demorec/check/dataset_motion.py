@@ -1,0 +1,188 @@
+"""Is what a LeRobot dataset shows possible and different: twins, coverage, limits, kinematics, the actions' lag."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from demorec.assets import asset_path
+from demorec.check.alignment import servo_response
+from demorec.check.base import Measurement, check, worst
+from demorec.check.coverage import infos_by_task, largest_gap, twins
+from demorec.check.dataset import Dataset
+from demorec.check.rows import displacement, link_matrices, matrices
+from demorec.check.run import motion_vector
+from demorec.features import ACTION, EE_POSE, STATE, VELOCITY
+from demorec.geometry import Array
+from demorec.urdf import Urdf
+
+
+@check(group="dataset", scope="dataset", measures="episodes that move like another", warn=0)
+def dataset_duplicates(dataset: Dataset) -> Measurement | None:
+    """Every episode is there once: no two have the same motion (within 0.0001 rad)."""
+    if len(dataset.rows) < 2 or STATE not in dataset.info.features:
+        return None
+    motions = [motion_vector(rows[STATE]) for rows in dataset.rows]
+    count, pair = twins(motions, [f"episode {n}" for n in range(len(motions))], tolerance=1e-4)
+    return Measurement(value=count, detail=pair or f"{len(motions)} different motions")
+
+
+@check(
+    group="dataset",
+    scope="dataset",
+    measures="largest gap in the range of a randomised quantity, share",
+    warn=0.35,
+    fail=0.6,
+)
+def dataset_coverage(dataset: Dataset) -> Measurement | None:
+    """Start places, yaws, sizes and goals are spread over their ranges (judged from 30 episodes on)."""
+    return worst(*(largest_gap(group) for group in infos_by_task(dataset.infos).values()))
+
+
+# ------------------------------------------------------------------------------------------------- physics
+
+
+@check(
+    group="dataset",
+    scope="dataset",
+    measures="state against joint limits and the gripper's range",
+    unit="rad, m",
+    warn=0.005,
+    fail=0.05,
+)
+def dataset_joint_limits(dataset: Dataset) -> Measurement | None:
+    """States are rad and metres within the robot's limits."""
+    found = []
+    for number, (rows, info) in enumerate(dataset.described()):
+        robot, state = info.robot, rows[STATE].astype(np.float64)
+        low = np.array([*robot.position_lower, 0.0])
+        high = np.array([*robot.position_upper, robot.gripper_max_width * info.scene.robot.scale])
+        beyond = np.maximum(np.maximum(low - state, state - high), 0.0)
+        frame = int(np.argmax(beyond.max(axis=1)))
+        found.append(Measurement(value=float(beyond.max()), frame=frame, detail=f"episode {number}"))
+    return worst(*found)
+
+
+@check(
+    group="dataset", scope="dataset", measures="ratio of state differences to velocities, off 1", warn=0.1, fail=0.16
+)
+def dataset_velocity(dataset: Dataset) -> Measurement | None:
+    """States change by velocity over time: catches a wrong fps and other joints' velocities. All episodes together."""
+    if VELOCITY not in dataset.info.features:
+        return None
+    product = square = 0.0
+    for rows in dataset.rows:
+        state, velocity = rows[STATE].astype(np.float64)[:, :-1], rows[VELOCITY].astype(np.float64)[:, :-1]
+        mean = (velocity[1:] + velocity[:-1]) / 2
+        product += float((np.diff(state, axis=0) * dataset.info.fps * mean).sum())
+        square += float((mean * mean).sum())
+    if square == 0.0:
+        return None
+    # At few frames a second the mean of two velocities says less about the way between them.
+    value = abs(product / square - 1.0) * min(1.0, dataset.info.fps / 20)
+    return Measurement(value=value, detail=f"ratio {product / square:.3f}")
+
+
+@check(
+    group="dataset",
+    scope="dataset",
+    measures="EE pose against forward kinematics of the state",
+    unit="m",
+    warn=1e-4,
+    fail=1e-3,
+)
+def dataset_forward_kinematics(dataset: Dataset) -> Measurement | None:
+    """observation.ee_pose is that of observation.state (float32; 0.1 m per rad of rotation)."""
+    if EE_POSE not in dataset.info.features:
+        return None
+    found, urdfs = [], {}
+    for number, (rows, info) in enumerate(dataset.described()):
+        key = (info.robot.urdf, info.scene.robot.scale)
+        if key not in urdfs:
+            urdfs[key] = Urdf.load(asset_path(info.robot.urdf), scale=info.scene.robot.scale)
+        joints = dict(zip(info.robot.arm_joints, rows[STATE].astype(np.float64).T, strict=False))
+        fk = link_matrices(urdfs[key], info.robot.tcp_link, joints, len(rows[STATE]))
+        off = displacement(matrices(rows[EE_POSE].astype(np.float64)), fk)
+        frame = int(np.argmax(off))
+        found.append(Measurement(value=float(off[frame]), frame=frame, detail=f"episode {number}"))
+    return worst(*found)
+
+
+@check(group="dataset", scope="dataset", measures="lag between action and state, off the contract's, frames", warn=0)
+def dataset_action_lag(dataset: Dataset) -> Measurement | None:
+    """Action t is what leads from observation t to t + 1, in every episode; catches shifted and made-up actions.
+
+    Poses are compared by position. Exploration noise is in the states and not in the actions: what counts is the
+    third of the moving frames in which the two are nearest. Increments are summed up first; where noise was executed,
+    it is taken back in them and they cannot be: then their course, smoothed, is compared with that of the changes of
+    state, all episodes together, and two frames are allowed.
+    """
+    found, wishes, changes = [], [], []
+    for number, (rows, info) in enumerate(dataset.described()):
+        kind = dataset.action_kind(info)
+        if kind is None:
+            continue
+        action, state = rows[ACTION].astype(np.float64), rows[STATE].astype(np.float64)
+        arm = len(info.robot.arm_joints)
+        is_joint = kind in ("joint", "joint_increment")
+        if not is_joint and EE_POSE not in rows:
+            continue
+        width = arm if is_joint else 3
+        reached = state[:, :arm] if is_joint else rows[EE_POSE].astype(np.float64)[:, :3]
+        start = np.array(info.scene.robot.joint_position) if is_joint else reached[0]
+        substeps = max(info.physics_hz // dataset.info.fps, 1)
+        if kind in ("joint_increment", "ee_delta") and not info.behaviour.get("action_noise", 0.0):
+            action = np.concatenate([start + np.cumsum(action[:, :width], axis=0), action[:, -1:]], axis=1)
+        elif kind in ("joint_increment", "ee_delta"):
+            # The servo is linear: its response to increments is the increments of its response.
+            wishes.append(servo_response(action[:, :width], start=np.zeros(width), substeps=substeps)[1:])
+            changes.append(np.diff(reached, axis=0))
+            continue
+        lag = _quantile_lag(action[:, :width], reached, start, substeps=substeps)
+        if lag is not None:
+            detail = f"episode {number}: {lag:+g} frames" if math.isfinite(lag) else f"episode {number}: unrelated"
+            found.append(Measurement(value=abs(lag), detail=detail))
+    if wishes:
+        found.append(_course_lag(wishes, changes))
+    return worst(*found)
+
+
+def _course_lag(wishes: list[Array], changes: list[Array], *, reach: int = 4, window: int = 9) -> Measurement:
+    """By how many whole frames changes run behind wishes, by the correlation of their smoothed courses."""
+    box = np.ones(window) / window
+
+    def smooth(table: Array) -> Array:
+        return np.stack([np.convolve(column, box, mode="same") for column in table.T], axis=1)
+
+    products, sizes = np.zeros(2 * reach + 1), np.zeros(2)
+    for wish, change in zip(wishes, changes, strict=True):
+        x, y = smooth(wish), smooth(change)
+        core = slice(reach, len(x) - reach)
+        sizes += (x[core] ** 2).sum(), (y[core] ** 2).sum()
+        products += [float((x[core] * np.roll(y, -k, axis=0)[core]).sum()) for k in range(-reach, reach + 1)]
+    best = int(np.argmax(products))
+    likeness = products[best] / max(math.sqrt(sizes[0] * sizes[1]), 1e-12)
+    lag = best - reach
+    if likeness < 0.5:
+        return Measurement(value=math.inf, detail=f"actions and changes of state are unrelated ({likeness:.2f})")
+    return Measurement(value=max(abs(lag) - 2, 0), detail=f"all episodes: {lag:+d} frames, likeness {likeness:.2f}")
+
+
+def _quantile_lag(wanted: Array, reached: Array, start: Array, *, substeps: int) -> float | None:
+    expected = servo_response(wanted, start=start, substeps=substeps)
+    shifts = range(-3, 4)
+    core = np.arange(3, len(expected) - 3)
+    if len(core) < 10:
+        return None
+    step = np.linalg.norm(reached[core + 1] - reached[core - 1], axis=1) / 2
+    moving = step > 0.3 * math.sqrt(float((step**2).mean()))
+    core, step = core[moving], step[moving]
+    if len(core) < 10:
+        return None
+    off = [float(np.quantile(np.linalg.norm(reached[core + k] - expected[core], axis=1) / step, 0.33)) for k in shifts]
+    best = int(np.argmin(off))
+    return math.inf if off[best] > 3.0 else float(shifts[best])
+
+
+# ------------------------------------------------------------------------------------------------- beside it

@@ -1,0 +1,22 @@
+"""Recorded actions back into the simulator: the proof that a recording is what it says.
+
+The world is rebuilt from the recording's own scene, the recorded float64 commands are sent again, and every state on
+the way is compared with the recorded one, bit by bit. On one type of machine nothing may differ. The same driver
+answers how robust a demonstration is (a lower command rate, noise, delay) and whether an exported dataset, with its
+float32 actions of any kind, still does the task.
+"""
+
+from demorec.replay.datasets import dataset_demonstrations
+from demorec.replay.demonstration import Demonstration, ReplayOptions, open_file
+from demorec.replay.drive import ReplayReport, is_as_recorded
+from demorec.replay.many import replay_all
+
+__all__ = [
+    "Demonstration",
+    "ReplayOptions",
+    "ReplayReport",
+    "dataset_demonstrations",
+    "is_as_recorded",
+    "open_file",
+    "replay_all",
+]

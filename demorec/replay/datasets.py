@@ -1,0 +1,97 @@
+"""Episodes of an exported dataset as demonstrations: float32 actions of any kind, the scene from the sidecar."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from demorec.episode import Action
+from demorec.errors import ConfigError
+from demorec.features import ACTION, STATE, ActionKind, joint_target_from_increment, pose_from_delta
+from demorec.geometry import Array, Pose
+from demorec.replay.demonstration import Demonstration, ReplayOptions
+from demorec.sim.world import World
+
+
+def dataset_demonstrations(
+    path: Path, wanted: Callable[[int], bool], options: ReplayOptions, *, limit: int | None = None
+) -> Iterator[Demonstration]:
+    """The episodes of an exported dataset, by what its sidecar keeps of their scenes.
+
+    Args:
+        path: The dataset.
+        wanted: Whether an episode, by its number in the dataset, is wanted.
+        options: How it will be replayed.
+        limit: No more than this many, spread evenly.
+
+    Raises:
+        ConfigError: The dataset has no sidecar of ours, other actions, or the options make no sense for it.
+        ExportError: It is damaged.
+    """
+    from demorec.check.dataset import Dataset
+
+    if options.states or options.export_hz:
+        raise ConfigError("--states and --export-hz are for recordings: a dataset has no full states and one rate.")
+    dataset = Dataset(path)
+    if not dataset.sidecar:
+        raise ConfigError(f"The dataset does not say how its scenes were (no demorec/episodes): {path}")
+    numbers = [number for number in range(len(dataset.rows)) if wanted(number)]
+    if limit is not None and len(numbers) > limit:
+        numbers = [numbers[k * len(numbers) // limit] for k in range(limit)]
+    for number in numbers:
+        rows, row, info = dataset.rows[number], dataset.sidecar[number], dataset.infos[number]
+        kind = dataset.action_kind(info)
+        if kind is None:
+            raise ConfigError(f"The dataset's actions are none that demorec writes, so they cannot be replayed: {path}")
+        state = rows[STATE].astype(np.float64)
+        actions = rows[ACTION].astype(np.float64)
+        yield Demonstration(
+            name=f"{path.name}_episode_{number:06d}",
+            info=info,
+            fps=dataset.info.fps,
+            commands=partial(dataset_commands, actions, kind),
+            joint_position=state[:, :-1],
+            joint_velocity=None,
+            gripper_width=state[:, -1],
+            object_poses={},
+            recorded_success=bool(row["success"]),
+            tolerance=1e-6,
+            digest=str(row["content_digest"]),
+        )
+
+
+def dataset_commands(actions: Array, kind: ActionKind, world: World) -> Iterator[Action]:
+    """What to send for the rows of a dataset's action column; a NaN target where IK finds nothing.
+
+    Args:
+        actions: (T, D).
+        kind: What they are (`demorec.features.action_vectors`).
+        world: At the episode's start.
+    """
+    kinematics = world.arm.kinematics
+    num_arm = len(world.robot.arm_joints)
+    target = world.arm.target.copy()
+    pose = world.observe().base_from_tcp
+    for row in actions:
+        gripper = float(row[-1])
+        if kind == "joint":
+            target = row[:num_arm].copy()
+        elif kind == "joint_increment":
+            target = joint_target_from_increment(target, row)
+        else:
+            if kind == "ee":
+                quat = row[3:7] / math.sqrt(float((row[3:7] * row[3:7]).sum()))
+                pose = Pose(position=row[:3], quat_xyzw=quat)
+            else:
+                pose = pose_from_delta(pose, row)
+            found = kinematics.inverse(pose, start=target)
+            if found is None:
+                nothing = np.full(num_arm, np.nan)
+                yield Action(joint_target=nothing, gripper_target=gripper, base_from_tcp_target=pose)
+                continue
+            target = found
+        yield Action(joint_target=target, gripper_target=gripper, base_from_tcp_target=kinematics.forward(target))

@@ -1,0 +1,150 @@
+"""What is replayed: a recording opened for it, and how its actions shall be sent."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from demorec.episode import Action, Check, EpisodeInfo, Frame
+from demorec.errors import ConfigError, RecordingError
+from demorec.geometry import Array
+from demorec.recording import Recording
+from demorec.recording.frames import command_at, frames_of
+from demorec.sim.world import World
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplayOptions:
+    """How actions are sent.
+
+    Attributes:
+        states: Place the recorded states one after the other, without physics, instead of sending actions.
+        export_hz: Commands a second; divides the recording's rate. None: the recorded rate.
+        noise: Standard deviation of Gaussian noise on every joint target, rad.
+        delay: Steps by which every command comes late.
+        seed: Of the noise.
+    """
+
+    states: bool = False
+    export_hz: int | None = None
+    noise: float = 0.0
+    delay: int = 0
+    seed: int = 0
+
+    def validate(self) -> None:
+        """Raise ConfigError for impossible values and combinations."""
+        if not 0.0 <= self.noise <= 1.0:
+            raise ConfigError(f"noise is {self.noise}, allowed are 0 to 1 rad.")
+        if not 0 <= self.delay <= 1000:
+            raise ConfigError(f"delay is {self.delay}, allowed are 0 to 1000 steps.")
+        if self.states and (self.noise or self.delay or self.export_hz):
+            raise ConfigError("--states sends no commands: leave out --noise, --delay and --export-hz.")
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether the commands are sent as recorded."""
+        return not (self.states or self.noise or self.delay or self.export_hz)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Demonstration:
+    """What is replayed: a start, commands, and what the recorded states were.
+
+    Attributes:
+        name: Of the file or of the dataset's episode.
+        info: The recorded scene and robot.
+        fps: Commands a second.
+        commands: (world at its start) -> what to send, one a step; built late, since IK needs the start.
+        joint_position: (T, n) recorded before each command; n = n_joints, or n_arm of a dataset.
+        joint_velocity: (T, n_joints), or None.
+        gripper_width: (T,) m.
+        object_poses: name -> (T, 7); empty for a dataset.
+        recorded_success: Whether the episode succeeded when it was recorded; None if that is not known.
+        final_state_digest: Of the recording, or "".
+        tolerance: Difference up to which a state counts as the same: 0 for float64, rounding for float32.
+        source: The recording's file; None for an episode of a dataset.
+        digest: Of its content.
+        recorded: The recorded frames, without pictures, where every one of them is replayed.
+        recorded_checks: Conditions of the task as recorded.
+    """
+
+    name: str
+    info: EpisodeInfo
+    fps: int
+    commands: Callable[[World], Iterator[Action]]
+    joint_position: Array
+    joint_velocity: Array | None
+    gripper_width: Array
+    object_poses: Mapping[str, Array]
+    recorded_success: bool | None
+    final_state_digest: str = ""
+    tolerance: float = 0.0
+    source: Path | None = None
+    digest: str = ""
+    recorded: tuple[Frame, ...] = ()
+    recorded_checks: tuple[Check, ...] = ()
+
+    def labelled(self, frame: Frame) -> Frame:
+        """A frame of the replay with the recorded label, phase and events of the same frame, if there is one."""
+        if frame.frame_index >= len(self.recorded):
+            return frame
+        then = self.recorded[frame.frame_index]
+        return replace(
+            frame,
+            action=then.action,
+            phase=then.phase,
+            events=then.events,
+            is_deliberate_miss=then.is_deliberate_miss,
+        )
+
+    @property
+    def num_steps(self) -> int:
+        """T."""
+        return len(self.joint_position)
+
+
+def open_demonstration(recording: Recording, options: ReplayOptions) -> Demonstration:
+    """A recording to be replayed.
+
+    Raises:
+        RecordingError: It is damaged or empty.
+        ConfigError: `export_hz` does not divide its rate.
+    """
+    info, columns = recording.info, recording.columns()
+    if columns.num_frames == 0:
+        raise RecordingError(f"The recording has no frames: {recording.path}")
+    fps = options.export_hz or info.fps
+    if info.fps % fps:
+        divisors = ", ".join(str(n) for n in range(1, info.fps + 1) if info.fps % n == 0)
+        raise ConfigError(f"export-hz is {fps}, which does not divide the recording's {info.fps}: use {divisors}.")
+    stride = info.fps // fps
+    rows = np.arange(0, columns.num_frames, stride)
+    # As the export does: where the arm shall be when the next observation is taken.
+    sent = np.minimum(rows + stride - 1, columns.num_frames - 1)
+    outcome = recording.outcome
+    return Demonstration(
+        name=recording.path.name,
+        info=info,
+        fps=fps,
+        commands=lambda world: (command_at(columns, int(row)) for row in sent),
+        joint_position=columns.joint_position[rows],
+        joint_velocity=None if options.states else columns.joint_velocity[rows],
+        gripper_width=columns.gripper_width[rows],
+        object_poses={name: poses[rows] for name, poses in columns.object_poses.items()},
+        recorded_success=None if outcome is None else outcome.success,
+        final_state_digest="" if outcome is None or stride > 1 else outcome.final_state_digest,
+        # Placing a body normalises its quaternion once more.
+        tolerance=1e-9 if options.states else 0.0,
+        digest=recording.digest(),
+        recorded=tuple(frames_of(recording, columns)) if stride == 1 else (),
+        recorded_checks=() if outcome is None else outcome.checks,
+    )
+
+
+def open_file(path: Path, options: ReplayOptions) -> Demonstration:
+    """A recording's file to be replayed; errors as `open_demonstration`."""
+    with Recording(path) as recording:
+        return replace(open_demonstration(recording, options), source=path)

@@ -1,0 +1,107 @@
+"""One replay after the other, recorded if wanted."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+
+from demorec.config import VideoConfig
+from demorec.episode import Frame, Outcome
+from demorec.errors import ConfigError
+from demorec.plain import from_plain
+from demorec.recording import EpisodeWriter
+from demorec.replay.demonstration import Demonstration, ReplayOptions
+from demorec.replay.drive import ReplayReport, replay
+from demorec.rerender import Painter, recorded_view
+from demorec.sim.world import World
+
+
+def replay_all(
+    demonstrations: Iterable[Demonstration], options: ReplayOptions, *, out: Path | None = None, overwrite: bool = False
+) -> Iterator[tuple[ReplayReport, tuple[Path, Path] | None]]:
+    """Replay one after the other, in one world as long as robot and rate stay the same.
+
+    Args:
+        demonstrations: What to replay.
+        options: How.
+        out: Folder for recordings of the replays; None records nothing.
+        overwrite: Whether recordings there may be replaced.
+
+    Yields:
+        The report, and (recording, recording of its replay) where one was made.
+    """
+    world: World | None = None
+    key: object = None
+    try:
+        for demonstration in demonstrations:
+            info = demonstration.info
+            sample_joints = out is not None and info.config.get("joint_rate") == "physics"
+            if world is None or key != (info.robot, demonstration.fps, sample_joints):
+                if world is not None:
+                    world.close()
+                world = World(info.robot, fps=demonstration.fps, sample_joints=sample_joints)
+                key = (info.robot, demonstration.fps, sample_joints)
+            if out is None:
+                yield replay(demonstration, world, options)[0], None
+            else:
+                report, path = record_replay(demonstration, world, options, out, overwrite=overwrite)
+                yield report, None if demonstration.source is None else (demonstration.source, path)
+    finally:
+        if world is not None:
+            world.close()
+
+
+def record_replay(
+    demonstration: Demonstration, world: World, options: ReplayOptions, out: Path, *, overwrite: bool
+) -> tuple[ReplayReport, Path]:
+    """Replay and record it, with pictures of the recording's cameras, into a file of the same name in `out`.
+
+    Raises:
+        ConfigError: The new recording would replace the one that is replayed.
+        RecordingError: A recording of that name is there already.
+    """
+    d = demonstration
+    path = out / (d.name if d.source is not None else f"{d.name}.mcap")
+    if d.source is not None and path.resolve() == d.source.resolve():
+        raise ConfigError(f"The replay would replace the recording itself, choose another --out: {out}")
+    out.mkdir(parents=True, exist_ok=True)
+    config = d.info.config
+    view = recorded_view(d.info)
+    info = replace(d.info, fps=d.fps, origin=f"replay of {d.digest[:16]}")
+    video = from_plain(config.get("video", {}), VideoConfig)
+    num_frames = 0
+    with ExitStack() as stack:
+        painter = None
+        if info.scene.cameras:
+            painter = stack.enter_context(Painter(str(config.get("renderer", "raster"))))
+        writer = stack.enter_context(EpisodeWriter(path, info, video=video, overwrite=overwrite))
+
+        def sink(frame: Frame) -> None:
+            nonlocal num_frames
+            if painter is not None and num_frames == 0:
+                painter.setup(
+                    world,
+                    view,
+                    depth=bool(config.get("depth", False)),
+                    segmentation=bool(config.get("segmentation", False)),
+                    antialias=bool(config.get("antialias", True)),
+                )
+            num_frames += 1
+            images = {} if painter is None else painter.images()
+            writer.write(replace(d.labelled(frame), images=images))
+
+        report, checks = replay(d, world, options, sink=sink)
+        success = bool(report.success) if checks else bool(report.recorded_success)
+        writer.finish(
+            Outcome(
+                success=success,
+                checks=checks if checks else d.recorded_checks,
+                failure_phase="" if success else "replay",
+                failure_reason="" if success else (report.failed_checks or ("unknown",))[0],
+                num_frames=num_frames,
+                final_state_digest=world.state_digest(),
+            )
+        )
+    return report, path
