@@ -78,7 +78,9 @@ class _Export:
         self._skipped_failures = 0
 
     def run(self, progress: Progress | None) -> ExportReport:
-        found = readings(self._found, self._options, progress)
+        aside = self._folder.with_name("coded")  # is removed with everything beside the new folder
+        aside.mkdir(exist_ok=True)
+        found = readings(self._found, self._options, progress, aside=aside)
         waiting: list[AttemptRecord] = []  # failed attempts before the first episode
         first = None
         for first in found:

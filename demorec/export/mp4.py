@@ -11,9 +11,10 @@ import hashlib
 import io
 import os
 import struct
+import tempfile
 from array import array
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import IO
@@ -37,18 +38,20 @@ class CodedVideo:
     Attributes:
         codec: "h264", "hevc" or "av1".
         first: The first picture as it was coded, a keyframe.
-        samples: All pictures back to back, as an mp4 file stores them.
+        samples: All pictures back to back, as an mp4 file stores them; or a file of them that is deleted once written.
         sizes: (T,) int64, bytes of each in `samples`.
         is_keyframe: (T,) bool, which ones can be decoded by themselves.
+        digest: SHA-256 of `samples`, hex.
     """
 
     codec: str
     width: int
     height: int
     first: bytes
-    samples: bytes
+    samples: bytes | Path
     sizes: NDArray[np.int64]
     is_keyframe: NDArray[np.bool_]
+    digest: str
 
     @classmethod
     def of_access_units(
@@ -59,8 +62,29 @@ class CodedVideo:
         samples, sizes, is_key = mp4_samples(codec, data, unit_lengths)
         first = data[: int(unit_lengths[0])] if len(unit_lengths) else b""
         return cls(
-            codec=codec, width=width, height=height, first=first, samples=samples, sizes=sizes, is_keyframe=is_key
+            codec=codec,
+            width=width,
+            height=height,
+            first=first,
+            samples=samples,
+            sizes=sizes,
+            is_keyframe=is_key,
+            digest=hashlib.sha256(samples).hexdigest(),
         )
+
+    @property
+    def num_bytes(self) -> int:
+        """Of all pictures."""
+        return int(self.sizes.sum())
+
+    def put_aside(self, folder: Path) -> CodedVideo:
+        """The same with the pictures in a new file in `folder`: cheap to hand to another process."""
+        if isinstance(self.samples, Path):
+            return self
+        handle, name = tempfile.mkstemp(dir=folder)
+        with os.fdopen(handle, "wb") as file:
+            file.write(self.samples)
+        return replace(self, samples=Path(name))
 
     def parameter_sets(self) -> bytes:
         """Of the first picture; ExportError if that is no keyframe that stands alone."""
@@ -90,15 +114,21 @@ class Mp4Writer:
         self._body_path = path.with_suffix(".pictures")
         self._body: IO[bytes] = self._body_path.open("w+b")
 
-    def add(self, video: CodedVideo) -> str:
-        """Append the pictures of an episode; return the SHA-256 (hex) of their bytes in the file."""
-        self._body.write(video.samples)
+    def add(self, video: CodedVideo) -> None:
+        """Append the pictures of an episode."""
+        if isinstance(video.samples, Path):
+            self._body.flush()
+            with video.samples.open("rb") as file:
+                _copy(file, self._body, video.num_bytes)
+            self._body.seek(0, os.SEEK_END)
+            video.samples.unlink()
+        else:
+            self._body.write(video.samples)
         self._sizes.extend(video.sizes.tolist())
         self._keyframes.extend((np.flatnonzero(video.is_keyframe) + self.num_frames + 1).tolist())
-        self._chunks.append((len(video.sizes), len(video.samples)))
+        self._chunks.append((len(video.sizes), video.num_bytes))
         self.num_frames += len(video.sizes)
-        self.num_bytes += len(video.samples)
-        return hashlib.sha256(video.samples).hexdigest()
+        self.num_bytes += video.num_bytes
 
     def close(self) -> None:
         """Write index and pictures into the final file; harmless when called twice."""

@@ -6,7 +6,7 @@ import os
 from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from demorec.export.layout import IMAGE_PREFIX, Feature
@@ -76,10 +76,14 @@ def read(source: Source, options: ExportOptions) -> Reading | None:
         )
 
 
-def readings(sources: Sequence[Source], options: ExportOptions, progress: Progress | None) -> Iterator[Reading]:
-    """Every wanted recording in order; several processes read ahead where that pays."""
+def readings(
+    sources: Sequence[Source], options: ExportOptions, progress: Progress | None, *, aside: Path
+) -> Iterator[Reading]:
+    """Every wanted recording in order; several processes read ahead where that pays, and leave pictures in `aside`."""
     workers = options.workers or _workers_that_pay(sources, options)
-    found = _in_processes(sources, options, workers) if workers > 1 else (read(source, options) for source in sources)
+    found: Iterator[Reading | None] = (read(source, options) for source in sources)
+    if workers > 1:
+        found = _in_processes(sources, options, workers, aside)
     for done, reading in enumerate(found, start=1):
         if reading is not None:
             yield reading
@@ -91,15 +95,27 @@ def _workers_that_pay(sources: Sequence[Source], options: ExportOptions) -> int:
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     transcodes = options.depth or options.fps is not None
     size = sum(source.path.stat().st_size for source in sources) * (20 if transcodes else 1)
-    return min(cores - 1, 8) if size >= _BYTES_THAT_PAY else 1
+    return min(cores, 8) if size >= _BYTES_THAT_PAY else 1
 
 
-def _in_processes(sources: Sequence[Source], options: ExportOptions, workers: int) -> Iterator[Reading | None]:
+def _read_aside(source: Source, options: ExportOptions, folder: Path) -> Reading | None:
+    """`read`, with the pictures in files: through a pipe they cost as much as all the rest."""
+    reading = read(source, options)
+    if reading is None or reading.prepared is None:
+        return reading
+    data = reading.prepared.data
+    data = replace(data, videos={key: video.put_aside(folder) for key, video in data.videos.items()})
+    return replace(reading, prepared=replace(reading.prepared, data=data))
+
+
+def _in_processes(
+    sources: Sequence[Source], options: ExportOptions, workers: int, aside: Path
+) -> Iterator[Reading | None]:
     waiting: deque[Future[Reading | None]] = deque()
     with ProcessPoolExecutor(max_workers=workers, mp_context=SPAWN) as pool:
         try:
             for source in sources:
-                waiting.append(pool.submit(read, source, options))
+                waiting.append(pool.submit(_read_aside, source, options, aside))
                 if len(waiting) >= workers * _AHEAD:
                     yield waiting.popleft().result()
             while waiting:

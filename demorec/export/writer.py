@@ -173,8 +173,8 @@ class DatasetWriter:
         statistics = vector_statistics({name: columns[name] for name in self._numeric})
         digests = {}
         for key in self._info.video_keys:
-            place, digests[key] = self._add_video(key, episode.videos[key], frames)
-            row.update(place)
+            row.update(self._add_video(key, episode.videos[key], frames))
+            digests[key] = episode.videos[key].digest
             self._video_info[key] = merged_video_info(self._video_info[key] or {}, dict(episode.video_info[key]))
             pixels = episode.pixels[key]
             self._pixels[key] = self._pixels[key] + pixels if key in self._pixels else pixels
@@ -189,13 +189,13 @@ class DatasetWriter:
             episode_index=self.num_episodes - 1, digest=episode_digest(episode.task, columns, digests)
         )
 
-    def _add_video(self, key: str, video: CodedVideo, frames: int) -> tuple[dict[str, int | float], str]:
+    def _add_video(self, key: str, video: CodedVideo, frames: int) -> dict[str, int | float]:
         if len(video.sizes) != frames:
             raise ExportError(f"{key} has {len(video.sizes)} pictures for {frames} frames.")
         file = self._videos.get(key)
         fps = self._info.fps
         if file is not None and (
-            file.num_bytes + len(video.samples) >= self._info.video_files_size_in_mb * MEBIBYTE
+            file.num_bytes + video.num_bytes >= self._info.video_files_size_in_mb * MEBIBYTE
             or (file.num_frames + frames) / fps > _MAX_SECONDS_PER_VIDEO
             or file.parameter_sets != video.parameter_sets()
         ):
@@ -207,14 +207,13 @@ class DatasetWriter:
             path = self._root / position.path(VIDEO_PATH, key)
             file = self._videos[key] = Mp4Writer(path, video, fps=fps)
         start = file.num_frames
-        digest = file.add(video)
-        place: dict[str, int | float] = {
+        file.add(video)
+        return {
             f"videos/{key}/chunk_index": position.chunk,
             f"videos/{key}/file_index": position.file,
             f"videos/{key}/from_timestamp": start / fps,
             f"videos/{key}/to_timestamp": (start + frames) / fps,
         }
-        return place, digest
 
     def finish(self) -> DatasetInfo:
         """Close all files and write tasks, statistics and info.json; return what it says."""

@@ -87,6 +87,7 @@ def test_two_exports_are_the_same_to_the_byte(run: Path, tmp_path: Path) -> None
     first, second = export(run, tmp_path / "a"), export(run, tmp_path / "b", workers=2)
     assert files_of(tmp_path / "a") == files_of(tmp_path / "b")
     assert first.digest == second.digest == dataset_digest(tmp_path / "a")
+    assert {path.name for path in tmp_path.iterdir()} == {"a", "b"}
 
 
 def test_the_digest_depends_on_the_content_alone(run: Path, tmp_path: Path) -> None:

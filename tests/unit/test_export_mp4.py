@@ -91,7 +91,21 @@ def test_the_index_is_in_front_and_seeking_finds_keyframes(tmp_path: Path) -> No
         assert np.array_equal(frame.to_ndarray(format="rgb24"), expected[number])
 
 
+def test_pictures_put_aside_are_written_the_same_and_cleared_away(tmp_path: Path) -> None:
+    videos = [coded("h264", count, seed=count)[0] for count in (5, 9, 3, 7)]
+    aside = tmp_path / "aside"
+    aside.mkdir()
+    for name, put in (("a.mp4", ()), ("b.mp4", (1, 2)), ("c.mp4", (0, 1, 2, 3)), ("d.mp4", (0, 3))):
+        writer = Mp4Writer(tmp_path / name, videos[0], fps=30)
+        for number, video in enumerate(videos):
+            writer.add(video.put_aside(aside) if number in put else video)
+        writer.close()
+        assert (tmp_path / name).read_bytes() == (tmp_path / "a.mp4").read_bytes()
+        assert list(aside.iterdir()) == []
+
+
 def samples_of(video: CodedVideo) -> list[bytes]:
+    assert isinstance(video.samples, bytes)
     ends = np.cumsum(video.sizes).tolist()
     assert ends[-1] == len(video.samples)
     return [video.samples[a:b] for a, b in zip([0, *ends], ends, strict=False)]
