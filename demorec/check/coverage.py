@@ -15,8 +15,8 @@ from demorec.episode import EpisodeInfo
 from demorec.geometry import Array
 from demorec.scene import Goal, Scene, yaw_of
 
-MIN_EPISODES = 30
-"""With fewer, gaps are chance."""
+MIN_EPISODES = 50
+"""With fewer, gaps are chance: the largest of 80 good runs of 50 is 0.26 of a range, of runs of 30 it is 0.38."""
 _MIN_VALUES = 10
 """A quantity with fewer distinct values was not drawn from a range."""
 _MAX_SHARE = 1 / 8
@@ -25,10 +25,11 @@ _SIZE, _MARGIN, _PLOT = 360, 24, 84
 
 
 def randomised(infos: Sequence[EpisodeInfo]) -> dict[str, Array]:
-    """Name -> one value per episode, of the start places, yaws and sizes of objects and the places of goals.
+    """Name -> one value per episode: start places, yaws, sizes and masses of objects, places of goals.
 
-    Quantities that not all episodes have, or that take only a few values, are left out. Lengths in metres, yaws in
-    rad within the body's symmetry.
+    A goal on a body has two places: that of the body, and its own in the body's frame. Quantities that not all
+    episodes have, or that take only a few values, are left out. Lengths in metres, yaws in rad within the body's
+    symmetry.
     """
     rows = [_values(info.scene) for info in infos]
     if not rows:
@@ -73,15 +74,11 @@ def largest_gap(infos: Sequence[EpisodeInfo]) -> Measurement | None:
     columns = randomised(infos)
     if not columns:
         return Measurement(value=1.0, detail="no start place, yaw or size differs between the episodes")
-    gaps = {}
-    for name, values in columns.items():
-        ordered = np.sort(_drawn(values))
-        if len(ordered) >= MIN_EPISODES:
-            gaps[name] = float(np.diff(ordered).max() / max(ordered[-1] - ordered[0], 1e-12))
-    if not gaps:
-        return None
+    drawn = {name: _drawn(values) for name, values in columns.items()}
+    judged = {name: values for name, values in drawn.items() if len(values) >= MIN_EPISODES} or columns
+    gaps = {name: float(np.diff(np.sort(values)).max() / np.ptp(values)) for name, values in judged.items()}
     name = max(gaps, key=lambda key: gaps[key])
-    return Measurement(value=gaps[name], detail=f"{name}, {len(infos)} episodes, {len(columns)} quantities")
+    return Measurement(value=gaps[name], detail=f"{name}, {len(infos)} episodes, {len(judged)} quantities")
 
 
 def _drawn(values: Array) -> Array:

@@ -36,11 +36,8 @@ def dataset_duplicates(dataset: Dataset) -> Measurement | None:
     fail=0.6,
 )
 def dataset_coverage(dataset: Dataset) -> Measurement | None:
-    """Start places, yaws, sizes and goals are spread over their ranges (judged from 30 episodes on)."""
+    """Start places, yaws, sizes and goals are spread over their ranges (judged from 50 episodes on)."""
     return worst(*(largest_gap(group) for group in infos_by_task(dataset.infos).values()))
-
-
-# ------------------------------------------------------------------------------------------------- physics
 
 
 @check(
@@ -183,6 +180,3 @@ def _quantile_lag(wanted: Array, reached: Array, start: Array, *, substeps: int)
     off = [float(np.quantile(np.linalg.norm(reached[core + k] - expected[core], axis=1) / step, 0.33)) for k in shifts]
     best = int(np.argmin(off))
     return math.inf if off[best] > 3.0 else float(shifts[best])
-
-
-# ------------------------------------------------------------------------------------------------- beside it

@@ -137,7 +137,7 @@ def motion_vector(joint_position: np.ndarray[Any, np.dtype[Any]]) -> np.ndarray[
     group="run", scope="run", measures="largest gap in the range of a randomised quantity, share", warn=0.35, fail=0.6
 )
 def run_coverage(run: RunFolder) -> Measurement | None:
-    """Start places, yaws, sizes and goals are spread over their ranges (judged from 30 episodes on)."""
+    """Start places, yaws, sizes and goals are spread over their ranges (judged from 50 episodes on)."""
     return worst_gap(run.successes)
 
 

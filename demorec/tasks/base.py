@@ -24,12 +24,12 @@ class Behaviour:
     """How the expert does it in one episode; recorded as `EpisodeInfo.behaviour`.
 
     Attributes:
-        speed: Factor on the speeds of free motions.
+        speed: Factor on the speeds of all motions; touching down with an object is never faster than at 1.
         approach_height, lift_height: Above the grasp, metres.
         grasp_offset: Shift of the grasp along the fingers' faces, metres.
         action_noise: Standard deviation of the exploration noise on the executed joint targets, rad.
         miss_x, miss_y: Deliberate error of the first grasp in the hand's frame, metres, x along the fingers' faces; 0
-            for none.
+            for none. What is done may be farther, to the other side or left out, so that nothing is touched.
         perception_x, perception_y: Error of every perceived object position, metres.
         perception_yaw: Error of every perceived object yaw, rad.
     """

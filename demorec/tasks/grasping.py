@@ -7,14 +7,16 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
+from demorec.episode import RobotSpec
 from demorec.geometry import Array, Pose, wrap_angle
 from demorec.scene import Body
 
-FINGER_HALF_WIDTH = 0.011
-"""Half the breadth of a finger along the hand's x axis, metres (Franka hand: 21 mm)."""
-_HAND_HALF_LENGTH = 0.07
-"""From the TCP to the outer sides of the open fingers, along the hand's y axis, metres."""
+# Of the open hand, metres, from the TCP along its x and y axes; the larger of the Panda's and the iiwa's.
+_FINGERS = (0.012, 0.07)
+_PALM = (0.035, 0.11)
+_UP = np.array([0.0, 0.0, 1.0])
 _GAP = 0.005
+"""Air between the hand and what it shall not touch, metres."""
 
 
 def hand_down(position: Sequence[float] | Array, yaw: float) -> Pose:
@@ -64,40 +66,48 @@ def grasp_yaws(body: Body, pose: Pose, now: float, open_width: float) -> list[fl
 
 
 def grasps_beside(
-    grasp: Pose, body: Body, pose: Pose, *, x: float, y: float, others: Iterable[tuple[Body, Pose]], finger_depth: float
+    grasp: Pose, body: Body, pose: Pose, *, x: float, y: float, others: Iterable[tuple[Body, Pose]], robot: RobotSpec
 ) -> list[Pose]:
-    """Where the open fingers go down beside a body, touching nothing: a grasp that misses.
+    """Where the open hand goes down beside a body, touching nothing: a grasp that misses.
 
     Args:
-        grasp: `world_from_tcp` of the good grasp.
+        grasp: `world_from_tcp` of a grasp of it.
         body, pose: What is missed, and its pose in the world.
-        x, y: Shift in the hand's frame, metres. x is made longer where the fingers would touch the body; the side
-            that it points to comes first in the result, if nothing else stands there.
+        x, y: From the body's centre in the hand's frame, metres. x is made longer where the fingers would touch the
+            body. The side that it points to (for 0: forward) comes first in the result, then the other one; a side
+            where something else stands in the way is left out, so there may be none.
         others: All the other bodies and their poses.
-        finger_depth: How far the finger tips reach beyond the TCP, metres.
+        robot: Whose hand it is.
     """
     hand_x, hand_y = grasp.rotation[:, 0], grasp.rotation[:, 1]
-    needed = _half_extent(body, pose, hand_x) + FINGER_HALF_WIDTH + _GAP
-    tips = grasp.position[2] - finger_depth
-    up = np.array([0.0, 0.0, 1.0])
-    in_the_way = [
-        (other, at) for other, at in others if other.collides and at.position[2] + _half_extent(other, at, up) > tips
-    ]
+    distance = max(abs(x), _half_extent(body, pose, hand_x) + _FINGERS[0] + _GAP)
+    centre = pose.position + ((grasp.position - pose.position) @ _UP) * _UP
+    tips, palm = grasp.position[2] - robot.finger_depth, grasp.position[2] + robot.palm_clearance
     found = []
     for side in (1.0, -1.0):
-        shift = side * math.copysign(max(abs(x), needed), x) * hand_x + y * hand_y
-        missed = Pose(position=grasp.position + shift, quat_xyzw=grasp.quat_xyzw)
-        if all(_stands_clear(missed, other, at) for other, at in in_the_way):
+        missed = Pose(
+            position=centre + side * math.copysign(distance, x) * hand_x + y * hand_y, quat_xyzw=grasp.quat_xyzw
+        )
+        if all(
+            _is_lower(other, at, tips)
+            or (_is_beside(missed, _FINGERS, other, at) and _is_lower(other, at, palm))
+            or _is_beside(missed, _PALM, other, at)
+            for other, at in others
+        ):
             found.append(missed)
     return found
 
 
-def _stands_clear(hand: Pose, body: Body, pose: Pose) -> bool:
-    """Whether a body's upright bounding cylinder stays clear of the open fingers, seen from above."""
-    x, y, _ = hand.inverse().apply(pose.position)
-    radius = math.hypot(*(_half_extent(body, pose, np.eye(3)[axis]) for axis in (0, 1)))
-    beside = max(abs(x) - FINGER_HALF_WIDTH, 0.0), max(abs(y) - _HAND_HALF_LENGTH, 0.0)
-    return math.hypot(*beside) > radius + _GAP
+def _is_lower(body: Body, pose: Pose, height: float) -> bool:
+    return not body.collides or pose.position[2] + _half_extent(body, pose, _UP) < height
+
+
+def _is_beside(hand: Pose, half_size: tuple[float, float], body: Body, pose: Pose) -> bool:
+    """Whether a body is clear of a rectangle around the TCP, both seen from above along the hand's axes."""
+    offset = np.abs((pose.position - hand.position) @ hand.rotation)
+    return any(
+        offset[axis] > half_size[axis] + _half_extent(body, pose, hand.rotation[:, axis]) + _GAP for axis in (0, 1)
+    )
 
 
 def _half_extent(body: Body, pose: Pose, direction: Array) -> float:

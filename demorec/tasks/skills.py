@@ -8,7 +8,7 @@ No step is wasted waiting: a policy that learns from idle frames learns to stand
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -129,8 +129,9 @@ class Expert:
         goal = self._base_from_world @ world_from_tcp
         return self.arm.inverse(goal, start=self.joint_target, rest=self.rest_for(world_from_tcp)) is not None
 
-    def _reaches_from_above(self, world_from_tcp: Pose, above_by: float) -> bool:
-        return self.reaches(world_from_tcp) and self.reaches(raised(world_from_tcp, above_by))
+    def _first_reachable(self, grasps: Iterable[Pose], above_by: float) -> Pose | None:
+        """The first grasp that the arm reaches, there and `above_by` metres higher."""
+        return next((g for g in grasps if self.reaches(g) and self.reaches(raised(g, above_by))), None)
 
     def move(
         self,
@@ -198,7 +199,7 @@ class Expert:
         for attempt in range(MAX_TRIES):
             if attempt > 0:
                 self.num_retries += 1
-            self._missing = self.behaviour.misses and not self._has_missed
+            self._missing = self.behaviour.misses and not self._has_missed and attempt == 0
             picked = yield from self.pick(goal.object)
             self._missing = False
             if not picked:
@@ -209,21 +210,21 @@ class Expert:
         raise GaveUp(*self.trouble)
 
     def reachable_grasp(self, name: str, *, above_by: float) -> Pose:
-        """`world_from_tcp` to grasp an object, reachable there and `above_by` metres higher.
+        """`world_from_tcp` to grasp an object, or to miss it on purpose, reachable there and `above_by` metres higher.
 
         Raises:
             GaveUp: Out of reach at every yaw.
         """
         pose = self.world.pose(name)
         grasps = [self._perturbed(grasp) for grasp in self._grasps(self.world.body(name), pose)]
+        found = None
         if self._missing:
-            beside = [missed for grasp in grasps for missed in self._grasps_beside(name, grasp)]
-            self._missing = self._has_missed = any(self._reaches_from_above(missed, above_by) for missed in beside)
-            grasps = beside if self._missing else grasps
-        for grasp in grasps:
-            if self._reaches_from_above(grasp, above_by):
-                self.note("grasp", f"grasp {name} at yaw {hand_yaw(grasp):.4f} rad")
-                return grasp
+            found = self._first_reachable((m for grasp in grasps for m in self._grasps_beside(name, grasp)), above_by)
+            self._missing = self._has_missed = found is not None
+        found = found or self._first_reachable(grasps, above_by)
+        if found is not None:
+            self.note("grasp", f"grasp {name} at yaw {hand_yaw(found):.4f} rad")
+            return found
         self.note("unreachable", f"{name} at {np.round(pose.position, 3).tolist()} is out of reach", trouble=True)
         raise GaveUp(self.phase, "unreachable")
 
@@ -293,11 +294,9 @@ class Expert:
             self.phase = "lower"
             wanted = self._place_pose(goal, keep_yaw=True)
             yield from self.move(raised(wanted, 0.015), speed=LIFT_SPEED, settle=False)
-            yield from self.move(
-                raised(wanted, -0.004),
-                speed=TOUCH_DOWN_SPEED / max(1.0, self.behaviour.speed),  # nobody hurries here
-                until=lambda: on_support(world, name, goal.onto),
-            )
+            # A faster behaviour does not hurry here: the target stops in one step, harder than the joints may.
+            speed = TOUCH_DOWN_SPEED / max(1.0, self.behaviour.speed)
+            yield from self.move(raised(wanted, -0.004), speed=speed, until=lambda: on_support(world, name, goal.onto))
         if not self._is_full():
             self.note("drop", f"dropped {name}", trouble=True)
             here = self.tcp()
@@ -352,18 +351,11 @@ class Expert:
         return [hand_down((pose.position[0], pose.position[1], z), yaw) for yaw in yaws]
 
     def _grasps_beside(self, name: str, grasp: Pose) -> list[Pose]:
-        """Where a grasp of an object misses it, as the behaviour wants it, and touches nothing else."""
-        world, behaviour = self.world, self.behaviour
+        """Where the hand misses an object as the behaviour wants it."""
+        world = self.world
+        shift = {"x": self.behaviour.miss_x, "y": self.behaviour.miss_y}
         others = [(body, world.pose(body.name)) for body in world.scene.bodies if body.name != name]
-        return grasps_beside(
-            grasp,
-            world.body(name),
-            world.pose(name),
-            x=behaviour.miss_x,
-            y=behaviour.miss_y,
-            others=others,
-            finger_depth=world.robot.finger_depth,
-        )
+        return grasps_beside(grasp, world.body(name), world.pose(name), **shift, others=others, robot=world.robot)
 
     def _perturbed(self, grasp: Pose) -> Pose:
         """A grasp with the behaviour's offset and perception error."""

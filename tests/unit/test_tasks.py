@@ -13,7 +13,10 @@ from demorec.errors import SceneError
 from demorec.geometry import Pose, wrap_angle
 from demorec.rollout import Episode, make_world
 from demorec.scene import Body, Shape
+from demorec.sim.robots.panda import PANDA
+from demorec.tasks import skills
 from demorec.tasks.base import Behaviour
+from demorec.tasks.conditions import lasting
 from demorec.tasks.grasping import grasp_yaws, grasps_beside, hand_down, hand_yaw, raised, symmetric_yaws
 from demorec.tasks.sampling import WORKSPACE, Region, Sampler
 
@@ -173,17 +176,52 @@ def test_a_deliberate_miss_is_flagged_and_mended():
     assert [event.name for frame in frames for event in frame.events] == ["grasp", "miss", "grasp", "place"]
 
 
-@pytest.mark.parametrize("index", range(6))
-def test_a_deliberate_miss_touches_nothing(index):
-    """Fast, with cubes of all sizes: no finger lands on the cube, and no opening finger pushes it."""
-    frames, outcome = run(behave(episode(index), speed=1.5, miss_x=0.03 * (-1) ** index, miss_y=0.012))
+@pytest.mark.parametrize("robot", ["panda", "iiwa"])
+@pytest.mark.parametrize(
+    ("index", "task", "offset"),
+    [
+        (0, "pick_place", 0.0),
+        (1, "pick_place", 0.005),
+        (2, "pick_place", -0.015),  # against the miss, as far as is allowed
+        (3, "pick_place", -0.005),
+        (4, "pick_shapes", 0.005),
+        (6, "pick_from_clutter", -0.005),
+    ],
+)
+def test_a_deliberate_miss_touches_nothing(robot, task, index, offset):
+    """Fast, with bodies of all sizes: no finger lands on one, and no opening finger pushes one."""
+    prepared = episode(index, robot=robot, task=task)
+    side = 1.0 if index % 2 == 0 else -1.0
+    frames, outcome = run(behave(prepared, speed=1.5, miss_x=0.03 * side, miss_y=0.012, grasp_offset=offset))
     assert outcome.success
+    events = [event.name for frame in frames for event in frame.events]
+    assert events.count("miss") == 1
     last = max(frame.frame_index for frame in frames if frame.is_deliberate_miss)
-    before = frames[0].observation.object_poses["red_cube"]
     opened = next(f for f in frames[last:] if f.phase != "close" and f.observation.gripper_width > 0.078)
     assert max(frame.observation.contact_force for frame in frames[: opened.frame_index]) < 1.0
-    moved = opened.observation.object_poses["red_cube"].position - before.position
-    assert np.abs(moved).max() < 2e-4
+    for name, start in frames[5].observation.object_poses.items():  # all lie still by then
+        assert np.abs(opened.observation.object_poses[name].position - start.position).max() < 3e-4, name
+
+
+def test_several_objects_are_missed_once():
+    frames, outcome = run(behave(episode(1, task="sort_by_color"), miss_x=0.03))
+    assert outcome.success
+    assert [event.name for frame in frames for event in frame.events].count("miss") == 1
+    assert len({event.message for frame in frames for event in frame.events if event.name == "place"}) >= 2
+
+
+def test_where_there_is_no_free_side_nothing_is_missed(monkeypatch):
+    monkeypatch.setattr(skills, "grasps_beside", lambda *_, **__: [])
+    frames, outcome = run(behave(episode(5), miss_x=0.03))
+    assert outcome.success
+    assert outcome.num_retries == 0
+    assert not any(frame.is_deliberate_miss for frame in frames if frame.phase not in ("start", "perceive"))
+
+
+def test_lasting_asks_for_a_row_without_a_gap():
+    answers = iter([True, True, False, True, True, True, True])
+    done = lasting(lambda: next(answers), steps=3)
+    assert [done() for _ in range(7)] == [False, False, False, False, False, True, True]
 
 
 def cube_at(x, y, *, side=0.04, yaw=0.0):
@@ -192,16 +230,17 @@ def cube_at(x, y, *, side=0.04, yaw=0.0):
 
 def test_a_miss_goes_to_the_free_side():
     cube, pose = cube_at(0.5, 0.1)
-    grasp = hand_down((0.5, 0.1, 0.02), 0.0)
+    grasp = hand_down((0.503, 0.1, 0.02), 0.0)  # shifted: the miss is counted from the cube
 
     def sides(*others):
-        found = grasps_beside(grasp, cube, pose, x=-0.05, y=0.0, others=others, finger_depth=0.007)
+        found = grasps_beside(grasp, cube, pose, x=-0.05, y=0.0, others=others, robot=PANDA)
         return [round(float(miss.position[0]) - 0.5, 6) for miss in found]
 
     assert sides() == [-0.05, 0.05]  # the wanted side first
     assert sides(cube_at(0.43, 0.1)) == [0.05]
     assert sides(cube_at(0.43, 0.1), cube_at(0.57, 0.1)) == []
-    assert sides(cube_at(0.43, 0.24), cube_at(0.57, -0.04)) == [-0.05, 0.05]  # beyond the fingers
+    assert sides(cube_at(0.43, 0.205), cube_at(0.57, -0.005)) == [-0.05, 0.05]  # beyond the fingers
+    assert sides(cube_at(0.43, 0.205, side=0.06)) == [0.05]  # as high as the palm, which is longer
     assert sides((body((0.3, 0.3, 0.02)), Pose.from_yaw([0.5, 0.1, 0.0], 0.0))) == [
         -0.05,
         0.05,
@@ -211,14 +250,17 @@ def test_a_miss_goes_to_the_free_side():
     assert sides((mark, Pose.from_yaw([0.5, 0.1, 0.0], 0.0))) == [-0.05, 0.05]
 
 
-@pytest.mark.parametrize(("side", "yaw", "needed"), [(0.06, 0.0, 0.030), (0.03, 0.0, 0.015), (0.04, 0.6, 0.0278)])
-def test_a_miss_is_as_far_as_the_fingers_need(side, yaw, needed):
-    """`needed` is half the cube seen along the hand's x axis: side / 2 (cos yaw + sin yaw)."""
+@pytest.mark.parametrize(("side", "yaw", "half"), [(0.06, 0.0, 0.030), (0.03, 0.0, 0.015), (0.04, 0.6, 0.0278)])
+def test_a_miss_is_as_far_as_the_fingers_need(side, yaw, half):
+    """`half` is that of the cube along the hand's x axis: side / 2 (cos yaw + sin yaw); half a finger is 12 mm."""
     cube, pose = cube_at(0.5, 0.1, side=side, yaw=yaw)
-    grasp = hand_down((0.5, 0.1, side / 2), 0.0)
-    near, _ = grasps_beside(grasp, cube, pose, x=0.02, y=0.0, others=(), finger_depth=0.007)
-    assert near.position[0] - 0.5 == pytest.approx(max(0.02, needed + 0.0105), abs=0.006)
-    assert near.position[0] - 0.5 > needed + 0.0105
+    grasp = hand_down((0.49, 0.1, side / 2), 0.0)
+    for x in (0.02, 0.05):
+        ahead, behind = grasps_beside(grasp, cube, pose, x=x, y=0.004, others=(), robot=PANDA)
+        for miss, sign in ((ahead, 1), (behind, -1)):
+            distance = sign * (miss.position[0] - 0.5)
+            assert distance == pytest.approx(max(x, half + 0.012 + 0.005), abs=1e-4)
+            assert miss.position[1:].tolist() == pytest.approx([0.096, side / 2])  # the hand's y axis points to -y
 
 
 def test_without_a_miss_nothing_is_flagged():
