@@ -15,6 +15,7 @@ from demorec.rollout import make_world
 from demorec.sim.arm import arm_kinematics
 from demorec.sim.world import World
 from demorec.tables import ROBOTS
+from demorec.tasks import grasping
 from demorec.tasks.grasping import hand_down
 from demorec.urdf import Urdf
 
@@ -91,3 +92,24 @@ def test_it_picks_and_places(spec):
         for frame in frames:
             world.apply(frame.command)
         assert world.state_digest() == outcome.final_state_digest
+
+
+def test_the_open_hand_is_no_larger_than_a_deliberate_miss_thinks(spec):
+    """Bounding boxes that Bullet tells of (its margin included), the hand pointing down along the world's axes."""
+    with World(spec) as world:
+        world.reset(episode(robot=spec.name).info.scene)
+        goal = world.arm.world_from_base.inverse() @ hand_down((0.5, 0.0, 0.4), 0.0)
+        found = world.arm.kinematics.inverse(goal, start=np.array(spec.home_q))
+        world.arm.place(found, spec.gripper_max_width)
+        world.client.performCollisionDetection()
+        tcp = world.arm.world_from_tcp().position
+        boxes = {
+            link: np.array(world.client.getAABB(world.arm.body, link)) - tcp
+            for link in (*world.arm.finger_links, world.arm.links[spec.hand_link])
+        }
+    hand = boxes.pop(world.arm.links[spec.hand_link])
+    for half_size, parts in ((grasping._FINGERS, list(boxes.values())), (grasping._PALM, [hand])):
+        for box in parts:
+            assert (np.abs(box[:, :2]).max(axis=0) < np.array(half_size) + grasping._GAP).all()
+    assert hand[0, 2] > spec.palm_clearance - 2e-3
+    assert min(box[0, 2] for box in boxes.values()) > -spec.finger_depth - grasping._GAP
