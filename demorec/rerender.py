@@ -256,8 +256,8 @@ class Painter:
     def __exit__(self, *exc: object) -> None:
         self._renderer.__exit__(*exc)
 
-    def setup(self, world: World, view: View, *, depth: bool, segmentation: bool, antialias: bool) -> None:
-        """Take over a world that was just reset to the view's scene."""
+    def setup(self, world: World, view: View, config: Mapping[str, Any]) -> None:
+        """Take over a world that was just reset to the view's scene; `config` is that of a recording."""
         self._errors = view.true_from_recorded
         self._renderer.setup(
             RenderSetup(
@@ -266,9 +266,9 @@ class Painter:
                 mounts=world.mounts(),
                 light=view.scene.light,
                 textures=world.textures,
-                depth=depth,
-                segmentation=segmentation,
-                antialias=antialias,
+                depth=bool(config.get("depth", False)),
+                segmentation=bool(config.get("segmentation", False)),
+                antialias=bool(config.get("antialias", True)),
             )
         )
 
@@ -335,13 +335,7 @@ def rerender(source: Path, out: Path, options: RerenderOptions, *, overwrite: bo
             EpisodeWriter(out, new_info, video=video, overwrite=overwrite) as writer,
         ):
             world.reset(view.scene)
-            painter.setup(
-                world,
-                view,
-                depth=bool(config.get("depth", False)),
-                segmentation=bool(config.get("segmentation", False)),
-                antialias=bool(config.get("antialias", True)),
-            )
+            painter.setup(world, view, config)
             for frame in frames_of(recording, columns):
                 writer.write(replace(frame, images=_draw(world, painter, frame)))
             writer.finish(_outcome(recording))

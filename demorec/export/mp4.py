@@ -78,9 +78,8 @@ class CodedVideo:
         return int(self.sizes.sum())
 
     def put_aside(self, folder: Path) -> CodedVideo:
-        """The same with the pictures in a new file in `folder`: cheap to hand to another process."""
-        if isinstance(self.samples, Path):
-            return self
+        """The same with its `samples`, bytes so far, in a new file in `folder`: cheap to hand to another process."""
+        assert isinstance(self.samples, bytes)
         handle, name = tempfile.mkstemp(dir=folder)
         with os.fdopen(handle, "wb") as file:
             file.write(self.samples)

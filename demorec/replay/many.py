@@ -81,13 +81,7 @@ def record_replay(
         def sink(frame: Frame) -> None:
             nonlocal num_frames
             if painter is not None and num_frames == 0:
-                painter.setup(
-                    world,
-                    view,
-                    depth=bool(config.get("depth", False)),
-                    segmentation=bool(config.get("segmentation", False)),
-                    antialias=bool(config.get("antialias", True)),
-                )
+                painter.setup(world, view, config)
             num_frames += 1
             images = {} if painter is None else painter.images()
             writer.write(replace(d.labelled(frame), images=images))

@@ -352,10 +352,9 @@ class Expert:
 
     def _grasps_beside(self, name: str, grasp: Pose) -> list[Pose]:
         """Where the hand misses an object as the behaviour wants it."""
-        world = self.world
-        shift = {"x": self.behaviour.miss_x, "y": self.behaviour.miss_y}
+        world, x, y = self.world, self.behaviour.miss_x, self.behaviour.miss_y
         others = [(body, world.pose(body.name)) for body in world.scene.bodies if body.name != name]
-        return grasps_beside(grasp, world.body(name), world.pose(name), **shift, others=others, robot=world.robot)
+        return grasps_beside(grasp, world.body(name), world.pose(name), x=x, y=y, others=others, robot=world.robot)
 
     def _perturbed(self, grasp: Pose) -> Pose:
         """A grasp with the behaviour's offset and perception error."""

@@ -151,9 +151,9 @@ class Tutorial(Task):
         release = expert.reachable_place(RELEASE_POINT)
         yield from expert.move(release, speed=0.5)
         expert.phase = "release"
-        yield from expert.set_gripper(
-            open_width, max_seconds=MAX_FALL_SECONDS, done=lasting(lambda: self._rests(world), steps=5)
-        )
+        # For a while: at the moment of landing the cube can be as slow as at rest.
+        rests = lasting(lambda: self._rests(world), steps=max(1, round(REST_SECONDS * world.fps)))
+        yield from expert.set_gripper(open_width, max_seconds=MAX_FALL_SECONDS, done=rests)
 
     def evaluate(self, world: World) -> tuple[Check, ...]:
         """The cube lies on the table."""
