@@ -16,6 +16,7 @@ from typing import Any, Protocol, cast, get_args
 
 import tyro
 
+from demorec.cli.output import PrintableFormatter, say, tell
 from demorec.errors import DemorecError
 from demorec.registry import Registry, nearest_match
 
@@ -106,9 +107,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     if name == "--version":
         from importlib.metadata import version
 
-        print(f"demorec {version('demorec')}")
+        say(f"demorec {version('demorec')}")
         return
-    print(_overview())
+    say(*_overview())
     sys.exit(0 if name in ("-h", "--help") else 2)
 
 
@@ -120,7 +121,9 @@ def generate_dataset_main(argv: Sequence[str] | None = None) -> None:
 
 def run_command(command: type[Command], args: Sequence[str], *, prog: str) -> int:
     """Parse the flags, run the command, turn its errors into one sentence and an exit code."""
-    logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
+    handler = logging.StreamHandler()
+    handler.setFormatter(PrintableFormatter("%(levelname)s: %(message)s"))
+    logging.basicConfig(level=logging.WARNING, handlers=[handler])
     try:
         find_defaults = getattr(command, "defaults", None)
         with _flag_types:
@@ -134,17 +137,17 @@ def run_command(command: type[Command], args: Sequence[str], *, prog: str) -> in
             )
         return cast(Command, parsed).run()
     except DemorecError as error:
-        print(f"{prog}: {error}", file=sys.stderr)
+        tell(f"{prog}: {error}")
         return error.exit_code
     except KeyboardInterrupt:
-        print(f"{prog}: interrupted.", file=sys.stderr)
+        tell(f"{prog}: interrupted.")
         return 130
     except BrokenPipeError:
         sys.stderr.close()
         return 1
 
 
-def _overview() -> str:
+def _overview() -> list[str]:
     lines = [
         "demorec: robot demonstrations you can trust",
         "",
@@ -155,9 +158,9 @@ def _overview() -> str:
         summary = (COMMANDS.load(name).__doc__ or "").strip().splitlines()[0]
         lines.append(f"  {name:<10} {summary}")
     lines += ["", "generate-dataset ... is demorec generate ..."]
-    return "\n".join(lines)
+    return lines
 
 
 def _fail(message: str, code: int) -> None:
-    print(f"demorec: {message}", file=sys.stderr)
+    tell(f"demorec: {message}")
     sys.exit(code)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from tyro.conf import Positional
 
+from demorec.cli.output import say, say_json
 from demorec.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -72,23 +72,23 @@ class Check:
                 reports.append(report)
                 bar.update()
                 if not self.json:
-                    bar.write("\n".join(_lines(report, verbose=self.verbose)), file=sys.stdout)
+                    say(*_lines(report, verbose=self.verbose))
         if self.replay:
             for replayed in _replays(self.paths, self.replay):
                 replays.append(replayed)
                 if not self.json:
                     from demorec.cli.replay import told
 
-                    print(told(replayed))
+                    say(told(replayed))
         if self.coverage_picture is not None:
             self._draw(self.coverage_picture)
         bad = {"fail", "warn"} if self.strict else {"fail"}
         failed = [report for report in reports if report.level in bad]
         diverged = [replayed for replayed in replays if not _as_recorded(replayed)]
         if self.json:
-            print(json.dumps([_plain(report) for report in reports] + [_plain_replay(r) for r in replays], indent=2))
+            say_json([_plain(report) for report in reports] + [_plain_replay(r) for r in replays])
         else:
-            print(_summary(reports, len(failed), len(replays), len(diverged)))
+            say(_summary(reports, len(failed), len(replays), len(diverged)))
         return 1 if failed or diverged else 0
 
     def _draw(self, path: Path) -> None:
@@ -96,7 +96,7 @@ class Check:
 
         drawn = draw_coverage(list(_infos(self.paths)), path)
         if not self.json:
-            print(f"Coverage of {drawn.num_episodes} episodes: {drawn.path}")
+            say(f"Coverage of {drawn.num_episodes} episodes: {drawn.path}")
 
 
 def _infos(paths: Sequence[Path]) -> Iterator[EpisodeInfo]:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from demorec.cli.output import say, say_json
 from demorec.config import GenerateConfig, VideoConfig
 from demorec.errors import ConfigError
 
@@ -104,7 +104,10 @@ class Evaluate:
                 overwrite=self.overwrite,
                 progress=progress,
             )
-        print(json.dumps(_plain(evaluation), indent=2) if self.json else "\n".join(_told(evaluation, out)))
+        if self.json:
+            say_json(_plain(evaluation))
+        else:
+            say(*_told(evaluation, out))
         return 0
 
     def _config(self) -> GenerateConfig:
@@ -132,9 +135,9 @@ class Evaluate:
                 raise ConfigError(f"The two were not tried on the same scenes: {name} is {there} and {here}.")
         comparison = compare(a.successes, b.successes)
         if self.json:
-            print(json.dumps(asdict(comparison), indent=2))
+            say_json(asdict(comparison))
         else:
-            print("\n".join(_compared(comparison, first, second)))
+            say(*_compared(comparison, first, second))
         return 0
 
 

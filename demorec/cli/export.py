@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
+from demorec.cli.output import say
 from demorec.errors import ConfigError
 from demorec.export.options import ExportOptions, ExportReport
 
@@ -51,7 +52,7 @@ class Export:
                 bar.update(done - bar.n)
 
             report = export_lerobot(self.sources, self.out, self.options, progress)
-        print("\n".join(_told(report)))
+        say(*_told(report))
         return 0
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import arg
 
 from demorec.cli.config_file import config_path, with_file_values
+from demorec.cli.output import tell
 from demorec.config import GenerateConfig
 from demorec.generate.options import RunOptions, default_out, default_repo_id
 
@@ -111,9 +111,8 @@ class Generate:
     @staticmethod
     def _interrupted(result: RunResult) -> int:
         done = len(result.run.successes)
-        print(
+        tell(
             f"Interrupted: {done} of {result.run.num_episodes} episodes are complete; the same command goes on: "
-            f"{result.folder}",
-            file=sys.stderr,
+            f"{result.folder}"
         )
         return 130

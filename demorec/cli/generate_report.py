@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ from typing import Self
 
 from tqdm import tqdm
 
+from demorec.cli.output import say, tell
 from demorec.generate.estimate import Estimate
 from demorec.generate.options import RunOptions, available_cores
 from demorec.generate.run import RunResult
@@ -68,9 +68,7 @@ class TerminalProgress:
 
     def says(self, message: str) -> None:
         """Something that a person should know."""
-        if self._bar is not None:
-            self._bar.clear()
-        print(message, file=sys.stderr, flush=True)
+        tell(message)
 
     def _show(self, title: str, done: int, total: int) -> None:
         if title != self._title:
@@ -156,15 +154,14 @@ def print_result(result: RunResult, export: ExportRecord | None, checked: CheckS
         rows.append(("checks", f"{verdict}, {checked.warnings} warnings; demorec check {folder} says more"))
     width = max(len(name) for name, _ in rows)
     for name, value in rows:
-        print(f"{name:<{width}}  {value}")
+        say(f"{name:<{width}}  {value}")
     for failure in () if checked is None else checked.failures[:10]:
-        print(f"Check failed: {failure}", file=sys.stderr)
+        tell(f"Check failed: {failure}")
     if run.given_up:
         shown = ", ".join(str(index) for index in run.given_up[:10]) + (", ..." if len(run.given_up) > 10 else "")
-        print(
+        tell(
             f"{len(run.given_up)} of {run.num_episodes} episodes failed at all {run.config.max_attempts} attempts and "
-            f"were given up: {shown}. The attempts are in {folder / 'failed'}; raise --max-attempts in a new --out.",
-            file=sys.stderr,
+            f"were given up: {shown}. The attempts are in {folder / 'failed'}; raise --max-attempts in a new --out."
         )
 
 
@@ -217,10 +214,10 @@ def print_estimate(estimate: Estimate, options: RunOptions) -> None:
         ("free disk", f"{megabytes(estimate.free_bytes)} at {options.out}"),
     ]
     for name, value in rows:
-        print(f"{name:<13}  {value}")
+        say(f"{name:<13}  {value}")
     if estimate.total_bytes > estimate.free_bytes:
-        print("The disk is too small for this run.", file=sys.stderr)
-    print("Nothing was kept; leave --dry-run out to generate.")
+        tell("The disk is too small for this run.")
+    say("Nothing was kept; leave --dry-run out to generate.")
 
 
 def duration(seconds: float) -> str:

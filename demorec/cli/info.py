@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from tyro.conf import Positional
 
+from demorec.cli.output import say, say_json
 from demorec.errors import ConfigError, ExportError, RecordingError
 
 if TYPE_CHECKING:
@@ -40,9 +41,10 @@ class Info:
         found = [_describe(path) for path in self.paths]
         if self.json:
             plain = [item for item, _ in found]
-            print(json.dumps(plain[0] if len(plain) == 1 else plain, indent=2))
+            say_json(plain[0] if len(plain) == 1 else plain)
         else:
-            print("\n\n".join("\n".join(lines) for _, lines in found))
+            for number, (_, lines) in enumerate(found):
+                say(*([""] if number else []), *lines)
         return 0
 
 

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
+from demorec.cli.output import say, say_json
+
 if TYPE_CHECKING:
     from demorec.registry import Registry
 
@@ -32,13 +34,11 @@ class ListRows:
         registry, describe = _tables()[self.what]
         rows = [(name, describe(registry, name)) for name in registry.names()]
         if self.json:
-            import json
-
-            print(json.dumps([{"name": name, "summary": summary} for name, summary in rows], indent=2))
+            say_json([{"name": name, "summary": summary} for name, summary in rows])
             return 0
         width = max(len(name) for name, _ in rows)
         for name, summary in rows:
-            print(f"{name:<{width}}  {summary}")
+            say(f"{name:<{width}}  {summary}")
         return 0
 
 

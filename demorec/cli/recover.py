@@ -7,6 +7,7 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
+from demorec.cli.output import say
 from demorec.errors import ConfigError
 
 
@@ -37,9 +38,9 @@ class Recover:
             raise ConfigError(f"There is no such file: {self.file}")
         result = recover(self.file, self.out or _default_target(self.file), overwrite=self.overwrite)
         if result.is_complete:
-            print(f"Complete: all {result.num_frames} frames and the outcome are there: {result.path}")
+            say(f"Complete: all {result.num_frames} frames and the outcome are there: {result.path}")
         else:
-            print(f"Kept {result.num_frames} frames, then {result.reason}: {result.path}")
+            say(f"Kept {result.num_frames} frames, then {result.reason}: {result.path}")
         return 0
 
 

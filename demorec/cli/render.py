@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
+from demorec.cli.output import say
 from demorec.config import VideoConfig
 from demorec.errors import ConfigError
 from demorec.processes import SPAWN
@@ -97,10 +98,10 @@ class Render:
                 compared += len(report.compared)
                 differing += len(report.differing)
                 for camera, frame in report.differing.items():
-                    bar.write(f"{report.source.name}: camera {camera} differs from the recording at frame {frame}")
-        print(f"{len(jobs)} recordings, {pictures} pictures: {self.out}")
+                    say(f"{report.source.name}: camera {camera} differs from the recording at frame {frame}")
+        say(f"{len(jobs)} recordings, {pictures} pictures: {self.out}")
         if compared:
-            print(f"{compared - differing} of {compared} unchanged cameras give the recorded pictures to the bit.")
+            say(f"{compared - differing} of {compared} unchanged cameras give the recorded pictures to the bit.")
         return 1 if differing else 0
 
     def _options(self) -> RerenderOptions:

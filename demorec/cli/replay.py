@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
+from demorec.cli.output import say, say_json
 from demorec.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -86,7 +86,7 @@ class Replay:
                     reports.append(report)
                     bar.update()
                     if not self.json:
-                        bar.write(told(report), file=sys.stdout)
+                        say(told(report))
                     if written is not None:
                         pairs.append(written)
             if not reports:
@@ -95,11 +95,11 @@ class Replay:
             if self.json:
                 from demorec.plain import to_plain
 
-                print(json.dumps([to_plain(report) for report in reports], indent=2))
+                say_json([to_plain(report) for report in reports])
             else:
-                print(_summary(reports, sum(good)))
+                say(_summary(reports, sum(good)))
                 if self.out is not None:
-                    print(f"Recordings of the replays: {self.out}")
+                    say(f"Recordings of the replays: {self.out}")
             if self.view:
                 _show(pairs)
         return 0 if all(good) else 1

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
+
+from demorec.cli.output import say, tell
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,14 +47,14 @@ class Reproduce:
         with TerminalProgress() as progress:
             found = reproduce(self.source, options, progress=progress)
         if not isinstance(found, Comparison):
-            print(f"Interrupted; the same command goes on: {self.out}", file=sys.stderr)
+            tell(f"Interrupted; the same command goes on: {self.out}")
             return 130
         for difference in found.versions:
-            print(f"Note: {difference}.", file=sys.stderr)
+            tell(f"Note: {difference}.")
         total = len(found.same) + len(found.different)
-        print(f"{len(found.same)} of {total} episodes are the same to the bit: {self.source} and {found.result.folder}")
+        say(f"{len(found.same)} of {total} episodes are the same to the bit: {self.source} and {found.result.folder}")
         if found.different:
             shown = ", ".join(f"{episode} (attempt {attempt})" for episode, attempt in found.different[:10])
-            print(f"Different: {shown}{', ...' if len(found.different) > 10 else ''}", file=sys.stderr)
+            tell(f"Different: {shown}{', ...' if len(found.different) > 10 else ''}")
             return 1
         return 0

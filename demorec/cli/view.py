@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
+from demorec.cli.output import say, tell
 from demorec.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -68,19 +68,19 @@ class View:
             if len(sources) != 2:
                 raise ConfigError(f"--compare takes two episodes, found {len(sources)}: name two recordings.")
         elif len(sources) > _MOST and not self.episodes:
-            print(f"Showing the first {_MOST} of {len(sources)} episodes; --episodes chooses others.", file=sys.stderr)
+            tell(f"Showing the first {_MOST} of {len(sources)} episodes; --episodes chooses others.")
             sources = sources[:_MOST]
 
         if self.save is not None:
             if self.compare:
                 save_comparison(sources[0], sources[1], self.save)
-                print(f"{_size(self.save)}: {self.save}")
+                say(f"{_size(self.save)}: {self.save}")
             else:
                 for source, target in zip(sources, numbered(self.save, len(sources)), strict=True):
                     if target.exists() and not self.overwrite:
                         raise ConfigError(_already("--save", target))
                     save(source, target)
-                    print(f"{_size(target)}: {target}")
+                    say(f"{_size(target)}: {target}")
             if self.screenshot is None:
                 return 0
         with tempfile.TemporaryDirectory(prefix="demorec-view-") as folder:
@@ -118,7 +118,7 @@ class View:
             from demorec.playback.viewer import serve_web
 
             with serve_web(files, web_port=self.port or 0) as (address, wait):
-                print(f"Open this in a browser on this machine (Ctrl-C ends it): {address}", flush=True)
+                say(f"Open this in a browser on this machine (Ctrl-C ends it): {address}")
                 return 1 if wait() else 0
         from demorec.playback.viewer import show
 
@@ -133,7 +133,7 @@ class View:
             middle = episode.duration / 2
         width, height = self.size
         screenshot(files, self.screenshot, seconds=middle if self.at is None else self.at, width=width, height=height)
-        print(f"{width}x{height}: {self.screenshot}")
+        say(f"{width}x{height}: {self.screenshot}")
 
 
 def _already(flag: str, target: Path) -> str:

@@ -17,6 +17,7 @@ from typing import Any, Self
 
 from demorec.errors import ConfigError, DemorecError
 from demorec.playback.programs import free_port, has_display, viewer_environment, viewer_program
+from demorec.text import printable
 
 _NICENESS = 15
 _END_SECONDS = 60.0
@@ -122,7 +123,7 @@ def _main() -> None:
         try:
             send(Path(line.rstrip("\n")), url, laid_out)
         except DemorecError as error:
-            print(f"--view: {error}", file=sys.stderr)
+            sys.stderr.write(printable(f"--view: {error}") + "\n")
 
 
 if __name__ == "__main__":

@@ -1,0 +1,68 @@
+"""The only way of the commands to a terminal: whole lines, in which nothing foreign can act.
+
+A file name, a task or a message of a recording may hold escape codes or line ends; `printable` spells them out in
+every line that is written here. `print` is forbidden in the package (ruff's T20).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import os
+import sys
+from typing import TextIO
+
+from tqdm import tqdm
+
+from demorec.errors import DemorecError
+from demorec.text import printable
+
+
+class OutputError(DemorecError):
+    """Standard output cannot take the answer: the disk behind it is full, for example."""
+
+
+def say(*lines: str) -> None:
+    """Write lines to standard output, the answer of a command.
+
+    Raises:
+        OutputError: They cannot be written.
+        BrokenPipeError: The reader has left (`| head`).
+    """
+    _write(sys.stdout, lines)
+
+
+def say_json(value: object) -> None:
+    """Write a value as JSON to standard output; characters beyond ASCII are escaped by JSON itself."""
+    say(*json.dumps(value, indent=2).splitlines())
+
+
+def tell(*lines: str) -> None:
+    """Write lines to standard error: what a person should know beside the answer. Never fails."""
+    with contextlib.suppress(OSError, OutputError):  # when nobody is left to be told
+        _write(sys.stderr, lines)
+
+
+def _write(stream: TextIO, lines: tuple[str, ...]) -> None:
+    text = "".join(f"{printable(line)}\n" for line in lines)
+    encoding = stream.encoding or "utf-8"
+    text = text.encode(encoding, "backslashreplace").decode(encoding)  # a terminal of another alphabet
+    try:
+        with tqdm.external_write_mode(file=stream):  # progress bars step aside
+            stream.write(text)
+            stream.flush()
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        # What is left in the buffer would fail again, with a traceback, at the end of the program.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+        raise OutputError(f"The answer cannot be written ({error.strerror}): {stream.name}") from error
+
+
+class PrintableFormatter(logging.Formatter):
+    """Log lines of libraries and of our own, as harmless as all others."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """One line, or several for a traceback, each made printable."""
+        return "\n".join(printable(line) for line in super().format(record).splitlines())

@@ -1,0 +1,29 @@
+"""Text that came from outside (file names, recordings, run.json, datasets) made fit for a terminal or a log."""
+
+from __future__ import annotations
+
+import unicodedata
+
+_VISIBLE = {"\n": "\\n", "\r": "\\r", "\t": "\\t"}
+_INVISIBLE_KINDS = ("Cc", "Cf", "Cs", "Zl", "Zp")
+"""Unicode's categories of what a terminal obeys or reorders instead of showing it: control characters (escape codes
+begin with one), format characters (among them those that turn the direction of writing), surrogates (bytes of a file
+name that are no UTF-8) and separators of lines and paragraphs."""
+
+
+def printable(text: str) -> str:
+    r"""The same text with every control character spelt out (\x1b, \n, \u202e), so that it can do nothing but be read.
+
+    All foreign text goes through here before it reaches a terminal; `demorec.cli.output` sees to that.
+    """
+    if text.isprintable():  # nearly always; a plain space counts as printable
+        return text
+    return "".join(_spelt(character) for character in text)
+
+
+def _spelt(character: str) -> str:
+    if unicodedata.category(character) not in _INVISIBLE_KINDS:
+        return character
+    code = ord(character)
+    width, letter = (2, "x") if code < 0x100 else (4, "u") if code < 0x10000 else (8, "U")
+    return _VISIBLE.get(character) or f"\\{letter}{code:0{width}x}"
