@@ -1,14 +1,30 @@
-"""Where model files are: pybullet_data's and our own, found without importing the simulator."""
+"""Where model files are: pybullet_data's, our own and those of the user's modules, found without the simulator.
+
+A recording names its models by what is the same on every machine: a path below pybullet_data, "demorec:NAME", or
+"my_robots:PATH" for a file beside a module of the user's own. A name never leads out of these folders, and into that of
+a module only if the user has allowed it.
+"""
 
 from __future__ import annotations
 
 import functools
 import importlib.util
+import os
+from collections.abc import Iterable
 from pathlib import Path
 
-from demorec.errors import MissingDependencyError, SceneError
+from demorec.errors import ConfigError, MissingDependencyError, NotAllowedError, SceneError
+from demorec.user_modules import is_allowed, module_file
 
 OWN_PREFIX = "demorec:"
+
+_modules_with_models: set[str] = set()
+"""Of this process, as `sys.path` is: models are looked up deep below whatever reads or draws a recording."""
+
+
+def allow_models(modules: Iterable[str]) -> None:
+    """From now on, model files beside these modules of the user's own are found."""
+    _modules_with_models.update(modules)
 
 
 @functools.cache
@@ -21,18 +37,60 @@ def data_folder() -> Path:
 
 
 def asset_path(name: str) -> Path:
-    """Absolute path of "demorec:NAME" (a file of `demorec/sim/assets`) or of a path below pybullet_data.
+    """Absolute path of a path below pybullet_data, "demorec:NAME" (of `demorec/sim/assets`) or "module:PATH".
 
     Raises:
-        SceneError: There is no such file.
+        SceneError: There is no such file, or the name leads out of its folder.
+        NotAllowedError: It is beside a module that the user has not allowed (`allow_models`).
+        ConfigError: That module cannot be found.
     """
-    if name.startswith(OWN_PREFIX):
-        path = Path(__file__).parent / "sim" / "assets" / name.removeprefix(OWN_PREFIX)
+    module, _, relative = name.rpartition(":")
+    if module and f"{module}:" != OWN_PREFIX:
+        if not is_allowed(module, _modules_with_models):
+            raise NotAllowedError(
+                f"The model {name!r} lies beside a module from outside of demorec: if you trust that module, add "
+                f"--allow {module}."
+            )
+        file = module_file(module)
+        folder, limit = file.parent, _top_folder(module)
     else:
-        path = data_folder() / name
+        folder = limit = Path(__file__).parent / "sim" / "assets" if module else data_folder()
+    path = Path(os.path.normpath(folder / relative))
+    if not path.is_relative_to(limit):
+        raise SceneError(f"The model file {name!r} lies outside of {limit}, where it has to be.")
     if not path.is_file():
-        raise SceneError(f"The model file {name!r} was not found: give a path below pybullet_data, or demorec:NAME.")
+        raise SceneError(
+            f"The model file {name!r} was not found: give a path below pybullet_data, demorec:NAME, or a file beside "
+            "your own module."
+        )
     return path
+
+
+def model_name(file: str | Path, module: str) -> str:
+    """The name under which recordings keep a model that a module of the user's own gives.
+
+    Args:
+        file: Absolute, relative to the module's file, below pybullet_data, or "demorec:NAME".
+        module: Which gives it.
+
+    Raises:
+        ConfigError: An absolute path that lies neither beside the module (or in its package) nor in pybullet_data.
+    """
+    name = str(file)
+    if ":" in name:
+        return name
+    folder = module_file(module).parent
+    path = Path(os.path.normpath(folder / name))
+    if path.is_file() and path.is_relative_to(_top_folder(module)):
+        return f"{module}:{os.path.relpath(path, folder)}"
+    if not Path(name).is_absolute():
+        return name
+    if path.is_relative_to(data_folder()):
+        return path.relative_to(data_folder()).as_posix()
+    raise ConfigError(
+        f"The module {module!r} names a model that is no file of its own folder nor of pybullet_data, so that no other "
+        f"machine would find what a recording says about it: put it beside the module, found {name}"
+    )
 
 
 def mesh_path(folder: Path, name: str) -> Path:
@@ -46,3 +104,8 @@ def mesh_path(folder: Path, name: str) -> Path:
         if candidate.is_file():
             return candidate
     raise SceneError(f"The mesh {name!r} is neither beside its URDF nor in pybullet_data: {folder}")
+
+
+def _top_folder(module: str) -> Path:
+    """The folder of the outermost package that a module is in, or that of its file."""
+    return module_file(module.partition(".")[0]).parent

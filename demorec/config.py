@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import tomllib
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -15,6 +16,7 @@ from typing import Any, Literal
 
 from demorec.errors import ConfigError
 from demorec.plain import from_plain
+from demorec.user_modules import modules_of
 from demorec.variation import PRESET_NAMES, Preset, Ranges
 
 MAX_PIXELS = 16_000_000
@@ -52,7 +54,7 @@ class GenerateConfig:
     fixed: bool = False
     """The task's one exact layout instead of random ones, where it has one (tutorial)."""
     robot: str = "panda"
-    """Which arm: a name of `demorec list robots`."""
+    """Which arm: a name of `demorec list robots`, or my_package.my_module:MY_ARM."""
     seed: int = 0
     """Root of all randomness."""
     fps: int = 30
@@ -60,7 +62,7 @@ class GenerateConfig:
     physics_hz: int = 240
     """Physics steps per second."""
     cameras: tuple[str, ...] = ("front", "wrist")
-    """Names of `demorec list cameras`, or "none"."""
+    """Names of `demorec list cameras`, or my_package.my_module:MY_CAMERA; or "none"."""
     width: int = 224
     """Of the pictures, pixels; even."""
     height: int = 224
@@ -96,23 +98,45 @@ class GenerateConfig:
         if self.cameras == ("none",):
             object.__setattr__(self, "cameras", ())
 
+    @property
+    def modules(self) -> tuple[str, ...]:
+        """The user's own modules that it names; whoever makes a config of their own words allows them thereby."""
+        return modules_of((self.task, self.robot, *self.cameras))
+
+    def check_names(self, allowed: Iterable[str]) -> None:
+        """Raise ConfigError unless all that it names may be loaded.
+
+        A config that was read from a recording, a run, a dataset or a policy must pass this before anything is made
+        of it: `demorec.rollout.prepare` imports what its plan's config names.
+
+        Args:
+            allowed: The user's own modules and packages that may be imported.
+
+        Raises:
+            NotAllowedError: It names something of another module.
+        """
+        from demorec.tables import CAMERAS, RENDERERS, ROBOTS, TASKS
+
+        allowed = tuple(allowed)
+        TASKS.check_name(self.task, allowed)
+        ROBOTS.check_name(self.robot, allowed)
+        RENDERERS.check_name(self.renderer)
+        for name in self.cameras:
+            if name == "none":
+                raise ConfigError(f"--cameras none stands alone, found {' '.join(self.cameras)}.")
+            CAMERAS.check_name(name, allowed)
+
     def validate(self) -> None:
-        """Check all values that can be judged without loading anything heavy.
+        """Check all values that can be judged without loading anything heavy; the config is the user's own words.
 
         Raises:
             ConfigError: The first impossible value, with what is allowed.
         """
         from demorec.registry import nearest_match
-        from demorec.tables import CAMERAS, RENDERERS, ROBOTS, TASKS
+        from demorec.tables import camera_name
 
-        TASKS.check_name(self.task)
-        ROBOTS.check_name(self.robot)
-        RENDERERS.check_name(self.renderer)
-        for name in self.cameras:
-            if name == "none":
-                raise ConfigError(f"--cameras none stands alone, found {' '.join(self.cameras)}.")
-            CAMERAS.check_name(name)
-        if len(set(self.cameras)) != len(self.cameras):
+        self.check_names(self.modules)
+        if len({camera_name(name) for name in self.cameras}) != len(self.cameras):
             raise ConfigError(f"A camera is named twice: {' '.join(self.cameras)}.")
         _check("seed", self.seed, 0, 2**63 - 1)
         _check("physics-hz", self.physics_hz, 60, 10_000)
@@ -150,11 +174,26 @@ class EpisodePlan:
     config: GenerateConfig
     episode_index: int
     attempt: int = 0
+    versions: Mapping[str, str] | None = None
+    """That the run began with; None: whatever is there now."""
 
 
-def deciding_versions() -> dict[str, str]:
-    """package -> version, of everything that decides the bits of an episode (numba draws, av codes the pictures)."""
-    return dict(_deciding_versions())
+def deciding_versions(config: GenerateConfig | None = None) -> dict[str, str]:
+    """package -> version, of everything that decides the bits of an episode (numba draws, av codes the pictures).
+
+    With a config, which is taken for the user's own words, also of the modules of the user's own that it names
+    (`demorec.own_versions`).
+
+    Raises:
+        ConfigError: One of these cannot be found.
+        SceneError: The model of the user's own robot is missing.
+    """
+    versions = dict(_deciding_versions())
+    if config is not None and config.modules:
+        from demorec.own_versions import own_versions
+
+        versions |= own_versions(config.modules, robot=config.robot)
+    return versions
 
 
 @functools.cache

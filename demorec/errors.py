@@ -19,6 +19,10 @@ class ConfigError(DemorecError):
     exit_code = 2
 
 
+class NotAllowedError(ConfigError):
+    """A file names a module from outside of demorec, and the user has not said that it may be run."""
+
+
 class SceneError(DemorecError):
     """No scene could be laid out or simulated within the given ranges; tried again a bounded number of times."""
 

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import difflib
 import importlib
+import inspect
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import cast
+from typing import Any, cast
 
-from demorec.errors import ConfigError
+from demorec.errors import ConfigError, NotAllowedError
+from demorec.user_modules import import_object, is_allowed, split_name
 
 
 def nearest_match(name: str, allowed: Iterable[str]) -> str:
@@ -25,44 +27,75 @@ def nearest_match(name: str, allowed: Iterable[str]) -> str:
 class Registry[T]:
     """Names of one kind and where their objects are.
 
+    A registry with a `subclass_of` or `instance_of` is open: it also takes "my_package.my_module:MyThing", if the
+    caller allows that module (`demorec.user_modules`) and the thing is of the right kind.
+
     Attributes:
         kind: What a row is, in the singular, for messages ("task").
         rows: name -> "module:attribute".
-        open_to_others: Whether "my_package.my_module:MyThing" is accepted beside the names.
+        subclass_of: "module:attribute" of the class that the user's own classes must derive from.
+        instance_of: "module:attribute" of the class that the user's own objects must be of.
     """
 
     kind: str
     rows: Mapping[str, str]
-    open_to_others: bool = False
+    subclass_of: str = ""
+    instance_of: str = ""
 
     def names(self) -> tuple[str, ...]:
         """Every name, in the order of the table."""
         return tuple(self.rows)
 
-    def check_name(self, name: str) -> None:
-        """Raise ConfigError with the nearest match unless `name` can be loaded; imports nothing."""
-        if name in self.rows or (self.open_to_others and ":" in name):
-            return
-        extra = ', or "package.module:Name" for one of your own' if self.open_to_others else ""
-        raise ConfigError(
-            f"Unknown {self.kind} {name!r}.{nearest_match(name, self.rows)} Allowed: {', '.join(self.rows)}{extra}."
-        )
+    def check_name(self, name: str, allowed: Iterable[str] = ()) -> None:
+        """Raise ConfigError with the nearest match unless `name` may be loaded; imports nothing.
 
-    def load(self, name: str) -> T:
-        """Import and return the object called `name`.
+        Args:
+            name: A row's, or "package.module:Thing" where the registry is open.
+            allowed: Modules and packages of the user's own that may be imported.
 
         Raises:
-            ConfigError: No such name, or somebody else's module or attribute cannot be imported.
+            NotAllowedError: It is a thing of a module that is not among those.
         """
-        self.check_name(name)
-        target = self.rows.get(name, name)
-        module_name, _, attribute = target.partition(":")
         if name in self.rows:
-            return cast(T, getattr(importlib.import_module(module_name), attribute))
-        try:
-            return cast(T, getattr(importlib.import_module(module_name), attribute))
-        except (ImportError, AttributeError) as error:
+            return
+        is_open = bool(self.subclass_of or self.instance_of)
+        parts = split_name(name) if is_open else None
+        if parts is None:
+            extra = ', or "package.module:Name" for one of your own' if is_open else ""
             raise ConfigError(
-                f"The {self.kind} {name!r} cannot be imported ({error}): give it as package.module:Name, with the "
-                "package installed or its folder on PYTHONPATH."
-            ) from error
+                f"Unknown {self.kind} {name!r}.{nearest_match(name, self.rows)} Allowed: {', '.join(self.rows)}{extra}."
+            )
+        if not is_allowed(parts[0], allowed):
+            raise NotAllowedError(
+                f"The {self.kind} {name!r} is code from outside of demorec that a file names, and only you can say "
+                f"whether to run it: if you trust that module, add --allow {parts[0]}."
+            )
+
+    def load(self, name: str, allowed: Iterable[str] = ()) -> T:
+        """Import and return the object called `name`; arguments as of `check_name`.
+
+        Raises:
+            ConfigError: No such name, or one of the user's own that cannot be imported or is of another kind.
+            NotAllowedError: As `check_name`.
+        """
+        self.check_name(name, allowed)
+        if name in self.rows:
+            return cast(T, _import(self.rows[name]))
+        found = import_object(self.kind, name)
+        base = _import(self.subclass_of or self.instance_of)
+        fits = isinstance(found, type) and issubclass(found, base) if self.subclass_of else isinstance(found, base)
+        if not fits:
+            relation = "a subclass" if self.subclass_of else "an instance"
+            raise ConfigError(
+                f"{name!r} is no {self.kind}: it must be {relation} of {base.__module__}.{base.__qualname__}."
+            )
+        if inspect.isabstract(found):
+            missing = ", ".join(sorted(getattr(found, "__abstractmethods__", ())))
+            raise ConfigError(f"The {self.kind} {name!r} is not complete: it lacks {missing}.")
+        return cast(T, found)
+
+
+def _import(target: str) -> Any:
+    """The object of a table's "module:attribute"."""
+    module_name, _, attribute = target.partition(":")
+    return getattr(importlib.import_module(module_name), attribute)

@@ -7,16 +7,17 @@ looks the pictures come out again as they were before coding, so the coded packe
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 
+from demorec.assets import allow_models
 from demorec.config import EpisodePlan, GenerateConfig, VideoConfig, read_toml
 from demorec.episode import CameraImages, EpisodeInfo, Frame, Outcome
-from demorec.errors import ConfigError, DemorecError, RecordingError
+from demorec.errors import ConfigError, DemorecError, NotAllowedError, RecordingError
 from demorec.geometry import Pose, look_at
 from demorec.plain import digest, from_plain
 from demorec.recording import EpisodeWriter, Recording
@@ -27,8 +28,9 @@ from demorec.rollout import prepare
 from demorec.scene import Camera, Scene
 from demorec.seeding import generator
 from demorec.sim.world import World
-from demorec.tables import CAMERAS, RENDERERS
+from demorec.tables import CAMERAS, RENDERERS, camera_name
 from demorec.tasks.vary import vary_looks
+from demorec.user_modules import split_name
 from demorec.variation import Ranges, resolve
 
 
@@ -106,7 +108,7 @@ class RerenderOptions:
     """What the new pictures shall be; None keeps what was recorded.
 
     Attributes:
-        cameras: Names: of the recording, of `free_cameras`, or of the cameras' table.
+        cameras: Names: of the recording, of `free_cameras`, of the cameras' table, or "module:CAMERA" of one's own.
         free_cameras: Cameras by pose and field of view.
         width, height: Pixels, of every camera that does not say its own.
         renderer: Row of the renderers' table.
@@ -114,6 +116,7 @@ class RerenderOptions:
         depth, segmentation: Whether these are recorded too.
         looks: Seed of random light, colours and textures; None keeps the recorded looks.
         video: Fields of `VideoConfig` that change.
+        allowed: The user's own modules that may be imported for what recordings name.
     """
 
     cameras: tuple[str, ...] | None = None
@@ -126,6 +129,7 @@ class RerenderOptions:
     segmentation: bool | None = None
     looks: int | None = None
     video: Mapping[str, Any] = field(default_factory=dict)
+    allowed: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -163,18 +167,24 @@ class View:
     true_from_recorded: Mapping[str, Pose] = field(default_factory=dict)
 
 
-def recorded_view(info: EpisodeInfo) -> View:
+def recorded_view(info: EpisodeInfo, allowed: Collection[str]) -> View:
     """The view of a recording.
 
     Recorded extrinsics may be off on purpose, as those of a real camera are; where the cameras really were follows
     from the seed. Only if the scene cannot be drawn again from it (another version, a scene of somebody else's), the
     recorded cameras are taken for the true ones.
+
+    Raises:
+        NotAllowedError: The scene cannot be drawn again without a module that is not among those `allowed`.
     """
     if not info.origin and any(name.startswith("calibration_") for name in info.behaviour):
         try:
             config = from_plain(info.config, GenerateConfig)
+            config.check_names(allowed)
             plan = EpisodePlan(config=config, episode_index=info.episode_index, attempt=info.attempt)
             episode = prepare(plan)
+        except NotAllowedError:
+            raise  # else the pictures would be taken from wrong places without a word
         except (ValueError, DemorecError):
             episode = None
         if episode is not None and episode.info.scene == info.scene:
@@ -190,7 +200,7 @@ def new_view(info: EpisodeInfo, options: RerenderOptions) -> View:
     Raises:
         ConfigError: An unknown camera, or a picture size that cannot be coded.
     """
-    old = recorded_view(info)
+    old = recorded_view(info, options.allowed)
     names = options.cameras or tuple(dict.fromkeys((*(c.name for c in info.scene.cameras), *options.free_cameras)))
     if not names:
         raise ConfigError("The recording has no cameras: name some with --cameras.")
@@ -206,8 +216,9 @@ def new_view(info: EpisodeInfo, options: RerenderOptions) -> View:
         elif name in recorded:
             w, h = options.width or recorded[name].width, options.height or recorded[name].height
             believed, actual = (replace(c, width=w, height=h) for c in (recorded[name], true[name]))
-        elif name in CAMERAS.rows:
-            believed = actual = CAMERAS.load(name).camera(name, info.robot, width=width, height=height)
+        elif name in CAMERAS.rows or split_name(name) is not None:
+            preset = CAMERAS.load(name, options.allowed)
+            believed = actual = preset.camera(camera_name(name), info.robot, width=width, height=height)
         else:
             known = tuple(dict.fromkeys((*recorded, *options.free_cameras, *CAMERAS.rows)))
             raise ConfigError(f"Unknown camera {name!r}.{nearest_match(name, known)} Allowed: {', '.join(known)}.")
@@ -313,6 +324,7 @@ def rerender(source: Path, out: Path, options: RerenderOptions, *, overwrite: bo
     """
     if out.resolve() == source.resolve():
         raise ConfigError(f"The new recording would replace its own source, choose another --out: {out}")
+    allow_models(options.allowed)
     with Recording(source) as recording:
         info, columns = recording.info, recording.columns()
         if columns.num_frames == 0:

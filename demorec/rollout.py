@@ -19,22 +19,24 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from demorec.assets import allow_models, model_name
 from demorec.config import EpisodePlan, GenerateConfig, deciding_versions
-from demorec.episode import Action, CameraImages, EpisodeInfo, Frame, Outcome, RobotSpec, frame_time_ns
+from demorec.episode import Action, CameraImages, EpisodeInfo, Frame, Outcome, frame_time_ns
 from demorec.errors import ConfigError
 from demorec.features import NOISE_LETS_GO
 from demorec.geometry import Array, Pose
 from demorec.motion import angle_between
 from demorec.plain import digest, to_plain
 from demorec.render import Renderer, RenderSetup
-from demorec.scene import Camera
+from demorec.scene import Camera, Scene
 from demorec.seeding import Purpose, generator
 from demorec.sim.world import World
-from demorec.tables import CAMERAS, RENDERERS, ROBOTS, TASKS
+from demorec.tables import CAMERAS, RENDERERS, TASKS, camera_name, load_robot
 from demorec.tasks.base import Behaviour, Step, Task
 from demorec.tasks.sampling import Sampler, stratified_point
 from demorec.tasks.skills import Expert, GaveUp
 from demorec.tasks.vary import calibration_errors, draw_behaviour, vary_cameras, vary_looks, vary_physics
+from demorec.user_modules import modules_of
 from demorec.variation import Ranges, resolve
 
 EVAL_SEED_OFFSET = 2**63
@@ -79,22 +81,31 @@ def _rng(plan: EpisodePlan, purpose: Purpose) -> np.random.Generator:
 def prepare(plan: EpisodePlan) -> Episode:
     """Draw an episode's scene, words and behaviour; a pure function of the plan, without a simulator.
 
+    Imports the user's own modules that the plan's config names: one that was read from a file must have passed
+    `GenerateConfig.check_names` before.
+
     Raises:
         ConfigError: An unknown name.
         SceneError: No layout was found within the task's ranges.
     """
     config = plan.config
-    robot: RobotSpec = ROBOTS.load(config.robot)
-    task = TASKS.load(config.task)()
+    allow_models(config.modules)
+    robot = load_robot(config.robot, config.modules)
+    task = TASKS.load(config.task, config.modules)()
     if config.fixed and not task.has_fixed_layout:
         raise ConfigError(f"--fixed was given, but the task {config.task!r} has no fixed layout: leave it out.")
     ranges = resolve(config.variation, config.ranges)
     scene = task.sample_scene(robot, _sampler(plan, ranges))
+    for module in modules_of([config.task]):
+        scene = _with_model_names(scene, module)
     robot = robot.scaled(scene.robot.scale)
     scene = replace(scene, physics=replace(scene.physics, hz=config.physics_hz))
     scene = vary_looks(vary_physics(scene, ranges, _rng(plan, "physics")), ranges, _rng(plan, "looks"))
     behaviour = draw_behaviour(ranges, _rng(plan, "behaviour"))
-    presets = [(name, task.camera_presets.get(name) or CAMERAS.load(name)) for name in config.cameras]
+    presets = [
+        (camera_name(name), task.camera_presets.get(name) or CAMERAS.load(name, config.modules))
+        for name in config.cameras
+    ]
     camera_rng = _rng(plan, "cameras")
     cameras = vary_cameras(
         tuple(preset.camera(name, robot, width=config.width, height=config.height) for name, preset in presets),
@@ -116,7 +127,7 @@ def prepare(plan: EpisodePlan) -> Episode:
         behaviour=behaviour.as_mapping() | _calibration_values(errors),
         config=to_plain(config),
         config_digest=digest(config),
-        versions=deciding_versions(),
+        versions=deciding_versions(config),
     )
     return Episode(
         plan=plan,
@@ -126,6 +137,15 @@ def prepare(plan: EpisodePlan) -> Episode:
         cameras=cameras,
         true_from_recorded={name: error for name, error in errors.items() if error != Pose()},
     )
+
+
+def _with_model_names(scene: Scene, module: str) -> Scene:
+    """The scene of a task of the user's own, its models named as recordings name them."""
+    shapes = [
+        replace(body.shape, file=model_name(body.shape.file, module)) if body.shape.file else body.shape
+        for body in scene.bodies
+    ]
+    return replace(scene, bodies=tuple(replace(b, shape=s) for b, s in zip(scene.bodies, shapes, strict=True)))
 
 
 def _sampler(plan: EpisodePlan, ranges: Ranges) -> Sampler:

@@ -30,7 +30,8 @@ class Shape:
         kind: Which geometry; decides what `size` means.
         size: box: (x, y, z) full extents; sphere: (radius,); cylinder and capsule: (radius, length) along z;
             mesh and urdf: (x, y, z) extents of the bounding box after scaling, for features and grasping.
-        file: mesh and urdf: path below pybullet_data, or "demorec:NAME" for a file of `demorec/sim/assets`.
+        file: mesh and urdf: path below pybullet_data, or "demorec:NAME" for a file of `demorec/sim/assets`,
+            or "module:PATH" for one beside a module of the user's own (a task may give it relative to its module).
         scale: mesh and urdf: uniform scale of the file.
         origin: mesh: the point of the file, in its own axes before scaling, that becomes the body's origin.
         y_up: mesh: whether the file's y axis points up (its x axis stays x).

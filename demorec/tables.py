@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from demorec.assets import model_name
 from demorec.registry import Registry
+from demorec.user_modules import modules_of, split_name
 
 if TYPE_CHECKING:
     from demorec.check.base import Check
@@ -27,17 +31,19 @@ TASKS: Registry[type[Task]] = Registry(
         "pick_shapes": "demorec.tasks.pick_shapes:PickShapes",
         "tutorial": "demorec.tasks.tutorial:Tutorial",
     },
-    open_to_others=True,
+    subclass_of="demorec.tasks.base:Task",
 )
 
 ROBOTS: Registry[RobotSpec] = Registry(
     kind="robot",
     rows={"panda": "demorec.sim.robots.panda:PANDA", "iiwa": "demorec.sim.robots.iiwa:IIWA"},
+    instance_of="demorec.episode:RobotSpec",
 )
 
 CAMERAS: Registry[CameraPreset] = Registry(
     kind="camera",
     rows={"front": "demorec.render.cameras:FRONT", "wrist": "demorec.render.cameras:WRIST"},
+    instance_of="demorec.render.cameras:CameraPreset",
 )
 
 RENDERERS: Registry[type[Renderer]] = Registry(
@@ -118,3 +124,19 @@ CHECKS: Registry[Check] = Registry(
         "dataset_opens": "demorec.check.dataset_files:dataset_opens",
     },
 )
+
+
+def load_robot(name: str, allowed: Collection[str] = ()) -> RobotSpec:
+    """`ROBOTS.load`, with the model of a robot of the user's own named as recordings name it.
+
+    Raises:
+        ConfigError: As `Registry.load`, or the model lies where a recording cannot name it.
+    """
+    robot = ROBOTS.load(name, allowed)
+    module, *_ = modules_of([name]) or ("",)
+    return replace(robot, urdf=model_name(robot.urdf, module)) if module else robot
+
+
+def camera_name(name: str) -> str:
+    """What a camera is called in recordings and datasets: the row's name, or "top" for "my_cameras:TOP"."""
+    return name if split_name(name) is None else name.rpartition(":")[2].lower()

@@ -13,6 +13,7 @@ from demorec.check.coverage import infos_by_task, largest_gap, twins
 from demorec.check.dataset import Dataset
 from demorec.check.rows import displacement, link_matrices, matrices
 from demorec.check.run import motion_vector
+from demorec.errors import NotAllowedError
 from demorec.features import ACTION, EE_POSE, STATE, VELOCITY
 from demorec.geometry import Array
 from demorec.urdf import Urdf
@@ -97,7 +98,10 @@ def dataset_forward_kinematics(dataset: Dataset) -> Measurement | None:
     for number, (rows, info) in enumerate(dataset.described()):
         key = (info.robot.urdf, info.scene.robot.scale)
         if key not in urdfs:
-            urdfs[key] = Urdf.load(asset_path(info.robot.urdf), scale=info.scene.robot.scale)
+            try:
+                urdfs[key] = Urdf.load(asset_path(info.robot.urdf), scale=info.scene.robot.scale)
+            except NotAllowedError:  # a dataset does not hold the model of a robot of the user's own
+                return None
         joints = dict(zip(info.robot.arm_joints, rows[STATE].astype(np.float64).T, strict=False))
         fk = link_matrices(urdfs[key], info.robot.tcp_link, joints, len(rows[STATE]))
         off = displacement(matrices(rows[EE_POSE].astype(np.float64)), fk)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from demorec.assets import allow_models
 from demorec.check.base import Check, Level, Result, Scope
 from demorec.check.dataset import Dataset
 from demorec.check.episode import RecordedEpisode
@@ -27,11 +28,13 @@ class CheckOptions:
         pictures: Whether pictures are decoded.
         only: Names of checks; empty for all.
         workers: Processes; 1 works in this one.
+        allowed: The user's own modules beside which models of robots may be read.
     """
 
     pictures: bool = True
     only: tuple[str, ...] = ()
     workers: int = 1
+    allowed: tuple[str, ...] = ()
 
     def validate(self) -> None:
         """Raise ConfigError for unknown names or impossible numbers."""
@@ -120,6 +123,7 @@ def check_subjects(subjects: Sequence[Subject], options: CheckOptions) -> Iterat
 
 def check_subject(subject: Subject, options: CheckOptions) -> SubjectReport:
     """All checks of one recording, run or dataset."""
+    allow_models(options.allowed)
     checks = options.checks(subject.kind)
     if subject.kind == "recording":
         with RecordedEpisode(subject.path) as episode:

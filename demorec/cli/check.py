@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from tyro.conf import Positional
 
+from demorec.cli.flags import Allow, allowed_modules
 from demorec.cli.output import say, say_json
 from demorec.errors import ConfigError
 
@@ -50,6 +51,8 @@ class Check:
     """Processes."""
     verbose: bool = False
     """Print the checks that pass, too."""
+    allow: Allow = ()
+    """A module or package of your own that may be imported for the tasks, robots and cameras that the files name."""
     json: bool = False
     """Print JSON: a list with one object for each recording, run and dataset."""
 
@@ -63,7 +66,8 @@ class Check:
 
         from demorec.check.report import CheckOptions, check_subjects, find_subjects
 
-        options = CheckOptions(pictures=self.pictures, only=self.only, workers=self.workers)
+        allowed = allowed_modules(self.allow)
+        options = CheckOptions(pictures=self.pictures, only=self.only, workers=self.workers, allowed=allowed)
         options.validate()
         subjects = find_subjects(self.paths)
         reports, replays = [], []
@@ -74,7 +78,7 @@ class Check:
                 if not self.json:
                     say(*_lines(report, verbose=self.verbose))
         if self.replay:
-            for replayed in _replays(self.paths, self.replay):
+            for replayed in _replays(self.paths, self.replay, allowed):
                 replays.append(replayed)
                 if not self.json:
                     from demorec.cli.replay import told
@@ -116,13 +120,14 @@ def _infos(paths: Sequence[Path]) -> Iterator[EpisodeInfo]:
             yield from Dataset(subject.path).infos
 
 
-def _replays(paths: Sequence[Path], count: int) -> Iterator[ReplayReport]:
+def _replays(paths: Sequence[Path], count: int, allowed: tuple[str, ...]) -> Iterator[ReplayReport]:
     from demorec.cli.replay import demonstrations
     from demorec.replay import ReplayOptions, replay_all
 
+    options = ReplayOptions(allowed=allowed)
     for path in paths:
-        found = demonstrations([path], ReplayOptions(), limit=count)
-        yield from (report for report, _ in replay_all(found, ReplayOptions()))
+        found = demonstrations([path], options, limit=count)
+        yield from (report for report, _ in replay_all(found, options))
 
 
 def _as_recorded(report: ReplayReport) -> bool:

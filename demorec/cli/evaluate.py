@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from demorec.cli.flags import Allow, allowed_modules
 from demorec.cli.output import say, say_json
 from demorec.config import GenerateConfig, VideoConfig
 from demorec.errors import ConfigError
@@ -59,6 +60,8 @@ class Evaluate:
     """Coding of the recorded pictures."""
     workers: int | None = None
     """Processes (auto: one for each core)."""
+    allow: Allow = ()
+    """A module or package of your own that may be imported for the cameras and steps that the policy names."""
     overwrite: bool = False
     """Delete the evaluation that the output folder holds, and begin anew."""
     compare: tuple[Path, Path] | None = None
@@ -88,6 +91,7 @@ class Evaluate:
             action=None if self.action is None else check_action_kind(self.action),
             action_steps=self.action_steps,
             episode_length=self.episode_length,
+            allowed=allowed_modules(self.allow),
         )
         out = self.out or Path("evaluations") / self.task.rpartition(":")[2]
         with tqdm(total=self.num_episodes, unit="rollout", disable=not sys.stderr.isatty()) as bar:

@@ -11,10 +11,12 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
+from demorec.cli.flags import Allow, allowed_modules
 from demorec.cli.output import say
 from demorec.config import VideoConfig
 from demorec.errors import ConfigError
 from demorec.processes import SPAWN
+from demorec.user_modules import modules_of
 
 if TYPE_CHECKING:
     from demorec.rerender import RerenderOptions, RerenderReport
@@ -44,8 +46,8 @@ class Render:
     out: Annotated[Path, arg(help_behavior_hint="(required)")]
     """Folder for the new recordings, or the name of one (.mcap)."""
     cameras: tuple[str, ...] = ()
-    """Names: of the recording, of the camera file, or of `demorec list cameras`; default: the
-    recorded ones and all of the file."""
+    """Names: of the recording, of the camera file, of `demorec list cameras`, or
+    my_package.my_module:MY_CAMERA; default: the recorded ones and all of the file."""
     camera_file: Path | None = None
     """Cameras by pose and field of view (TOML)."""
     width: int | None = None
@@ -74,6 +76,8 @@ class Render:
     """1..100."""
     workers: int | None = None
     """Processes; default: one for each core."""
+    allow: Allow = ()
+    """A module or package of your own that may be imported for the tasks, robots and cameras that the files name."""
     overwrite: bool = False
     """Replace recordings that are there already."""
 
@@ -130,6 +134,7 @@ class Render:
             segmentation=self.segmentation or None,
             looks=self.looks,
             video=changes,
+            allowed=(*allowed_modules(self.allow), *modules_of(self.cameras)),
         )
 
 

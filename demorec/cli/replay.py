@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
-from demorec.cli.output import say, say_json
+from demorec.cli.flags import Allow, allowed_modules
+from demorec.cli.output import say, say_json, tell
 from demorec.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -57,6 +58,8 @@ class Replay:
     """Show recording and replay over each other in Rerun."""
     overwrite: bool = False
     """Replace recordings in the output folder."""
+    allow: Allow = ()
+    """A module or package of your own that may be imported for the tasks, robots and cameras that the files name."""
     json: bool = False
     """Print JSON: a list with one object for each episode."""
 
@@ -71,7 +74,12 @@ class Replay:
         from demorec.replay import ReplayOptions, is_as_recorded, replay_all
 
         options = ReplayOptions(
-            states=self.states, export_hz=self.export_hz, noise=self.noise, delay=self.delay, seed=self.seed
+            states=self.states,
+            export_hz=self.export_hz,
+            noise=self.noise,
+            delay=self.delay,
+            seed=self.seed,
+            allowed=allowed_modules(self.allow),
         )
         options.validate()
         with ExitStack() as stack:
@@ -108,7 +116,26 @@ class Replay:
 def demonstrations(
     paths: Sequence[Path], options: ReplayOptions, *, episodes: str = "", limit: int | None = None
 ) -> Iterator[Demonstration]:
-    """What there is to replay in some paths, in order; with a limit: so many of each path, spread evenly."""
+    """What there is to replay in some paths, in order; with a limit: so many of each path, spread evenly.
+
+    Tells where modules of the user's own are not what they were when the episodes were recorded.
+    """
+    from demorec.assets import allow_models
+    from demorec.own_versions import changed_sources
+
+    allow_models(options.allowed)
+    noted: set[str] = set()
+    for demonstration in _found(paths, options, episodes=episodes, limit=limit):
+        for line in changed_sources(demonstration.info.versions, options.allowed):
+            if line not in noted:
+                tell(f"Note: {line} since this was recorded.")
+            noted.add(line)
+        yield demonstration
+
+
+def _found(
+    paths: Sequence[Path], options: ReplayOptions, *, episodes: str, limit: int | None
+) -> Iterator[Demonstration]:
     from demorec.export.options import parse_episodes
     from demorec.replay import dataset_demonstrations, open_file
 

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
+from demorec.cli.flags import Allow, allowed_modules
 from demorec.cli.output import say, tell
 
 
@@ -33,6 +34,8 @@ class Reproduce:
     """Processes of this machine, or tasks of a Ray cluster."""
     address: str = "local"
     """Ray: the cluster, for example auto or HOST:6379; local: this machine alone."""
+    allow: Allow = ()
+    """A module or package of your own that may be imported for the tasks, robots and cameras that the source names."""
 
     def run(self) -> int:
         """Generate again, compare, report."""
@@ -45,7 +48,7 @@ class Reproduce:
         )
         options.validate()
         with TerminalProgress() as progress:
-            found = reproduce(self.source, options, progress=progress)
+            found = reproduce(self.source, options, progress=progress, allowed=allowed_modules(self.allow))
         if not isinstance(found, Comparison):
             tell(f"Interrupted; the same command goes on: {self.out}")
             return 130

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
+from demorec.assets import allow_models
+from demorec.cli.flags import Allow, allowed_modules
 from demorec.cli.output import say, tell
 from demorec.errors import ConfigError
 
@@ -54,12 +56,15 @@ class View:
     """Serve Rerun's web viewer to this machine and print its address; Ctrl-C ends it."""
     port: int | None = None
     """Of the web viewer; default: a free one."""
+    allow: Allow = ()
+    """A module or package of your own beside which the models of robots and objects may be read."""
     overwrite: bool = False
     """Replace the file of --save or --screenshot, if it is there."""
 
     def run(self) -> int:
         """Convert, then show, save, photograph or serve."""
         self._validate()
+        allow_models(allowed_modules(self.allow))
         from demorec.playback.save import numbered, save, save_comparison, save_each
         from demorec.playback.sources import find_episodes, select
 

@@ -6,14 +6,16 @@ import contextlib
 import hashlib
 import io
 import json
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.errors import ConfigError, MissingDependencyError
+from demorec.errors import ConfigError, MissingDependencyError, NotAllowedError
 from demorec.features import ActionKind
+from demorec.user_modules import is_allowed
 
 CONFIG_NAME, TRAIN_CONFIG_NAME = "config.json", "train_config.json"
 
@@ -45,6 +47,31 @@ def policy_summary(checkpoint: Path) -> tuple[dict[str, Any], str]:
     except ValueError as error:
         raise ConfigError(f"{CONFIG_NAME} of the policy is no JSON ({error}): {checkpoint}") from error
     return config, sha.hexdigest()[:16]
+
+
+def check_steps(checkpoint: Path, allowed: Iterable[str]) -> None:
+    """Refuse a policy whose processing steps are classes that nobody has allowed.
+
+    LeRobot's own steps go by a name of its registry; whatever a step's "class" names, LeRobot imports and calls.
+
+    Raises:
+        NotAllowedError: A step is of a module that is not among those `allowed`.
+    """
+    for path in sorted(checkpoint.glob("*.json")):
+        try:
+            plain = json.loads(path.read_text())
+        except (OSError, ValueError):
+            continue  # LeRobot cannot read it either, and says so
+        steps = plain.get("steps") if isinstance(plain, dict) else None
+        for step in steps if isinstance(steps, list) else ():
+            if not isinstance(step, dict) or "registry_name" in step or "class" not in step:
+                continue
+            module = str(step["class"]).rpartition(".")[0]
+            if not is_allowed(module, allowed):
+                raise NotAllowedError(
+                    f"The policy names the code of a processing step, {step['class']!r}, instead of LeRobot's name of "
+                    f"one, and only you can say whether to run it: if you trust it, add --allow {module}: {path}"
+                )
 
 
 def trained_action(checkpoint: Path) -> ActionKind | None:

@@ -13,7 +13,7 @@ import functools
 import json
 import os
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from typing import Any
 from demorec.config import EpisodePlan, GenerateConfig
 from demorec.episode import Frame, Outcome, frame_time_ns
 from demorec.errors import ConfigError, DemorecError
-from demorec.evaluate.policy import Policy, find_checkpoint, policy_summary, trained_action
+from demorec.evaluate.policy import Policy, check_steps, find_checkpoint, policy_summary, trained_action
 from demorec.evaluate.progress import Progress, factors_of
 from demorec.evaluate.statistics import Rate
 from demorec.features import ENVIRONMENT_STATE, ActionKind
@@ -96,20 +96,31 @@ def settings_for(
     action: ActionKind | None = None,
     action_steps: int | None = None,
     episode_length: int | None = None,
+    allowed: Sequence[str] = (),
 ) -> Settings:
     """Fill in what the policy itself tells: its kind, its actions, its inputs, its cameras' sizes.
 
+    Args:
+        policy: Folder of the policy.
+        config: The caller's own words: which scenes.
+        action, action_steps, episode_length: As of `Settings`; None: as trained, or the environment's.
+        allowed: The user's own modules that may be imported for what the policy names.
+
     Raises:
         ConfigError: No policy, cameras that it needs and did not get, or actions of an unknown meaning.
+        NotAllowedError: The policy names something of a module that is not allowed.
     """
     checkpoint = find_checkpoint(policy)
+    check_steps(checkpoint, allowed)
     plain, digest = policy_summary(checkpoint)
     inputs: Mapping[str, Any] = plain.get("input_features") or {}
     pictures = {name.removeprefix("observation.images."): value["shape"] for name, value in inputs.items()
                 if name.startswith("observation.images.")}  # fmt: skip
     if pictures:
         (_, height, width), *_ = pictures.values()
-        config = replace(config, cameras=tuple(pictures), width=width, height=height)
+        of_policy = replace(config, cameras=tuple(pictures), width=width, height=height)
+        of_policy.check_names((*config.modules, *allowed))
+        config = of_policy
     action = action or trained_action(checkpoint)
     if action is None:
         raise ConfigError(

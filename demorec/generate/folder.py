@@ -153,7 +153,7 @@ def open_run(
     with run_lock(path):
         if not (options.overwrite and _clear(path)):
             _refuse_strangers(path)
-        asked = RunFile(config=config, versions=deciding_versions(), num_episodes=options.num_episodes)
+        asked = RunFile(config=config, versions=deciding_versions(config), num_episodes=options.num_episodes)
         run = _known_run(path, asked, progress=progress, inspect=inspect)
         if run.num_episodes > options.num_episodes:
             progress.says(f"The run has {run.num_episodes} episodes already, more than asked; all of them stay.")

@@ -8,6 +8,7 @@ from typing import Any
 
 from demorec.config import EpisodePlan, GenerateConfig
 from demorec.generate.run_file import Attempt, RunFile
+from demorec.own_versions import version_differences
 from demorec.plain import to_plain
 
 
@@ -23,6 +24,7 @@ class Schedule:
 
     def __init__(self, run: RunFile, *, episodes: Iterable[int] | None = None) -> None:
         self._config = run.config
+        self._versions = run.versions
         self._known = {(a.episode_index, a.attempt): a.success for a in run.attempts}
         self._success = {a.episode_index: a.attempt for a in run.successes}
         self._again: deque[EpisodePlan] = deque()
@@ -61,14 +63,14 @@ class Schedule:
                     return
 
     def _plan(self, index: int, number: int) -> EpisodePlan:
-        return EpisodePlan(config=self._config, episode_index=index, attempt=number)
+        return EpisodePlan(config=self._config, episode_index=index, attempt=number, versions=self._versions)
 
 
 def differences(before: RunFile, config: GenerateConfig, versions: Mapping[str, str]) -> tuple[str, ...]:
     """One line for each value of config and versions in which a run differs from what is asked now."""
-    return plain_differences(
-        {**to_plain(before.config), "version of": dict(before.versions)},
-        {**to_plain(config), "version of": dict(versions)},
+    return (
+        *plain_differences(to_plain(before.config), to_plain(config)),
+        *version_differences(before.versions, versions),
     )
 
 

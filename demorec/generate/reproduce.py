@@ -7,22 +7,22 @@ compared episode by episode, since all that is left of its recordings is in it.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import pyarrow.parquet as pq
 
-from demorec.config import GenerateConfig, deciding_versions, parse_config
+from demorec.config import GenerateConfig, parse_config
 from demorec.errors import ConfigError
 from demorec.export import ExportOptions, export_lerobot
 from demorec.export.layout import SIDECAR_DIR
 from demorec.export.sidecar import CONFIGS_PATH, EXPORT_PATH
 from demorec.generate.options import RunOptions
-from demorec.generate.plan import plain_differences
 from demorec.generate.run import Progress, RunResult, generate
 from demorec.generate.run_file import DATASET, RUN_NAME, load_run_file
+from demorec.own_versions import version_differences
 
 Key = tuple[int, int]
 """(episode of the run, attempt)."""
@@ -64,13 +64,23 @@ class Comparison:
     versions: tuple[str, ...]
 
 
-def reproduce(source: Path, options: RunOptions, *, progress: Progress) -> Comparison | RunResult:
+def reproduce(
+    source: Path, options: RunOptions, *, progress: Progress, allowed: Sequence[str] = ()
+) -> Comparison | RunResult:
     """Make the source's run again in `options.out` and compare; the run's result alone when it was interrupted.
+
+    Args:
+        source: A run or a dataset.
+        options: How it is carried out.
+        progress: Is told how it goes.
+        allowed: The user's own modules that may be imported for what the source names.
 
     Raises:
         ConfigError: The source is no run and no dataset, or was made from several runs.
+        NotAllowedError: It names something of a module that is not allowed.
     """
     original = read_original(source)
+    original.config.check_names(allowed)
     result = generate(original.config, replace(options, num_episodes=original.num_episodes), progress=progress)
     if result.interrupted:
         return result
@@ -85,7 +95,7 @@ def reproduce(source: Path, options: RunOptions, *, progress: Progress) -> Compa
         result=result,
         same=same,
         different=tuple(key for key in original.digests if key not in same),
-        versions=plain_differences(original.versions, deciding_versions()) if original.versions else (),
+        versions=version_differences(original.versions, result.run.versions) if original.versions else (),
     )
 
 

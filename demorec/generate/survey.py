@@ -19,6 +19,7 @@ from demorec.generate.run_file import (
     sha256_of,
     sync_folder,
 )
+from demorec.own_versions import version_differences
 from demorec.plain import to_plain
 
 Inspector = Callable[[Path], Inspected]
@@ -85,9 +86,9 @@ def _adopt(path: Path, run: RunFile, inspect: Inspector) -> Attempt:
     name = recording_name(line.episode_index, line.attempt, success=line.success)
     if (path.parent.name, path.name) != (place, name):
         raise DemorecError(f"it holds episode {line.episode_index}, attempt {line.attempt}")
-    different = plain_differences(
-        {**found.config, "version of": dict(found.versions)},
-        {**to_plain(run.config), "version of": dict(run.versions)},
+    different = (
+        *plain_differences(found.config, to_plain(run.config)),
+        *version_differences(found.versions, run.versions),
     )
     if different:
         raise DemorecError(f"it is of another run ({'; '.join(different)})")

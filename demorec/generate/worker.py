@@ -10,16 +10,17 @@ from __future__ import annotations
 import os
 import platform
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
 from demorec.config import EpisodePlan
 from demorec.episode import CameraImages, EpisodeInfo
-from demorec.errors import SceneError
+from demorec.errors import ConfigError, SceneError
 from demorec.generate.recordings import inspect_recording
 from demorec.generate.run_file import EPISODES, FAILED, STARTING, UNFINISHED, Attempt, recording_name, sync_folder
+from demorec.own_versions import version_differences
 from demorec.recording import EpisodeWriter
 from demorec.render import Renderer, RenderSetup
 from demorec.rollout import Rollout, make_renderer, make_world, prepare
@@ -62,6 +63,7 @@ def _record(plan: EpisodePlan, path: Path, seconds: dict[str, float]) -> None:
     before_first_frame = SIMULATION if _workshop.is_warm else STARTING
     with _measured(seconds, before_first_frame):
         episode = prepare(plan)
+        _check_versions(plan, episode.info.versions)
         world, renderer = _workshop.equip(episode.info)
     rollout = Rollout(world, episode, _Stopwatch(renderer, seconds) if renderer else None)
     with EpisodeWriter(path, episode.info, video=plan.config.video) as recording:
@@ -83,6 +85,13 @@ def _record(plan: EpisodePlan, path: Path, seconds: dict[str, float]) -> None:
         assert rollout.outcome is not None  # set when the frames are exhausted
         with _measured(seconds, RECORDING):
             recording.finish(rollout.outcome)
+
+
+def _check_versions(plan: EpisodePlan, here: Mapping[str, str]) -> None:
+    """A module of the user's own that was edited while the run goes on would be mixed into it by a fresh worker."""
+    different = () if plan.versions is None else version_differences(plan.versions, here)
+    if different:
+        raise ConfigError(f"What decides the run's episodes is not what it was at its start: {'; '.join(different)}")
 
 
 class _Workshop:

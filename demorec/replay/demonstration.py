@@ -26,6 +26,7 @@ class ReplayOptions:
         noise: Standard deviation of Gaussian noise on every joint target, rad.
         delay: Steps by which every command comes late.
         seed: Of the noise.
+        allowed: The user's own modules that may be imported for what the demonstrations name.
     """
 
     states: bool = False
@@ -33,6 +34,7 @@ class ReplayOptions:
     noise: float = 0.0
     delay: int = 0
     seed: int = 0
+    allowed: tuple[str, ...] = ()
 
     def validate(self) -> None:
         """Raise ConfigError for impossible values and combinations."""

@@ -7,6 +7,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
+from demorec.assets import allow_models
 from demorec.config import VideoConfig
 from demorec.episode import Frame, Outcome
 from demorec.errors import ConfigError
@@ -16,6 +17,7 @@ from demorec.replay.demonstration import Demonstration, ReplayOptions
 from demorec.replay.drive import ReplayReport, replay
 from demorec.rerender import Painter, recorded_view
 from demorec.sim.world import World
+from demorec.tables import TASKS
 
 
 def replay_all(
@@ -31,12 +33,18 @@ def replay_all(
 
     Yields:
         The report, and (recording, recording of its replay) where one was made.
+
+    Raises:
+        NotAllowedError: A demonstration's task is of a module that `options` do not allow.
     """
+    allow_models(options.allowed)
     world: World | None = None
     key: object = None
     try:
         for demonstration in demonstrations:
             info = demonstration.info
+            if not options.states:
+                TASKS.check_name(info.task, options.allowed)  # before anything is made
             sample_joints = out is not None and info.config.get("joint_rate") == "physics"
             if world is None or key != (info.robot, demonstration.fps, sample_joints):
                 if world is not None:
@@ -66,9 +74,9 @@ def record_replay(
     path = out / (d.name if d.source is not None else f"{d.name}.mcap")
     if d.source is not None and path.resolve() == d.source.resolve():
         raise ConfigError(f"The replay would replace the recording itself, choose another --out: {out}")
-    out.mkdir(parents=True, exist_ok=True)
     config = d.info.config
-    view = recorded_view(d.info)
+    view = recorded_view(d.info, options.allowed)
+    out.mkdir(parents=True, exist_ok=True)
     info = replace(d.info, fps=d.fps, origin=f"replay of {d.digest[:16]}")
     video = from_plain(config.get("video", {}), VideoConfig)
     num_frames = 0

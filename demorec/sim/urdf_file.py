@@ -1,4 +1,4 @@
-"""URDFs of our own whose meshes are pybullet_data's: PyBullet looks for meshes beside the URDF only."""
+"""URDFs of our own and of the user's, with meshes of pybullet_data: PyBullet looks for meshes beside the URDF only."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from demorec.assets import OWN_PREFIX, asset_path, mesh_path
+from demorec.assets import asset_path, mesh_path
 
 
 @contextmanager
@@ -24,7 +24,7 @@ def urdf_file(name: str) -> Iterator[str]:
         SceneError: The URDF or one of its meshes is missing.
     """
     path = asset_path(name)
-    if not name.startswith(OWN_PREFIX):
+    if ":" not in name:  # of pybullet_data, meshes beside it
         yield str(path)
         return
     descriptor, copy = tempfile.mkstemp(suffix=".urdf", prefix="demorec_")

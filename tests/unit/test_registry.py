@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
+
 import pytest
 
-from demorec.errors import ConfigError, MissingDependencyError
+from demorec.errors import ConfigError, MissingDependencyError, NotAllowedError
 from demorec.registry import Registry
 
-SHAPES: Registry[object] = Registry(
-    kind="shape", rows={"ordered": "collections:OrderedDict", "counter": "collections:Counter"}, open_to_others=True
+SHAPES: Registry[type] = Registry(
+    kind="shape",
+    rows={"ordered": "collections:OrderedDict", "counter": "collections:Counter"},
+    subclass_of="numbers:Number",
 )
+NUMBERS: Registry[object] = Registry(kind="number", rows={}, instance_of="numbers:Number")
 
 
 def test_known_names_load() -> None:
@@ -23,22 +28,72 @@ def test_unknown_names_get_the_nearest_match() -> None:
         SHAPES.load("conter")
 
 
-def test_somebody_elses_object_loads() -> None:
-    import decimal
+@pytest.mark.parametrize("allowed", [("fractions",), ("decimal", "fractions")])
+def test_somebody_elses_object_loads_when_its_module_is_allowed(allowed: tuple[str, ...]) -> None:
+    assert SHAPES.load("fractions:Fraction", allowed) is Fraction
 
-    assert SHAPES.load("decimal:Decimal") is decimal.Decimal
+
+@pytest.mark.parametrize("allowed", [(), ("fraction",), ("fractions.sub",), ("decimal",)])
+def test_somebody_elses_object_is_refused_when_nobody_allowed_its_module(allowed: tuple[str, ...]) -> None:
+    with pytest.raises(NotAllowedError, match=r"if you trust that module, add --allow fractions\."):
+        SHAPES.load("fractions:Fraction", allowed)
+
+
+def test_a_package_allows_what_is_in_it() -> None:
+    registry: Registry[type] = Registry(kind="decoder", rows={}, subclass_of="json.decoder:JSONDecoder")
+    assert registry.load("json.decoder:JSONDecoder", ["json"]).__name__ == "JSONDecoder"
 
 
 @pytest.mark.parametrize("name", ["no_such_package.task:Mine", "decimal:NoSuchThing"])
 def test_somebody_elses_mistake_is_one_sentence(name: str) -> None:
     with pytest.raises(ConfigError, match="cannot be imported"):
-        SHAPES.load(name)
+        SHAPES.load(name, ["no_such_package", "decimal"])
+
+
+@pytest.mark.parametrize(
+    ("source", "reason"),
+    [("def (", "SyntaxError"), ("1 / 0", "ZeroDivisionError"), ("raise SystemExit(3)", "SystemExit: 3")],
+)
+def test_whatever_a_module_raises_is_one_sentence(
+    source: str, reason: str, tmp_path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "breaks_on_import.py").write_text(source)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with pytest.raises(ConfigError, match=f"cannot be imported .*{reason}"):
+        SHAPES.load("breaks_on_import:Mine", ["breaks_on_import"])
+
+
+@pytest.mark.parametrize("name", ["os:abort", "builtins:exit", "demorec.errors:DemorecError", "fractions:math"])
+def test_things_of_another_kind_are_refused_and_not_called(name: str) -> None:
+    with pytest.raises(ConfigError, match=r"is no shape: it must be a subclass of numbers\.Number"):
+        SHAPES.load(name, [name.partition(":")[0]])
+
+
+def test_a_class_is_no_instance_of_itself() -> None:
+    assert NUMBERS.load("math:pi", ["math"]) == pytest.approx(3.14159, abs=1e-5)
+    with pytest.raises(ConfigError, match=r"is no number: it must be an instance of numbers\.Number"):
+        NUMBERS.load("fractions:Fraction", ["fractions"])
+
+
+def test_an_unfinished_class_is_refused() -> None:
+    from demorec.tables import TASKS
+
+    with pytest.raises(ConfigError, match="is not complete: it lacks evaluate, instruction, sample_scene, script"):
+        TASKS.load("demorec.tasks.base:Task", ["demorec"])
+
+
+@pytest.mark.parametrize(
+    "name", ["", ":", "a:", ":b", "a:b:c", "a b:c", "a..b:c", "a:b.c", "../a:b", "no colon", "1:2"]
+)
+def test_names_of_another_form_are_unknown_whatever_is_allowed(name: str) -> None:
+    with pytest.raises(ConfigError, match="Unknown shape"):
+        SHAPES.load(name, ["a", "no", ""])
 
 
 def test_closed_tables_refuse_foreign_names() -> None:
     closed: Registry[object] = Registry(kind="camera", rows={"front": "collections:Counter"})
     with pytest.raises(ConfigError, match="Unknown camera"):
-        closed.load("decimal:Decimal")
+        closed.load("decimal:Decimal", ["decimal"])
 
 
 def test_errors_cross_processes() -> None:

@@ -1,0 +1,217 @@
+"""Names inside files run no code: recordings, runs, datasets and policies name a module that marks its import."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from helpers_check import Spoilt
+
+from demorec.cli import main
+from demorec.config import GenerateConfig
+from demorec.errors import NotAllowedError
+from demorec.export import ExportOptions, export_lerobot
+from demorec.generate.recordings import inspect_recording
+from demorec.generate.run_file import RUN_NAME, RunFile, save_run_file
+from demorec.plain import to_plain
+
+SAMPLE = next((Path(__file__).parents[2] / "recordings" / "sample").glob("*.mcap"))
+MODULE = "names_of_a_stranger"
+SOURCE = '''
+from pathlib import Path
+from demorec.tasks.pick_place import PickPlace
+
+Path(__file__).with_name("marker").touch()
+
+class Mine(PickPlace):
+    """A task like another."""
+'''
+HARMFUL = ["os:abort", "builtins:exit", "demorec.errors:DemorecError", "no colon", "a:b:c", ""]
+
+
+def exit_code(*args: object) -> int:
+    try:
+        main([str(arg) for arg in args])
+    except SystemExit as ended:
+        return int(ended.code or 0)
+    return 0
+
+
+@pytest.fixture
+def marker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """Is there when the stranger's module, which is on the path, has been imported."""
+    folder = tmp_path / "somewhere"
+    folder.mkdir()
+    (folder / f"{MODULE}.py").write_text(SOURCE)
+    monkeypatch.syspath_prepend(str(folder))
+    monkeypatch.chdir(folder)
+    yield folder / "marker"
+    sys.modules.pop(MODULE, None)
+
+
+def recording_of(name: str, path: Path) -> Path:
+    """A recording whose task, robot, camera and renderer are called `name`, with a camera that is off its place."""
+    spoilt = Spoilt(SAMPLE)
+    camera = spoilt.info.scene.cameras[0].name
+    config = GenerateConfig(task=name, robot=name, cameras=(name,), width=64, height=64, variation="full")
+    spoilt.info = replace(
+        spoilt.info,
+        task=name,
+        config={**spoilt.info.config, **to_plain(config)} | {"renderer": "raster"},
+        behaviour={**spoilt.info.behaviour, f"calibration_{camera}_x": 0.01},
+    )
+    spoilt.frames = spoilt.frames[:8]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return spoilt.write(path)
+
+
+def run_of(name: str, folder: Path) -> Path:
+    file = "episodes/episode_000000.mcap"
+    attempt = replace(inspect_recording(recording_of(name, folder / file)).attempt, file=file, success=True)
+    config = GenerateConfig(task=name, robot=name, cameras=(name,))
+    save_run_file(RunFile(config=config, versions={}, num_episodes=1, attempts=(attempt,)), folder)
+    return folder
+
+
+def dataset_of(name: str, folder: Path, source: Path) -> Path:
+    export_lerobot([source], folder, ExportOptions(verify=False, include_failures=True))
+    (table_path,) = (folder / "demorec" / "episodes").rglob("*.parquet")
+    table = pq.read_table(table_path)
+    (described,) = table.column("episode_info").to_pylist()
+    assert json.loads(described)["task"] == name  # the export kept the stranger's word
+    assert isinstance(table, pa.Table)
+    return folder
+
+
+COMMANDS = {
+    "info": ["info", "{path}"],
+    "view": ["view", "{path}", "--save", "{out}/view.rrd"],
+    "check": ["check", "{path}", "--replay", "1", "--no-pictures"],
+    "replay": ["replay", "{path}", "--out", "{out}/replayed"],
+    "replay states": ["replay", "{path}", "--out", "{out}/replayed", "--states"],
+    "render": ["render", "{path}", "--out", "{out}/rendered", "--workers", "1"],
+    "reproduce": ["reproduce", "{path}", "--out", "{out}/reproduced", "--workers", "1"],
+    "export": ["export", "lerobot", "{path}", "--out", "{out}/exported", "--no-verify"],
+    "recover": ["recover", "{path}"],
+    "evaluate": ["evaluate", "--compare", "{path}", "{path}"],
+}
+"""Every command that reads what others may have made."""
+
+
+@pytest.mark.parametrize("kind", ["recording", "run", "dataset"])
+def test_no_command_imports_what_a_file_names(kind: str, tmp_path: Path, marker: Path, capsys) -> None:
+    name = f"{MODULE}:Mine"
+    path = recording_of(name, tmp_path / "alone.mcap") if kind == "recording" else run_of(name, tmp_path / "run")
+    if kind == "dataset":
+        path = dataset_of(name, tmp_path / "dataset", path)
+    refused = set()
+    for command, words in COMMANDS.items():
+        code = exit_code(*(word.format(path=path, out=tmp_path / "out" / command) for word in words))
+        told = capsys.readouterr()
+        assert not marker.exists(), command
+        assert MODULE not in sys.modules, command
+        assert "Traceback" not in told.err, command
+        if f"add --allow {MODULE}" in told.err:
+            refused.add(command)
+            assert code == 2, command
+            assert not list((tmp_path / "out" / command).rglob("*")), "a refused request leaves nothing behind"
+    expected = {
+        "recording": {"check", "replay", "replay states", "render"},
+        "run": {"check", "replay", "replay states", "render", "reproduce"},
+        "dataset": {"check", "replay", "reproduce"},
+    }
+    assert refused == expected[kind]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [["check", "--no-pictures", "--replay", "1"], ["replay"], ["render", "--workers", "1", "--out", "new.mcap"]],
+    ids=lambda words: words[0],
+)
+def test_allowed_modules_are_imported(words: list[str], tmp_path: Path, marker: Path, capsys) -> None:
+    path = recording_of(f"{MODULE}:Mine", tmp_path / "alone.mcap")
+    exit_code(*words, path, "--allow", MODULE)
+    assert marker.exists()
+    assert "add --allow" not in capsys.readouterr().err
+
+
+def test_reproduce_goes_to_work_with_an_allowed_module(tmp_path: Path, marker: Path, monkeypatch) -> None:
+    asked: list[GenerateConfig] = []
+
+    class Reached(Exception):
+        pass
+
+    def generate(config: GenerateConfig, *rest: object, **more: object) -> None:
+        asked.append(config)
+        raise Reached
+
+    monkeypatch.setattr("demorec.generate.reproduce.generate", generate)
+    run = run_of(f"{MODULE}:Mine", tmp_path / "run")
+    with pytest.raises(Reached):
+        exit_code("reproduce", run, "--out", tmp_path / "again", "--allow", MODULE)
+    assert asked[0].task == f"{MODULE}:Mine"
+
+
+@pytest.mark.parametrize("name", HARMFUL)
+def test_harmful_names_are_one_sentence_even_if_their_module_is_allowed(name: str, tmp_path: Path, capsys) -> None:
+    run = run_of(name, tmp_path / "run")
+    for words in (COMMANDS["replay"], COMMANDS["reproduce"]):
+        command = [word.format(path=run, out=tmp_path / "out") for word in words]
+        assert exit_code(*command) == 2
+        told = capsys.readouterr().err
+        assert len(told.splitlines()) == 1, told
+    assert exit_code("replay", run, "--allow", name.partition(":")[0] or "a") == 2
+    told = capsys.readouterr().err
+    assert len(told.splitlines()) == 1, told
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("name", ["my_tasks:Mine", "my tasks", "", "../my_tasks", "my_tasks.py:"])
+def test_what_can_be_no_module_is_refused(name: str, tmp_path: Path, capsys) -> None:
+    assert exit_code("replay", tmp_path / "any.mcap", "--allow", name) == 2
+    assert "--allow names a module or package, for example my_tasks, found" in capsys.readouterr().err
+
+
+def test_a_policy_cannot_name_the_code_of_its_steps_nor_its_cameras(tmp_path: Path, marker: Path) -> None:
+    from demorec.evaluate.rollouts import settings_for
+
+    policy = tmp_path / "policy"
+    policy.mkdir()
+    shape = {"type": "VISUAL", "shape": [3, 64, 64]}
+    config = {"type": "act", "input_features": {f"observation.images.{MODULE}:Mine": shape}}
+    (policy / "config.json").write_text(json.dumps(config))
+    with pytest.raises(NotAllowedError, match=f"add --allow {MODULE}"):
+        settings_for(policy, GenerateConfig(cameras=()), action="joint")
+    (policy / "config.json").write_text(json.dumps({"type": "act", "input_features": {}}))
+    steps = [{"registry_name": "to_batch_processor"}, {"class": f"{MODULE}.Mine"}, 7, {"class": 3}]
+    (policy / "policy_preprocessor.json").write_text(json.dumps({"steps": steps}))
+    with pytest.raises(NotAllowedError, match=f"add --allow {MODULE}"):
+        settings_for(policy, GenerateConfig(cameras=()), action="joint")
+    (policy / "policy_preprocessor.json").write_text(json.dumps({"steps": steps[:2]}))
+    assert settings_for(policy, GenerateConfig(cameras=()), action="joint", allowed=[MODULE]).policy_type == "act"
+    assert not marker.exists()
+
+
+@pytest.mark.parametrize(
+    "file", ["/etc/hostname", "../../secret.urdf", "demorec:../robots/panda.py", "stranger:abort.urdf"]
+)
+def test_models_that_a_file_names_lie_in_known_folders(file: str) -> None:
+    from demorec.assets import asset_path
+    from demorec.errors import DemorecError
+
+    with pytest.raises(DemorecError, match=r"lies outside of|add --allow stranger\."):
+        asset_path(file)
+
+
+def test_run_files_are_not_touched_by_being_refused(tmp_path: Path, marker: Path) -> None:
+    run = run_of(f"{MODULE}:Mine", tmp_path / "run")
+    before = (run / RUN_NAME).read_bytes()
+    assert exit_code("reproduce", run, "--out", tmp_path / "again") == 2
+    assert (run / RUN_NAME).read_bytes() == before
+    assert not (tmp_path / "again").exists()
