@@ -6,6 +6,10 @@ All arguments go to `super().__init__`, so that errors cross process borders (pi
 
 from __future__ import annotations
 
+import errno
+from collections.abc import Iterator
+from pathlib import Path
+
 
 class DemorecError(Exception):
     """Base of the tree; `exit_code` is what the command line returns for it."""
@@ -37,6 +41,46 @@ class ExportError(DemorecError):
 
 class GenerationError(DemorecError):
     """A run cannot go on: a full disk, a vanished folder, workers that die; what is finished stays."""
+
+
+class ResourceError(DemorecError):
+    """The machine lacks memory or open files, or cannot read its disk: says nothing about the data that it was to read.
+
+    Never a reason to call a file damaged, to set it aside or to make it again.
+    """
+
+
+_LACKS = {
+    errno.ENOMEM: "This machine has too little memory for this: free some, or raise the limit (ulimit -v)",
+    errno.EMFILE: "Too few files may be open for this: raise the limit (ulimit -n)",
+    errno.ENFILE: "Too many files are open on this machine: end other programs",
+    errno.EIO: "The storage reports an input/output error: see whether it is sound",
+}
+
+
+def resource_error(error: BaseException, path: Path | None = None) -> ResourceError | None:
+    """What `error`, or one that it was raised from, says about the machine; None when it is about something else.
+
+    Args:
+        error: Caught while something was read or written.
+        path: Of that, if it is known.
+    """
+    for cause in _chain(error):
+        if isinstance(cause, ResourceError):
+            return cause
+        number = errno.ENOMEM if isinstance(cause, MemoryError) else getattr(cause, "errno", None)
+        if number in _LACKS:
+            unknown = "." if path is None else f"; whether the file is sound is not known: {path}"
+            return ResourceError(_LACKS[number] + unknown)
+    return None
+
+
+def _chain(error: BaseException) -> Iterator[BaseException]:
+    """An error, what it was raised from, and so on."""
+    cause: BaseException | None = error
+    while cause is not None:
+        yield cause
+        cause = cause.__cause__ or cause.__context__
 
 
 class MissingDependencyError(DemorecError):

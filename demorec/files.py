@@ -1,0 +1,72 @@
+"""Files of unknown origin, opened without waiting and read within bounds.
+
+A folder may hold anything under the name that is looked for: opening a FIFO waits for its other end for ever, reading
+a device never ends, and a file of some gigabytes fills the memory before anybody has looked at its first byte.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import stat
+from pathlib import Path
+from typing import Any, BinaryIO
+
+_KINDS = {
+    stat.S_IFIFO: "a FIFO",
+    stat.S_IFSOCK: "a socket",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+    stat.S_IFDIR: "a folder",
+}
+
+
+def open_regular(path: Path) -> BinaryIO:
+    """Open a regular file (or a link to one) for reading, without ever waiting.
+
+    Raises:
+        OSError: There is none, it cannot be opened, or it is a folder, FIFO, socket or device; `strerror` says which.
+    """
+    _refuse_irregular(path, path.stat().st_mode)
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    try:
+        _refuse_irregular(path, os.fstat(descriptor).st_mode)  # it may have been exchanged in between
+        return os.fdopen(descriptor, "rb")
+    except BaseException:
+        os.close(descriptor)
+        raise
+
+
+def read_text_limited(path: Path, limit: int) -> str:
+    """The text of a regular UTF-8 file of at most `limit` bytes.
+
+    Raises:
+        OSError: As `open_regular`, or the file is larger.
+        UnicodeDecodeError: It is no UTF-8.
+    """
+    with open_regular(path) as file:
+        # Not limit + 1: reading reserves memory for all that it is asked for.
+        data = file.read(min(os.fstat(file.fileno()).st_size, limit) + 1)
+    if len(data) > limit:
+        raise OSError(errno.EFBIG, f"it is larger than {limit:,} bytes", str(path))
+    return data.decode()
+
+
+def read_json_limited(path: Path, limit: int) -> Any:
+    """The content of a regular JSON file of at most `limit` bytes.
+
+    Raises:
+        OSError: As `read_text_limited`.
+        ValueError: It is no UTF-8, no JSON, or nested too deeply to be read.
+    """
+    try:
+        return json.loads(read_text_limited(path, limit))
+    except RecursionError:
+        raise ValueError("its values are nested too deeply") from None
+
+
+def _refuse_irregular(path: Path, mode: int) -> None:
+    if not stat.S_ISREG(mode):
+        kind = _KINDS.get(stat.S_IFMT(mode), "something else")
+        raise OSError(errno.EINVAL, f"it is {kind}, not a regular file", str(path))

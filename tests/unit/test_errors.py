@@ -1,0 +1,54 @@
+"""Errors: what the machine lacks is kept apart from what the data are."""
+
+from __future__ import annotations
+
+import errno
+import pickle
+
+import pytest
+
+from demorec.errors import RecordingError, ResourceError, resource_error
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (MemoryError(), "memory"),
+        (OSError(errno.ENOMEM, "Cannot allocate memory"), "memory"),
+        (OSError(errno.EMFILE, "Too many open files"), "ulimit -n"),
+        (OSError(errno.ENFILE, "Too many open files in system"), "open on this machine"),
+        (OSError(errno.EIO, "Input/output error"), "storage"),
+    ],
+)
+def test_what_the_machine_lacks_is_told_as_such_however_it_is_wrapped(tmp_path, error, words):
+    def wrapped() -> RuntimeError:
+        try:
+            try:
+                raise error
+            except type(error) as cause:
+                raise ValueError("a library") from cause
+        except ValueError:
+            try:
+                raise RuntimeError("another library")
+            except RuntimeError as outer:
+                return outer
+
+    for raised in (error, wrapped()):
+        found = resource_error(raised, tmp_path)
+        assert words in str(found)
+        assert str(found).endswith(f"whether the file is sound is not known: {tmp_path}")
+        assert resource_error(found) is found
+        assert str(pickle.loads(pickle.dumps(found))) == str(found)
+    assert not isinstance(found, RecordingError)
+
+
+@pytest.mark.parametrize(
+    "error", [OSError(errno.ENOENT, "none"), OSError("?"), ValueError(), RecordingError("damaged")]
+)
+def test_every_other_error_is_left_alone(error):
+    assert resource_error(error) is None
+
+
+def test_without_a_file_nothing_is_said_of_one():
+    assert str(resource_error(MemoryError())).endswith("(ulimit -v).")
+    assert ResourceError("x").exit_code == 1
