@@ -15,7 +15,7 @@ from demorec.errors import ExportError
 from demorec.export.layout import SIDECAR_DIR, DatasetInfo
 from demorec.export.reader import EpisodePlace, RowReader, episode_places, read_tasks
 from demorec.features import ACTION, ActionKind, action_names
-from demorec.plain import from_json
+from demorec.validity import read_episode_info
 
 Rows = Mapping[str, NDArray[Any]]
 
@@ -67,7 +67,7 @@ class Dataset:
     def infos(self) -> list[EpisodeInfo]:
         """What was known of each episode before its first frame; empty for a dataset of somebody else's."""
         try:
-            return [from_json(row["episode_info"], EpisodeInfo) for row in self.sidecar]
+            return [read_episode_info(row["episode_info"]) for row in self.sidecar]
         except (ValueError, KeyError, TypeError) as error:
             raise ExportError(f"The sidecar's episode_info cannot be used ({error}): {self.path}") from error
 

@@ -19,8 +19,8 @@ from demorec.episode import Check, EpisodeInfo, Outcome, frame_time_ns
 from demorec.errors import RecordingError
 from demorec.geometry import Array
 from demorec.kinematics import ArmKinematics
-from demorec.plain import from_json
 from demorec.playback.episode import Curves, Episode, Video, VideoBatch
+from demorec.validity import read_episode_info
 
 _SIDECAR = "demorec"
 _IMAGES = "observation.images."
@@ -48,7 +48,7 @@ def open_dataset_episode(root: Path, episode_index: int) -> Iterator[Episode]:
     try:
         features = json.loads((root / "meta" / "info.json").read_text())
         export = json.loads((root / _SIDECAR / "export.json").read_text())
-        info = from_json(row["episode_info"], EpisodeInfo)
+        info = read_episode_info(row["episode_info"])
     except (OSError, ValueError, KeyError) as error:
         raise RecordingError(f"The dataset cannot be read ({error}): {root}") from error
     columns = [name for name, entry in features["features"].items() if entry["dtype"] not in ("video", "string")]

@@ -8,12 +8,16 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from array import array
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from io import BytesIO
 
 import numpy as np
 import zstandard
 from numpy.typing import NDArray
+
+from demorec.recording.limits import Limits
 
 RECORD_HEAD = struct.Struct("<BQ")
 """Opcode and length of what follows (MCAP specification, Records)."""
@@ -60,18 +64,19 @@ class ChunkPlace:
         offsets = record[position : position + num_bytes]
         position += num_bytes + 8  # message_index_length
         (name_bytes,) = struct.unpack_from("<I", record, position)
-        _, uncompressed_size = struct.unpack_from("<QQ", record, position + 4 + name_bytes)
+        (uncompressed_size,) = struct.unpack_from("<Q", record, position + 4 + name_bytes + 8)
         channels = np.frombuffer(offsets, dtype=[("channel", "<u2"), ("offset", "<u8")])["channel"]
         return cls(
             start=start, length=length, channels=frozenset(channels.tolist()), uncompressed_size=uncompressed_size
         )
 
 
-def chunk_content(record: bytes | memoryview, expected_size: int | None = None) -> bytes:
-    """The records in a chunk, given the content of its record.
+def chunk_content(record: bytes | memoryview, limits: Limits, expected_size: int | None = None) -> bytes:
+    """The records in a chunk, given the content of its record; a checksum of 0 stands for none.
 
     Raises:
-        ValueError, struct.error, zstandard.ZstdError: It is damaged, or not of the expected size.
+        ValueError, struct.error, zstandard.ZstdError: It is damaged, larger than the limits allow, or not of the
+            expected size.
     """
     _, _, size, stored_crc, name_bytes = _CHUNK_HEAD.unpack_from(record)
     position = _CHUNK_HEAD.size
@@ -80,18 +85,20 @@ def chunk_content(record: bytes | memoryview, expected_size: int | None = None) 
     start = position + name_bytes + 8
     if expected_size is not None and size != expected_size:
         raise ValueError("a chunk differs from its index")
-    if size > MAX_RECORD_BYTES:
-        raise ValueError(f"a chunk of {size} bytes")
     if start + num_bytes > len(record):
         raise ValueError("a chunk that is cut off")
+    limits.check_chunk(size, num_bytes)
     stored = memoryview(record)[start : start + num_bytes]
     if compression == b"zstd":
+        # Where the compressed data tell their size, that much is reserved, whatever is said here to be the most.
+        if zstandard.frame_content_size(stored) not in (size, -1):
+            raise ValueError("a chunk of another size than its compressed data")
         content = zstandard.ZstdDecompressor().decompress(stored, max_output_size=size)
     elif compression == b"":
         content = bytes(stored)
     else:
         raise ValueError(f"a chunk compressed with {compression!r}, expected zstd")
-    if len(content) != size or zlib.crc32(content) != stored_crc:
+    if len(content) != size or (stored_crc and zlib.crc32(content) != stored_crc):
         raise ValueError("a chunk fails its checksum")
     return content
 
@@ -148,20 +155,21 @@ class Block:
         return self.heads(length)
 
 
-def blocks_of(contents: Sequence[bytes], topics: Mapping[str, int]) -> dict[str, Block]:
+def blocks_of(contents: Iterable[bytes], topics: Mapping[str, int], limits: Limits) -> dict[str, Block]:
     """topic -> its messages in the contents of chunks, given topic -> channel.
 
     Raises:
-        ValueError, struct.error: The records do not fill their chunk.
+        ValueError, struct.error: The records do not fill their chunk, or are more than the limits allow.
     """
-    found: list[int] = []
-    offset = 0
+    found = array("q")
+    joined = BytesIO()
     for chunk in contents:
-        _find_records(chunk, offset, found.append)
-        offset += len(chunk)
-    content = b"".join(contents)
+        _find_records(chunk, joined.tell(), found.append)
+        limits.check_records(len(found))
+        joined.write(chunk)
+    content = joined.getvalue()
     values = np.frombuffer(content, dtype=np.uint8)
-    starts = np.array(found, dtype=np.int64)
+    starts = np.frombuffer(found, dtype=np.int64)
     starts = starts[values[starts] == _MESSAGE]
     if len(starts) and int(starts[-1]) + _MESSAGE_HEAD.itemsize > len(values):
         raise ValueError("a message that ends within its head")
@@ -169,7 +177,7 @@ def blocks_of(contents: Sequence[bytes], topics: Mapping[str, int]) -> dict[str,
     lengths = heads["length"].astype(np.int64) - (_MESSAGE_HEAD.itemsize - RECORD_HEAD.size)
     if len(lengths) and int(lengths.min()) < 0:
         raise ValueError("a message that ends within its head")
-    starts += _MESSAGE_HEAD.itemsize
+    starts = starts + _MESSAGE_HEAD.itemsize
     times = heads["log_time"].astype(np.int64)
     blocks = {}
     for topic, channel in topics.items():

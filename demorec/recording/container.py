@@ -1,4 +1,5 @@
-"""Random access to an MCAP file that trusts nothing: every byte that is used was covered by a checksum.
+"""Random access to an MCAP file that trusts nothing: every byte that is used was covered by a checksum, where its
+writer left one (0 stands for none), and nothing unpacks to more than `Limits` allows.
 
 The summary at the end tells where each chunk is and which topics it holds, so one topic is read without touching the
 others, one chunk at a time. The mcap library parses the records; what this adds is the checking, and one error.
@@ -8,7 +9,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
@@ -31,8 +32,12 @@ from mcap.records import (
 )
 
 from demorec.errors import RecordingError
+from demorec.files import open_regular
 from demorec.recording.chunks import MAX_RECORD_BYTES, RECORD_HEAD, Block, ChunkPlace, blocks_of, chunk_content
+from demorec.recording.limits import LimitError, Limits
 
+MAX_METADATA_BYTES = 4 << 20
+"""Of a metadata record: ours have some 20 kB."""
 MAGIC = b"\x89MCAP0\r\n"
 _MESSAGE_HEAD = struct.Struct("<HIQQ")
 _FOOTER_BYTES = RECORD_HEAD.size + 20
@@ -53,6 +58,8 @@ def damage_as_recording_error(path: Path) -> Iterator[None]:
         yield
     except RecordingError:
         raise
+    except LimitError as error:
+        raise RecordingError(f"The recording is not read, {error}: {path}") from error
     except (OSError, MemoryError, ValueError, KeyError, IndexError, OverflowError, EOFError, struct.error) as error:
         raise RecordingError(f"The recording is damaged ({_short(error)}): {path}") from error
     except Exception as error:
@@ -81,7 +88,7 @@ class Container:
     def __init__(self, path: Path) -> None:
         self.path = path
         try:
-            self._file: BinaryIO = path.open("rb")
+            self._file: BinaryIO = open_regular(path)
         except OSError as error:
             raise RecordingError(f"The recording cannot be read ({error.strerror}): {path}") from error
         try:
@@ -97,6 +104,7 @@ class Container:
 
     def _read_summary(self) -> None:
         size = self._file.seek(0, 2)
+        self._limits = Limits.of_file(size)
         if size == 0:
             raise RecordingError(f"The file is empty, so no recording: {self.path}")
         if self._read_at(0, min(size, len(MAGIC))) != MAGIC:
@@ -113,13 +121,13 @@ class Container:
             raise RecordingError(f"The recording is damaged or has no index: {self.path}")
         # The checksum covers the summary and the footer up to the checksum itself.
         summary = self._read_at(footer.summary_start, footer_start - footer.summary_start + _FOOTER_BYTES - 4)
-        if zlib.crc32(summary) != footer.summary_crc:
+        if footer.summary_crc and zlib.crc32(summary) != footer.summary_crc:
             raise RecordingError(f"The recording is damaged: the checksum of its index does not match: {self.path}")
         self._parse_summary(summary[: footer_start - footer.summary_start])
 
     def _parse_summary(self, summary: bytes) -> None:
         channels: dict[int, Channel] = {}
-        self.schemas: dict[int, Schema] = {}
+        self.schemas = {0: Schema(id=0, name="", encoding="", data=b"")}  # 0: messages without one
         self._chunks: list[ChunkPlace] = []
         self._metadata: dict[str, MetadataIndex] = {}
         self._attachments: dict[str, AttachmentIndex] = {}
@@ -147,6 +155,11 @@ class Container:
             elif opcode == Opcode.STATISTICS:
                 counts = dict(_read(content, Statistics).channel_message_counts)
         self._chunks.sort(key=lambda chunk: chunk.start)
+        self._limits.check_total(sum(chunk.uncompressed_size for chunk in self._chunks))
+        self._limits.check_records(sum(counts.values()))
+        for channel in channels.values():
+            if channel.schema_id not in self.schemas:
+                raise ValueError(f"no schema {channel.schema_id} for the topic {channel.topic!r}")
         self._topics = {channel.id: channel.topic for channel in channels.values()}
         self.channels = {channel.topic: channel for channel in channels.values()}
         self.counts = {channel.topic: counts.get(channel.id, 0) for channel in channels.values()}
@@ -177,6 +190,10 @@ class Container:
         index = self._metadata.get(name)
         if index is None:
             return None
+        if index.length > MAX_METADATA_BYTES:
+            raise RecordingError(
+                f"The metadata {name} have {index.length / 1e6:,.0f} MB, those of recordings a few kB: {self.path}"
+            )
         with damage_as_recording_error(self.path):
             record = self._record_at(index.offset, index.length, Opcode.METADATA, Metadata)
             return dict(record.metadata)
@@ -197,7 +214,7 @@ class Container:
         with damage_as_recording_error(self.path):
             data = self._read_at(index.offset, index.length)
             content, stored = data[RECORD_HEAD.size : -4], int.from_bytes(data[-4:], "little")
-            if zlib.crc32(content) != stored:
+            if stored and zlib.crc32(content) != stored:
                 raise RecordingError(
                     f"The recording is damaged: the attachment {name!r} fails its checksum: {self.path}"
                 )
@@ -207,22 +224,20 @@ class Container:
     def messages(self, topics: Collection[str]) -> Iterator[Message]:
         """Messages of some topics in the order of the file; chunks without them are not read."""
         wanted = {self.channels[topic].id: topic for topic in topics if topic in self.channels}
-        for index in self._chunks:
-            if wanted.keys().isdisjoint(index.channels):
-                continue
-            with damage_as_recording_error(self.path):
-                found = list(_messages_of(self._chunk_content(index), wanted))
-            yield from found
+        places = [place for place in self._chunks if not place.channels.isdisjoint(wanted)]
+        with damage_as_recording_error(self.path):
+            yield from _messages_of((self._chunk_content(place) for place in places), wanted, self._limits)
 
     def blocks(self, topics: Collection[str]) -> dict[str, Block]:
         """topic -> all its messages; the chunks that hold any of them are in memory together."""
         wanted = {topic: self.channels[topic].id if topic in self.channels else -1 for topic in topics}
         places = [place for place in self._chunks if not place.channels.isdisjoint(wanted.values())]
         with damage_as_recording_error(self.path):
-            return blocks_of([self._chunk_content(place) for place in places], wanted)
+            return blocks_of((self._chunk_content(place) for place in places), wanted, self._limits)
 
     def _chunk_content(self, place: ChunkPlace) -> bytes:
-        return chunk_content(self._content_at(place.start, place.length, Opcode.CHUNK), place.uncompressed_size)
+        record = self._content_at(place.start, place.length, Opcode.CHUNK)
+        return chunk_content(record, self._limits, place.uncompressed_size)
 
 
 def _read[R: McapRecord](content: bytes | memoryview, kind: type[R]) -> R:
@@ -253,20 +268,24 @@ def _records_of(content: bytes) -> Iterator[tuple[int, bytes]]:
         position += length
 
 
-def _messages_of(content: bytes, wanted: dict[int, str]) -> Iterator[Message]:
+def _messages_of(contents: Iterable[bytes], wanted: dict[int, str], limits: Limits) -> Iterator[Message]:
     # Every record of a chunk comes through here: those that are not wanted are stepped over, not copied.
-    position, end = 0, len(content)
-    while position < end:
-        opcode, length = RECORD_HEAD.unpack_from(content, position)
-        start = position + RECORD_HEAD.size
-        position = start + length
-        if position > end:
-            raise ValueError("a record that reaches beyond its chunk")
-        if opcode == Opcode.MESSAGE:
-            channel_id, _, log_time, _ = _MESSAGE_HEAD.unpack_from(content, start)
-            topic = wanted.get(channel_id)
-            if topic is not None:
-                yield Message(topic, log_time, content[start + _MESSAGE_HEAD.size : position])
+    count = 0
+    for content in contents:
+        position, end = 0, len(content)
+        while position < end:
+            opcode, length = RECORD_HEAD.unpack_from(content, position)
+            start = position + RECORD_HEAD.size
+            position = start + length
+            if position > end:
+                raise ValueError("a record that reaches beyond its chunk")
+            count += 1
+            if opcode == Opcode.MESSAGE:
+                channel_id, _, log_time, _ = _MESSAGE_HEAD.unpack_from(content, start)
+                topic = wanted.get(channel_id)
+                if topic is not None:
+                    yield Message(topic, log_time, content[start + _MESSAGE_HEAD.size : position])
+        limits.check_records(count)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -293,14 +312,13 @@ def salvage(path: Path) -> Iterator[SalvagedMessage | SalvagedMetadata | str | N
 
     Ends with a string that says why reading stopped, or without one where the data ends as it should. Raises OSError.
     """
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         size = file.seek(0, 2)
         file.seek(0)
         if file.read(len(MAGIC)) != MAGIC:
             yield "the file is empty" if size == 0 else "the file is no MCAP file"
             return
-        schemas: dict[int, str] = {}
-        channels: dict[int, Channel] = {}
+        reader = _Salvage(Limits.of_file(size))
         while True:
             head = file.read(RECORD_HEAD.size)
             if len(head) < RECORD_HEAD.size:
@@ -310,43 +328,61 @@ def salvage(path: Path) -> Iterator[SalvagedMessage | SalvagedMetadata | str | N
             if length > min(size - file.tell(), MAX_RECORD_BYTES):
                 yield "a record is cut off"
                 return
-            content = file.read(length)
             if opcode in (Opcode.DATA_END, Opcode.FOOTER):
                 return
+            if opcode not in _SALVAGED or (opcode == Opcode.METADATA and length > MAX_METADATA_BYTES):
+                file.seek(length, 1)
+                continue
             try:
                 with damage_as_recording_error(path):
-                    found = list(_salvaged(opcode, content, schemas, channels))
-            except RecordingError:
-                yield "a record is damaged"
+                    yield from reader.read(opcode, file.read(length))
+            except RecordingError as error:
+                limited = isinstance(error.__cause__, LimitError)
+                yield f"the rest is not read, {error.__cause__}" if limited else "a record is damaged"
                 return
-            yield from found
             if opcode == Opcode.CHUNK:
                 yield None
 
 
-def _salvaged(
-    opcode: int, content: bytes, schemas: dict[int, str], channels: dict[int, Channel]
-) -> Iterator[SalvagedMessage | SalvagedMetadata]:
-    stream = ReadDataStream(BytesIO(content))
-    if opcode == Opcode.METADATA:
-        record = Metadata.read(stream)
-        yield SalvagedMetadata(name=record.name, values=dict(record.metadata))
-    elif opcode == Opcode.SCHEMA:
-        schema = Schema.read(stream)
-        schemas[schema.id] = schema.name
-    elif opcode == Opcode.CHANNEL:
-        channel = Channel.read(stream)
-        channels[channel.id] = channel
-    elif opcode == Opcode.CHUNK:
-        for inner, record_content in _records_of(chunk_content(content)):
-            yield from _salvaged(inner, record_content, schemas, channels)
-    elif opcode == Opcode.MESSAGE:
-        channel_id, _, log_time, _ = _MESSAGE_HEAD.unpack_from(content)
-        channel = channels[channel_id]
-        yield SalvagedMessage(
-            topic=channel.topic,
-            schema=schemas[channel.schema_id],
-            time_ns=log_time,
-            data=content[_MESSAGE_HEAD.size :],
-            is_latched="offered_qos_profiles" in channel.metadata,
-        )
+_SALVAGED = frozenset((Opcode.METADATA, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.CHUNK, Opcode.MESSAGE))
+
+
+class _Salvage:
+    """What has been learnt from the records so far: schemas, channels, how much they unpacked to."""
+
+    def __init__(self, limits: Limits) -> None:
+        self._limits = limits
+        self._num_bytes = self._num_records = 0
+        self._schemas: dict[int, str] = {}
+        self._channels: dict[int, Channel] = {}
+
+    def read(self, opcode: int, content: bytes) -> Iterator[SalvagedMessage | SalvagedMetadata]:
+        """What a record holds."""
+        if opcode == Opcode.CHUNK:
+            unpacked = chunk_content(content, self._limits)
+            self._num_bytes += len(unpacked)
+            self._limits.check_total(self._num_bytes)
+            for inner, record_content in _records_of(unpacked):
+                self._num_records += 1
+                self._limits.check_records(self._num_records)
+                if inner in _SALVAGED and inner != Opcode.CHUNK:
+                    yield from self.read(inner, record_content)
+        elif opcode == Opcode.MESSAGE:
+            channel_id, _, log_time, _ = _MESSAGE_HEAD.unpack_from(content)
+            channel = self._channels[channel_id]
+            yield SalvagedMessage(
+                topic=channel.topic,
+                schema=self._schemas[channel.schema_id],
+                time_ns=log_time,
+                data=content[_MESSAGE_HEAD.size :],
+                is_latched="offered_qos_profiles" in channel.metadata,
+            )
+        elif opcode == Opcode.METADATA:
+            record = _read(content, Metadata)
+            yield SalvagedMetadata(name=record.name, values=dict(record.metadata))
+        elif opcode == Opcode.SCHEMA:
+            schema = _read_schema(content)
+            self._schemas[schema.id] = schema.name
+        elif opcode == Opcode.CHANNEL:
+            channel = _read_channel(content)
+            self._channels[channel.id] = channel

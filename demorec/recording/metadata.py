@@ -12,13 +12,15 @@ from dataclasses import dataclass
 
 from demorec.episode import FORMAT_VERSION, EpisodeInfo, Outcome
 from demorec.errors import RecordingError
-from demorec.plain import from_json, to_json
+from demorec.plain import to_json
 from demorec.recording.video import VideoSettings
+from demorec.validity import from_description, read_episode_info
 
 EPISODE = "demorec.episode"
 OUTCOME = "demorec.outcome"
 RECOVERED = "demorec.recovered"
 _CHECKSUM = "crc32"
+_KNOWN_VERSIONS = tuple(str(version) for version in range(1, FORMAT_VERSION + 1))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,26 +67,42 @@ def read_episode_metadata(metadata: Mapping[str, str]) -> tuple[EpisodeInfo, dic
     """Inverse of `episode_metadata`; RecordingError on damage or an unknown format version."""
     check_seal(EPISODE, metadata)
     version = metadata.get("format_version", "")
-    if not version.isdigit() or not 1 <= int(version) <= FORMAT_VERSION:
+    if version not in _KNOWN_VERSIONS:
         raise RecordingError(
-            f"The recording has format version {version or 'none'}, this demorec reads 1 to {FORMAT_VERSION}: "
+            f"The recording has format version {version[:20] or 'none'}, this demorec reads 1 to {FORMAT_VERSION}: "
             "use the demorec that wrote it, or a newer one."
         )
     try:
-        info = from_json(metadata["info"], EpisodeInfo)
-        cameras = from_json(metadata["cameras"], dict[str, CameraStreams])
+        info = read_episode_info(metadata["info"])
+        cameras = from_description(metadata["cameras"], dict[str, CameraStreams])
+        _check_cameras(info, cameras)
     except (KeyError, ValueError) as error:
         raise RecordingError(f"The recording's metadata is not that of format version {version} ({error}).") from error
     return info, cameras
+
+
+def _check_cameras(info: EpisodeInfo, cameras: Mapping[str, CameraStreams]) -> None:
+    """ValueError unless all cameras of the scene (none, before the first frame) were recorded as it says."""
+    if cameras and cameras.keys() != {camera.name for camera in info.scene.cameras}:
+        raise ValueError("the recorded cameras are not those of the scene")
+    for camera in info.scene.cameras if cameras else ():
+        video = cameras[camera.name].video
+        if (video.width, video.height, video.fps) != (camera.width, camera.height, info.fps):
+            raise ValueError(f"the video of the camera {camera.name!r} has another size or rate than the scene")
+        if video.gop < 1:
+            raise ValueError(f"the video of the camera {camera.name!r} has a GOP of {video.gop}")
 
 
 def read_outcome_metadata(metadata: Mapping[str, str]) -> Outcome:
     """Inverse of `outcome_metadata`; RecordingError on damage."""
     check_seal(OUTCOME, metadata)
     try:
-        return from_json(metadata["outcome"], Outcome)
+        outcome = from_description(metadata["outcome"], Outcome)
+        if min(outcome.num_frames, outcome.num_retries) < 0:
+            raise ValueError("a number of frames or retries below 0")
     except (KeyError, ValueError) as error:
         raise RecordingError(f"The recording's outcome cannot be read ({error}).") from error
+    return outcome
 
 
 def _sealed(metadata: dict[str, str]) -> dict[str, str]:

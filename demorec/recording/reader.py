@@ -77,6 +77,8 @@ class Recording:
         self.num_frames = self._container.counts.get(channels.GRIPPER, 0)
         if self.outcome is None and not self.is_recovered:
             raise RecordingError(f"The recording was never finished: demorec recover makes a readable one: {self.path}")
+        if self.num_frames and len(self._cameras) != len(self.info.scene.cameras):
+            raise RecordingError(f"The recording has frames, but none of its scene's cameras was recorded: {self.path}")
         if self.outcome is not None and self.outcome.num_frames != self.num_frames:
             raise RecordingError(
                 f"The recording has {self.num_frames} frames, but its outcome says {self.outcome.num_frames}: "

@@ -17,6 +17,7 @@ from demorec.config import VideoConfig
 from demorec.recording import Recording
 from demorec.recording.chunks import ChunkPlace, blocks_of
 from demorec.recording.container import Container
+from demorec.recording.limits import Limits
 from demorec.recording.messages import PictureMessages, coded_pictures
 
 
@@ -56,6 +57,9 @@ def test_places_are_what_the_mcap_library_reads(path: Path) -> None:
     container.close()
 
 
+LIMITS = Limits.of_file(1000)
+
+
 def message(channel: int, time_ns: int, data: bytes) -> bytes:
     """A Message record (MCAP specification): channel, sequence, log time, publish time, data."""
     content = struct.pack("<HIQQ", channel, 0, time_ns, time_ns) + data
@@ -65,7 +69,7 @@ def message(channel: int, time_ns: int, data: bytes) -> bytes:
 def test_records_of_other_kinds_are_stepped_over() -> None:
     other = struct.pack("<BQ", 3, 4) + b"\5\5\5\5"
     contents = [other + message(1, 10, b"ab") + other, b"", message(2, 11, b"") + message(1, 12, b"cde")]
-    blocks = blocks_of(contents, {"/one": 1, "/two": 2, "/three": 3})
+    blocks = blocks_of(contents, {"/one": 1, "/two": 2, "/three": 3}, LIMITS)
     assert [list(blocks[topic].messages()) for topic in ("/one", "/two", "/three")] == [[b"ab", b"cde"], [b""], []]
     assert blocks["/one"].time_ns.tolist() == [10, 12]
 
@@ -82,7 +86,7 @@ def test_records_of_other_kinds_are_stepped_over() -> None:
 )
 def test_records_that_do_not_fill_their_chunk_are_refused(content: bytes) -> None:
     with pytest.raises((ValueError, struct.error)):
-        blocks_of([content], {"/one": 1})
+        blocks_of([content], {"/one": 1}, LIMITS)
 
 
 @pytest.mark.parametrize("codec", ["h264", "av1", "jpeg"])
@@ -99,7 +103,7 @@ def test_pictures_of_several_formats_and_cut_off_ones() -> None:
     made = [PictureMessages("a", "h264").compressed_image(0, b"one")]
     made += [PictureMessages("a longer frame", "jpeg").compressed_image(7, b"three")]
     for messages in (made, made[:1] * 2):
-        block = blocks_of([b"".join(message(1, 0, data) for data in messages)], {"/x": 1})["/x"]
+        block = blocks_of([b"".join(message(1, 0, data) for data in messages)], {"/x": 1}, LIMITS)["/x"]
         assert list(coded_pictures(block, "h264").messages()) == (
             [b"one", b"three"] if messages is made else [b"one"] * 2
         )

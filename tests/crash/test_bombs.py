@@ -1,0 +1,195 @@
+"""Small files that unpack to gigabytes, hold millions of records or nest without end: refused in a sentence, at once.
+
+The commands run in a process of their own, whose largest memory is measured.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import struct
+import zlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import zstandard
+from helpers_commands import MOST_BYTES, Commands
+from helpers_mcap import chunk_record, message_record, record, rewritten
+from helpers_recording import write_episode
+
+from demorec.errors import ConfigError, RecordingError
+from demorec.recording import Recording, recover
+
+
+@pytest.fixture(scope="module")
+def commands() -> Iterator[Commands]:
+    with Commands() as process:
+        yield process
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_episode(tmp_path_factory.mktemp("bombs") / "good.mcap", num_frames=12, cameras=())
+
+
+def one_huge_chunk(good: Path, path: Path) -> None:
+    """4 GB of zeros, as the zstd data say themselves; the chunk says that it is small."""
+    compressor = zstandard.ZstdCompressor(level=1).compressobj(size=4 << 30)
+    zeros = bytes(1 << 24)
+    packed = b"".join(compressor.compress(zeros) for _ in range(256)) + compressor.flush()
+    path.write_bytes(rewritten(good, extra_chunks=[chunk_record(packed, size=1000, crc=1)]))
+
+
+def many_large_chunks(good: Path, path: Path) -> None:
+    """64 MB of records each."""
+    content = record(200, bytes((64 << 20) - 9))
+    chunk = chunk_record(zstandard.ZstdCompressor().compress(content), size=len(content), crc=zlib.crc32(content))
+    path.write_bytes(rewritten(good, extra_chunks=[chunk] * 60))
+
+
+def empty_records(good: Path, path: Path) -> None:
+    """Millions of records of nothing."""
+    content = record(200, b"") * 3_000_000
+    chunk = chunk_record(zstandard.ZstdCompressor().compress(content), size=len(content), crc=zlib.crc32(content))
+    path.write_bytes(rewritten(good, extra_chunks=[chunk] * 7))
+
+
+def empty_messages(good: Path, path: Path) -> None:
+    """Two million messages on a topic that is there."""
+    content = message_record(2, 0, b"") * 1_900_000
+    chunk = chunk_record(zstandard.ZstdCompressor().compress(content), size=len(content), crc=zlib.crc32(content))
+    path.write_bytes(rewritten(good, extra_chunks=[chunk] * 3))
+
+
+BOMBS: tuple[Callable[[Path, Path], None], ...] = (one_huge_chunk, many_large_chunks, empty_records, empty_messages)
+
+
+@pytest.mark.parametrize("bomb", BOMBS)
+def test_a_small_recording_never_becomes_large(
+    bomb: Callable[[Path, Path], None], good: Path, commands: Commands, tmp_path: Path
+) -> None:
+    path = tmp_path / "bomb.mcap"
+    bomb(good, path)
+    assert path.stat().st_size < 1_000_000
+    said = commands.refused("check", path)
+    assert "DEMOREC_UNPACKED_MB" in said or "another size" in said
+
+
+@pytest.mark.parametrize("bomb", BOMBS)
+def test_recovering_a_bomb_is_bounded(
+    bomb: Callable[[Path, Path], None], good: Path, commands: Commands, tmp_path: Path
+) -> None:
+    path = tmp_path / "bomb.mcap"
+    bomb(good, path)
+    told = commands.run("recover", path, "--out", tmp_path / "kept.mcap")
+    assert told.code is not None, told.text
+    assert told.peak_bytes < MOST_BYTES, told
+
+
+def test_the_limit_can_be_raised(good: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "large.mcap"
+    content = record(200, bytes(80 << 20))
+    chunk = chunk_record(zstandard.ZstdCompressor().compress(content), size=len(content), crc=zlib.crc32(content))
+    path.write_bytes(rewritten(good, extra_chunks=[chunk]))
+    with pytest.raises(RecordingError, match=r"84 MB, allowed are 67 MB; DEMOREC_UNPACKED_MB raises this"):
+        Recording(path)
+    monkeypatch.setenv("DEMOREC_UNPACKED_MB", "100")
+    with Recording(path) as recording, Recording(good) as original:
+        assert recording.digest() == original.digest()
+    for wrong in ("many", "-1", "0", "1e9", "9" * 5000, "٣"):
+        monkeypatch.setenv("DEMOREC_UNPACKED_MB", wrong)
+        with pytest.raises(ConfigError, match="must be a number of megabytes"):
+            Recording(path)
+
+
+def test_pictures_that_compress_well_are_no_bomb(tmp_path: Path) -> None:
+    """Black JPEG files beside a robot that stands still: the most that our own recordings unpack to."""
+    from dataclasses import replace
+
+    import numpy as np
+    from helpers_recording import make_episode
+
+    from demorec.config import VideoConfig
+    from demorec.episode import frame_time_ns
+    from demorec.recording import EpisodeWriter
+
+    info, frames, outcome = make_episode(num_frames=1, cameras=("front", "wrist"), width=1280, height=720)
+    black = {
+        name: replace(image, color=np.zeros_like(image.color), depth=np.zeros(image.color.shape[:2], dtype=np.float32))
+        for name, image in frames[0].images.items()
+    }
+    path = tmp_path / "black.mcap"
+    with EpisodeWriter(path, info, video=VideoConfig(codec="jpeg")) as writer:
+        for index in range(90):
+            writer.write(
+                replace(frames[0], frame_index=index, time_ns=frame_time_ns(index, 30), images=black, events=())
+            )
+        writer.finish(replace(outcome, num_frames=90))
+    with Recording(path) as recording:
+        limits, places = recording._container._limits, recording._container._chunks
+        unpacked = sum(place.uncompressed_size for place in places)
+        assert unpacked > 25 * path.stat().st_size
+        assert unpacked < 200 * path.stat().st_size
+        assert recording.num_frames == 90
+        assert 16 * sum(count for _, count in recording.topics.values()) < path.stat().st_size
+        for place in places:
+            limits.check_chunk(place.uncompressed_size, place.length)
+
+
+def test_metadata_of_two_hundred_megabytes_are_not_read(good: Path, commands: Commands, tmp_path: Path) -> None:
+    path = tmp_path / "large.mcap"
+    values = {"info": "x" * (200 << 20)}
+    path.write_bytes(rewritten(good, metadata={"demorec.episode": values}))
+    assert "metadata demorec.episode have 210 MB" in commands.refused("info", path)
+    commands.refused("recover", path, "--out", tmp_path / "kept.mcap")
+
+
+@pytest.mark.parametrize("opening", ["[", '{"a":'])
+@pytest.mark.parametrize("depth", [200, 5000, 100_000])
+def test_metadata_nested_without_end(opening: str, depth: int, good: Path, tmp_path: Path) -> None:
+    closing = {"[": "]", '{"a":': "1}"}[opening] if depth < 1000 else ""
+    text = '{"config": ' + opening * depth + closing * (depth if closing == "]" else 0) + "}"
+    path = tmp_path / "nested.mcap"
+    path.write_bytes(rewritten(good, change={"demorec.episode": {"info": text}}))
+    with pytest.raises(RecordingError) as caught:
+        Recording(path)
+    assert len(str(caught.value)) < 600
+
+
+def test_a_description_of_very_many_values(good: Path, commands: Commands, tmp_path: Path) -> None:
+    path = tmp_path / "many.mcap"
+    with Recording(good) as recording:
+        found = recording._container.metadata("demorec.episode")
+    assert found is not None
+    info = json.loads(found["info"])
+    info["scene"]["bodies"] = [{}] * 240_000
+    path.write_bytes(rewritten(good, change={"demorec.episode": {"info": json.dumps(info)}}))
+    assert len(commands.refused("info", path)) < 1000
+
+
+def test_frames_that_only_the_index_has(good: Path, tmp_path: Path) -> None:
+    path = tmp_path / "claims.mcap"
+    path.write_bytes(rewritten(good, counts=lambda topic, count: 2**60))
+    with pytest.raises(RecordingError, match="records, too many for a file of its size"):
+        Recording(path)
+
+
+def test_a_fifo_is_no_recording(commands: Commands, tmp_path: Path) -> None:
+    path = tmp_path / "episode.mcap"
+    os.mkfifo(path)
+    with pytest.raises(RecordingError, match="it is a FIFO"):
+        Recording(path)
+    with pytest.raises(RecordingError, match="it is a FIFO"):
+        recover(path, tmp_path / "kept.mcap")
+    for command in (["info", tmp_path], ["check", tmp_path], ["check", path], ["info", path]):
+        commands.refused(*command)
+
+
+def test_files_without_checksums_are_read(good: Path, tmp_path: Path) -> None:
+    """A checksum of 0 means that there is none (MCAP specification), which rosbag2 writes."""
+    path = tmp_path / "bare.mcap"
+    path.write_bytes(rewritten(good, with_checksums=False))
+    assert struct.unpack("<I", path.read_bytes()[-12:-8]) == (0,)
+    with Recording(path) as recording, Recording(good) as original:
+        assert recording.digest() == original.digest()
