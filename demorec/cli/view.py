@@ -65,6 +65,7 @@ class View:
         """Convert, then show, save, photograph or serve."""
         self._validate()
         allow_models(allowed_modules(self.allow))
+        from demorec.playback.glyphs import DrawableText
         from demorec.playback.save import numbered, save, save_comparison, save_each
         from demorec.playback.sources import find_episodes, select
 
@@ -88,13 +89,22 @@ class View:
                     say(f"{_size(target)}: {target}")
             if self.screenshot is None:
                 return 0
+        text = DrawableText()
+        if self.screenshot is not None:
+            sources = [text.source(source) for source in sources]
         with tempfile.TemporaryDirectory(prefix="demorec-view-") as folder:
             if self.compare:
                 files = [Path(folder) / "comparison.rrd"]
                 save_comparison(sources[0], sources[1], files[0])
             else:
                 files = save_each(sources, Path(folder))
-            return self._show(files, sources)
+            code = self._show(files, sources)
+        if text.missing:
+            tell(
+                f"The picture lacks {len(text.missing)} characters for which Rerun's viewer without a screen has no "
+                f"font ({''.join(sorted(text.missing)[:20])}); the window, --web and --save keep them."
+            )
+        return code
 
     def _validate(self) -> None:
         if self.web and (self.save is not None or self.screenshot is not None):

@@ -33,9 +33,7 @@ _SAME_SIZE = 0.1
 
 
 def log_bodies(recording: rr.RecordingStream, paths: Paths, episode: Episode, tint: Rgba | None = None) -> None:
-    """Every body at its place or along its way, and the goals as wire frames.
-
-    An object whose way the source does not know is drawn at its start and, as a wire frame, at its end.
+    """Every body at its place or along its way, and as wire frames the goals and the known ends of objects.
 
     A body whose model is not installed here, or is another one, is drawn as the recording describes it.
     """
@@ -54,7 +52,7 @@ def log_bodies(recording: rr.RecordingStream, paths: Paths, episode: Episode, ti
             recording.log(entity, _transform(body.world_from_body.vector()), static=True)
     for name, pose in episode.end_poses.items():
         wire = rr.Boxes3D(sizes=[scene.body(name).shape.extents], colors=[(200, 200, 200)], radii=[-1.0])
-        recording.log(f"{paths.goal(name)}/end", _transform(pose), wire, static=True)
+        recording.log(paths.end(name), _transform(pose), wire, static=True)
     for goal in scene.goals:
         wire = rr.Boxes3D(sizes=[scene.body(goal.object).shape.extents], colors=[GOAL], radii=[-1.5])
         recording.log(

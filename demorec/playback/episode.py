@@ -66,7 +66,7 @@ class Episode:
         joint_position: (T, n_joints) rad, fingers m.
         base_from_tcp: (T, 7).
         object_poses: name -> (T, 7), world_from_object.
-        end_poses: name -> (7,) where an object ended, for sources without `object_poses`.
+        end_poses: name -> (7,) where an object ended, for sources that may not know its way there.
         world_from_camera: name -> (T, 7).
         phase: T names.
         events: (time_ns, event).

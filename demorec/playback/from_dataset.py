@@ -17,9 +17,11 @@ from rerun.experimental import LeRobotReader
 from demorec.assets import asset_path
 from demorec.episode import Check, EpisodeInfo, Outcome, frame_time_ns
 from demorec.errors import RecordingError
-from demorec.geometry import Array
+from demorec.features import ENVIRONMENT_STATE
+from demorec.geometry import Array, Pose
 from demorec.kinematics import ArmKinematics
 from demorec.playback.episode import Curves, Episode, Video, VideoBatch
+from demorec.playback.held_objects import held_object_poses
 from demorec.validity import read_episode_info
 
 _SIDECAR = "demorec"
@@ -71,7 +73,7 @@ def open_dataset_episode(root: Path, episode_index: int) -> Iterator[Episode]:
         time_ns=time_ns,
         joint_position=np.concatenate([state[:, :num_arm], fingers], axis=1),
         base_from_tcp=base_from_tcp,
-        object_poses={},
+        object_poses=_object_poses(info, row, data, features, base_from_tcp),
         end_poses={item["name"]: np.array(item["world_from_object_end"]) for item in row["objects"]},
         world_from_camera=_camera_poses(root, episode_index),
         phase=_phases(row, num_frames),
@@ -120,6 +122,24 @@ def _tcp_poses(info: EpisodeInfo, state: Array) -> Array:
         scale=info.scene.robot.scale,
     )
     return np.array([arm.forward(row).vector() for row in state[:, : arm.num_joints]])
+
+
+def _object_poses(
+    info: EpisodeInfo, row: dict[str, Any], data: dict[str, Array], features: dict[str, Any], base_from_tcp: Array
+) -> dict[str, Array]:
+    """Name -> (T, 7): recorded where the dataset has `observation.environment_state`, else as the hand carries them."""
+    if ENVIRONMENT_STATE not in data:
+        ends = {item["name"]: np.array(item["world_from_object_end"]) for item in row["objects"]}
+        opening, target = data["observation.state"][:, -1], data["action"][:, -1]
+        return held_object_poses(info.scene, ends, base_from_tcp, opening, target, int(features["fps"]))
+    first = {name: column for column, name in enumerate(features["features"][ENVIRONMENT_STATE]["names"])}
+    base, values = info.scene.robot.world_from_base, data[ENVIRONMENT_STATE]
+    result = {}
+    for body in info.scene.movable:
+        column = first[f"{body.name}.pose.x"]
+        rows = values[:, column : column + 7]
+        result[body.name] = np.array([(base @ Pose(position=p[:3], quat_xyzw=p[3:])).vector() for p in rows])
+    return result
 
 
 def _outcome(row: dict[str, Any], num_frames: int) -> Outcome:

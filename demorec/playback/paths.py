@@ -34,6 +34,10 @@ class Paths:
         """Where an object shall end."""
         return f"{self.world}/goals/{name}"
 
+    def end(self, name: str) -> str:
+        """Where an object ended; not below the goal, whose transform would act on it too."""
+        return f"{self.world}/ends/{name}"
+
     def camera(self, name: str) -> str:
         """A camera: its pose, its pinhole and its pictures."""
         return f"{self.world}/cameras/{name}"

@@ -47,7 +47,7 @@ def summary(episode: Episode) -> str:
     if episode.outcome is not None and episode.outcome.checks:
         lines += ["", "| | check | value | limit |", "|---|---|---|---|"]
         for check in episode.outcome.checks:
-            mark = "✔" if check.passed else "**✘**"
+            mark = "✓" if check.passed else "**✗**"
             unit = f" {check.unit}" if check.unit else ""
             lines.append(f"| {mark} | {check.name} | {check.value:.3g}{unit} | {check.limit:.3g}{unit} |")
     return "\n".join(lines) + "\n"

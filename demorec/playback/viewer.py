@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -15,12 +17,17 @@ from urllib.request import urlopen
 
 from rerun.experimental import ViewerClient
 
-from demorec.errors import ConfigError, MissingDependencyError, RecordingError
+from demorec.errors import ConfigError, DemorecError, RecordingError
 from demorec.playback.programs import free_port, has_display, viewer_environment, viewer_program
 from demorec.playback.times import SECONDS
 
 _START_SECONDS = 60.0
 _SETTLE_SECONDS = 30.0
+_END_SECONDS = 5.0
+_PANIC = re.compile(r"panicked at '(?P<message>.*)'$", re.MULTILINE)
+_NO_DRIVER = ("Failed to create render state", "Failed to get render context")
+"""How the viewer's panic begins where there is no Vulkan driver, or where OpenGL alone is not enough for it."""
+_NO_GLYPH = re.compile(r'No glyph for "(?P<character>.+?)" \((?P<code>U\+[0-9A-F]+)\)')
 
 
 def show(recordings: Sequence[Path]) -> None:
@@ -57,17 +64,37 @@ class Report:
     message: str
 
 
+def why_it_ended(said: str) -> DemorecError:
+    """The error for a viewer that ended by itself, from what it wrote to its standard error."""
+    panic = _PANIC.search(said)
+    message = panic["message"] if panic else ""
+    if message.startswith(_NO_DRIVER):
+        return RecordingError(
+            f"Rerun's viewer found no Vulkan driver to draw a picture with ({message.rstrip('.')}): "
+            "apt-get install mesa-vulkan-drivers brings one that needs no graphics card."
+        )
+    glyph = _NO_GLYPH.match(message)
+    if glyph:
+        return RecordingError(
+            f"Rerun's viewer without a screen cannot draw {glyph['character']!r} ({glyph['code']}), which the file "
+            "contains: look at it in the window, or with --web."
+        )
+    return RecordingError(f"Rerun's viewer ended by itself: {message or said.strip()[-300:]}")
+
+
 class HeadlessViewer:
     """Context manager over a viewer without a screen that shows .rrd or .mcap files, the first one in front.
 
     Raises:
-        MissingDependencyError: No graphics driver.
-        RecordingError: The viewer does not come up, or cannot load the file.
+        RecordingError: There is no graphics driver, the viewer does not come up or ends by itself, or it cannot load
+            the file.
     """
 
     def __init__(self, *recordings: Path, width: int = 1600, height: int = 950) -> None:
         self._port = free_port()
         self._recordings = recordings
+        # Not a pipe, which would fill up when nobody reads it.
+        self._said = tempfile.TemporaryFile(mode="w+", errors="replace")  # noqa: SIM115 (closed by close)
         self._process = subprocess.Popen(
             [
                 viewer_program(), "--headless", "--port", str(self._port), "--bind", "127.0.0.1",
@@ -76,8 +103,7 @@ class HeadlessViewer:
             env=viewer_environment(),
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            text=True,
+            stderr=self._said,
         )  # fmt: skip
         try:
             self.client = self._connect()
@@ -91,22 +117,33 @@ class HeadlessViewer:
     def __exit__(
         self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        self.close()
+        try:
+            if isinstance(exc, (OSError, RuntimeError, ValueError)) and self._has_ended():
+                raise self._reason() from exc
+        finally:
+            self.close()
 
     def close(self) -> None:
         """End the viewer; harmless when called twice."""
         end_process(self._process)
+        self._said.close()
+
+    def _has_ended(self) -> bool:
+        """Whether the viewer ended by itself; one that panics has left its clients before it has said why."""
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(_END_SECONDS)
+        return self._process.poll() is not None
+
+    def _reason(self) -> DemorecError:
+        """Why the viewer has ended, by what it said."""
+        self._said.seek(0)
+        return why_it_ended(self._said.read())
 
     def _connect(self) -> ViewerClient:
         deadline = time.monotonic() + _START_SECONDS
         while time.monotonic() < deadline:
             if self._process.poll() is not None:
-                said = self._process.stderr.read() if self._process.stderr else ""
-                if "adapter" in said or "Vulkan" in said:
-                    raise MissingDependencyError(
-                        "A picture without a screen", "mesa-vulkan-drivers", "apt-get install mesa-vulkan-drivers"
-                    )
-                raise RecordingError(f"Rerun's viewer ended at once: {said.strip()[-300:]}")
+                raise self._reason()
             try:
                 client = ViewerClient.connect(f"rerun+http://127.0.0.1:{self._port}/proxy")
                 state = client.get_state()
@@ -149,6 +186,8 @@ class HeadlessViewer:
             try:
                 return bytes(self.client.take_screenshot(*view))
             except TimeoutError as error:
+                if self._process.poll() is not None:
+                    raise
                 if time.monotonic() > deadline:
                     raise RecordingError(
                         f"Rerun's viewer has not drawn a picture within {_START_SECONDS:.0f} s: is the machine busy?"
@@ -244,5 +283,3 @@ def end_process(process: subprocess.Popen[Any]) -> None:
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
-    if process.stderr is not None:
-        process.stderr.close()

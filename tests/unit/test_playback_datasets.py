@@ -1,0 +1,77 @@
+"""Objects in the playback of a dataset, judged by the recording that it was exported from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers_export import export
+from rerun.chunk import RrdReader
+
+from demorec.geometry import Array
+from demorec.playback.from_dataset import open_dataset_episode
+from demorec.playback.held_objects import held
+from demorec.playback.save import save
+from demorec.playback.sources import find_episodes
+from demorec.recording import Recording
+
+SAMPLE = Path(__file__).parents[2] / "recordings" / "sample" / "format_1.mcap"
+"""A simulated episode: the cube is lifted, carried 26 cm and put down."""
+
+
+@pytest.fixture(scope="module")
+def recorded() -> Array:
+    with Recording(SAMPLE) as recording:
+        return recording.columns().object_poses["red_cube"]
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("dataset") / "cubes"
+    export(SAMPLE, folder)
+    return folder
+
+
+def test_what_the_hand_holds_moves_with_it(dataset: Path, recorded: Array) -> None:
+    with open_dataset_episode(dataset, 0) as episode:
+        drawn = episode.object_poses["red_cube"]
+    assert np.ptp(recorded[:, 2]) > 0.1  # lifted
+    assert drawn.shape == recorded.shape
+    np.testing.assert_allclose(drawn[:, :3], recorded[:, :3], atol=2e-3)
+    np.testing.assert_array_equal(drawn[-1], recorded[-1])
+    turned = np.abs((drawn[:, 3:] * recorded[:, 3:]).sum(axis=1))
+    assert turned.min() > np.cos(np.deg2rad(3) / 2)
+
+
+def test_recorded_object_poses_are_shown_where_a_dataset_has_them(tmp_path: Path, recorded: Array) -> None:
+    export(SAMPLE, tmp_path / "cubes", privileged=True)
+    with open_dataset_episode(tmp_path / "cubes", 0) as episode:
+        np.testing.assert_allclose(episode.object_poses["red_cube"], recorded, atol=1e-6)
+
+
+def test_an_end_is_drawn_where_the_object_ended(dataset: Path, recorded: Array, tmp_path: Path) -> None:
+    save(find_episodes([dataset])[0], tmp_path / "x.rrd")
+    positions: dict[str, Array] = {}
+    for chunk in RrdReader(tmp_path / "x.rrd").stream():
+        batch = chunk.to_record_batch()
+        if chunk.is_static and "Transform3D:translation" in batch.schema.names:
+            positions[chunk.entity_path] = np.array(batch.column("Transform3D:translation").to_pylist()[0][0])
+    (end,) = [entity for entity in positions if "/ends/" in entity or entity.endswith("/end")]
+    above = [parent for parent in positions if end.startswith(f"{parent}/")]
+    np.testing.assert_allclose(sum(positions[entity] for entity in [end, *above]), recorded[-1, :3], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("opening", "target", "expected"),
+    [
+        # Millimetres. Closed around 50 mm, then opened.
+        ([80, 75, 68, 60, 52, 50, 50, 50, 50, 60], [80] + [0] * 7 + [80] * 2, [0, 0, 0, 0, 0, 0, 1, 1, 0, 0]),
+        # Closed beside the object: nothing stops the fingers before they are where they shall be.
+        ([80, 50, 20, 0, 0, 0], [80] + [0] * 5, [0] * 6),
+        # Something that gives way is held, something lost is not.
+        ([80, 60, 50, 50, 49, 48, 40, 30, 20, 10], [80] + [0] * 9, [0, 0, 0, 1, 1, 1, 0, 0, 0, 0]),
+    ],
+)
+def test_closing_fingers_that_stop_hold_something(opening: list[int], target: list[int], expected: list[int]) -> None:
+    assert held(np.array(opening) / 1000, np.array(target) / 1000, 30).astype(int).tolist() == expected
