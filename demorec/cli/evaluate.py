@@ -26,7 +26,7 @@ class Evaluate:
 
     Examples:
       demorec evaluate --policy outputs/train --task pick_place --num-episodes 100
-      demorec evaluate --policy outputs/train --split all --seed 1 --workers 8 --out evaluations/all
+      demorec evaluate --policy outputs/train --split all --seed 1 --out all
       demorec evaluate --compare evaluations/clean evaluations/noisy
       demorec view evaluations/clean/failed            (watch the failures)
     """

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
 from demorec.cli.output import say, tell
 
@@ -25,7 +25,7 @@ class Reproduce:
 
     source: Positional[Path]
     """A run, or a dataset that was exported from one."""
-    out: Annotated[Path, arg(help_behavior_hint="(required)")]
+    out: Path
     """Folder of the new run."""
     workers: int | None = None
     """Processes that simulate (auto: one for each core)."""
