@@ -6,16 +6,13 @@ Modules of this package import heavy libraries inside `run` only, so that `--hel
 
 from __future__ import annotations
 
-import inspect
 import logging
 import sys
+import textwrap
 from collections.abc import Sequence
-from pathlib import Path
-from types import NoneType
-from typing import Any, Protocol, cast, get_args
+from typing import Protocol
 
-import tyro
-
+from demorec.cli.flags import parse, terminal_width
 from demorec.cli.output import PrintableFormatter, say, tell
 from demorec.errors import DemorecError
 from demorec.registry import Registry, nearest_match
@@ -49,53 +46,6 @@ COMMANDS: Registry[type[Command]] = Registry(
 )
 
 
-_flag_types = tyro.constructors.ConstructorRegistry()
-
-
-@_flag_types.primitive_rule
-def _optional_value(
-    info: tyro.constructors.PrimitiveTypeInfo,
-) -> tyro.constructors.PrimitiveConstructorSpec[Any] | None:
-    """`--workers INT` with auto for None, where tyro would show `--workers {None}|INT`."""
-    kinds = [kind for kind in get_args(info.type) if kind is not NoneType]
-    if NoneType not in get_args(info.type) or len(kinds) != 1 or kinds[0] not in (int, float, str, Path):
-        return None
-    kind = kinds[0]
-    return tyro.constructors.PrimitiveConstructorSpec(
-        nargs=1,
-        metavar=kind.__name__.upper(),
-        instance_from_str=lambda words: None if words[0] == "auto" else kind(words[0]),
-        is_instance=lambda value: value is None or isinstance(value, kind),
-        str_from_instance=lambda value: ["auto" if value is None else str(value)],
-    )
-
-
-@_flag_types.primitive_rule
-def _optional_range(
-    info: tyro.constructors.PrimitiveTypeInfo,
-) -> tyro.constructors.PrimitiveConstructorSpec[Any] | None:
-    """`--cube-mass LOW HIGH` with auto for None, where tyro would show `--cube-mass {None}|{FLOAT FLOAT}`."""
-    kinds = [kind for kind in get_args(info.type) if kind is not NoneType]
-    if NoneType not in get_args(info.type) or kinds not in ([tuple[int, int]], [tuple[float, float]]):
-        return None
-    kind = get_args(kinds[0])[0]
-
-    def parse(words: list[str]) -> tuple[Any, ...] | None:
-        if words == ["auto"]:
-            return None
-        if len(words) != 2:
-            raise ValueError("two numbers are needed, LOW and HIGH, or auto")
-        return tuple(kind(word) for word in words)
-
-    return tyro.constructors.PrimitiveConstructorSpec(
-        nargs=(1, 2),
-        metavar="LOW HIGH",
-        instance_from_str=parse,
-        is_instance=lambda value: value is None or (isinstance(value, tuple) and len(value) == 2),
-        str_from_instance=lambda value: ["auto"] if value is None else [str(number) for number in value],
-    )
-
-
 def main(argv: Sequence[str] | None = None) -> None:
     """Entry point of `demorec`."""
     args = list(sys.argv[1:] if argv is None else argv)
@@ -126,16 +76,9 @@ def run_command(command: type[Command], args: Sequence[str], *, prog: str) -> in
     logging.basicConfig(level=logging.WARNING, handlers=[handler])
     try:
         find_defaults = getattr(command, "defaults", None)
-        with _flag_types:
-            parsed = tyro.cli(
-                cast(Any, command),
-                args=args,
-                prog=prog,
-                description=inspect.cleandoc(command.__doc__ or ""),
-                default=tyro.MISSING_NONPROP if find_defaults is None else find_defaults(args),
-                config=(tyro.conf.OmitArgPrefixes,),
-            )
-        return cast(Command, parsed).run()
+        defaults = None if find_defaults is None else find_defaults(args)
+        parsed: Command = parse(command, args, prog=prog, defaults=defaults)
+        return parsed.run()
     except DemorecError as error:
         tell(f"{prog}: {error}")
         return error.exit_code
@@ -156,7 +99,8 @@ def _overview() -> list[str]:
     ]
     for name in COMMANDS.names():
         summary = (COMMANDS.load(name).__doc__ or "").strip().splitlines()[0]
-        lines.append(f"  {name:<10} {summary}")
+        indent = " " * 13
+        lines += textwrap.wrap(f"{name:<10} {summary}", terminal_width(), initial_indent="  ", subsequent_indent=indent)
     lines += ["", "generate-dataset ... is demorec generate ..."]
     return lines
 

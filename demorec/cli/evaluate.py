@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from demorec.cli.flags import Allow, allowed_modules
+from demorec.cli.allow import Allow, allowed_modules
 from demorec.cli.output import say, say_json
 from demorec.config import GenerateConfig, VideoConfig
 from demorec.errors import ConfigError
@@ -27,7 +27,7 @@ class Evaluate:
 
     Examples:
       demorec evaluate --policy outputs/train --task pick_place --num-episodes 100
-      demorec evaluate --policy outputs/train --split all --seed 1 --workers 8 --out evaluations/all
+      demorec evaluate --policy outputs/train --split all --seed 1 --out all
       demorec evaluate --compare evaluations/clean evaluations/noisy
       demorec view evaluations/clean/failed            (watch the failures)
     """

@@ -22,17 +22,17 @@ class Export:
     not at all; the recordings are never touched.
 
     Examples:
-      demorec export lerobot recordings/cubes --out datasets/cubes --repo-id me/cubes
-      demorec export lerobot run_a run_b --out datasets/both --privileged --action joint_increment
-      demorec export lerobot recordings/cubes --out datasets/cubes --append --episodes 100:
-      demorec export lerobot recordings/cubes --out datasets/slow --fps 10
+      demorec export lerobot recordings/cubes --out cubes --repo-id me/cubes
+      demorec export lerobot run_a run_b --out both --action joint_increment
+      demorec export lerobot recordings/cubes --out cubes --append --episodes 100:
+      demorec export lerobot recordings/cubes --out slow --fps 10
     """
 
     format: Positional[Literal["lerobot"]]
     """Of the dataset."""
     sources: Positional[tuple[Path, ...]]
     """Runs, recordings, or folders of recordings."""
-    out: Annotated[Path, arg(help_behavior_hint="(required)")]
+    out: Path
     """Folder of the dataset."""
     options: Annotated[ExportOptions, arg(name="")] = field(default_factory=ExportOptions)
     """How."""

@@ -1,19 +1,189 @@
-"""Flags that several commands have."""
+"""How the fields of a command become flags, and how its help is laid out.
+
+tyro draws the help; the rules here decide what it says: values that are optional show their type alone, a default is
+told only where it is a value, and texts are broken where the terminal ends.
+"""
 
 from __future__ import annotations
 
+import codecs
+import dataclasses
+import functools
+import inspect
+import io
+import re
+import shutil
+import sys
+import textwrap
 from collections.abc import Sequence
-from typing import Annotated
+from contextlib import redirect_stdout
+from pathlib import Path
+from types import NoneType
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
-from tyro.conf import UseAppendAction, arg
+import docstring_parser
+import tyro
+from tyro.constructors import (
+    MISSING_NONPROP,
+    PrimitiveConstructorSpec,
+    PrimitiveTypeInfo,
+    StructConstructorSpec,
+    StructFieldSpec,
+    StructTypeInfo,
+)
 
-from demorec.user_modules import check_allowed
+from demorec.cli.output import say
 
-Allow = Annotated[tuple[str, ...], UseAppendAction, arg(metavar="MODULE", help_behavior_hint="(may be given again)")]
-"""One module or package each time, since paths may follow."""
+FLAG_TYPES = tyro.constructors.ConstructorRegistry()
+
+_NARROWEST = 40
+"""Columns; on a narrower terminal lines are broken there, as tyro breaks the table of flags."""
 
 
-def allowed_modules(names: Sequence[str]) -> tuple[str, ...]:
-    """What --allow names; ConfigError where that can be no module."""
-    check_allowed(names)
-    return tuple(names)
+def terminal_width() -> int:
+    """Columns of the terminal, or of COLUMNS, or 80."""
+    return max(_NARROWEST, shutil.get_terminal_size().columns)
+
+
+def parse(command: type, args: Sequence[str], *, prog: str, defaults: object) -> Any:
+    """An instance of the command from its flags.
+
+    Args:
+        command: A dataclass.
+        args: Of the command line.
+        prog: Name of the program.
+        defaults: An instance whose values are the defaults, or None for those of the class.
+
+    Raises:
+        SystemExit: 0 after --help, 2 after a wrong flag, which was told.
+    """
+    # tyro draws its boxes as the encoding allows, but knows that of Unicode by one spelling only.
+    page = io.TextIOWrapper(io.BytesIO(), encoding=codecs.lookup(sys.stdout.encoding or "utf-8").name)
+    try:
+        with FLAG_TYPES, redirect_stdout(page):
+            return tyro.cli(
+                command,
+                args=args,
+                prog=prog,
+                description=inspect.cleandoc(command.__doc__ or ""),
+                default=MISSING_NONPROP if defaults is None else defaults,
+                config=(tyro.conf.OmitArgPrefixes,),
+            )
+    except SystemExit:
+        page.seek(0)
+        say(*laid_out(page.read(), terminal_width()))
+        raise
+
+
+def laid_out(page: str, width: int) -> list[str]:
+    """tyro's help in lines that fit: the boxes do, usage and paragraphs are filled, indented lines (examples) stay."""
+    lines: list[str] = []
+    for line in page.splitlines():
+        if line.startswith("usage:"):
+            together = re.sub(r" (?!\[|--)", "\xa0", line)  # a flag and its value
+            parts = textwrap.wrap(together, width, subsequent_indent="       ", break_on_hyphens=False)
+            lines += [part.replace("\xa0", " ") for part in parts]
+        elif len(line) > width and not line.startswith(" "):
+            lines += textwrap.wrap(line, width, break_on_hyphens=False, break_long_words=False)
+        elif line.strip(" │|") or (not line and lines and lines[-1]):  # an empty hint may leave an empty row
+            lines.append(line.rstrip())
+    return lines
+
+
+@FLAG_TYPES.struct_rule
+def _options(info: StructTypeInfo) -> StructConstructorSpec | None:
+    """A dataclass: its fields with the docstrings below them, and a hint at the default where that is a value."""
+    if not dataclasses.is_dataclass(info.type):
+        return None
+    types = get_type_hints(info.type, include_extras=True)
+    texts = _field_texts(info.type)
+    fields = []
+    for field in dataclasses.fields(info.type):
+        default = _default(field, info.default)
+        kind = types[field.name]
+        hint = "(required)" if default is MISSING_NONPROP else "" if default in (None, "", ()) else None
+        if hint is not None:
+            kind = Annotated[kind, tyro.conf.arg(help_behavior_hint=hint)]
+        fields.append(StructFieldSpec(name=field.name, type=kind, default=default, helptext=texts[field.name]))
+    return StructConstructorSpec(instantiate=info.type, fields=tuple(fields))
+
+
+@functools.cache
+def _field_texts(kind: type) -> dict[str, str]:
+    """Field -> the docstring below it, in one line."""
+    parsed = docstring_parser.parse_from_object(kind)
+    return {text.arg_name: " ".join((text.description or "").split()) for text in parsed.params}
+
+
+def _default(field: dataclasses.Field[Any], instance: Any) -> Any:
+    """A field's value in the instance that gives the defaults, or its own default."""
+    if dataclasses.is_dataclass(instance):
+        return getattr(instance, field.name)
+    if field.default is not dataclasses.MISSING:
+        return field.default
+    if field.default_factory is not dataclasses.MISSING:
+        return field.default_factory()
+    return MISSING_NONPROP
+
+
+@FLAG_TYPES.primitive_rule
+def _optional_value(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+    """`--workers INT` with auto for None, where tyro would show `--workers {None}|INT`."""
+    kind = _kind_beside_none(info.type)
+    if kind not in (int, float, str, Path):
+        return None
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar=kind.__name__.upper(),
+        instance_from_str=lambda words: None if words[0] == "auto" else kind(words[0]),
+        is_instance=lambda value: value is None or isinstance(value, kind),
+        str_from_instance=lambda value: ["auto" if value is None else str(value)],
+    )
+
+
+@FLAG_TYPES.primitive_rule
+def _optional_choice(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+    """`--codec {auto,h264,av1}` with auto for None, where tyro would show `--codec {None,h264,av1}`."""
+    kind = _kind_beside_none(info.type)
+    if get_origin(kind) is not Literal:
+        return None
+    choices = ("auto", *get_args(kind))
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar=f"{{{','.join(choices)}}}",
+        choices=choices,
+        instance_from_str=lambda words: None if words[0] == "auto" else words[0],
+        is_instance=lambda value: value is None or value in choices,
+        str_from_instance=lambda value: ["auto" if value is None else value],
+    )
+
+
+@FLAG_TYPES.primitive_rule
+def _optional_pair(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+    """`--cube-mass LOW HIGH` with auto for None, where tyro would show `--cube-mass {None}|{FLOAT FLOAT}`."""
+    pair = _kind_beside_none(info.type)
+    if pair not in (tuple[int, int], tuple[float, float], tuple[Path, Path]):
+        return None
+    kind = get_args(pair)[0]
+    metavar, needed = ("PATH PATH", "paths") if kind is Path else ("LOW HIGH", "numbers")
+
+    def from_words(words: list[str]) -> tuple[Any, ...] | None:
+        if words == ["auto"]:
+            return None
+        if len(words) != 2:
+            raise ValueError(f"two {needed} are needed, {metavar}, or auto")
+        return tuple(kind(word) for word in words)
+
+    return PrimitiveConstructorSpec(
+        nargs=(1, 2),
+        metavar=metavar,
+        instance_from_str=from_words,
+        is_instance=lambda value: value is None or (isinstance(value, tuple) and len(value) == 2),
+        str_from_instance=lambda value: ["auto"] if value is None else [str(part) for part in value],
+    )
+
+
+def _kind_beside_none(kind: Any) -> Any:
+    """`X` of `X | None`; None for every other type."""
+    kinds = [part for part in get_args(kind) if part is not NoneType]
+    return kinds[0] if NoneType in get_args(kind) and len(kinds) == 1 else None

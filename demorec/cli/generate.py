@@ -29,13 +29,13 @@ class Generate:
 
     Examples:
       generate-dataset --num-episodes 50 --out recordings/cubes
-      generate-dataset --config run.toml --seed 7          (a flag wins over the file)
+      generate-dataset --config run.toml --seed 7        (a flag wins over the file)
       generate-dataset --cameras front wrist --width 320 --height 240 --codec av1
-      generate-dataset --num-episodes 1000 --dry-run       (how long, how large, how often does it succeed)
-      generate-dataset --executor ray --address auto --out /shared/cubes --num-episodes 100000
+      generate-dataset --num-episodes 1000 --dry-run   (time, size and success rate)
+      generate-dataset --executor ray --address auto --out /shared/cubes
     """
 
-    config: Annotated[Path | None, arg(help_behavior_hint="")] = None
+    config: Path | None = None
     """TOML file with any of the options below, without the dashes: num_episodes = 50."""
     options: Annotated[RunOptions, arg(name="run")] = field(default_factory=RunOptions)
     """How it is carried out; leaves the data alone."""

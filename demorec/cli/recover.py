@@ -19,14 +19,14 @@ class Recover:
     Exits with 1 when there is nothing to keep.
 
     Examples:
-      demorec recover recordings/cubes/unfinished/node-123-0/episode_000003.mcap.part
+      demorec recover recordings/cubes/unfinished/node-1-0/episode_000003.mcap.part
       demorec recover broken.mcap --out kept.mcap
     """
 
     file: Positional[Path]
     """An unfinished recording (NAME.mcap.part), or a finished one that was damaged."""
     out: Path | None = None
-    """The recording to be made; default: NAME.mcap beside NAME.mcap.part, NAME.recovered.mcap beside NAME.mcap."""
+    """The recording to be made (auto: NAME.mcap beside NAME.mcap.part, NAME.recovered.mcap beside NAME.mcap)."""
     overwrite: bool = False
     """Replace the recording that is to be made, if it is there."""
 

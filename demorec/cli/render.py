@@ -7,11 +7,11 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Literal
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
-from demorec.cli.flags import Allow, allowed_modules
+from demorec.cli.allow import Allow, allowed_modules
 from demorec.cli.output import say
 from demorec.config import VideoConfig
 from demorec.errors import ConfigError
@@ -37,13 +37,13 @@ class Render:
 
     Examples:
       demorec render recordings/cubes --out large --width 640 --height 480
-      demorec render episode.mcap --out side --cameras front side --camera-file cameras.toml
-      demorec render recordings/cubes --out looks_1 --looks 1 --depth --segmentation
+      demorec render a.mcap --out side --cameras side --camera-file cameras.toml
+      demorec render recordings/cubes --out looks_1 --looks 1 --depth
     """
 
     paths: Positional[tuple[Path, ...]]
     """Recordings, runs, or folders of recordings."""
-    out: Annotated[Path, arg(help_behavior_hint="(required)")]
+    out: Path
     """Folder for the new recordings, or the name of one (.mcap)."""
     cameras: tuple[str, ...] = ()
     """Names: of the recording, of the camera file, of `demorec list cameras`, or
@@ -51,11 +51,11 @@ class Render:
     camera_file: Path | None = None
     """Cameras by pose and field of view (TOML)."""
     width: int | None = None
-    """Of the pictures, pixels; default: as recorded."""
+    """Of the pictures, pixels (auto: as recorded)."""
     height: int | None = None
-    """Of the pictures, pixels; default: as recorded."""
+    """Of the pictures, pixels (auto: as recorded)."""
     renderer: str | None = None
-    """A name of `demorec list renderers`; default: as recorded."""
+    """A name of `demorec list renderers` (auto: as recorded)."""
     antialias: bool = True
     """Smooth edges where the recording's were (raster only)."""
     depth: bool = False
@@ -63,19 +63,19 @@ class Render:
     segmentation: bool = False
     """Record segmentation pictures, too, where the recording has none."""
     looks: int | None = None
-    """Seed of random light, colours and textures; default: the recorded looks."""
+    """Seed of random light, colours and textures (auto: the recorded looks)."""
     codec: Literal["h264", "av1", "jpeg"] | None = None
-    """Of the new pictures; default: as recorded, as are the next four."""
+    """Of the new pictures (auto: as recorded)."""
     gop: int | None = None
-    """Pictures from one keyframe to the next."""
+    """Pictures from one keyframe to the next (auto: as recorded)."""
     crf: int | None = None
-    """Constant rate factor, smaller is better."""
+    """Constant rate factor, smaller is better (auto: as recorded)."""
     preset: str | None = None
-    """Encoder preset."""
+    """Encoder preset (auto: as recorded)."""
     jpeg_quality: int | None = None
-    """1..100."""
+    """Of --codec jpeg, 1 to 100, larger is better (auto: as recorded)."""
     workers: int | None = None
-    """Processes; default: one for each core."""
+    """Processes (auto: one for each core)."""
     allow: Allow = ()
     """A module or package of your own that may be imported for the tasks, robots and cameras that the files name."""
     overwrite: bool = False

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
-from demorec.cli.flags import Allow, allowed_modules
+from demorec.cli.allow import Allow, allowed_modules
 from demorec.cli.output import say, say_json, tell
 from demorec.errors import ConfigError
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
-from demorec.cli.flags import Allow, allowed_modules
+from demorec.cli.allow import Allow, allowed_modules
 from demorec.cli.output import say, tell
 
 
@@ -26,7 +26,7 @@ class Reproduce:
 
     source: Positional[Path]
     """A run, or a dataset that was exported from one."""
-    out: Annotated[Path, arg(help_behavior_hint="(required)")]
+    out: Path
     """Folder of the new run."""
     workers: int | None = None
     """Processes that simulate (auto: one for each core)."""

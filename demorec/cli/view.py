@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from tyro.conf import Positional
 
 from demorec.assets import allow_models
-from demorec.cli.flags import Allow, allowed_modules
+from demorec.cli.allow import Allow, allowed_modules
 from demorec.cli.output import say, tell
 from demorec.errors import ConfigError
 
@@ -30,7 +30,7 @@ class View:
 
     Examples:
       demorec view recordings/cubes
-      demorec view recordings/cubes/episodes/episode_000003.mcap --screenshot cube.png --at 2.5
+      demorec view episode_000003.mcap --screenshot cube.png --at 2.5
       demorec view datasets/cubes --episodes 0:10 --web
       demorec view recordings/cubes --save cubes.rrd
       demorec view original.mcap replayed.mcap --compare
@@ -49,13 +49,13 @@ class View:
     screenshot: Path | None = None
     """Write a picture (.png) of the viewer instead of opening a window."""
     at: float | None = None
-    """Second of the episode that the screenshot shows; default: the middle of the first episode."""
+    """Second of the episode that the screenshot shows (auto: the middle of the first episode)."""
     size: tuple[int, int] = (1600, 950)
     """Of the screenshot, pixels."""
     web: bool = False
     """Serve Rerun's web viewer to this machine and print its address; Ctrl-C ends it."""
     port: int | None = None
-    """Of the web viewer; default: a free one."""
+    """Of the web viewer (auto: a free one)."""
     allow: Allow = ()
     """A module or package of your own beside which the models of robots and objects may be read."""
     overwrite: bool = False

@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from demorec.errors import ExportError
 from demorec.export.depth import DEPTH_SUFFIX, code_values, quantised
@@ -27,7 +26,6 @@ from demorec.export.prepare import frame_stride, prepare_episode
 from demorec.export.transcode import reason_to_transcode
 from demorec.processes import SPAWN
 from demorec.recording import Recording
-from demorec.recording.video import decode
 
 MAX_EPISODES = 500
 """Samples are taken of so many episodes, spread evenly, if there are more."""
@@ -140,7 +138,7 @@ def _wrong_pictures(item: Any, recording: Recording, camera: str, moment: int, s
         settings = recording.video_settings(camera)
         found = item[key].numpy().transpose(1, 2, 0).astype(np.float64)
         limit = _TRANSCODED_TOLERANCE if reason_to_transcode(settings, stride) else 0.0
-        if np.abs(found - _recorded_picture(recording, camera, moment * stride)).mean() > limit:
+        if np.abs(found - recording.image(camera, moment * stride)).mean() > limit:
             wrong.append(key)
     if key + DEPTH_SUFFIX in item:
         found = item[key + DEPTH_SUFFIX].numpy()
@@ -149,11 +147,3 @@ def _wrong_pictures(item: Any, recording: Recording, camera: str, moment: int, s
         if np.abs(found - code_values()[quantised(recorded)]).max() > _DEPTH_TOLERANCE:
             wrong.append(key + DEPTH_SUFFIX)
     return wrong
-
-
-def _recorded_picture(recording: Recording, camera: str, frame: int) -> NDArray[np.float64]:
-    """Decoded from the keyframe before it on."""
-    packets = list(islice(recording.packets(camera), frame + 1))
-    start = max(index for index, packet in enumerate(packets) if packet.is_keyframe)
-    *_, picture = decode(recording.video_settings(camera), packets[start:])
-    return picture.astype(np.float64)

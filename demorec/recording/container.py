@@ -167,6 +167,8 @@ class Container:
     def _read_at(self, offset: int, length: int) -> bytes:
         if not 0 <= length <= MAX_RECORD_BYTES:
             raise RecordingError(f"The recording is damaged: a record of {length} bytes: {self.path}")
+        if self._file.closed:
+            raise RecordingError(f"The recording was closed before it was read: {self.path}")
         self._file.seek(offset)
         data = self._file.read(length)
         if len(data) != length:

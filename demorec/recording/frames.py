@@ -1,14 +1,19 @@
-"""A recording's rows back into frames: for whoever writes a recording from another one (re-render, replay, tests)."""
+"""A recording's rows back into frames: for whoever looks at it, or writes a recording from it (re-render, replay)."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from itertools import islice
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from demorec.episode import Action, CameraImages, EpisodeColumns, Event, Frame, JointSample, Observation
 from demorec.geometry import Array, Pose
-from demorec.recording.reader import Recording
+
+if TYPE_CHECKING:
+    from demorec.recording.reader import Recording
 
 
 def pose_of(row: Array) -> Pose:
@@ -109,3 +114,27 @@ def decoded_images(recording: Recording, columns: EpisodeColumns) -> Iterator[Ma
             )
             for name, (color, depth, labels) in streams.items()
         }
+
+
+def frames_with_images(recording: Recording) -> Iterator[Frame]:
+    """Every frame with its decoded pictures, one after the other: a few pictures are in memory at a time."""
+    columns = recording.columns()
+    for frame, images in zip(frames_of(recording, columns), decoded_images(recording, columns), strict=True):
+        yield replace(frame, images=images)
+
+
+def images_at(recording: Recording, columns: EpisodeColumns, frame: int) -> Mapping[str, CameraImages]:
+    """The pictures of one frame; only those from the keyframe before it on are decoded."""
+
+    def at[P](pictures: Callable[[str], Iterator[P]], camera: str) -> P:
+        return next(islice(pictures(camera), frame, None))
+
+    return {
+        name: CameraImages(
+            color=recording.image(name, frame),
+            depth=at(recording.depth, name) if recording.has_depth(name) else None,
+            segmentation=at(recording.segmentation, name) if recording.has_segmentation(name) else None,
+            world_from_camera=pose_of(columns.world_from_camera[name][frame]),
+        )
+        for name in recording.cameras
+    }

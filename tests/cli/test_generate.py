@@ -52,7 +52,7 @@ def test_impossible_requests_end_with_one_sentence_and_leave_nothing(capsys, tmp
     [
         (["--num-epsodes", "3"], ["Unrecognized options: --num-epsodes", "Perhaps you meant", "--num-episodes INT"]),
         (["--width", "wide"], ["Error parsing --width"]),
-        (["--cube-mass", "0.1"], ["Error parsing --cube-mass: two numbers are needed, LOW and HIGH, or auto"]),
+        (["--cube-mass", "0.1"], ["Error parsing --cube-mass: two numbers are needed, LOW HIGH, or auto"]),
         (["--cube-mass", "0.1", "0.2", "0.3"], ["Error parsing --cube-mass"]),
         (["--executor", "slurm"], ["invalid choice 'slurm'", "local", "ray"]),
     ],

@@ -1,0 +1,198 @@
+"""A recording in a notebook: a sequence of frames with pictures, a table, a page, and the examples of the documents."""
+
+from __future__ import annotations
+
+import base64
+import io
+import re
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers_recording import frame_number, make_episode, write_episode
+from PIL import Image
+
+from demorec.config import VideoConfig
+from demorec.errors import MissingDependencyError, RecordingError
+from demorec.recording import Recording, reader
+
+NUM_FRAMES = 47
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    target = tmp_path_factory.mktemp("notebook") / "episode_000000.mcap"
+    return write_episode(target, num_frames=NUM_FRAMES, depth=True, segmentation=True, video=VideoConfig(gop=10))
+
+
+@pytest.fixture(scope="module")
+def truth():
+    _, frames, _ = make_episode(num_frames=NUM_FRAMES, depth=True, segmentation=True)
+    return frames
+
+
+def same_frame(found, true) -> None:
+    assert found.frame_index == true.frame_index
+    assert found.time_ns == true.time_ns
+    assert found.phase == true.phase
+    assert [event.name for event in found.events] == [event.name for event in true.events]
+    assert np.array_equal(found.observation.joint_position, true.observation.joint_position)
+    assert np.array_equal(found.command.joint_target, true.command.joint_target)
+    assert list(found.images) == list(true.images)
+    for camera, images in found.images.items():
+        assert frame_number(images.color) == true.frame_index
+        assert np.abs(images.color.astype(int) - true.images[camera].color).mean() < 12
+        assert np.allclose(images.depth, true.images[camera].depth, atol=5.1e-4)
+        assert np.array_equal(images.segmentation, true.images[camera].segmentation)
+        assert np.allclose(images.world_from_camera.position, true.images[camera].world_from_camera.position)
+
+
+def test_frames_come_with_numbers_and_pictures(path, truth):
+    with Recording(path) as recording:
+        assert len(recording) == NUM_FRAMES
+        count = 0
+        for found, true in zip(recording, truth, strict=True):
+            same_frame(found, true)
+            count += 1
+    assert count == NUM_FRAMES
+
+
+@pytest.mark.parametrize("index", [0, 1, 9, 10, 33, NUM_FRAMES - 1, -1, -NUM_FRAMES])
+def test_any_frame_can_be_picked(path, truth, index):
+    with Recording(path) as recording:
+        same_frame(recording[index], truth[index])
+
+
+def test_slices_are_those_of_a_list(path, truth):
+    with Recording(str(path)) as recording:
+        for part in (slice(3, 9, 2), slice(None, None, -20), slice(-2, None), slice(40, 400), slice(9, 3)):
+            found = recording[part]
+            assert [frame.frame_index for frame in found] == [frame.frame_index for frame in truth[part]]
+        same_frame(recording[5:6][0], truth[5])
+
+
+@pytest.mark.parametrize("index", [NUM_FRAMES, -NUM_FRAMES - 1])
+def test_there_are_no_frames_beyond_the_ends(path, index):
+    with Recording(path) as recording:
+        with pytest.raises(IndexError):
+            recording[index]
+        with pytest.raises(IndexError):
+            recording.image("front", index)
+
+
+@pytest.mark.parametrize("codec", ["h264", "av1", "jpeg"])
+def test_a_picked_picture_is_that_of_the_whole_stream(tmp_path, codec):
+    file = write_episode(tmp_path / "a.mcap", num_frames=12, video=VideoConfig(codec=codec, gop=5))
+    with Recording(file) as recording:
+        whole = list(recording.images("wrist"))
+        for index in (11, 0, 4, 5, -3):
+            assert np.array_equal(recording.image("wrist", index), whole[index])
+
+
+def test_only_pictures_from_the_keyframe_on_are_decoded(path, monkeypatch):
+    given = []
+
+    def decode(settings, packets):
+        given.extend(packets)
+        return real(settings, iter(given))
+
+    real = reader.decode
+    monkeypatch.setattr(reader, "decode", decode)
+    with Recording(path) as recording:
+        recording.image("front", 33)
+    assert [packet.frame_index for packet in given] == [30, 31, 32, 33]  # a keyframe every ten
+
+
+def test_a_closed_recording_says_so(path):
+    with Recording(path) as recording:
+        pass
+    with pytest.raises(RecordingError, match="closed before it was read"):
+        recording[3]
+
+
+def test_the_table_holds_every_number(path, truth):
+    with Recording(path) as recording:
+        table = recording.to_pandas()
+    assert table.index.name == "frame_index"
+    assert list(table.index) == list(range(NUM_FRAMES))
+    for row, frame in zip(table.to_dict("records"), truth, strict=True):
+        seen, command = frame.observation, frame.command
+        assert row["time_ns"] == frame.time_ns
+        assert row["phase"] == frame.phase
+        assert row["is_deliberate_miss"] == frame.is_deliberate_miss
+        assert row["joint_position.panda_joint3"] == seen.joint_position[2]
+        assert row["joint_effort.panda_finger_joint2"] == seen.joint_effort[8]
+        assert row["base_from_tcp.z"] == seen.base_from_tcp.position[2]
+        assert row["object_poses.cube.qw"] == seen.object_poses["cube"].quat_xyzw[3]
+        assert row["command_joint_target.panda_joint7"] == command.joint_target[6]
+        assert row["action_gripper"] == frame.action.gripper_target
+        assert row["world_from_camera.wrist.x"] == frame.images["wrist"].world_from_camera.position[0]
+    numbers = 2 + 3 * 9 + 2 + 7 + 2 * (7 + 1 + 7) + 7 + 2 * 7 + 1
+    assert table.shape == (NUM_FRAMES, numbers)
+
+
+def test_without_pandas_a_sentence_says_how_to_get_it(path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with Recording(path) as recording, pytest.raises(MissingDependencyError, match="pip install pandas"):
+        recording.to_pandas()
+
+
+class Page(HTMLParser):
+    """Collects the text of a page and its pictures; knows which elements were opened and closed."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.texts: list[str] = []
+        self.pictures: list[bytes] = []
+        self.tags: set[str] = set()
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.add(tag)
+        if tag == "img":
+            self.pictures.append(base64.b64decode(dict(attrs)["src"].partition("base64,")[2]))
+
+    def handle_data(self, data):
+        self.texts.append(data)
+
+
+def test_the_page_of_a_notebook(path):
+    with Recording(path) as recording:
+        page = Page(recording._repr_html_())
+        line = repr(recording)
+    text = " ".join(page.texts)
+    for what in ("pick up the red cube", "47 frames (1.6 s at 30 Hz)", "pick_place with panda", "success", path.name):
+        assert what in text
+    assert "47 frames (1.6 s at 30 Hz)" in line
+    assert "\n" not in line
+    pictures = [np.asarray(Image.open(io.BytesIO(data))) for data in page.pictures]
+    assert [frame_number(picture) for picture in pictures] == 2 * [0, 12, 23, 34, 46]
+
+
+def test_foreign_text_does_nothing_in_a_page_or_a_line(tmp_path, path):
+    evil = tmp_path / "<script>alert(1)<\\script>\x1b[2J.mcap"
+    evil.write_bytes(path.read_bytes())
+    with Recording(evil) as recording:
+        assert Page(recording._repr_html_()).tags <= {"table", "tr", "th", "td", "img"}
+        assert "\x1b" not in repr(recording) + recording._repr_html_()
+
+
+def test_recordings_without_pictures_or_frames_have_a_page_too(tmp_path):
+    with Recording(write_episode(tmp_path / "a.mcap", num_frames=3, cameras=())) as recording:
+        assert "cameras" in recording._repr_html_()
+        assert recording[2].images == {}
+        assert [dict(frame.images) for frame in recording] == [{}, {}, {}]
+
+
+def test_the_examples_of_the_document_run(path, capsys):
+    text = (ROOT / "docs" / "recording.md").read_text()
+    examples = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    assert examples
+    for example in examples:
+        code = re.sub(r'"recordings/[^"]*\.mcap"', repr(str(path)), example)
+        assert code != example
+        exec(compile(code, "docs/recording.md", "exec"), {})
+    assert capsys.readouterr().out
