@@ -1,11 +1,14 @@
-"""Processes of our own: started afresh (not forked, since threads and locks do not survive that)."""
+"""Processes of our own: started afresh (not forked, since threads and locks do not survive that), ending with us."""
 
 from __future__ import annotations
 
+import multiprocessing
+import os
 import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from multiprocessing import connection
 from multiprocessing.context import SpawnContext, SpawnProcess
 from typing import Any
 
@@ -17,6 +20,10 @@ class _Process(SpawnProcess):
         with _main_hidden():
             super().start()
 
+    def run(self) -> None:
+        threading.Thread(target=_end_with_parent, daemon=True).start()
+        super().run()
+
 
 class _Context(SpawnContext):
     Process = _Process
@@ -25,9 +32,20 @@ class _Context(SpawnContext):
 SPAWN = _Context()
 """Like `multiprocessing.get_context("spawn")`, but its processes do not run the main module's file again.
 
-All that they carry out is imported by name. So a script that calls demorec needs no `if __name__ == "__main__"`, and a
-worker does not load the command line's libraries.
+They end when the process that started them ends, whatever it dies of. All that they carry out is imported by name: a
+script that calls demorec needs no `if __name__ == "__main__"`, and a worker does not load the command line's libraries.
 """
+
+
+def _end_with_parent() -> None:
+    """Leave no orphan behind when the parent is killed: its end of a pipe closes, whatever it died of.
+
+    The queue of a ProcessPoolExecutor does not tell: its workers hold both ends of that pipe themselves.
+    """
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    connection.wait([parent.sentinel])
+    os._exit(1)
 
 
 @contextmanager

@@ -12,7 +12,9 @@ from PIL import Image, ImageDraw
 
 from demorec.check.base import Measurement
 from demorec.episode import EpisodeInfo
+from demorec.errors import ConfigError
 from demorec.geometry import Array
+from demorec.replacing import PICTURE, written_whole
 from demorec.scene import Goal, Scene, yaw_of
 
 MIN_EPISODES = 50
@@ -130,7 +132,11 @@ class CoveragePicture:
 
 
 def draw_coverage(infos: Sequence[EpisodeInfo], path: Path) -> CoveragePicture:
-    """A picture: starts (dots, in the object's colour) and goals (rings) from above, and a histogram per quantity."""
+    """A PNG file: starts (dots, in the object's colour) and goals (rings) from above, and a histogram per quantity.
+
+    Raises:
+        ConfigError: The file cannot be written; then none is there, or the one that was there before.
+    """
     columns = randomised(infos)
     rows = -(-max(len(columns), 1) // 3)
     height = max(_SIZE + 2 * _MARGIN, rows * (_PLOT + 2 * _MARGIN) + _MARGIN)
@@ -141,8 +147,12 @@ def draw_coverage(infos: Sequence[EpisodeInfo], path: Path) -> CoveragePicture:
         left = _SIZE + 3 * _MARGIN + (number % 3) * (140 + _MARGIN)
         top = _MARGIN + (number // 3) * (_PLOT + 2 * _MARGIN)
         _draw_histogram(draw, name, values, left, top)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    image.save(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with written_whole(path, PICTURE) as part:
+            image.save(part, format="png")
+    except OSError as error:
+        raise ConfigError(f"The picture cannot be written ({error.strerror or error}): {path}") from error
     return CoveragePicture(path=path, num_episodes=len(infos))
 
 

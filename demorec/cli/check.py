@@ -12,7 +12,9 @@ from tyro.conf import Positional
 
 from demorec.cli.allow import Allow, allowed_modules
 from demorec.cli.output import say, say_json
+from demorec.cli.paths import places_read
 from demorec.errors import ConfigError
+from demorec.replacing import PICTURE, check_replaceable
 
 if TYPE_CHECKING:
     from demorec.check.base import Level, Result
@@ -47,6 +49,8 @@ class Check:
     """Also replay this many episodes of each run or dataset, spread evenly, and every recording given by itself."""
     coverage_picture: Path | None = None
     """Draw start places, goals and ranges of all episodes into this PNG file."""
+    overwrite: bool = False
+    """Replace the picture of --coverage-picture, if it is there."""
     workers: int = 1
     """Processes."""
     verbose: bool = False
@@ -62,6 +66,8 @@ class Check:
             raise ConfigError("No path is given: name a recording, a run or a dataset, e.g. demorec check recordings.")
         if self.replay < 0:
             raise ConfigError(f"replay is {self.replay}, it must be 0 or more.")
+        if self.coverage_picture is not None:
+            self._check_picture(self.coverage_picture)
         from tqdm import tqdm
 
         from demorec.check.report import CheckOptions, check_subjects, find_subjects
@@ -94,6 +100,11 @@ class Check:
         else:
             say(_summary(reports, len(failed), len(replays), len(diverged)))
         return 1 if failed or diverged else 0
+
+    def _check_picture(self, path: Path) -> None:
+        if path.suffix.lower() != ".png":
+            raise ConfigError(f"--coverage-picture writes a .png file, found the name {path.name!r}.")
+        check_replaceable(path, PICTURE, overwrite=self.overwrite, sources=places_read(self.paths))
 
     def _draw(self, path: Path) -> None:
         from demorec.check.coverage import draw_coverage

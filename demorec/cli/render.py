@@ -13,6 +13,7 @@ from tyro.conf import Positional
 
 from demorec.cli.allow import Allow, allowed_modules
 from demorec.cli.output import say
+from demorec.cli.paths import refuse_sources
 from demorec.config import VideoConfig
 from demorec.errors import ConfigError
 from demorec.processes import SPAWN
@@ -154,6 +155,7 @@ def _jobs(paths: Sequence[Path], out: Path) -> list[tuple[Path, Path]]:
     targets = [target for _, target in jobs]
     if len(set(targets)) != len(targets):
         raise ConfigError("Two recordings have the same name and would get into each other's way: render them apart.")
+    refuse_sources([file for file, _ in jobs], targets)
     return jobs
 
 

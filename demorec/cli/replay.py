@@ -14,6 +14,7 @@ from tyro.conf import Positional
 
 from demorec.cli.allow import Allow, allowed_modules
 from demorec.cli.output import say, say_json, tell
+from demorec.cli.paths import refuse_sources
 from demorec.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -86,6 +87,8 @@ class Replay:
             out = self.out
             if out is None and self.view:
                 out = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="demorec-replay-")))
+            if out is not None:
+                _check_out(self.paths, out)
             found = demonstrations(self.paths, options, episodes=self.episodes)
             reports: list[ReplayReport] = []
             pairs: list[tuple[Path, Path]] = []
@@ -111,6 +114,19 @@ class Replay:
             if self.view:
                 _show(pairs)
         return 0 if all(good) else 1
+
+
+def _check_out(paths: Sequence[Path], out: Path) -> None:
+    """Refuse to write replays over recordings that are replayed, or over each other."""
+    files = [file for path in paths if not _is_dataset(path) for file in _recordings(path)]
+    names = [file.name for file in files]
+    if len(set(names)) != len(names):
+        raise ConfigError("Two recordings have the same name and would get into each other's way: replay them apart.")
+    refuse_sources(files, [out / name for name in names])
+
+
+def _is_dataset(path: Path) -> bool:
+    return (path / "meta" / "info.json").is_file()
 
 
 def demonstrations(
@@ -141,7 +157,7 @@ def _found(
 
     wanted = parse_episodes(episodes)
     for path in paths:
-        if (path / "meta" / "info.json").is_file():
+        if _is_dataset(path):
             yield from dataset_demonstrations(path, wanted, options, limit=limit)
             continue
         files = _recordings(path)

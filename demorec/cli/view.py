@@ -13,7 +13,9 @@ from tyro.conf import Positional
 from demorec.assets import allow_models
 from demorec.cli.allow import Allow, allowed_modules
 from demorec.cli.output import say, tell
+from demorec.cli.paths import places_read
 from demorec.errors import ConfigError
+from demorec.replacing import PICTURE, RERUN_FILE, check_replaceable
 
 if TYPE_CHECKING:
     from demorec.playback.sources import Source
@@ -76,15 +78,15 @@ class View:
         elif len(sources) > _MOST and not self.episodes:
             tell(f"Showing the first {_MOST} of {len(sources)} episodes; --episodes chooses others.")
             sources = sources[:_MOST]
+        targets = [] if self.save is None else numbered(self.save, 1 if self.compare else len(sources))
+        self._check_targets(targets)
 
         if self.save is not None:
             if self.compare:
                 save_comparison(sources[0], sources[1], self.save)
                 say(f"{_size(self.save)}: {self.save}")
             else:
-                for source, target in zip(sources, numbered(self.save, len(sources)), strict=True):
-                    if target.exists() and not self.overwrite:
-                        raise ConfigError(_already("--save", target))
+                for source, target in zip(sources, targets, strict=True):
                     save(source, target)
                     say(f"{_size(target)}: {target}")
             if self.screenshot is None:
@@ -122,8 +124,13 @@ class View:
                 raise ConfigError(f"{flag} writes a {suffix} file, found the name {target.name!r}.")
             if not target.absolute().parent.is_dir():
                 raise ConfigError(f"{flag}: there is no folder {target.parent}.")
-            if target.exists() and not self.overwrite:
-                raise ConfigError(_already(flag, target))
+
+    def _check_targets(self, saved: Sequence[Path]) -> None:
+        """Refuse to replace anything but an .rrd file by --save and a picture by --screenshot, before any work."""
+        kinds = [(target, RERUN_FILE) for target in saved]
+        kinds += [] if self.screenshot is None else [(self.screenshot, PICTURE)]
+        for target, kind in kinds:
+            check_replaceable(target, kind, overwrite=self.overwrite, sources=places_read(self.paths))
 
     def _show(self, files: Sequence[Path], sources: Sequence[Source]) -> int:
         if self.screenshot is not None:
@@ -149,10 +156,6 @@ class View:
         width, height = self.size
         screenshot(files, self.screenshot, seconds=middle if self.at is None else self.at, width=width, height=height)
         say(f"{width}x{height}: {self.screenshot}")
-
-
-def _already(flag: str, target: Path) -> str:
-    return f"{flag}: the file is there already, give another name or --overwrite: {target}"
 
 
 def _size(path: Path) -> str:

@@ -12,8 +12,8 @@ from __future__ import annotations
 import functools
 import json
 import os
-import shutil
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ from demorec.evaluate.policy import Policy, check_steps, find_checkpoint, policy
 from demorec.evaluate.progress import Progress, factors_of
 from demorec.evaluate.statistics import Rate
 from demorec.features import ENVIRONMENT_STATE, ActionKind
+from demorec.generate.contents import foreign_recordings
 from demorec.generate.executor import Lost, Raised
 from demorec.generate.local import LocalExecutor
 from demorec.generate.plan import plain_differences
@@ -32,6 +33,7 @@ from demorec.generate.run_file import EPISODES, FAILED, Attempt
 from demorec.gym_env import DemorecEnv, Situation
 from demorec.plain import from_plain, to_plain
 from demorec.recording import EpisodeWriter
+from demorec.replacing import Kind, check_replaceable, json_object, replaced_parts, settle_parts
 from demorec.rollout import prepare
 
 EVALUATION_NAME = "evaluation.json"
@@ -152,7 +154,8 @@ def evaluate(
     """Run the policy in episodes 0 .. num_episodes - 1; goes on where an evaluation in `out` stopped.
 
     Raises:
-        ConfigError: Another evaluation, or something else, is in the folder.
+        ConfigError: Another evaluation, or something else, is in the folder; or what is to be overwritten is not an
+            evaluation alone.
         DemorecError: A rollout could not be carried out.
     """
     evaluation = _open(settings, out, overwrite=overwrite)
@@ -281,14 +284,20 @@ _stage = _Stage()
 def _open(settings: Settings, out: Path, *, overwrite: bool) -> Evaluation:
     """The evaluation that is in the folder already, or a new one."""
     ours = out / EVALUATION_NAME
+    if out.is_dir():
+        settle_parts(out, _PARTS)
     if out.exists() and (not out.is_dir() or any(out.iterdir())) and not ours.is_file():
         raise ConfigError(f"The folder holds something that is no evaluation, choose another --out: {out}")
-    if ours.is_file() and overwrite:
-        for place in (EPISODES, FAILED):
-            shutil.rmtree(out / place, ignore_errors=True)
-        ours.unlink()
+    if overwrite:
+        check_replaceable(out, EVALUATION, overwrite=True)
+    with replaced_parts(out, _PARTS) if overwrite and ours.is_file() else nullcontext():
+        return _begin_or_continue(settings, out)
+
+
+def _begin_or_continue(settings: Settings, out: Path) -> Evaluation:
+    """Bring the folder and its evaluation.json to what is known now."""
     evaluation = Evaluation(settings=settings)
-    if ours.is_file():
+    if (out / EVALUATION_NAME).is_file():
         evaluation = load_evaluation(out)
         lines = plain_differences(_deciding(evaluation.settings), _deciding(settings))
         if lines:
@@ -301,6 +310,23 @@ def _open(settings: Settings, out: Path, *, overwrite: bool) -> Evaluation:
         (out / place).mkdir(parents=True, exist_ok=True)
     _save(evaluation, out)
     return evaluation
+
+
+_PARTS = (EVALUATION_NAME, EPISODES, FAILED)
+
+
+def _is_evaluation(folder: Path) -> bool:
+    found = json_object(folder / EVALUATION_NAME)
+    return isinstance(found.get("settings"), dict) and isinstance(found.get("rollouts"), list)
+
+
+EVALUATION = Kind(
+    name="an evaluation",
+    is_folder=True,
+    recognises=_is_evaluation,
+    strangers=lambda folder: [name for place in (EPISODES, FAILED) for name in foreign_recordings(folder, place)],
+)
+"""What else is in its folder is never touched."""
 
 
 def _deciding(settings: Settings) -> dict[str, Any]:

@@ -11,20 +11,22 @@ from typing import Any
 
 import numpy as np
 
-from demorec.errors import ExportError
+from demorec.errors import ConfigError, ExportError
 from demorec.export.card import CardFacts, write_card
 from demorec.export.digest import combined_digest
 from demorec.export.existing import Existing, features_to_append, link_files, open_existing
 from demorec.export.hub import push_to_hub
 from demorec.export.inspect import episode_digests
+from demorec.export.kind import DATASET, GROWING_DATASET
 from demorec.export.layout import DatasetInfo
 from demorec.export.options import ExportOptions, ExportReport, Progress
 from demorec.export.readings import Reading, readings
 from demorec.export.sidecar import AttemptRecord, SidecarStart, SidecarWriter
-from demorec.export.sources import Source, find_recordings, refuse_differences
-from demorec.export.staging import staged_folder
+from demorec.export.sources import Source, find_recordings, places_of, refuse_differences
+from demorec.export.staging import CODED, staged_folder
 from demorec.export.verify import MAX_EPISODES, Sample, Verifier
 from demorec.export.writer import DatasetWriter, WriterStart
+from demorec.replacing import shown
 
 
 def export_lerobot(
@@ -39,7 +41,8 @@ def export_lerobot(
         progress: Called after every recording.
 
     Raises:
-        ConfigError: Options that contradict each other.
+        ConfigError: Options that contradict each other, something at `out` that is never replaced, or episodes to be
+            appended that the dataset has already.
         ExportError: Nothing to export, recordings that differ, a dataset in the way, a full disk, a failed
             verification. What was at `out` is still there then.
         RecordingError: A recording is damaged.
@@ -47,8 +50,9 @@ def export_lerobot(
     options.validate()
     found = find_recordings(sources, include_failures=options.include_failures)
     existing = open_existing(out) if options.append and out.exists() else None
+    kind, replace_it = (DATASET, options.overwrite) if existing is None else (GROWING_DATASET, True)
     with (
-        staged_folder(out, replace=options.overwrite or existing is not None) as folder,
+        staged_folder(out, kind, replace=replace_it, sources=places_of(found)) as folder,
         Verifier() if options.verify else nullcontext() as verifier,
     ):
         if existing is not None:
@@ -71,6 +75,7 @@ class _Export:
         self._found = found
         self._options = options
         self._existing = existing
+        self._before = episode_digests(existing.root, existing.info) if existing is not None else []
         self._left_out: tuple[str, ...] = ()
         self._transcoded: dict[str, None] = {}
         self._digests: list[str] = []
@@ -78,7 +83,7 @@ class _Export:
         self._skipped_failures = 0
 
     def run(self, progress: Progress | None) -> ExportReport:
-        aside = self._folder.with_name("coded")  # is removed with everything beside the new folder
+        aside = self._folder.with_name(CODED)  # is removed with everything beside the new folder
         aside.mkdir(exist_ok=True)
         found = readings(self._found, self._options, progress, aside=aside)
         waiting: list[AttemptRecord] = []  # failed attempts before the first episode
@@ -112,11 +117,11 @@ class _Export:
                         first.profile, first.path, (source.path for source in self._found), self._options
                     )
                 self._add(writer, sidecar, reading)
+            self._refuse_duplicates()
             finished = writer.finish()
             configs = sidecar.finish(self._about_this_export())
         facts = CardFacts(options=self._options, configs=configs, is_transcoded=bool(self._transcoded))
         write_card(self._folder, finished, facts)
-        before = episode_digests(self._existing.root, self._existing.info) if self._existing else []
         return ExportReport(
             path=self._folder,
             num_episodes=finished.total_episodes,
@@ -126,7 +131,7 @@ class _Export:
             skipped_failures=self._skipped_failures,
             transcoded=tuple(self._transcoded),
             left_out=self._left_out,
-            digest=combined_digest(finished, [*before, *self._digests]),
+            digest=combined_digest(finished, [*self._before, *self._digests]),
         )
 
     def samples(self) -> list[Sample]:
@@ -156,6 +161,17 @@ class _Export:
         self._digests.append(written.digest)
         self._recordings.append(reading.path)
         self._transcoded.update(dict.fromkeys(reading.transcoded))
+
+    def _refuse_duplicates(self) -> None:
+        """Raise ConfigError when new episodes have the content of some that the dataset appended to has already."""
+        there = {digest: number for number, digest in enumerate(self._before)}
+        pairs = zip(self._recordings, self._digests, strict=True)
+        twice = [f"{path.name} (episode {there[digest]} of it)" for path, digest in pairs if digest in there]
+        if twice and not self._options.allow_duplicates:
+            raise ConfigError(
+                f"The dataset has {len(twice)} of these episodes already: {shown(twice)}. Leave them out with "
+                "--episodes, or give --allow-duplicates to have them twice."
+            )
 
     def _add_failure(self, sidecar: SidecarWriter, attempt: AttemptRecord) -> None:
         sidecar.add_attempt(attempt, in_dataset=False)

@@ -40,8 +40,10 @@ class ExportOptions:
     """Frames per second of the dataset; divides that of the recordings, the frames between are left out."""
     append: bool = False
     """Add the episodes to the dataset that is there already."""
+    allow_duplicates: bool = False
+    """With --append: add episodes whose content the dataset has already a second time, instead of refusing them."""
     overwrite: bool = False
-    """Replace the dataset that is there already."""
+    """Replace the dataset that is there already; anything else than a dataset, or with anything else in it, is not."""
     verify: bool = True
     """Open the finished dataset with the installed LeRobot and compare samples of it with the recordings."""
     workers: int = 0
@@ -77,6 +79,8 @@ class ExportOptions:
         parse_episodes(self.episodes)
         if self.append and self.overwrite:
             raise ConfigError("--append and --overwrite exclude each other: choose one.")
+        if self.allow_duplicates and not self.append:
+            raise ConfigError("--allow-duplicates belongs to --append.")
         if self.fps is not None and self.fps < 1:
             raise ConfigError(f"fps is {self.fps}, it must be at least 1.")
         if self.workers < 0:

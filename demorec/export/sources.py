@@ -56,6 +56,16 @@ def find_recordings(paths: Sequence[Path], *, include_failures: bool) -> list[So
     return found
 
 
+def places_of(sources: Iterable[Source]) -> list[Path]:
+    """What an export must not write over: the recordings, and a run's folders of them with all that is in there.
+
+    A dataset that lies beside them, as a run's own does, may be replaced.
+    """
+    files = [source.path for source in sources]
+    folders = dict.fromkeys(file.absolute().parent for file in files)
+    return [*(folder for folder in folders if folder.name in ("episodes", "failed")), *files]
+
+
 def _attempt_order(source: Source) -> tuple[str, bool, str]:
     """Failed attempts at an episode before the one that succeeded."""
     episode, _, attempt = source.path.stem.partition(".")

@@ -2,7 +2,8 @@
 
 Everything is written below `.NAME.demorec-export/new`. At the end the two folders change places by one system call
 (renameat2 with RENAME_EXCHANGE on Linux, renamex_np on macOS): at no moment is the dataset missing or half written.
-Leftovers of a crash lie in that one folder and are removed by the next export to the same place.
+Leftovers of a crash lie in that one folder, which a line in its lock file marks as ours, and are removed by the next
+export to the same place. What is replaced is deleted last.
 """
 
 from __future__ import annotations
@@ -13,76 +14,94 @@ import fcntl
 import os
 import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from demorec.errors import ExportError
+from demorec.replacing import Kind, check_replaceable
 
 _RENAME_EXCHANGE = 2
 _AT_FDCWD = -100
 _RENAME_SWAP_MACOS = 2
+_MARK = b"demorec export\n"
+"""What the lock file of a workshop holds."""
+NEW, OLD, CODED, _LOCK = "new", "old", "coded", "lock"
+"""All that a workshop holds: the folder in the making, the one that it replaces, pictures of the export's processes."""
 
 
 @contextmanager
-def staged_folder(target: Path, *, replace: bool) -> Iterator[Path]:
+def staged_folder(target: Path, kind: Kind, *, replace: bool, sources: Iterable[Path]) -> Iterator[Path]:
     """Give an empty folder that becomes `target` when the block ends without an error.
 
     Args:
         target: Where the folder shall be; its parent is made if it is missing.
-        replace: Whether a folder that is there is replaced (and then deleted).
+        kind: What may be replaced.
+        replace: Whether a folder of that kind that is there is replaced (and then deleted).
+        sources: What the new folder is made from, which is never replaced.
 
     Raises:
         ExportError: The target is there and not to be replaced, another export is writing to it, or the disk is full.
+        ConfigError: The target must not be replaced.
     """
-    target = Path.cwd() / target
-    if not replace and (target.is_symlink() or target.exists()) and not _is_empty_folder(target):
-        raise ExportError(f"The dataset is there already, choose --append, --overwrite or another --out: {target}")
-    if target.is_symlink():
-        target = target.resolve()
+    target, sources = Path.cwd() / target, tuple(sources)
+
+    def check() -> None:
+        check_replaceable(target, kind, overwrite=replace, sources=sources, already=ExportError)
+
+    check()
+    target = target.resolve()
     workshop = target.parent / f".{target.name}.demorec-export"
     try:
         workshop.mkdir(parents=True, exist_ok=True)
         with _locked(workshop, target):
-            new = workshop / "new"
-            if (workshop / "old").exists() and not target.exists():  # a crash between the two renames
-                (workshop / "old").rename(target)
-                if not replace:
-                    raise ExportError(f"The dataset is there already, restored after a crash: {target}")
+            new = workshop / NEW
+            if (workshop / OLD).exists() and not target.exists():  # a crash between the two renames
+                (workshop / OLD).rename(target)
+                check()
             try:
                 if new.exists():
                     shutil.rmtree(new)
                 new.mkdir()
                 yield new
                 _sync_folders(new)
+                check()  # much may have been put there meanwhile
                 _take_place(new, target)
                 sync_file(target.parent)
             finally:
-                shutil.rmtree(workshop, ignore_errors=True)
+                if target.exists() or not (workshop / OLD).exists():
+                    shutil.rmtree(workshop, ignore_errors=True)
     except OSError as error:
         raise ExportError(f"The dataset cannot be written ({error.strerror or error}): {target}") from error
 
 
-def _is_empty_folder(path: Path) -> bool:
-    return path.is_dir() and not any(path.iterdir())
+def _check_ours(workshop: Path) -> None:
+    """Refuse a folder of the workshop's name that no export has made."""
+    found = {path.name for path in workshop.iterdir()} if not workshop.is_symlink() else {""}
+    lock = workshop / _LOCK
+    is_marked = lock.is_file() and lock.read_bytes() == _MARK
+    if not found <= {NEW, OLD, CODED, _LOCK} or (found - {_LOCK} and not is_marked):
+        raise ExportError(f"This folder was not made by demorec and is in the way, move it elsewhere: {workshop}")
 
 
 @contextmanager
 def _locked(workshop: Path, target: Path) -> Iterator[None]:
     """Hold the workshop; the lock dies with the process, so a crash leaves none."""
     while True:
-        handle = os.open(workshop / "lock", os.O_RDWR | os.O_CREAT, 0o644)
+        _check_ours(workshop)
+        handle = os.open(workshop / _LOCK, os.O_RDWR | os.O_CREAT, 0o644)
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             os.close(handle)
             raise ExportError(f"Another export is writing this dataset, wait until it is done: {target}") from error
         # The holder before us may have removed the folder, and its lock file with it, between the two calls.
-        if (workshop / "lock").exists() and os.path.samestat(os.fstat(handle), (workshop / "lock").stat()):
+        if (workshop / _LOCK).exists() and os.path.samestat(os.fstat(handle), (workshop / _LOCK).stat()):
             break
         os.close(handle)
         workshop.mkdir(parents=True, exist_ok=True)
     try:
+        os.pwrite(handle, _MARK, 0)
         yield
     finally:
         os.close(handle)
@@ -98,7 +117,7 @@ def _take_place(new: Path, target: Path) -> None:
         if error.errno not in (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP):
             raise
         # A file system without the exchange: two renames, the second one undone if it fails.
-        aside = new.with_name("old")
+        aside = new.with_name(OLD)
         target.rename(aside)
         try:
             new.rename(target)

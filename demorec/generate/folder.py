@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import platform
-import shutil
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,12 +14,12 @@ from typing import TYPE_CHECKING
 
 from demorec.config import GenerateConfig, deciding_versions
 from demorec.errors import ConfigError, DemorecError, GenerationError
+from demorec.generate.contents import PARTS, RUN
 from demorec.generate.executor import peak_memory
 from demorec.generate.lock import LOCK_NAME, run_lock
 from demorec.generate.options import RunOptions, available_cores
 from demorec.generate.plan import differences
 from demorec.generate.run_file import (
-    DATASET,
     EPISODES,
     FAILED,
     RUN_NAME,
@@ -33,11 +32,10 @@ from demorec.generate.run_file import (
     save_run_file,
 )
 from demorec.generate.survey import Inspector, recordings_of, survey
+from demorec.replacing import check_replaceable, replaced_parts, settle_parts, shown
 
 if TYPE_CHECKING:
     from demorec.generate.run import Progress, RunResult
-
-_OURS = (EPISODES, FAILED, UNFINISHED, DATASET)
 
 
 class RunFolder:
@@ -145,32 +143,45 @@ def open_run(
     """Open, continue or begin a run in `options.out`, locked until the context ends.
 
     Raises:
-        ConfigError: The folder is in use, holds another run or somebody's files, or cannot be written to.
+        ConfigError: The folder is in use, holds another run or somebody's files, or cannot be written to; or what is
+            to be overwritten is not a run alone.
     """
     assert options.out is not None
     path = options.out.absolute()
     _make_folder(path)
     with run_lock(path):
-        if not (options.overwrite and _clear(path)):
+        settle_parts(path, PARTS)
+        replaces = options.overwrite and ((path / RUN_NAME).exists() or bool(recordings_of(path)))
+        if replaces:
+            check_replaceable(path, RUN, overwrite=True)
+        else:
             _refuse_strangers(path)
         asked = RunFile(config=config, versions=deciding_versions(config), num_episodes=options.num_episodes)
-        run = _known_run(path, asked, progress=progress, inspect=inspect)
-        if run.num_episodes > options.num_episodes:
-            progress.says(f"The run has {run.num_episodes} episodes already, more than asked; all of them stay.")
-        run = replace(run, num_episodes=max(run.num_episodes, options.num_episodes))
-        try:
-            for name in (EPISODES, FAILED, UNFINISHED):
-                (path / name).mkdir(exist_ok=True)
-            found = survey(path, run, inspect=inspect, progress=progress.verifying)
-        except OSError as error:
-            raise ConfigError(f"The output folder cannot be used ({error.strerror}): {path}") from error
-        for file, reason in found.set_aside.items():
-            progress.says(f"{file} was moved to {UNFINISHED}/: {reason}.")
-        for line in (line for line in found.attempts if line.episode_index >= run.num_episodes):
-            run = replace(run, num_episodes=line.episode_index + 1)
-        folder = RunFolder(path, run.with_attempts(found.attempts))
-        folder.save()
+        # What is overwritten is deleted when the new run's run.json is there, and put back when that cannot be made.
+        with replaced_parts(path, PARTS) if replaces else nullcontext():
+            folder = _begin_or_continue(path, asked, progress=progress, inspect=inspect)
         yield folder
+
+
+def _begin_or_continue(path: Path, asked: RunFile, *, progress: Progress, inspect: Inspector) -> RunFolder:
+    """Bring the folder and its run.json to what is known now."""
+    run = _known_run(path, asked, progress=progress, inspect=inspect)
+    if run.num_episodes > asked.num_episodes:
+        progress.says(f"The run has {run.num_episodes} episodes already, more than asked; all of them stay.")
+    run = replace(run, num_episodes=max(run.num_episodes, asked.num_episodes))
+    try:
+        for name in (EPISODES, FAILED, UNFINISHED):
+            (path / name).mkdir(exist_ok=True)
+        found = survey(path, run, inspect=inspect, progress=progress.verifying)
+    except OSError as error:
+        raise ConfigError(f"The output folder cannot be used ({error.strerror}): {path}") from error
+    for file, reason in found.set_aside.items():
+        progress.says(f"{file} was moved to {UNFINISHED}/: {reason}.")
+    for line in (line for line in found.attempts if line.episode_index >= run.num_episodes):
+        run = replace(run, num_episodes=line.episode_index + 1)
+    folder = RunFolder(path, run.with_attempts(found.attempts))
+    folder.save()
+    return folder
 
 
 def machine() -> dict[str, str]:
@@ -234,20 +245,11 @@ def _make_folder(path: Path) -> None:
 def _refuse_strangers(path: Path) -> None:
     if (path / RUN_NAME).exists() or recordings_of(path):
         return
-    strangers = sorted(p.name for p in path.iterdir() if p.name not in (*_OURS, LOCK_NAME, f"{RUN_NAME}.part"))
+    strangers = sorted(p.name for p in path.iterdir() if p.name not in (*PARTS, LOCK_NAME, f"{RUN_NAME}.part"))
     if strangers:
-        shown = ", ".join(strangers[:5]) + (", ..." if len(strangers) > 5 else "")
-        raise ConfigError(f"The output folder holds files that are of no run ({shown}): choose another --out: {path}")
-
-
-def _clear(path: Path) -> bool:
-    """Delete the run that is there, and nothing that is not of a run; returns whether there was one."""
-    if not (path / RUN_NAME).exists() and not recordings_of(path):
-        return False
-    for name in _OURS:
-        shutil.rmtree(path / name, ignore_errors=True)
-    (path / RUN_NAME).unlink(missing_ok=True)
-    return True
+        raise ConfigError(
+            f"The output folder holds files that are of no run ({shown(strangers)}): choose another --out: {path}"
+        )
 
 
 def _free_name(path: Path) -> Path:

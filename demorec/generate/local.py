@@ -6,11 +6,9 @@ pipe of its own a worker's death is an end-of-file and nothing else.
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import signal
 import sys
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -153,7 +151,6 @@ def _worker_main(pipe: Connection[Report, EpisodePlan | None], maker: str, folde
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     signal.signal(signal.SIGTERM, _raise_interrupted)
-    threading.Thread(target=_end_with_driver, daemon=True).start()
     try:
         while (plan := pipe.recv()) is not None:
             pipe.send(attempt_episode(maker, plan, folder))
@@ -167,14 +164,6 @@ def _worker_main(pipe: Connection[Report, EpisodePlan | None], maker: str, folde
 def _raise_interrupted(number: int, frame: FrameType | None) -> None:
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     raise _Interrupted
-
-
-def _end_with_driver() -> None:
-    """Leave no orphan behind when the driver is killed: its end of a pipe closes, whatever it died of."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        connection.wait([parent.sentinel])
-        os._exit(1)
 
 
 def _death(exitcode: int | None) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,6 +14,11 @@ from demorec.playback.compare import log_comparison, new_comparison
 from demorec.playback.layout import comparison_layout, episode_layout
 from demorec.playback.scene import log_episode, new_recording
 from demorec.playback.sources import Source
+from demorec.replacing import RERUN_FILE, written_whole
+
+_END = b"RRF2FOOT"
+"""What the last bytes of a complete .rrd file contain: Rerun writes the table of contents there at last."""
+_END_BYTES = 12
 
 
 def save(source: Source, target: Path) -> None:
@@ -39,7 +45,7 @@ def save_each(sources: Sequence[Source], folder: Path) -> list[Path]:
     """Each episode into an .rrd file of its own.
 
     Raises:
-        DemorecError: An episode cannot be read.
+        DemorecError: An episode cannot be read, or a file cannot be written.
     """
     files = [folder / f"{index:06d}.rrd" for index in range(len(sources))]
     for source, file in zip(sources, files, strict=True):
@@ -68,21 +74,30 @@ def _save_episode(source: Source, target: Path) -> None:
 
 @contextmanager
 def _saving(recording: rr.RecordingStream, target: Path, layout: rr.blueprint.Blueprint) -> Iterator[None]:
-    recording.save(target, default_blueprint=layout)
+    """Write what is logged in the block; RecordingError when not all of it is in the file at the end.
+
+    Rerun writes in a thread of its own, which ends at the first error and keeps the reason to its log.
+    """
     try:
-        yield
-    finally:
-        recording.disconnect()
+        recording.save(target, default_blueprint=layout)
+        try:
+            yield
+            recording.flush()
+        finally:
+            recording.disconnect()
+    except RuntimeError as error:
+        raise RecordingError(f"The file cannot be written (is the disk full?): {target}") from error
+    with target.open("rb") as file:
+        file.seek(max(-_END_BYTES, -file.seek(0, os.SEEK_END)), os.SEEK_END)
+        if _END not in file.read():
+            raise RecordingError(f"The file was cut off while it was written (is the disk full?): {target}")
 
 
 @contextmanager
 def _partial(target: Path) -> Iterator[Path]:
     """A name beside the target, renamed when the block ends well and removed when not."""
-    part = target.with_name(f".{target.name}.part.rrd")
     try:
-        yield part
-        part.replace(target)
+        with written_whole(target, RERUN_FILE) as part:
+            yield part
     except OSError as error:
-        raise RecordingError(f"The file cannot be written ({error.strerror}): {target}") from error
-    finally:
-        part.unlink(missing_ok=True)
+        raise RecordingError(f"The file cannot be written ({error.strerror or error}): {target}") from error

@@ -20,6 +20,7 @@ from rerun.experimental import ViewerClient
 from demorec.errors import ConfigError, DemorecError, RecordingError
 from demorec.playback.programs import free_port, has_display, viewer_environment, viewer_program
 from demorec.playback.times import SECONDS
+from demorec.replacing import PICTURE, written_whole
 
 _START_SECONDS = 60.0
 _SETTLE_SECONDS = 30.0
@@ -194,8 +195,10 @@ class HeadlessViewer:
                     ) from error
 
     def save_picture(self, target: Path) -> None:
-        """The whole window as PNG."""
-        target.write_bytes(self._picture())
+        """The whole window as PNG, whole or not at all; OSError when it cannot be written."""
+        picture = self._picture()
+        with written_whole(target, PICTURE) as part:
+            part.write_bytes(picture)
 
     def view_picture(self, name: str) -> bytes:
         """One view as PNG; KeyError when no view has that name."""

@@ -14,6 +14,7 @@ from foxglove.messages import CompressedVideo
 from demorec.errors import RecordingError
 from demorec.recording import messages
 from demorec.recording.ros2 import DEFINITIONS
+from demorec.replacing import RECORDING, check_replaceable, lock_part
 
 _CHUNK_BYTES = 1 << 20
 _LATCHED_QOS = (
@@ -73,23 +74,40 @@ class PartFile:
 
     Args:
         path: The finished file.
-        part: Where it is until then, when that is not NAME.part; a file of that name is replaced.
-        overwrite: Whether `path`, or an unfinished recording of its name, may be replaced.
+        part: Where it is until then, when that is not NAME.part.
+        overwrite: Whether `path`, or an unfinished recording of its name, may be replaced by the new one.
+        is_worthless: Whether an unfinished recording, whose writer is dead, holds nothing that could not be made again,
+            so that it is replaced whether or not that is asked for.
 
     Raises:
         RecordingError: A file of that name, or an unfinished one, is there already; or it cannot be written.
+        ConfigError: What is there is no recording, which is not replaced by one.
     """
 
-    def __init__(self, path: Path, *, part: Path | None = None, overwrite: bool = False) -> None:
+    def __init__(
+        self,
+        path: Path,
+        *,
+        part: Path | None = None,
+        overwrite: bool = False,
+        is_worthless: Callable[[Path], bool] = lambda part: False,
+    ) -> None:
         self.path, self.part, self._overwrite = path, part or part_path(path), overwrite
         self._check_free()
-        if part is None and self.part.exists() and not overwrite:
-            raise RecordingError(
-                f"An unfinished recording of that name is there already; recover it, delete it, or --overwrite: "
-                f"{self.part}"
-            )
         try:
-            self._disk = _Disk(self.part)
+            # Held until the file has its name or is left: no other process takes it for what a dead one left.
+            self._lock: int | None = lock_part(self.part, RECORDING, refused=RecordingError)
+            try:
+                if os.fstat(self._lock).st_size and not overwrite and not is_worthless(self.part):
+                    raise RecordingError(
+                        "An unfinished recording of that name is there already; recover it, delete it, or --overwrite: "
+                        f"{self.part}"
+                    )
+                self._disk = _Disk(self.part)
+            except BaseException:
+                os.close(self._lock)
+                self._lock = None
+                raise
         except OSError as error:
             raise self._unwritable(error) from error
         self._channels: dict[str, foxglove.Channel] = {}
@@ -105,8 +123,7 @@ class PartFile:
         self._is_open = True
 
     def _check_free(self) -> None:
-        if self.path.exists() and not self._overwrite:
-            raise RecordingError(f"The recording is there already, choose another name or --overwrite: {self.path}")
+        check_replaceable(self.path, RECORDING, overwrite=self._overwrite, already=RecordingError)
 
     def _unwritable(self, error: Exception) -> RecordingError:
         reason = error.strerror if isinstance(error, OSError) else str(error)
@@ -166,8 +183,12 @@ class PartFile:
         if self._disk.error is not None:
             raise self._unwritable(self._disk.error) from self._disk.error
 
-    def close(self) -> None:
-        """Leave NAME.part as it is; harmless when called twice."""
+    def end(self) -> None:
+        """Write the index and make NAME.part durable, whole but without its name; harmless when called twice.
+
+        Raises:
+            RecordingError: The disk is full.
+        """
         if self._is_open:
             self._is_open = False
             try:
@@ -177,15 +198,24 @@ class PartFile:
             finally:
                 self._disk.close()
 
+    def close(self) -> None:
+        """End it and leave NAME.part as it is; harmless when called twice."""
+        try:
+            self.end()
+        finally:
+            if self._lock is not None:
+                os.close(self._lock)
+                self._lock = None
+
     def publish(self) -> None:
-        """Write the index, make the file durable and give it its name.
+        """End the file and give it its name.
 
         Raises:
             RecordingError: A file of that name has appeared meanwhile, or the disk is full.
         """
-        self.close()
-        self._check_free()
         try:
+            self.end()
+            self._check_free()
             self.part.replace(self.path)
             folder = os.open(self.path.parent, os.O_RDONLY)
             try:
@@ -194,3 +224,5 @@ class PartFile:
                 os.close(folder)
         except OSError as error:
             raise self._unwritable(error) from error
+        finally:
+            self.close()

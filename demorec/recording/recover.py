@@ -59,7 +59,8 @@ def recover(source: Path, target: Path, *, overwrite: bool = False) -> Recovered
     last_ns = frame_time_ns(survey.num_frames - 1, info.fps)
     num_messages = 0
     # The usual place for an unfinished file is where the source may lie.
-    file = PartFile(target, part=target.with_name(f"{target.name}.recovering"), overwrite=overwrite)
+    part = target.with_name(f"{target.name}.recovering")
+    file = PartFile(target, part=part, overwrite=overwrite, is_worthless=lambda part: True)
     try:
         file.metadata(metadata.EPISODE, survey.episode)
         for item in _items(source):
@@ -74,11 +75,12 @@ def recover(source: Path, target: Path, *, overwrite: bool = False) -> Recovered
             file.metadata(metadata.OUTCOME, survey.outcome)
         else:
             file.metadata(metadata.RECOVERED, metadata.recovered_metadata(kept_frames=survey.num_frames))
+        file.end()
+        with Recording(part) as recording:
+            recording.columns()  # a recovered file that cannot be read would be worse than none
         file.publish()
     finally:
         file.close()
-    with Recording(target) as recording:
-        recording.columns()  # a recovered file that cannot be read would be worse than none
     return Recovered(
         path=target,
         num_frames=survey.num_frames,
@@ -86,6 +88,24 @@ def recover(source: Path, target: Path, *, overwrite: bool = False) -> Recovered
         is_complete=survey.outcome is not None,
         reason="" if survey.outcome is not None else survey.reason,
     )
+
+
+def can_be_made_again(part: Path, *, origin: str) -> bool:
+    """Whether an unfinished recording holds nothing yet, or was derived from the same recording in the same way.
+
+    Args:
+        part: What a crash left.
+        origin: `EpisodeInfo.origin` of the recording that is about to be written in its place.
+    """
+    for item in _items(part):
+        if isinstance(item, SalvagedMetadata) and item.name == metadata.EPISODE:
+            info, _ = metadata.read_episode_metadata(item.values)
+            return bool(origin) and info.origin == origin
+        if isinstance(item, str):
+            return item == "the end is missing"  # after nothing: the writer was killed before the first frame
+        if item is not None:
+            return False
+    return False
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -22,6 +22,7 @@ from demorec.errors import RecordingError
 from demorec.recording import channels, messages, metadata
 from demorec.recording.part_file import PartFile
 from demorec.recording.pictures import CameraRecorder
+from demorec.recording.recover import can_be_made_again
 from demorec.recording.transforms import FrameTree
 
 
@@ -67,10 +68,12 @@ class EpisodeWriter:
         path: The file to be made; its folder must exist.
         info: Written first.
         video: How colour pictures are coded.
-        overwrite: Whether a file of that name may be replaced.
+        overwrite: Whether a recording of that name may be replaced.
 
     Raises:
-        RecordingError: The file, or an unfinished one of that name, is there already; or it cannot be written.
+        RecordingError: The file, or an unfinished one of that name, is there already; or it cannot be written. What a
+            killed replay or rendering of the same recording left is replaced.
+        ConfigError: To be overwritten is what is no recording.
     """
 
     def __init__(
@@ -86,7 +89,9 @@ class EpisodeWriter:
         self._num_written = 0
         self._phase: str | None = None
         self._is_miss: bool | None = None
-        self._file = PartFile(path, overwrite=overwrite)
+        self._file = PartFile(
+            path, overwrite=overwrite, is_worthless=lambda part: can_be_made_again(part, origin=info.origin)
+        )
 
     def __enter__(self) -> Self:
         return self

@@ -67,7 +67,9 @@ def test_a_dataset_in_the_way(run: Path, tmp_path: Path, capsys: pytest.CaptureF
     (tmp_path / "d").mkdir()
     (tmp_path / "d" / "thesis.txt").write_text("years of work")
     assert demorec("export", "lerobot", run, "--out", tmp_path / "d", "--no-verify") == 1
-    assert "--overwrite" in capsys.readouterr().err
+    assert "--overwrite" not in capsys.readouterr().err  # it would not help
+    assert demorec("export", "lerobot", run, "--out", tmp_path / "d", "--no-verify", "--overwrite") == 2
+    assert "it is not a LeRobot dataset" in capsys.readouterr().err
     assert (tmp_path / "d" / "thesis.txt").read_text() == "years of work"
 
 

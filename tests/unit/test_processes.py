@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import psutil
+
 SCRIPT = """
 import sys
 from concurrent.futures import ProcessPoolExecutor
@@ -45,3 +47,31 @@ def test_python_itself_would_run_the_script_again(tmp_path):
     done = subprocess.run([sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode != 0
     assert "bootstrapping phase" in done.stderr
+
+
+PARENT = """
+import time
+from concurrent.futures import ProcessPoolExecutor
+
+from demorec.processes import SPAWN
+
+with ProcessPoolExecutor(max_workers=2, mp_context=SPAWN) as pool:
+    busy = [pool.submit(time.sleep, 600), pool.submit(time.sleep, 0)]
+    busy[1].result()
+    print("ready", flush=True)
+    time.sleep(600)
+"""
+
+
+def test_workers_of_a_pool_end_with_their_parent_busy_or_idle(tmp_path):
+    (tmp_path / "script.py").write_text(PARENT)
+    parent = subprocess.Popen([sys.executable, "script.py"], cwd=tmp_path, stdout=subprocess.PIPE, text=True)
+    assert parent.stdout is not None
+    assert parent.stdout.readline() == "ready\n"
+    descendants = psutil.Process(parent.pid).children(recursive=True)
+    workers = [process for process in descendants if "spawn_main" in " ".join(process.cmdline())]
+    assert len(workers) == 2
+    parent.kill()
+    parent.wait()
+    _, alive = psutil.wait_procs(descendants, timeout=20)
+    assert not alive

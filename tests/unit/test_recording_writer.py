@@ -13,7 +13,7 @@ from helpers_recording import make_episode, write_episode
 from demorec.config import VideoConfig
 from demorec.episode import Event, Frame, Outcome
 from demorec.errors import RecordingError
-from demorec.recording import EpisodeWriter, Recording, recover
+from demorec.recording import EpisodeWriter, Recording, part_file, recover
 
 
 def names(folder: Path) -> list[str]:
@@ -156,9 +156,10 @@ def test_an_impossible_preset_is_told_in_one_sentence(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
-def test_a_full_disk(tmp_path: Path) -> None:
+def test_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     info, frames, _ = make_episode(num_frames=31, cameras=())
-    (tmp_path / "a.mcap.part").symlink_to("/dev/full")
+    disk = part_file._Disk
+    monkeypatch.setattr(part_file, "_Disk", lambda part: disk(Path("/dev/full")))
     writer = EpisodeWriter(tmp_path / "a.mcap", info, overwrite=True)
     with pytest.raises(RecordingError, match="cannot be written") as caught:
         write_all(writer, frames)

@@ -1,0 +1,87 @@
+"""What in the folder of a run is the run's own, so that --overwrite may replace it; everything else is somebody's."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+from demorec.export.kind import DATASET, is_dataset_file
+from demorec.export.sidecar import CONFIGS_PATH
+from demorec.generate.run_file import DATASET as DATASET_FOLDER
+from demorec.generate.run_file import EPISODES, FAILED, RUN_NAME, UNFINISHED
+from demorec.generate.survey import recordings_of
+from demorec.replacing import RECORDING, Kind, files_below, json_object
+
+PARTS = (RUN_NAME, EPISODES, FAILED, UNFINISHED, DATASET_FOLDER)
+"""All that a run writes; what else is in its folder is never touched."""
+
+_NAME = r"episode_\d{6,}(\.attempt_\d+)?\.mcap"
+_RECORDING = re.compile(_NAME)
+_UNFINISHED = re.compile(
+    rf"[^/]+-\d+-\d+/{_NAME}\.part"  # of a worker: host, process, number
+    rf"|{_NAME}(\.\d+)?"  # set aside, since it was damaged or of another run
+    r"|error_episode_\d+\.txt"
+)
+_SET_ASIDE_DATASET = re.compile(rf"{DATASET_FOLDER}(\.\d+)?/(.*)")
+
+
+def foreign_recordings(folder: Path, place: str, *, known: frozenset[str] = frozenset()) -> Iterator[str]:
+    """What in a folder of recordings is none of ours.
+
+    Args:
+        folder: Of the run or the evaluation.
+        place: episodes or failed.
+        known: Files, relative to `folder`, that it has made, whatever has become of them.
+    """
+    if (folder / place).is_symlink():
+        yield place
+        return
+    for name in files_below(folder / place):
+        file = folder / place / name
+        is_ours = file.is_file() and (
+            f"{place}/{name}" in known or file.stat().st_size == 0 or RECORDING.recognises(file)
+        )
+        if not (_RECORDING.fullmatch(name) and is_ours):
+            yield f"{place}/{name}"
+
+
+def is_dataset_of_run(dataset: Path, config_digest: str) -> bool:
+    """Whether a folder is a dataset of episodes of one run alone, with nothing else in it."""
+    return (
+        not dataset.is_symlink()
+        and DATASET.recognises(dataset)
+        and not DATASET.strangers(dataset)
+        and set(json_object(dataset / CONFIGS_PATH)) == {config_digest}
+    )
+
+
+def _recognises(folder: Path) -> bool:
+    run = json_object(folder / RUN_NAME)
+    return (isinstance(run.get("episodes"), list) and "config_digest" in run) or any(
+        RECORDING.recognises(file) for file in recordings_of(folder)
+    )
+
+
+def _strangers(folder: Path) -> list[str]:
+    run = json_object(folder / RUN_NAME)
+    lines = run.get("episodes")
+    known = frozenset(str(line.get("file")) for line in lines or () if isinstance(line, dict))
+    found = [name for place in (EPISODES, FAILED) for name in foreign_recordings(folder, place, known=known)]
+    if (folder / UNFINISHED).is_symlink():
+        found.append(UNFINISHED)
+    else:
+        found += [f"{UNFINISHED}/{name}" for name in files_below(folder / UNFINISHED) if not _is_unfinished(name)]
+    dataset = folder / DATASET_FOLDER
+    if os.path.lexists(dataset) and not is_dataset_of_run(dataset, str(run.get("config_digest"))):
+        found.append(DATASET_FOLDER)
+    return found
+
+
+def _is_unfinished(name: str) -> bool:
+    dataset = _SET_ASIDE_DATASET.fullmatch(name)
+    return is_dataset_file(dataset[2]) if dataset else _UNFINISHED.fullmatch(name) is not None
+
+
+RUN = Kind(name="a run of generate-dataset", is_folder=True, recognises=_recognises, strangers=_strangers)

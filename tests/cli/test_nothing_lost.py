@@ -1,0 +1,442 @@
+"""Every command that replaces or deletes something, made to destroy a neighbour: nothing is lost, and it says why."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers_export import export, files_of, make_run
+from helpers_generate import run_fake
+from helpers_recording import write_episode
+from PIL import Image
+
+from demorec.cli import main
+from demorec.config import GenerateConfig
+from demorec.errors import ConfigError, DemorecError
+from demorec.evaluate.rollouts import EVALUATION_NAME, Settings, _open
+from demorec.replacing import PICTURE, RECORDING, RERUN_FILE, check_replaceable, settle_parts, written_whole
+
+
+def demorec(*arguments: object) -> int:
+    with pytest.raises(SystemExit) as done:
+        main([str(argument) for argument in arguments])
+    return int(done.value.code or 0)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a run, a recording and a dataset, to be copied."""
+    folder = tmp_path_factory.mktemp("made")
+    make_run(folder / "runs" / "run", (4, 5), cameras=("front",))
+    write_episode(folder / "alone.mcap", num_frames=4, cameras=(), episode_index=7)
+    export(folder / "runs" / "run", folder / "dataset")
+    return folder
+
+
+@pytest.fixture
+def place(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder that is a home, in which somebody works in `work`; all of it is compared afterwards."""
+    home = tmp_path / "home"
+    shutil.copytree(made, home)
+    (home / "thesis").mkdir()
+    (home / "thesis" / "chapter_1.tex").write_text("years of work")
+    (home / "thesis.tex").write_text("years of work")
+    for name in ("work", "repository", "mixed", "noted"):
+        shutil.copytree(home / "dataset", home / name)
+    (home / "repository" / ".git").mkdir()
+    (home / "repository" / ".git" / "HEAD").write_text("ref: refs/heads/main")
+    (home / "mixed" / "data" / "notes.txt").write_text("years of work")
+    (home / "noted" / "notes").symlink_to(home / "thesis")
+    for name in ("runs", "thesis", "mixed"):
+        (home / f"link_to_{name}").symlink_to(home / name)
+    (home / "link_to_nothing").symlink_to(home / "nothing")
+    monkeypatch.setenv("HOME", str(home))
+    monkeypatch.chdir(home / "work")
+    return home
+
+
+TARGETS = {
+    "runs/run": "this command reads something in it",
+    "runs/run/episodes": "this command reads",
+    "runs": "this command reads something in it",
+    "link_to_runs": "this command reads something in it",
+    ".": "this command reads something in it",
+    "..": "this command reads something in it",
+    "work": "it is the current folder",
+    "repository": "it is a repository",
+    "thesis": "it is not a LeRobot dataset",
+    "link_to_thesis": "it is not a LeRobot dataset",
+    "thesis.tex": "it is a file",
+    "alone.mcap": "it is a file",
+    "mixed": "data/notes.txt",
+    "link_to_mixed": "data/notes.txt",
+    "noted": "(notes)",
+    "link_to_nothing": "a link to something that is not there",
+}
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_export_replaces_nothing_but_a_dataset(place: Path, capsys: pytest.CaptureFixture[str], target: str) -> None:
+    before = files_of(place.parent)
+    arguments = ("export", "lerobot", place / "runs/run", "--out", place / target, "--no-verify")
+    assert demorec(*arguments, "--overwrite") == 2
+    said = capsys.readouterr().err
+    assert TARGETS[target] in said
+    assert len(said.splitlines()) == 1
+    assert demorec(*arguments) == 1  # and without the flag nobody is told to use it
+    assert "--overwrite" not in capsys.readouterr().err
+    assert files_of(place.parent) == before
+
+
+def test_the_home_folder_is_no_target(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = files_of(place.parent)
+    elsewhere = write_episode(place.parent / "other.mcap", num_frames=3, cameras=())
+    for target, word in ((place, "home folder"), (place.parent, "reads something in it"), (Path("/"), "reads")):
+        assert demorec("export", "lerobot", elsewhere, "--out", target, "--overwrite", "--no-verify") == 2
+        assert word in capsys.readouterr().err
+    assert before.items() <= files_of(place.parent).items()
+
+
+@pytest.mark.parametrize("target", ["mixed", "repository", "thesis", "thesis.tex", "noted"])
+def test_append_takes_over_what_is_there_or_refuses(place: Path, target: str) -> None:
+    """Foreign files are taken over; where they cannot be, and in a repository, nothing is appended."""
+    before = files_of(place)
+    other = make_run(place.parent / "other", (6,), cameras=("front",), seed=1)
+    code = demorec("export", "lerobot", other, "--out", place / target, "--append", "--no-verify")
+    assert code == (0 if target == "mixed" else code or 1)
+    after = files_of(place)
+    kept = {name: data for name, data in before.items() if not name.startswith(target) or code}
+    assert kept.items() <= after.items()
+    assert (place / "mixed/data/notes.txt").read_text() == "years of work"
+
+
+def test_a_dataset_is_replaced_and_its_neighbours_are_not(place: Path) -> None:
+    before = files_of(place)
+    other = write_episode(place.parent / "other.mcap", num_frames=3, cameras=("front",))
+    assert demorec("export", "lerobot", other, "--out", place / "dataset", "--overwrite", "--no-verify") == 0
+    after = files_of(place)
+    for name, data in before.items():
+        assert name.startswith("dataset/") or after[name] == data
+    assert json.loads(after["dataset/meta/info.json"])["total_frames"] == 3
+
+
+def test_a_workshop_of_somebody_else_is_left_alone(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    workshop = place / ".new.demorec-export"
+    (workshop / "new").mkdir(parents=True)
+    (workshop / "new" / "chapter_2.tex").write_text("years of work")
+    before = files_of(place)
+    assert demorec("export", "lerobot", place / "runs/run", "--out", place / "new", "--no-verify") == 1
+    assert "not made by demorec" in capsys.readouterr().err
+    assert files_of(place) == before
+
+
+def test_files_put_into_the_target_meanwhile_are_kept(place: Path) -> None:
+    from demorec.export import ExportOptions, export_lerobot
+
+    def note(done: int, total: int) -> None:
+        (place / "dataset" / "notes.txt").write_text("years of work")
+
+    with pytest.raises(ConfigError, match=r"notes\.txt"):
+        export_lerobot([place / "runs/run"], place / "dataset", ExportOptions(overwrite=True, verify=False), note)
+    assert (place / "dataset" / "notes.txt").read_text() == "years of work"
+    assert not (place / ".dataset.demorec-export").exists()
+
+
+# A run: --overwrite of generate-dataset.
+
+
+@pytest.fixture(scope="module")
+def run_made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of stand-in recordings, to be copied."""
+    return run_fake(tmp_path_factory.mktemp("run") / "run", num_episodes=2).folder
+
+
+@pytest.fixture
+def run(run_made: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(run_made, tmp_path / "run")
+
+
+def spoil_dataset(run: Path, made: Path) -> None:
+    shutil.copytree(made / "dataset", run / "dataset")
+
+
+SPOILERS: dict[str, Callable[[Path, Path], object]] = {
+    "episodes/notes.txt": lambda run, made: (run / "episodes/notes.txt").write_text("mine"),
+    "episodes/episode_000077.mcap": lambda run, made: (run / "episodes/episode_000077.mcap").write_text("mine"),
+    "episodes/mine.mcap": lambda run, made: shutil.copy(made / "alone.mcap", run / "episodes/mine.mcap"),
+    "failed/chapter/1.tex": lambda run, made: [
+        (run / "failed/chapter").mkdir(), (run / "failed/chapter/1.tex").write_text("mine")
+    ],
+    "unfinished/ideas.txt": lambda run, made: (run / "unfinished/ideas.txt").write_text("mine"),
+    "dataset": spoil_dataset,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("foreign", SPOILERS)
+def test_a_run_with_something_foreign_is_not_overwritten(run: Path, made: Path, foreign: str) -> None:
+    SPOILERS[foreign](run, made)
+    before = {name: data for name, data in files_of(run).items() if name != ".lock"}
+    with pytest.raises(ConfigError, match="not part of a run") as error:
+        run_fake(run, num_episodes=2, seed=1, overwrite=True)
+    assert foreign in str(error.value)
+    assert {name: data for name, data in files_of(run).items() if name != ".lock"} == before
+
+
+def test_a_run_where_somebody_works_is_not_overwritten(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = {name: data for name, data in files_of(run).items() if name != ".lock"}
+    with monkeypatch.context() as patch:
+        patch.setenv("HOME", str(run))
+        with pytest.raises(ConfigError, match="it is the home folder"):
+            run_fake(run, num_episodes=2, seed=1, overwrite=True)
+    with monkeypatch.context() as patch:
+        patch.chdir(run / "episodes")
+        with pytest.raises(ConfigError, match="the current folder lies in it"):
+            run_fake(run, num_episodes=2, seed=1, overwrite=True)
+    (run / ".git").mkdir()
+    with pytest.raises(ConfigError, match="it is a repository"):
+        run_fake(run, num_episodes=2, seed=1, overwrite=True)
+    assert {name: data for name, data in files_of(run).items() if name != ".lock"} == before
+
+
+def test_folders_named_as_a_runs_are_not_overwritten(tmp_path: Path) -> None:
+    for name in ("episodes", "dataset"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "pilot.mkv").write_text("a series")
+    before = files_of(tmp_path)
+    with pytest.raises(ConfigError, match="not a run"):
+        run_fake(tmp_path, overwrite=True)
+    assert {name: data for name, data in files_of(tmp_path).items() if name != ".lock"} == before
+
+
+def test_an_overwriting_that_fails_puts_the_run_back(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import demorec.generate.folder as module
+
+    def fail(*arguments: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    before = {name: data for name, data in files_of(run).items() if name != ".lock"}
+    monkeypatch.setattr(module, "save_run_file", fail)
+    with pytest.raises(DemorecError, match="No space left"):
+        run_fake(run, num_episodes=2, seed=1, overwrite=True)
+    assert {name: data for name, data in files_of(run).items() if name != ".lock"} == before
+    assert not (run / ".demorec-replaced").exists()
+
+
+@pytest.mark.parametrize("moment", ["before", "moving", "moved", "made"])
+def test_a_crash_while_overwriting_loses_nothing(tmp_path: Path, moment: str) -> None:
+    """The four states that a kill within replaced_parts can leave, built by hand."""
+    names = ("run.json", "episodes", "failed")
+    old = {"run.json": b"old", "episodes/a": b"old a", "failed/b": b"old b"}
+    for name, data in old.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(data)
+    aside = tmp_path / ".demorec-replaced"
+    aside.mkdir()
+    (aside / "what-this-is.txt").touch()
+    for name in {"before": (), "moving": names[:2], "moved": names, "made": names}[moment]:
+        (tmp_path / name).rename(aside / name)
+    if moment in ("moved", "made"):
+        (tmp_path / "episodes").mkdir()
+    if moment == "made":
+        (tmp_path / "run.json").write_bytes(b"new")
+    settle_parts(tmp_path, names)
+    assert files_of(tmp_path) == ({"run.json": b"new"} if moment == "made" else old)
+    assert not aside.exists()
+
+
+def test_a_folder_of_somebody_else_is_not_taken_for_what_was_set_aside(tmp_path: Path) -> None:
+    (tmp_path / ".demorec-replaced").mkdir()
+    (tmp_path / ".demorec-replaced" / "mine").touch()
+    (tmp_path / "run.json").touch()
+    with pytest.raises(ConfigError, match="not made by demorec"):
+        settle_parts(tmp_path, ("run.json",))
+    assert (tmp_path / ".demorec-replaced" / "mine").exists()
+
+
+# An evaluation.
+
+
+@pytest.fixture
+def evaluation(tmp_path: Path, made: Path) -> Path:
+    """One with a rollout in each folder."""
+    out = tmp_path / "evaluation"
+    _open(SETTINGS, out, overwrite=False)
+    for place in ("episodes", "failed"):
+        shutil.copy(made / "alone.mcap", out / place / "episode_000000.mcap")
+    return out
+
+
+SETTINGS = Settings(
+    policy="p", policy_type="act", policy_digest="0" * 16, config=GenerateConfig(cameras=()), action="joint"
+)
+
+
+@pytest.mark.parametrize("foreign", ["episodes/notes.txt", "failed/thesis.mcap", "episodes/deep/er.txt"])
+def test_an_evaluation_with_something_foreign_is_not_overwritten(evaluation: Path, foreign: str) -> None:
+    (evaluation / foreign).parent.mkdir(exist_ok=True)
+    (evaluation / foreign).write_text("mine")
+    before = files_of(evaluation)
+    with pytest.raises(ConfigError, match="not part of an evaluation") as error:
+        _open(SETTINGS, evaluation, overwrite=True)
+    assert foreign in str(error.value)
+    assert files_of(evaluation) == before
+
+
+def test_an_evaluation_is_overwritten_and_what_lies_beside_stays(evaluation: Path) -> None:
+    (evaluation / "notes.txt").write_text("mine")
+    _open(SETTINGS, evaluation, overwrite=True)
+    assert files_of(evaluation).keys() == {EVALUATION_NAME, "notes.txt"}
+
+
+@pytest.mark.parametrize("content", ["{}", "[]", "", '{"settings": 1, "rollouts": []}'])
+def test_what_only_has_the_name_of_an_evaluation_is_kept(evaluation: Path, content: str) -> None:
+    (evaluation / EVALUATION_NAME).write_text(content)
+    before = files_of(evaluation)
+    with pytest.raises(ConfigError, match="not an evaluation"):
+        _open(SETTINGS, evaluation, overwrite=True)
+    assert files_of(evaluation) == before
+
+
+# Commands that write recordings, and those that write pictures and .rrd files.
+
+
+def test_recover_replaces_recordings_only(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (place / "broken.mcap").write_bytes((place / "alone.mcap").read_bytes()[:-500])
+    before = files_of(place.parent)
+    for target in ("thesis.tex", "thesis", "link_to_thesis", "link_to_nothing", "broken.mcap"):
+        code = demorec("recover", place / "broken.mcap", "--out", place / target, "--overwrite")
+        assert code == (1 if target == "broken.mcap" else 2), target
+        assert len(capsys.readouterr().err.splitlines()) == 1
+    (place / "x.mcap.recovering").write_text("years of work")
+    assert demorec("recover", place / "broken.mcap", "--out", place / "x.mcap") == 1
+    assert files_of(place.parent) == {**before, "home/x.mcap.recovering": b"years of work"}
+    assert demorec("recover", place / "broken.mcap", "--out", place / "alone.mcap", "--overwrite") == 0
+
+
+@pytest.mark.parametrize("command", ["render", "replay"])
+def test_render_and_replay_never_replace_what_they_read(
+    place: Path, capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    """Refused before anything is simulated or drawn, so made-up recordings will do."""
+    copy = place / "copy"
+    copy.mkdir()
+    shutil.copy(place / "alone.mcap", copy / "alone.mcap")
+    shutil.copy(place / "alone.mcap", copy / "second.mcap")
+    (place / "link").symlink_to(copy)
+    before = files_of(place.parent)
+    for sources, out in (
+        ((copy,), copy),
+        ((copy,), place / "link"),
+        ((place / "link",), copy),
+        ((place / "alone.mcap", copy / "second.mcap"), copy),
+        ((place / "runs/run", copy), copy),
+    ):
+        assert demorec(command, *sources, "--out", out, "--overwrite") == 2
+        assert "that this command reads" in capsys.readouterr().err
+    assert files_of(place.parent) == before
+
+
+def test_a_recording_replaces_recordings_only(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """What render, replay and evaluate write with."""
+    from helpers_recording import make_episode
+
+    from demorec.recording import EpisodeWriter
+
+    info, _, _ = make_episode(num_frames=1, cameras=())
+    before = files_of(place.parent)
+    for target in ("thesis.tex", "thesis", "dataset", "link_to_thesis"):
+        with pytest.raises(ConfigError, match="never replaced"):
+            EpisodeWriter(place / target, info, overwrite=True)
+    (place / "b.mcap.part").symlink_to(place / "thesis.tex")
+    for overwrite in (False, True):
+        with pytest.raises(DemorecError, match="in the way"):
+            EpisodeWriter(place / "b.mcap", info, overwrite=overwrite)
+    (place / "b.mcap.part").unlink()
+    assert files_of(place.parent) == before
+
+
+VIEWED = {
+    "alone.rrd": "it is not a Rerun file",  # a recording under another name
+    "link.rrd": "this command reads it",
+    "thesis.rrd": "it is not a Rerun file",
+    "folder.rrd": "it is a folder",
+    "dangling.rrd": "a link to something that is not there",
+}
+
+
+@pytest.mark.parametrize("target", VIEWED)
+def test_view_saves_over_rerun_files_only(place: Path, capsys: pytest.CaptureFixture[str], target: str) -> None:
+    shutil.copy(place / "alone.mcap", place / "alone.rrd")
+    (place / "link.rrd").symlink_to(place / "alone.mcap")
+    (place / "thesis.rrd").write_text("years of work")
+    (place / "folder.rrd").mkdir()
+    (place / "dangling.rrd").symlink_to(place / "nothing")
+    before = files_of(place.parent)
+    assert demorec("view", place / "alone.mcap", "--save", place / target, "--overwrite") == 2
+    assert VIEWED[target] in capsys.readouterr().err
+    assert demorec("view", place / "alone.mcap", "--save", place / target) == 2
+    assert "--overwrite" not in capsys.readouterr().err
+    assert files_of(place.parent) == before
+
+
+@pytest.mark.parametrize("command", ["view", "check"])
+def test_pictures_replace_pictures_only(place: Path, capsys: pytest.CaptureFixture[str], command: str) -> None:
+    flag = {"view": "--screenshot", "check": "--coverage-picture"}[command]
+    (place / "thesis.png").write_text("years of work")
+    (place / "link.png").symlink_to(place / "alone.mcap")
+    frame = place / "dataset" / "images" / "front" / "episode-000000" / "frame-000000.png"
+    frame.parent.mkdir(parents=True)
+    Image.fromarray(np.zeros((4, 4, 3), np.uint8)).save(frame)
+    Image.fromarray(np.zeros((4, 4, 3), np.uint8)).save(place / "photo.png")
+    before = files_of(place.parent)
+    for source, target, word in (
+        ("alone.mcap", "thesis.png", "it is not a picture"),
+        ("alone.mcap", "link.png", "this command reads it"),
+        ("dataset", frame, "it lies in what this command reads"),
+    ):
+        assert demorec(command, place / source, flag, place / target, "--overwrite") == 2
+        assert word in capsys.readouterr().err
+    assert demorec(command, place / "alone.mcap", flag, place / "photo.png") == 2
+    assert "--overwrite to replace it" in capsys.readouterr().err
+    assert files_of(place.parent) == before
+
+
+def test_a_coverage_picture_is_replaced_on_request(place: Path) -> None:
+    target = place / "c.png"
+    for flags in ((), ("--overwrite",)):
+        demorec("check", place / "alone.mcap", "--only", "opens", "--coverage-picture", target, *flags)
+        assert target.read_bytes().startswith(b"\x89PNG")
+    assert not [path for path in place.iterdir() if path.name.endswith("demorec-part")]
+
+
+# The rule itself.
+
+
+@pytest.mark.parametrize("kind", [RECORDING, RERUN_FILE, PICTURE])
+def test_special_files_are_never_replaced(tmp_path: Path, kind: object) -> None:
+    os.mkfifo(tmp_path / "fifo")  # reading it would wait for ever
+    for target in (tmp_path / "fifo", Path("/dev/null")):
+        with pytest.raises(ConfigError, match="no regular file"):
+            check_replaceable(target, kind, overwrite=True)  # type: ignore[arg-type]
+
+
+def test_an_unfinished_file_of_somebody_else_is_kept(tmp_path: Path) -> None:
+    part = tmp_path / ".x.png.demorec-part"
+    part.write_text("mine")
+    with pytest.raises(ConfigError, match="not the unfinished"), written_whole(tmp_path / "x.png", PICTURE):
+        pass
+    assert part.read_text() == "mine"
+
+
+def test_two_processes_do_not_write_one_file(tmp_path: Path) -> None:
+    target = tmp_path / "x.png"
+    with written_whole(target, PICTURE) as part:
+        part.write_bytes(b"\x89PNG\r\n\x1a\n1")
+        with pytest.raises(ConfigError, match="Another process"), written_whole(target, PICTURE):
+            pass
+    assert target.read_bytes().endswith(b"1")

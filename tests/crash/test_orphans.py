@@ -1,0 +1,53 @@
+"""Commands that work in several processes, killed with SIGKILL in the middle: no descendant lives on."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+from helpers_export import make_run
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_run(tmp_path_factory.mktemp("orphans") / "run", [30] * 12)
+
+
+def command(run: Path, out: Path, name: str) -> list[str]:
+    arguments = {
+        "export": ["export", "lerobot", run, "--out", out / "d", "--workers", "2"],
+        "check": ["check", run, "--workers", "2"],
+        "render": ["render", run, "--out", out / "r", "--workers", "2"],
+    }[name]
+    return [sys.executable, "-c", "from demorec.cli import main; main()", *map(str, arguments)]
+
+
+def workers_of(process: subprocess.Popen[bytes]) -> list[psutil.Process]:
+    try:
+        found = psutil.Process(process.pid).children(recursive=True)
+        return [child for child in found if "spawn_main" in " ".join(child.cmdline())]
+    except psutil.Error:
+        return []
+
+
+@pytest.mark.parametrize("name", ["export", "check", "render"])
+def test_a_killed_command_leaves_no_orphans(run: Path, tmp_path: Path, name: str) -> None:
+    """Killed as soon as two workers are there: they are starting, working or waiting for work."""
+    process = subprocess.Popen(
+        command(run, tmp_path, name), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env={**os.environ}
+    )
+    deadline = time.monotonic() + 120
+    while len(workers_of(process)) < 2:
+        assert process.poll() is None, "it ended before it could be killed"
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    descendants = psutil.Process(process.pid).children(recursive=True)
+    process.kill()
+    process.wait()
+    _, alive = psutil.wait_procs(descendants, timeout=60)
+    assert not alive
