@@ -8,7 +8,7 @@ import numpy as np
 
 from demorec.assets import asset_path
 from demorec.episode import Action, RobotSpec
-from demorec.errors import SceneError
+from demorec.errors import DemorecError, SceneError
 from demorec.geometry import Array, Pose
 from demorec.kinematics import ArmKinematics
 from demorec.scene import RobotPlacement
@@ -47,7 +47,7 @@ class Arm:
                     useFixedBase=True,
                     globalScaling=placement.scale,
                 )
-        except SceneError:
+        except DemorecError:
             raise
         except Exception as error:  # PyBullet raises its own bare pybullet.error
             raise SceneError(f"The robot {spec.name!r} cannot be loaded from {spec.urdf!r} ({error}).") from error

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from demorec.assets import asset_path
-from demorec.errors import SceneError
+from demorec.errors import DemorecError, SceneError
 from demorec.scene import Body, Shape
 from demorec.sim.urdf_file import urdf_file
 
@@ -35,7 +35,7 @@ def add_body(client: Any, body: Body) -> int:
                     useFixedBase=not body.movable,
                     globalScaling=body.shape.scale,
                 )
-        except SceneError:
+        except DemorecError:
             raise
         except Exception as error:  # PyBullet raises its own bare pybullet.error
             raise SceneError(f"The body {body.name!r} cannot be loaded from {body.shape.file!r} ({error}).") from error

@@ -1,0 +1,200 @@
+"""The robot and the camera of examples/own_robot, for somebody outside of this repository, as docs/robots.md says."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from helpers_check import simulate
+from helpers_generate import inspect
+
+from demorec.cli import generate_dataset_main, main
+from demorec.config import EpisodePlan, GenerateConfig, deciding_versions
+from demorec.errors import ConfigError, SceneError
+from demorec.generate.options import RunOptions
+from demorec.generate.run import generate
+from demorec.generate.run_file import load_run_file
+from demorec.generate.worker import make_episode
+from demorec.own_versions import changed_sources, own_versions, source_digest
+from demorec.recording import Recording
+from demorec.replay import ReplayOptions, open_file, replay_all
+
+ROOT = Path(__file__).parents[2]
+EXAMPLE = ROOT / "examples" / "own_robot"
+XARM6 = "my_robots:XARM6"
+
+
+def call(entry, *args: object) -> int:
+    with pytest.raises(SystemExit) as ended:
+        entry([str(arg) for arg in args])
+    return int(ended.value.code or 0)
+
+
+def forget(*modules: str) -> None:
+    for name in modules:
+        sys.modules.pop(name, None)
+    source_digest.cache_clear()
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """The example's folder, where the user is; it is not on the path, as for the installed commands."""
+    folder = tmp_path / "mine"
+    shutil.copytree(EXAMPLE, folder)
+    monkeypatch.chdir(folder)
+    before = list(sys.path)
+    sys.path[:] = [entry for entry in sys.path if entry not in ("", str(folder))]
+    monkeypatch.setattr("demorec.assets._modules_with_models", set())
+    forget("my_robots")
+    yield folder
+    sys.path[:] = before
+    forget("my_robots")
+
+
+@pytest.mark.slow
+def test_the_example_makes_checks_and_replays_a_dataset(folder: Path, tmp_path: Path, capsys, monkeypatch) -> None:
+    run = tmp_path / "run"
+    flags = ["--robot", XARM6, "--cameras", "front", "my_robots:TOP", "--width", "64", "--height", "64"]
+    assert call(generate_dataset_main, *flags, "--num-episodes", "2", "--workers", "1", "--out", run) == 0
+    told = capsys.readouterr().out
+    assert "2 of 2 asked" in told
+    assert re.search(r"checks +none failed", told)
+    recording = run / "episodes" / "episode_000000.mcap"
+    with Recording(recording) as opened:
+        assert opened.cameras == ("front", "top")
+        assert opened.info.robot.urdf == "my_robots:xarm6.urdf"  # and no path of this machine
+        assert opened.info.versions == load_run_file(run).versions
+    assert (run / "dataset" / "videos" / "observation.images.top").is_dir()
+
+    # Elsewhere, without the module: the recording is enough to look and to check, and says what replaying needs.
+    (folder / "xarm6.urdf").rename(tmp_path / "xarm6.urdf")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("demorec.assets._modules_with_models", set())
+    assert call(main, "check", recording, "--no-pictures") == 0
+    assert call(main, "view", recording, "--save", tmp_path / "view.rrd") == 0
+    capsys.readouterr()
+    assert call(main, "replay", recording) == 2
+    assert "add --allow my_robots." in capsys.readouterr().err
+
+    (tmp_path / "xarm6.urdf").rename(folder / "xarm6.urdf")
+    monkeypatch.chdir(folder)
+    assert call(main, "replay", recording, "--allow", "my_robots") == 0
+    assert "identical, succeeds" in capsys.readouterr().out
+
+    # What the file says has changed since: the run is not gone on with, and replay says so.
+    (folder / "my_robots.py").write_text((folder / "my_robots.py").read_text() + "\nFASTER = True\n")
+    forget("my_robots")
+    assert call(generate_dataset_main, *flags, "--num-episodes", "3", "--workers", "1", "--out", run) == 2
+    assert "holds another run (the source of my_robots has changed)" in capsys.readouterr().err
+    assert call(main, "replay", recording, "--allow", "my_robots") == 0
+    assert "Note: the source of my_robots has changed since this was recorded." in capsys.readouterr().err
+
+
+def test_the_robot_does_a_task_and_replays(folder: Path, tmp_path: Path) -> None:
+    path = simulate(tmp_path / "e.mcap", robot=XARM6, cameras=("my_robots:TOP",), renderer="tiny", width=32, height=32)
+    with Recording(path) as opened:
+        assert opened.cameras == ("top",)
+        assert opened.outcome is not None
+        assert opened.outcome.success
+    options = ReplayOptions(allowed=("my_robots",))
+    ((report, _),) = replay_all([open_file(path, options)], options)
+    assert report.is_identical
+
+
+def test_a_run_is_not_gone_on_with_when_its_task_was_edited(folder: Path, tmp_path: Path) -> None:
+    (folder / "my_tasks.py").write_text("SPEED = 1.0\n")
+    config = GenerateConfig(task="my_tasks:Mine", cameras=())
+
+    def go(num_episodes: int) -> int:
+        options = RunOptions(out=tmp_path / "run", num_episodes=num_episodes, workers=1)
+        return len(generate(config, options, maker="helpers_makers:make", inspect=inspect).run.successes)
+
+    assert go(1) == 1
+    assert go(2) == 2
+    (folder / "my_tasks.py").write_text("SPEED = 2.0\n")
+    forget("my_tasks")
+    with pytest.raises(ConfigError, match=r"holds another run \(the source of my_tasks has changed\)"):
+        go(3)
+    assert load_run_file(tmp_path / "run").versions.keys() == {*deciding_versions(), "source of my_tasks"}
+
+
+def test_a_fresh_worker_does_not_mix_an_edited_module_in(folder: Path, tmp_path: Path) -> None:
+    config = GenerateConfig(robot=XARM6, cameras=())
+    plan = EpisodePlan(config=config, episode_index=0, versions=deciding_versions(config))
+    (folder / "my_robots.py").write_text((folder / "my_robots.py").read_text() + "# faster\n")
+    forget("my_robots")
+    for place in ("episodes", "failed", "unfinished"):
+        (tmp_path / "run" / place).mkdir(parents=True)
+    with pytest.raises(ConfigError, match="not what it was at its start: the source of my_robots has changed"):
+        make_episode(plan, tmp_path / "run")
+
+
+def test_a_model_that_changed_is_another_version(folder: Path) -> None:
+    config = GenerateConfig(robot=XARM6, cameras=())
+    before = deciding_versions(config)
+    assert before.keys() - deciding_versions().keys() == {"source of my_robots", "source of my_robots:xarm6.urdf"}
+    urdf = folder / "xarm6.urdf"
+    urdf.write_text(urdf.read_text().replace('effort="50.0"', 'effort="40.0"'))
+    after = deciding_versions(config)
+    assert {name for name in after if after[name] != before[name]} == {"source of my_robots:xarm6.urdf"}
+    assert changed_sources(before, ["my_robots"]) == ("the source of my_robots:xarm6.urdf has changed",)
+    assert changed_sources(before, []) == ()  # nobody may look
+    assert deciding_versions(GenerateConfig()) == deciding_versions()
+
+
+def test_the_source_counts_with_what_it_imports_from_beside_it(folder: Path) -> None:
+    (folder / "my_tasks.py").write_text("import os\nfrom helpers import sizes\nimport my_robots\n")
+    (folder / "helpers").mkdir()
+    (folder / "helpers" / "__init__.py").write_text("")
+    (folder / "helpers" / "sizes.py").write_text("from . import units\n")
+    (folder / "helpers" / "units.py").write_text("MM = 1e-3\n")
+    (folder / "helpers" / "unused.py").write_text("A = 1\n")
+    digests = []
+
+    def look() -> str:
+        forget("my_tasks")
+        digests.append(own_versions(["my_tasks"])["source of my_tasks"])
+        return digests[-1]
+
+    first = look()
+    assert look() == first
+    (folder / "helpers" / "unused.py").write_text("A = 2\n")
+    assert look() == first
+    for name in ("my_tasks.py", "helpers/__init__.py", "helpers/sizes.py", "helpers/units.py", "my_robots.py"):
+        (folder / name).write_text((folder / name).read_text() + "# edited\n")
+        look()
+    assert len(set(digests)) == 1 + 5
+    assert "my_robots" not in sys.modules  # read, not run
+
+
+@pytest.mark.parametrize("where", ["absolute", "pybullet_data", "absolute in pybullet_data"])
+def test_models_are_found_wherever_they_may_lie(where: str, folder: Path) -> None:
+    from demorec.assets import data_folder, model_name
+
+    name, wanted = {
+        "absolute": (str(folder / "xarm6.urdf"), "my_robots:xarm6.urdf"),
+        "pybullet_data": ("franka_panda/panda.urdf", "franka_panda/panda.urdf"),
+        "absolute in pybullet_data": (str(data_folder() / "franka_panda/panda.urdf"), "franka_panda/panda.urdf"),
+    }[where]
+    assert model_name(name, "my_robots") == wanted
+
+
+def test_a_model_from_elsewhere_cannot_be_recorded(folder: Path, tmp_path: Path) -> None:
+    from demorec.assets import allow_models, asset_path, model_name
+
+    shutil.copy(folder / "xarm6.urdf", tmp_path / "xarm6.urdf")
+    with pytest.raises(ConfigError, match="put it beside the module, found "):
+        model_name(str(tmp_path / "xarm6.urdf"), "my_robots")
+    allow_models(["my_robots"])
+    with pytest.raises(SceneError, match="lies outside of"):
+        asset_path("my_robots:../xarm6.urdf")
+
+
+def test_the_document_shows_the_files(folder: Path) -> None:
+    text = (ROOT / "docs" / "robots.md").read_text()
+    (shown,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    assert shown == (EXAMPLE / "my_robots.py").read_text()
