@@ -36,7 +36,7 @@ class Reproduce:
 
     def run(self) -> int:
         """Generate again, compare, report."""
-        from demorec.cli.generate_report import TerminalProgress
+        from demorec.cli.progress import RunProgress
         from demorec.generate.options import RunOptions
         from demorec.generate.reproduce import Comparison, reproduce
 
@@ -44,7 +44,7 @@ class Reproduce:
             out=self.out, workers=self.workers, executor=self.executor, address=self.address, export=False
         )
         options.validate()
-        with TerminalProgress() as progress:
+        with RunProgress() as progress:
             found = reproduce(self.source, options, progress=progress)
         if not isinstance(found, Comparison):
             tell(f"Interrupted; the same command goes on: {self.out}")
