@@ -69,7 +69,7 @@ def resource_error(error: BaseException, path: Path | None = None) -> ResourceEr
         error: Caught while something was read or written.
         path: Of that, if it is known.
     """
-    for cause in _chain(error):
+    for cause in error_chain(error):
         if isinstance(cause, ResourceError):
             return cause
         number = errno.ENOMEM if isinstance(cause, MemoryError) else getattr(cause, "errno", None)
@@ -79,7 +79,7 @@ def resource_error(error: BaseException, path: Path | None = None) -> ResourceEr
     return None
 
 
-def _chain(error: BaseException) -> Iterator[BaseException]:
+def error_chain(error: BaseException) -> Iterator[BaseException]:
     """An error, what it was raised from, and so on."""
     cause: BaseException | None = error
     while cause is not None:

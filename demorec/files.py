@@ -10,8 +10,9 @@ import errno
 import json
 import os
 import stat
+from io import BufferedReader
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 _KINDS = {
     stat.S_IFIFO: "a FIFO",
@@ -22,7 +23,7 @@ _KINDS = {
 }
 
 
-def open_regular(path: Path) -> BinaryIO:
+def open_regular(path: Path) -> BufferedReader:
     """Open a regular file (or a link to one) for reading, without ever waiting.
 
     Raises:
@@ -46,10 +47,10 @@ def read_text_limited(path: Path, limit: int) -> str:
         UnicodeDecodeError: It is no UTF-8.
     """
     with open_regular(path) as file:
-        # Not limit + 1: reading reserves memory for all that it is asked for.
-        data = file.read(min(os.fstat(file.fileno()).st_size, limit) + 1)
-    if len(data) > limit:
-        raise OSError(errno.EFBIG, f"it is larger than {limit:,} bytes", str(path))
+        size = os.fstat(file.fileno()).st_size
+        if size > limit:
+            raise OSError(errno.EFBIG, f"it is larger than {limit:,} bytes", str(path))
+        data = file.read(size)
     return data.decode()
 
 

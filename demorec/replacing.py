@@ -198,6 +198,11 @@ def replaced_parts(folder: Path, names: Sequence[str]) -> Iterator[None]:
     _drop(aside, names)
 
 
+def has_unsettled_parts(folder: Path) -> bool:
+    """Whether a crash within `replaced_parts` has left something for `settle_parts`."""
+    return os.path.lexists(folder / _ASIDE)
+
+
 def settle_parts(folder: Path, names: Sequence[str]) -> None:
     """Finish what a crash within `replaced_parts` left: put the old back, or delete it where the new is there.
 

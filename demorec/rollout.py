@@ -78,6 +78,18 @@ def _rng(plan: EpisodePlan, purpose: Purpose) -> np.random.Generator:
     )
 
 
+def load_task(config: GenerateConfig) -> type[Task]:
+    """The task that a config names.
+
+    Raises:
+        ConfigError: There is none of that name, it cannot be imported, or the config asks for what it does not have.
+    """
+    task: type[Task] = TASKS.load(config.task, config.modules)
+    if config.fixed and not task.has_fixed_layout:
+        raise ConfigError(f"--fixed was given, but the task {config.task!r} has no fixed layout: leave it out.")
+    return task
+
+
 def prepare(plan: EpisodePlan) -> Episode:
     """Draw an episode's scene, words and behaviour; a pure function of the plan, without a simulator.
 
@@ -85,15 +97,13 @@ def prepare(plan: EpisodePlan) -> Episode:
     `GenerateConfig.check_names` before.
 
     Raises:
-        ConfigError: An unknown name.
+        ConfigError: As `load_task`.
         SceneError: No layout was found within the task's ranges.
     """
     config = plan.config
     allow_models(config.modules)
     robot = load_robot(config.robot, config.modules)
-    task = TASKS.load(config.task, config.modules)()
-    if config.fixed and not task.has_fixed_layout:
-        raise ConfigError(f"--fixed was given, but the task {config.task!r} has no fixed layout: leave it out.")
+    task = load_task(config)()
     ranges = resolve(config.variation, config.ranges)
     scene = task.sample_scene(robot, _sampler(plan, ranges))
     for module in modules_of([config.task]):

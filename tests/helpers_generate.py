@@ -13,6 +13,7 @@ from helpers_makers import line_of, succeeds
 
 from demorec.config import GenerateConfig
 from demorec.errors import DemorecError
+from demorec.files import read_text_limited
 from demorec.generate.options import RunOptions
 from demorec.generate.recordings import Inspected
 from demorec.generate.run import NoProgress, RunResult, generate
@@ -21,7 +22,7 @@ from demorec.generate.run import NoProgress, RunResult, generate
 def inspect(path: Path) -> Inspected:
     """Reads a stand-in recording."""
     try:
-        content = json.loads(path.read_text())
+        content = json.loads(read_text_limited(path, 100_000))
         return Inspected(
             attempt=line_of(path, content, path.name), config=content["config"], versions=content["versions"]
         )

@@ -9,14 +9,16 @@ from pathlib import Path
 from typing import Literal
 
 from demorec.assets import allow_models
-from demorec.check.base import Check, Level, Result, Scope
+from demorec.check.base import Check, Group, Level, Result, Scope
 from demorec.check.dataset import Dataset
 from demorec.check.episode import RecordedEpisode
 from demorec.check.run import RUN_NAME, RunFolder
-from demorec.errors import ConfigError, DemorecError
+from demorec.errors import ConfigError, DemorecError, resource_error
 from demorec.processes import SPAWN
 from demorec.tables import CHECKS
 
+_OF_THE_FILE: tuple[Group, ...] = ("file", "time")
+"""Groups of the checks that look at the file itself, not at what was recorded."""
 _SEVERITY: dict[Level, int] = {"skip": 0, "pass": 0, "warn": 1, "fail": 2}
 
 
@@ -57,17 +59,32 @@ class SubjectReport:
         path: What was checked.
         kind: What it is.
         results: In the order of the table.
+        is_failed_attempt: As in `Subject`.
     """
 
     path: Path
     kind: Scope
     results: tuple[Result, ...]
+    is_failed_attempt: bool = False
 
     @property
     def level(self) -> Literal["pass", "warn", "fail"]:
         """The worst."""
         severity = max((_SEVERITY[result.level] for result in self.results), default=0)
         return ("pass", "warn", "fail")[severity]
+
+    def is_bad(self, *, strict: bool = False) -> bool:
+        """Whether it must not be as it is: a check failed, or with `strict` warned.
+
+        A failed attempt that a run keeps may have dropped its cube or hit the table, that is why it failed; bad is one
+        whose file is damaged, which the checks of file and time find.
+        """
+        limit = _SEVERITY["warn" if strict else "fail"]
+        return any(
+            _SEVERITY[result.level] >= limit
+            for result in self.results
+            if not self.is_failed_attempt or result.group in _OF_THE_FILE
+        )
 
     def count(self, level: Level) -> int:
         """How many results have a level."""
@@ -76,10 +93,18 @@ class SubjectReport:
 
 @dataclass(frozen=True, kw_only=True)
 class Subject:
-    """Something to check."""
+    """Something to check.
+
+    Attributes:
+        path: Where it is.
+        kind: What it is.
+        is_failed_attempt: Whether it is a failed attempt that a run keeps, found there and not named by the user: it
+            is judged apart from what the run made.
+    """
 
     path: Path
     kind: Scope
+    is_failed_attempt: bool = False
 
 
 def find_subjects(paths: Sequence[Path]) -> list[Subject]:
@@ -95,7 +120,10 @@ def find_subjects(paths: Sequence[Path]) -> list[Subject]:
             found.append(Subject(path=path, kind="recording"))
         elif (path / RUN_NAME).is_file():
             found.append(Subject(path=path, kind="run"))
-            found += [Subject(path=file, kind="recording") for file in RunFolder(path).recordings]
+            found += [
+                Subject(path=file, kind="recording", is_failed_attempt=file.parent.name == "failed")
+                for file in RunFolder(path).recordings
+            ]
             if (path / "dataset" / "meta" / "info.json").is_file():
                 found.append(Subject(path=path / "dataset", kind="dataset"))
         elif (path / "meta" / "info.json").is_file():
@@ -133,7 +161,12 @@ def check_subject(subject: Subject, options: CheckOptions) -> SubjectReport:
     else:
         dataset = Dataset(subject.path)
         results = _run(checks, dataset, ("dataset_readable",), lambda: dataset.rows)
-    return SubjectReport(path=subject.path, kind=subject.kind, results=tuple(results))
+    return SubjectReport(
+        path=subject.path,
+        kind=subject.kind,
+        results=tuple(results),
+        is_failed_attempt=subject.is_failed_attempt,
+    )
 
 
 def _run(
@@ -149,9 +182,11 @@ def _run(
         try:
             read()
         except DemorecError as error:
+            if (lack := resource_error(error)) is not None:
+                raise lack from error
             unreadable = str(error)
     for check in checks:
-        if unreadable and check.group not in ("file", "time") and check.name not in gates:
+        if unreadable and check.group not in _OF_THE_FILE and check.name not in gates:
             results.append(check.skipped("the numbers cannot be read"))
             continue
         results.append(check.run(subject))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
@@ -14,10 +13,14 @@ import numpy as np
 from demorec.check.base import Measurement, check, worst
 from demorec.check.coverage import infos_by_task, largest_gap, start_vector, twins
 from demorec.episode import EpisodeInfo
-from demorec.errors import ConfigError, RecordingError
+from demorec.errors import ConfigError, RecordingError, resource_error
+from demorec.files import open_regular, read_json_limited
 from demorec.recording import Recording
 
 RUN_NAME = "run.json"
+_MAX_JSON_BYTES = 2 << 30
+_LINE = {"episode_index": int, "attempt": int, "seed": int, "success": bool, "file": str, "sha256": str}
+"""What the line of an attempt says, as far as it is checked."""
 
 
 class RunFolder:
@@ -34,11 +37,18 @@ class RunFolder:
     def run(self) -> dict[str, Any]:
         """run.json; ConfigError when it cannot be read."""
         try:
-            run = json.loads((self.path / RUN_NAME).read_text())
+            run = read_json_limited(self.path / RUN_NAME, _MAX_JSON_BYTES)
             lines = run["episodes"]
-            if not all("state" in line and "episode_index" in line for line in lines):
-                raise ValueError("episodes without state or number")
-        except (OSError, ValueError, KeyError, TypeError) as error:
+            for line in (line for line in lines if line["state"] != "planned"):
+                wrong = [key for key, kind in _LINE.items() if not isinstance(line[key], kind)]
+                if wrong:
+                    raise ValueError(f"the line of an episode with an impossible {wrong[0]}")
+            if not isinstance(run["num_episodes"], int):
+                raise ValueError("num_episodes is no whole number")
+        except OSError as error:
+            unusable = ConfigError(f"{RUN_NAME} cannot be used ({error.strerror}): {self.path}")
+            raise resource_error(error) or unusable from error
+        except (ValueError, KeyError, TypeError) as error:
             raise ConfigError(f"{RUN_NAME} cannot be used ({error}): {self.path}") from error
         return dict(run)
 
@@ -66,8 +76,11 @@ class RunFolder:
 
     @property
     def successes(self) -> list[EpisodeInfo]:
-        """Infos of the recordings in episodes/."""
-        return [info for file, info in self.infos.items() if file.startswith("episodes/")]
+        """Infos of the recordings in episodes/ that were asked for last (others may be there from a larger request)."""
+        asked = self.run["num_episodes"]
+        return [
+            info for file, info in self.infos.items() if file.startswith("episodes/") and info.episode_index < asked
+        ]
 
 
 @check(group="run", scope="run", measures="files missing, changed since they were made, or not in run.json", warn=0)
@@ -79,9 +92,14 @@ def run_files(run: RunFolder) -> Measurement:
     wrong += [f"{file} is missing" for file in sorted(listed.keys() - there)]
     wrong += [f"{file} is not in run.json" for file in sorted(there - listed.keys())]
     for file in sorted(there & listed.keys()):
-        with (run.path / file).open("rb") as stream:
-            if hashlib.file_digest(stream, "sha256").hexdigest() != listed[file]["sha256"]:
-                wrong.append(f"{file} has changed")
+        try:
+            with open_regular(run.path / file) as stream:
+                if hashlib.file_digest(stream, "sha256").hexdigest() != listed[file]["sha256"]:
+                    wrong.append(f"{file} has changed")
+        except OSError as error:
+            if (lack := resource_error(error, run.path / file)) is not None:
+                raise lack from error
+            wrong.append(f"{file} cannot be read ({error.strerror})")
     return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{len(there)} recordings")
 
 
@@ -148,13 +166,13 @@ def worst_gap(infos: Sequence[EpisodeInfo]) -> Measurement | None:
 
 @check(group="run", scope="run", measures="episodes that the run's dataset lacks or has too many", warn=0)
 def run_dataset(run: RunFolder) -> Measurement | None:
-    """The dataset that was made from the run has an episode for each success."""
+    """The dataset that was made from the run has an episode for each success of those asked for last."""
     path = run.path / "dataset" / "meta" / "info.json"
     if not path.is_file():
         return None
     try:
-        episodes = int(json.loads(path.read_text())["total_episodes"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        episodes = int(read_json_limited(path, _MAX_JSON_BYTES)["total_episodes"])
+    except (OSError, ValueError, KeyError, TypeError, OverflowError) as error:
         raise ConfigError(f"info.json of the dataset cannot be used ({error}): {path}") from error
-    successes = sum(1 for line in run.lines if line["success"])
+    successes = sum(1 for line in run.lines if line["success"] and line["episode_index"] < run.run["num_episodes"])
     return Measurement(value=abs(episodes - successes), detail=f"{episodes} in the dataset, {successes} successes")

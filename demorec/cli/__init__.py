@@ -14,7 +14,7 @@ from typing import Protocol
 
 from demorec.cli.flags import parse, terminal_width
 from demorec.cli.output import PrintableFormatter, say, tell
-from demorec.errors import DemorecError
+from demorec.errors import DemorecError, resource_error
 from demorec.registry import Registry, nearest_match
 
 
@@ -88,6 +88,12 @@ def run_command(command: type[Command], args: Sequence[str], *, prog: str) -> in
     except BrokenPipeError:
         sys.stderr.close()
         return 1
+    except (OSError, MemoryError, ImportError) as error:  # memory and files may run out in any line, an import too
+        lack = resource_error(error)
+        if lack is None:
+            raise
+        tell(f"{prog}: {lack}")
+        return lack.exit_code
 
 
 def _overview() -> list[str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ from tyro.conf import Positional
 from demorec.cli.allow import Allow, allowed_modules
 from demorec.cli.output import say, say_json
 from demorec.cli.paths import places_read
+from demorec.cli.progress import ProgressBar
 from demorec.errors import ConfigError
 from demorec.replacing import PICTURE, check_replaceable
 
@@ -27,8 +27,9 @@ if TYPE_CHECKING:
 class Check:
     """Check recordings, runs and datasets: files, time, physics, alignment, calibration, pictures.
 
-    Exit code 0: everything passed (warnings allowed); 1: a check failed. `demorec list checks` says what is measured
-    and with which limits.
+    Exit code 0: everything passed (warnings allowed); 1: a check failed. The failed attempts that a run keeps are
+    judged apart: their own failures are told, but only a damaged file counts. `demorec list checks` says what is
+    measured and with which limits.
 
     Examples:
       demorec check recordings/cubes
@@ -68,8 +69,6 @@ class Check:
             raise ConfigError(f"replay is {self.replay}, it must be 0 or more.")
         if self.coverage_picture is not None:
             self._check_picture(self.coverage_picture)
-        from tqdm import tqdm
-
         from demorec.check.report import CheckOptions, check_subjects, find_subjects
 
         allowed = allowed_modules(self.allow)
@@ -77,10 +76,10 @@ class Check:
         options.validate()
         subjects = find_subjects(self.paths)
         reports, replays = [], []
-        with tqdm(total=len(subjects), unit="item", desc="checking", disable=not sys.stderr.isatty()) as bar:
+        with ProgressBar("checking", total=len(subjects), unit="item") as bar:
             for report in check_subjects(subjects, options):
                 reports.append(report)
-                bar.update()
+                bar.advance()
                 if not self.json:
                     say(*_lines(report, verbose=self.verbose))
         if self.replay:
@@ -92,8 +91,7 @@ class Check:
                     say(told(replayed))
         if self.coverage_picture is not None:
             self._draw(self.coverage_picture)
-        bad = {"fail", "warn"} if self.strict else {"fail"}
-        failed = [report for report in reports if report.level in bad]
+        failed = [report for report in reports if report.is_bad(strict=self.strict)]
         diverged = [replayed for replayed in replays if not _as_recorded(replayed)]
         if self.json:
             say_json([_plain(report) for report in reports] + [_plain_replay(r) for r in replays])
@@ -156,7 +154,8 @@ def _lines(report: SubjectReport, *, verbose: bool) -> list[str]:
         ("skip", "not applicable"),
     )
     counts = ", ".join(f"{report.count(level)} {word}" for level, word in words if report.count(level))
-    lines = [f"{report.level:<4}  {report.kind} {report.path}: {counts}"]
+    kind = "failed attempt" if report.is_failed_attempt else report.kind
+    lines = [f"{report.level:<4}  {kind} {report.path}: {counts}"]
     shown = [result for result in report.results if verbose or result.level in ("warn", "fail")]
     return lines + [f"      {_result(result)}" for result in shown]
 
@@ -173,6 +172,8 @@ def _result(result: Result) -> str:
 def _summary(reports: Sequence[SubjectReport], failed: int, replays: int, diverged: int) -> str:
     warned = sum(report.level == "warn" for report in reports)
     text = f"{len(reports)} checked, {failed} failed, {warned} with warnings."
+    if apart := sum(report.is_failed_attempt and report.level == "fail" and not report.is_bad() for report in reports):
+        text += f" Not counted: {apart} failed attempts that fail checks of what they recorded."
     return text + (f" {replays} replayed, {diverged} not as recorded." if replays else "")
 
 
@@ -183,7 +184,9 @@ def _plain(report: SubjectReport) -> dict[str, Any]:
     for result in results:
         if result["value"] is not None and abs(result["value"]) == float("inf"):
             result["value"] = None  # JSON has no infinity; the level and the detail tell
-    return {"path": str(report.path), "kind": report.kind, "level": report.level, "results": results}
+    return {"path": str(report.path), "kind": report.kind, "level": report.level, "results": results} | (
+        {"failed_attempt": True} if report.is_failed_attempt else {}
+    )
 
 
 def _plain_replay(report: ReplayReport) -> dict[str, Any]:

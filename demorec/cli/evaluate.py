@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from demorec.cli.allow import Allow, allowed_modules
 from demorec.cli.output import say, say_json
+from demorec.cli.progress import ProgressBar
 from demorec.config import GenerateConfig, VideoConfig
 from demorec.errors import ConfigError
 
@@ -79,8 +79,6 @@ class Evaluate:
             raise ConfigError(f"num-episodes is {self.num_episodes}, allowed are 1 to 1000000.")
         if self.workers is not None and self.workers < 1:
             raise ConfigError(f"workers is {self.workers}, at least 1 is needed.")
-        from tqdm import tqdm
-
         from demorec.acting import check_action_kind
         from demorec.evaluate.rollouts import evaluate, settings_for
         from demorec.generate.options import available_cores
@@ -94,11 +92,11 @@ class Evaluate:
             allowed=allowed_modules(self.allow),
         )
         out = self.out or Path("evaluations") / self.task.rpartition(":")[2]
-        with tqdm(total=self.num_episodes, unit="rollout", disable=not sys.stderr.isatty()) as bar:
+        with ProgressBar("evaluating", total=self.num_episodes, unit="rollout") as bar:
 
             def progress(evaluation: Evaluation) -> None:
-                bar.update(len(evaluation.rollouts) - bar.n)
-                bar.set_postfix_str(str(evaluation.rate))
+                bar.note(str(evaluation.rate))
+                bar.set(len(evaluation.rollouts))
 
             evaluation = evaluate(
                 settings,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
@@ -10,6 +9,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from demorec.cli.output import say
+from demorec.cli.progress import ProgressBar
 from demorec.errors import ConfigError
 from demorec.export.options import ExportOptions, ExportReport
 
@@ -41,17 +41,10 @@ class Export:
         """Export and say what came out."""
         if not self.sources:
             raise ConfigError("No recordings are given: name a run, e.g. demorec export lerobot recordings/cubes.")
-        from tqdm import tqdm
-
         from demorec.export.lerobot import export_lerobot
 
-        with tqdm(total=0, unit="episode", desc="exporting", disable=not sys.stderr.isatty()) as bar:
-
-            def progress(done: int, total: int) -> None:
-                bar.total = total
-                bar.update(done - bar.n)
-
-            report = export_lerobot(self.sources, self.out, self.options, progress)
+        with ProgressBar("exporting") as bar:
+            report = export_lerobot(self.sources, self.out, self.options, bar.set)
         say(*_told(report))
         return 0
 

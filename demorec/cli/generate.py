@@ -24,7 +24,8 @@ if TYPE_CHECKING:
 class Generate:
     """Generate scripted demonstrations: simulate, record (MCAP), export (LeRobot), check.
 
-    The same command again goes on where it stopped; a larger --num-episodes extends the run. Episodes are a pure
+    The same command again goes on where it stopped; a larger --num-episodes extends the run, a smaller one is content
+    with its first episodes and leaves the others where they are. Episodes are a pure
     function of the options below and the seed: the same for any number of workers, any executor and any order.
 
     Examples:
@@ -70,23 +71,24 @@ class Generate:
             print_estimate(estimate(self.episodes, options), options)
             return 0
 
-        from demorec.cli.generate_report import TerminalProgress, check_run, print_result
+        from demorec.cli.generate_report import check_run, print_result
+        from demorec.cli.progress import RunProgress
         from demorec.generate.interrupts import terminate_as_interrupt
         from demorec.generate.run import generate
 
-        with self._watching(options) as watch, TerminalProgress(watch=watch) as progress:
+        with self._watching(options) as watch, RunProgress(watch=watch) as progress:
             result = generate(self.episodes, options, progress=progress)
         if result.interrupted:
             return self._interrupted(result)
         export, checked = None, None
-        with TerminalProgress() as progress, terminate_as_interrupt():
+        with RunProgress() as progress, terminate_as_interrupt():
             if options.export and result.run.successes:
                 from demorec.generate.export_step import export_run
 
                 assert options.repo_id is not None
                 export, _ = export_run(result.folder, repo_id=options.repo_id, progress=progress.exporting)
             if self.check and result.run.successes:
-                checked = check_run(result.folder, progress=progress.checking)
+                checked = check_run(result, progress=progress.checking)
         print_result(result, export, checked)
         return 1 if result.run.given_up or (checked is not None and checked.failures) else 0
 

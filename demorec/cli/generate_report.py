@@ -1,16 +1,18 @@
-"""What a person sees of a run: a progress bar on a terminal, a table at the end."""
+"""What a person sees of a run in the end: a table of what there is, and the commands that come next."""
 
 from __future__ import annotations
 
+import shlex
+import shutil
+import sys
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Self
-
-from tqdm import tqdm
 
 from demorec.cli.output import say, tell
+from demorec.cli.progress import duration
 from demorec.generate.estimate import Estimate
 from demorec.generate.options import RunOptions, available_cores
 from demorec.generate.run import RunResult
@@ -18,71 +20,6 @@ from demorec.generate.run_file import DATASET, EPISODES, STARTING, UNFINISHED, A
 
 _WORTH_PROCESSES = 50
 """Recordings from which on several processes check faster than one."""
-
-
-class TerminalProgress:
-    """Progress bars on a terminal, nothing but messages without one; a context manager.
-
-    `watch` is called with every attempt that has ended.
-    """
-
-    def __init__(self, *, watch: Callable[[Attempt], None] | None = None) -> None:
-        self._watch = watch
-        self._bar: tqdm | None = None  # type: ignore[type-arg]
-        self._title = ""
-        self._failed = 0
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        self._close()
-
-    def verifying(self, done: int, total: int) -> None:
-        """Recordings of an earlier session are being verified."""
-        self._show("verifying", done, total)
-
-    def checking(self, done: int, total: int) -> None:
-        """Run, recordings and dataset are being checked."""
-        self._show("checking", done, total)
-
-    def exporting(self, done: int, total: int) -> None:
-        """Recordings are being exported."""
-        self._show("exporting", done, total)
-
-    def started(self, run: RunFile, workers: int) -> None:
-        """The work begins."""
-        self._show("generating", len(run.successes), run.num_episodes)
-
-    def ended(self, attempt: Attempt) -> None:
-        """An attempt has come to its end."""
-        if self._watch is not None:
-            self._watch(attempt)
-        if self._bar is None:
-            return
-        if attempt.success:
-            self._bar.update()
-        else:
-            self._failed += 1
-            self._bar.set_postfix_str(f"{self._failed} failed attempts")
-
-    def says(self, message: str) -> None:
-        """Something that a person should know."""
-        tell(message)
-
-    def _show(self, title: str, done: int, total: int) -> None:
-        if title != self._title:
-            self._close()
-            self._title = title
-            # disable=None: only on a terminal.
-            self._bar = tqdm(desc=title, total=total, initial=done, unit="episode", disable=None, dynamic_ncols=True)
-        elif self._bar is not None:
-            self._bar.update(done - self._bar.n)
-
-    def _close(self) -> None:
-        if self._bar is not None:
-            self._bar.close()
-        self._bar, self._title = None, ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,26 +30,36 @@ class CheckSummary:
         subjects: How many recordings, runs and datasets were checked.
         warnings: How many checks gave a warning.
         failures: One line for each check that failed.
+        failed_attempts: How many failed attempts fail checks of what they recorded, which is told but counts for
+            nothing.
     """
 
     subjects: int
     warnings: int
     failures: tuple[str, ...]
+    failed_attempts: int
 
 
-def check_run(folder: Path, *, progress: Callable[[int, int], None]) -> CheckSummary:
-    """Every check of run, recordings and dataset that needs no decoded pictures."""
+def check_run(result: RunResult, *, progress: Callable[[int, int], None]) -> CheckSummary:
+    """Every check of run, recordings and dataset that needs no decoded pictures; of the episodes asked for."""
     from demorec.check.report import CheckOptions, check_subjects, find_subjects
 
-    subjects = find_subjects([folder])
+    beyond = {result.folder / attempt.file for attempt in result.run.beyond}
+    subjects = [subject for subject in find_subjects([result.folder]) if subject.path not in beyond]
     workers = available_cores() if len(subjects) > _WORTH_PROCESSES else 1
     warnings = 0
     failures: list[str] = []
+    failed_attempts = 0
     for done, report in enumerate(check_subjects(subjects, CheckOptions(pictures=False, workers=workers))):
+        progress(done + 1, len(subjects))
+        if report.is_failed_attempt and not report.is_bad():
+            failed_attempts += report.level == "fail"
+            continue
         warnings += report.count("warn")
         failures += [f"{report.path.name}: {r.check}: {r.detail}" for r in report.results if r.level == "fail"]
-        progress(done + 1, len(subjects))
-    return CheckSummary(subjects=len(subjects), warnings=warnings, failures=tuple(failures))
+    return CheckSummary(
+        subjects=len(subjects), warnings=warnings, failures=tuple(failures), failed_attempts=failed_attempts
+    )
 
 
 def print_result(result: RunResult, export: ExportRecord | None, checked: CheckSummary | None) -> None:
@@ -139,7 +86,7 @@ def print_result(result: RunResult, export: ExportRecord | None, checked: CheckS
         wall = result.session.wall_seconds
         rate = sum(a.success for a in result.made) / wall * 60
         rows.append(
-            ("this session", f"{wall:.1f} s with {_workers(result.session.workers)}, {rate:.1f} episodes a minute")
+            ("wall time", f"{wall:.1f} s with {_workers(result.session.workers)}, {rate:.1f} episodes a minute")
         )
     leftovers = sum(1 for path in (folder / UNFINISHED).rglob("*") if path.is_file())
     if leftovers:
@@ -151,10 +98,13 @@ def print_result(result: RunResult, export: ExportRecord | None, checked: CheckS
         rows.append(("dataset digest", export.dataset_digest))
     if checked is not None:
         verdict = f"{len(checked.failures)} failed" if checked.failures else "none failed"
-        rows.append(("checks", f"{verdict}, {checked.warnings} warnings; demorec check {folder} says more"))
+        apart = f" (not counted: those of {checked.failed_attempts} failed attempts)" if checked.failed_attempts else ""
+        rows.append(("checks", f"{verdict}, {checked.warnings} warnings{apart}"))
     width = max(len(name) for name, _ in rows)
     for name, value in rows:
         say(f"{name:<{width}}  {value}")
+    if run.successes:
+        say("", "Next:", *(f"  {command}" for command in next_commands(result, export)))
     for failure in () if checked is None else checked.failures[:10]:
         tell(f"Check failed: {failure}")
     if run.given_up:
@@ -163,6 +113,29 @@ def print_result(result: RunResult, export: ExportRecord | None, checked: CheckS
             f"{len(run.given_up)} of {run.num_episodes} episodes failed at all {run.config.max_attempts} attempts and "
             f"were given up: {shown}. The attempts are in {folder / 'failed'}; raise --max-attempts in a new --out."
         )
+
+
+def next_commands(result: RunResult, export: ExportRecord | None) -> list[str]:
+    """What to type next, quoted for the shell."""
+    folder = str(result.folder)
+    commands = [[_program("demorec"), "view", folder], [_program("demorec"), "check", folder]]
+    # LeRobot's policies take pictures, or an environment state that this dataset does not have.
+    if export is not None and result.run.config.cameras and find_spec("torch") and find_spec("lerobot"):
+        commands.append(
+            [
+                _program("lerobot-train"),
+                f"--dataset.repo_id={export.repo_id}",
+                f"--dataset.root={result.folder / DATASET}",
+                "--policy.type=act",
+                "--policy.push_to_hub=false",
+            ]
+        )
+    return [shlex.join(command) for command in commands]
+
+
+def _program(name: str) -> str:
+    """What starts it from the user's shell: its path where PATH does not lead to it."""
+    return name if shutil.which(name) else str(Path(sys.executable).with_name(name))
 
 
 def megabytes(count: float) -> str:
@@ -218,11 +191,3 @@ def print_estimate(estimate: Estimate, options: RunOptions) -> None:
     if estimate.total_bytes > estimate.free_bytes:
         tell("The disk is too small for this run.")
     say("Nothing was kept; leave --dry-run out to generate.")
-
-
-def duration(seconds: float) -> str:
-    """Seconds in the unit that reads best."""
-    for unit, factor in (("days", 86400.0), ("h", 3600.0), ("min", 60.0)):
-        if seconds >= 2 * factor:
-            return f"{seconds / factor:.1f} {unit}"
-    return f"{seconds:.0f} s"

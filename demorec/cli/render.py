@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
@@ -14,6 +13,7 @@ from tyro.conf import Positional
 from demorec.cli.allow import Allow, allowed_modules
 from demorec.cli.output import say
 from demorec.cli.paths import refuse_sources
+from demorec.cli.progress import ProgressBar
 from demorec.config import VideoConfig
 from demorec.errors import ConfigError
 from demorec.processes import SPAWN
@@ -88,17 +88,15 @@ class Render:
             raise ConfigError("No path is given: name a recording or a run, e.g. demorec render recordings --out new.")
         options = self._options()
         jobs = _jobs(self.paths, self.out)
-        from tqdm import tqdm
-
         from demorec.generate.options import available_cores
 
         if self.workers is not None and not 1 <= self.workers <= 1024:
             raise ConfigError(f"workers is {self.workers}, allowed are 1 to 1024.")
         workers = min(self.workers or available_cores(), len(jobs))
         differing = compared = pictures = 0
-        with tqdm(total=len(jobs), unit="episode", desc="rendering", disable=not sys.stderr.isatty()) as bar:
+        with ProgressBar("rendering", total=len(jobs)) as bar:
             for report in _rendered(jobs, options, self.overwrite, workers):
-                bar.update()
+                bar.advance()
                 pictures += report.num_pictures
                 compared += len(report.compared)
                 differing += len(report.differing)

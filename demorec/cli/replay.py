@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
@@ -15,6 +14,7 @@ from tyro.conf import Positional
 from demorec.cli.allow import Allow, allowed_modules
 from demorec.cli.output import say, say_json, tell
 from demorec.cli.paths import refuse_sources
+from demorec.cli.progress import ProgressBar
 from demorec.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -70,8 +70,6 @@ class Replay:
             raise ConfigError("No path is given: name a recording, a run or a dataset, e.g. demorec replay recordings.")
         if self.tolerance < 0:
             raise ConfigError(f"tolerance is {self.tolerance}, it must be 0 or more.")
-        from tqdm import tqdm
-
         from demorec.replay import ReplayOptions, is_as_recorded, replay_all
 
         options = ReplayOptions(
@@ -92,10 +90,10 @@ class Replay:
             found = demonstrations(self.paths, options, episodes=self.episodes)
             reports: list[ReplayReport] = []
             pairs: list[tuple[Path, Path]] = []
-            with tqdm(unit="episode", desc="replaying", disable=not sys.stderr.isatty()) as bar:
+            with ProgressBar("replaying") as bar:
                 for report, written in replay_all(found, options, out=out, overwrite=self.overwrite):
                     reports.append(report)
-                    bar.update()
+                    bar.advance()
                     if not self.json:
                         say(told(report))
                     if written is not None:

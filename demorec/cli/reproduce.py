@@ -39,7 +39,7 @@ class Reproduce:
 
     def run(self) -> int:
         """Generate again, compare, report."""
-        from demorec.cli.generate_report import TerminalProgress
+        from demorec.cli.progress import RunProgress
         from demorec.generate.options import RunOptions
         from demorec.generate.reproduce import Comparison, reproduce
 
@@ -47,7 +47,7 @@ class Reproduce:
             out=self.out, workers=self.workers, executor=self.executor, address=self.address, export=False
         )
         options.validate()
-        with TerminalProgress() as progress:
+        with RunProgress() as progress:
             found = reproduce(self.source, options, progress=progress, allowed=allowed_modules(self.allow))
         if not isinstance(found, Comparison):
             tell(f"Interrupted; the same command goes on: {self.out}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import importlib
 import traceback
 from collections.abc import Callable
@@ -12,7 +13,7 @@ from typing import Protocol
 import psutil
 
 from demorec.config import EpisodePlan
-from demorec.errors import DemorecError
+from demorec.errors import DemorecError, error_chain
 from demorec.generate.run_file import Attempt
 
 Maker = Callable[[EpisodePlan, Path], Attempt]
@@ -39,7 +40,8 @@ class Made:
 class Raised:
     """An attempt raised an exception. Told in words: an exception of somebody's task may not survive pickling.
 
-    `errno` is that of the operating system's error in the chain, if any; `exit_code` that of a DemorecError, else 0.
+    `errno` is that of the operating system's error in the chain, if any (ENOMEM for a MemoryError); `exit_code` that of
+    a DemorecError, else 0.
     """
 
     plan: EpisodePlan
@@ -101,15 +103,14 @@ def attempt_episode(maker: str, plan: EpisodePlan, folder: Path) -> Made | Raise
         attempt = make(plan, folder)
     except Exception as error:
         # A library may wrap the operating system's error; the first one in the chain tells what to do.
-        cause: BaseException | None = error
-        while cause is not None and not isinstance(cause, OSError):
-            cause = cause.__cause__ or cause.__context__
+        cause = next((c for c in error_chain(error) if isinstance(c, OSError | MemoryError)), None)
+        number = errno.ENOMEM if isinstance(cause, MemoryError) else getattr(cause, "errno", None)
         return Raised(
             plan=plan,
             kind=type(error).__name__,
             message=str(error),
             traceback=traceback.format_exc(),
-            errno=cause.errno if isinstance(cause, OSError) else None,
+            errno=number,
             exit_code=error.exit_code if isinstance(error, DemorecError) else 0,
         )
     return Made(plan=plan, attempt=attempt, peak_bytes=peak_memory())

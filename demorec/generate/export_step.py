@@ -18,7 +18,8 @@ def export_run(
 ) -> tuple[ExportRecord, ExportReport | None]:
     """Export the successful episodes of a run to its dataset/, unless that is there already.
 
-    A dataset that this run made from less is replaced; one that it did not make is left alone.
+    Episodes beyond what was asked for last are left out. A dataset that this run made from other content is replaced;
+    one that it did not make is left alone.
 
     Returns:
         What run.json says about the dataset now, and the export's own report if it was made just now.
@@ -43,8 +44,12 @@ def export_run(
         # Written down before: after a crash in between, what is there is known to be ours.
         save_run_file(replace(run, export=record), folder)
         start = time.process_time()
+        wanted = f":{run.num_episodes}" if run.beyond else ""
         report = export_lerobot(
-            [folder], target, ExportOptions(repo_id=repo_id, overwrite=target.exists()), progress=progress
+            [folder],
+            target,
+            ExportOptions(repo_id=repo_id, episodes=wanted, overwrite=target.exists()),
+            progress=progress,
         )
         record = replace(record, dataset_digest=report.digest, seconds=round(time.process_time() - start, 3))
         save_run_file(replace(run, export=record), folder)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import platform
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from demorec.config import GenerateConfig, deciding_versions
-from demorec.errors import ConfigError, DemorecError, GenerationError
+from demorec.errors import ConfigError, DemorecError, GenerationError, resource_error
 from demorec.generate.contents import PARTS, RUN
 from demorec.generate.executor import peak_memory
 from demorec.generate.lock import LOCK_NAME, run_lock
@@ -32,7 +32,7 @@ from demorec.generate.run_file import (
     save_run_file,
 )
 from demorec.generate.survey import Inspector, recordings_of, survey
-from demorec.replacing import check_replaceable, replaced_parts, settle_parts, shown
+from demorec.replacing import check_replaceable, has_unsettled_parts, replaced_parts, settle_parts, shown
 
 if TYPE_CHECKING:
     from demorec.generate.run import Progress, RunResult
@@ -51,7 +51,7 @@ class RunFolder:
         self.path = path
         self.run = run
         self.lost_workers = 0
-        self._attempts = {(a.episode_index, a.attempt): a for a in run.attempts}
+        self._attempts = {(a.episode_index, a.attempt): a for a in run.known}
         self._made: list[Attempt] = []
         self._peak_worker_bytes = 0
         self._session = Session(started=_now(), machine=machine())
@@ -63,7 +63,7 @@ class RunFolder:
     @property
     def kept(self) -> str:
         """A sentence on what is there, for messages."""
-        done = sum(a.success for a in self._attempts.values())
+        done = sum(a.success for a in self._attempts.values() if a.episode_index < self.run.num_episodes)
         return f"{done} of {self.run.num_episodes} episodes are complete and kept: {self.path}"
 
     def begin_session(self, *, executor: str, workers: int) -> None:
@@ -108,7 +108,7 @@ class RunFolder:
             save_run_file(self.run, self.path)
         except OSError as error:
             self.check_alive()
-            raise GenerationError(
+            raise resource_error(error) or GenerationError(
                 f"run.json cannot be written ({error.strerror}); mend that and run the same command again, which "
                 f"finds every complete episode: {self.path}"
             ) from error
@@ -142,44 +142,64 @@ def open_run(
 ) -> Iterator[RunFolder]:
     """Open, continue or begin a run in `options.out`, locked until the context ends.
 
+    Nothing is written, not even the lock, before the request is known to fit what is there.
+
     Raises:
         ConfigError: The folder is in use, holds another run or somebody's files, or cannot be written to; or what is
             to be overwritten is not a run alone.
     """
     assert options.out is not None
     path = options.out.absolute()
+    asked = RunFile(config=config, versions=deciding_versions(config), num_episodes=options.num_episodes)
+    with _told_as_unusable(path):
+        if not has_unsettled_parts(path):
+            _check_request(path, asked, options, inspect=inspect)
     _make_folder(path)
-    with run_lock(path):
+    with run_lock(path):  # from here on nobody else changes it, so what was found is looked at once more
         settle_parts(path, PARTS)
-        replaces = options.overwrite and ((path / RUN_NAME).exists() or bool(recordings_of(path)))
-        if replaces:
-            check_replaceable(path, RUN, overwrite=True)
-        else:
-            _refuse_strangers(path)
-        asked = RunFile(config=config, versions=deciding_versions(config), num_episodes=options.num_episodes)
+        replaces = _check_request(path, asked, options, inspect=inspect)
         # What is overwritten is deleted when the new run's run.json is there, and put back when that cannot be made.
         with replaced_parts(path, PARTS) if replaces else nullcontext():
             folder = _begin_or_continue(path, asked, progress=progress, inspect=inspect)
         yield folder
 
 
+def _check_request(path: Path, asked: RunFile, options: RunOptions, *, inspect: Inspector) -> bool:
+    """Refuse what does not fit the folder; tell whether a run that is there shall be replaced. Only reads."""
+    if options.overwrite and _holds_a_run(path):
+        check_replaceable(path, RUN, overwrite=True)
+        return True
+    _refuse_strangers(path)
+    _known_run(path, asked, inspect=inspect)
+    return False
+
+
+def _holds_a_run(path: Path) -> bool:
+    return (path / RUN_NAME).exists() or bool(recordings_of(path))
+
+
 def _begin_or_continue(path: Path, asked: RunFile, *, progress: Progress, inspect: Inspector) -> RunFolder:
     """Bring the folder and its run.json to what is known now."""
-    run = _known_run(path, asked, progress=progress, inspect=inspect)
-    if run.num_episodes > asked.num_episodes:
-        progress.says(f"The run has {run.num_episodes} episodes already, more than asked; all of them stay.")
-    run = replace(run, num_episodes=max(run.num_episodes, asked.num_episodes))
-    try:
+    run, damage = _known_run(path, asked, inspect=inspect)
+    if damage:
+        kept = _free_name(path / f"{RUN_NAME}.damaged")
+        (path / RUN_NAME).rename(kept)
+        progress.says(f"{damage}. It is kept as {kept.name}; the recordings are read instead.")
+    run = replace(run, num_episodes=asked.num_episodes)
+    with _told_as_unusable(path):
         for name in (EPISODES, FAILED, UNFINISHED):
             (path / name).mkdir(exist_ok=True)
         found = survey(path, run, inspect=inspect, progress=progress.verifying)
-    except OSError as error:
-        raise ConfigError(f"The output folder cannot be used ({error.strerror}): {path}") from error
     for file, reason in found.set_aside.items():
         progress.says(f"{file} was moved to {UNFINISHED}/: {reason}.")
-    for line in (line for line in found.attempts if line.episode_index >= run.num_episodes):
-        run = replace(run, num_episodes=line.episode_index + 1)
-    folder = RunFolder(path, run.with_attempts(found.attempts))
+    run = run.with_attempts(found.attempts)
+    if run.beyond:
+        more = len({line.episode_index for line in run.beyond})
+        progress.says(
+            f"The folder holds {more} episodes beyond the {run.num_episodes} that are asked for now: they stay as "
+            "recordings, outside of the run's digest and dataset."
+        )
+    folder = RunFolder(path, run)
     folder.save()
     return folder
 
@@ -195,42 +215,59 @@ def machine() -> dict[str, str]:
     }
 
 
-def _known_run(path: Path, asked: RunFile, *, progress: Progress, inspect: Inspector) -> RunFile:
-    """What the folder says it holds, if that is the run that is asked for."""
-    if (path / RUN_NAME).exists():
-        try:
+def _known_run(path: Path, asked: RunFile, *, inspect: Inspector) -> tuple[RunFile, str]:
+    """The run that the folder holds, if it is the one that is asked for, and what is wrong with run.json ("": nothing).
+
+    Only reads. A run without any episode claims nothing: the one that is asked for takes its place.
+
+    Raises:
+        ConfigError: The folder holds another run.
+    """
+    run, damage = asked, ""
+    try:
+        if (path / RUN_NAME).exists():
             run = load_run_file(path)
-        except DamagedRunFileError as error:
-            # The recordings know what they are of; a run.json that nobody can read is kept for whoever wants to try.
-            damaged = _free_name(path / f"{RUN_NAME}.damaged")
-            run = _run_of_recordings(path, asked, inspect)
-            (path / RUN_NAME).rename(damaged)
-            progress.says(f"{error}. It is kept as {damaged.name}; the recordings are read instead.")
-    elif recordings_of(path):
-        run = _run_of_recordings(path, asked, inspect)
-    else:
-        return asked
+    except DamagedRunFileError as error:
+        # The recordings know what they are of; a run.json that nobody can read is kept for whoever wants to try.
+        damage = str(error)
+    recordings = recordings_of(path)
+    if run is asked and recordings:
+        run = _run_of_recordings(recordings, asked, inspect)
     different = differences(run, asked.config, asked.versions)
+    if different and not recordings and not any(line.file for line in run.known):
+        return asked, damage
     if different:
         raise ConfigError(
             f"The output folder holds another run ({'; '.join(different)}): choose another --out, ask for the same, or "
             f"give --overwrite to delete it: {path}"
         )
-    return run
+    return run, damage
 
 
-def _run_of_recordings(path: Path, asked: RunFile, inspect: Inspector) -> RunFile:
+def _run_of_recordings(recordings: Iterable[Path], asked: RunFile, inspect: Inspector) -> RunFile:
     """The run that the first readable recording belongs to; the survey looks at each of them."""
     from demorec.plain import from_plain
 
-    for file in recordings_of(path):
+    for file in recordings:
         try:
             found = inspect(file)
             config = from_plain(dict(found.config), GenerateConfig)
-        except (DemorecError, OSError, ValueError):
+        except (DemorecError, OSError, ValueError, MemoryError) as error:
+            if (lack := resource_error(error, file)) is not None:
+                raise lack from error
             continue
         return RunFile(config=config, versions=found.versions, num_episodes=asked.num_episodes)
     return asked
+
+
+@contextmanager
+def _told_as_unusable(path: Path) -> Iterator[None]:
+    """Turn errors of the file system into one sentence about the folder."""
+    try:
+        yield
+    except OSError as error:
+        unusable = ConfigError(f"The output folder cannot be used ({error.strerror}): choose another --out: {path}")
+        raise resource_error(error) or unusable from error
 
 
 def _make_folder(path: Path) -> None:
@@ -243,7 +280,7 @@ def _make_folder(path: Path) -> None:
 
 
 def _refuse_strangers(path: Path) -> None:
-    if (path / RUN_NAME).exists() or recordings_of(path):
+    if not path.is_dir() or _holds_a_run(path):
         return
     strangers = sorted(p.name for p in path.iterdir() if p.name not in (*PARTS, LOCK_NAME, f"{RUN_NAME}.part"))
     if strangers:

@@ -5,11 +5,12 @@ from __future__ import annotations
 import fcntl
 import os
 import platform
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from demorec.errors import ConfigError
+from demorec.errors import ConfigError, resource_error
 
 LOCK_NAME = ".lock"
 
@@ -26,11 +27,16 @@ def run_lock(folder: Path) -> Iterator[None]:
     """
     path = folder / LOCK_NAME
     try:
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        if os.path.lexists(path) and not stat.S_ISREG(path.lstat().st_mode):
+            raise ConfigError(f"The lock of the output folder is no file: remove it, or choose another --out: {path}")
+        # Neither a FIFO is waited for nor a link followed: what is opened is written to.
+        flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOFOLLOW
+        descriptor = os.open(path, flags, 0o644)
     except OSError as error:
-        raise ConfigError(
+        unusable = ConfigError(
             f"The output folder cannot be written to ({error.strerror}): choose another --out: {folder}"
-        ) from error
+        )
+        raise resource_error(error) or unusable from error
     try:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -19,7 +19,8 @@ class RunOptions:
     out: Path | None = None
     """Folder of the run (auto: recordings/TASK). The same command again goes on where it stopped."""
     num_episodes: int = 50
-    """How many successful episodes to make; a larger number extends the run."""
+    """How many successful episodes to make; a larger number extends the run, a smaller one leaves the
+    others out of it."""
     workers: int | None = None
     """Processes that simulate (auto: one for each core; with Ray: as many as the cluster has room for)."""
     executor: Literal["local", "ray"] = "local"

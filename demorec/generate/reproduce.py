@@ -105,9 +105,10 @@ def read_original(source: Path) -> Original:
         run = load_run_file(source)
         if not run.attempts:
             raise ConfigError(f"The run has no episodes yet: {source}")
+        run.config.validate()
         return Original(
             config=run.config,
-            num_episodes=run.num_episodes,
+            num_episodes=1 + max(a.episode_index for a in run.attempts),
             versions=run.versions,
             digests={(a.episode_index, a.attempt): a.digest for a in run.attempts},
             export=None,
@@ -130,8 +131,10 @@ def _read_dataset(source: Path) -> Original:
         if any(row["origin"] for row in rows):
             raise ConfigError(f"The dataset holds replayed or rendered episodes, which no run makes: {source}")
         (config,) = configs.values()
+        original = parse_config(config, GenerateConfig, source=str(source / CONFIGS_PATH))
+        original.validate()
         return Original(
-            config=parse_config(config, GenerateConfig, source=str(source / CONFIGS_PATH)),
+            config=original,
             num_episodes=1 + max(row["run_episode_index"] for row in rows),
             versions=json.loads(rows[0]["episode_info"])["versions"],
             digests=_digests(rows),

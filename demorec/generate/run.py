@@ -32,6 +32,7 @@ MAX_LOSSES = 5
 GRACE_S = 3.0
 """How long current episodes may go on after the first Ctrl-C."""
 _POLL_S = 0.2
+_MORE_MEMORY = "try fewer --workers or a machine with more memory"
 _REFUSED = {
     errno.ENOSPC: "the disk is full",
     errno.EDQUOT: "the quota is used up",
@@ -113,11 +114,12 @@ def generate(
         episodes: Order in which episodes are begun (default: ascending); the result does not depend on it.
 
     Raises:
-        ConfigError: The folder is in use, holds another run or cannot be written to.
+        ConfigError: The task cannot be loaded, or the folder is in use, holds another run or cannot be written to.
         GenerationError: The run cannot go on; everything finished is kept.
         KeyboardInterrupt: At the second Ctrl-C.
     """
     progress = progress or NoProgress()
+    _refuse_impossible(config, options)
     with ExitStack() as stack:
         folder = stack.enter_context(open_run(config, options, progress=progress, inspect=inspect))
         schedule = Schedule(folder.run, episodes=episodes)
@@ -138,6 +140,15 @@ def generate(
             raise
         folder.end_session("interrupted" if interrupted else "ended")
         return folder.result(interrupted=interrupted)
+
+
+def _refuse_impossible(config: GenerateConfig, options: RunOptions) -> None:
+    """Raise what the first worker would raise, before anything is written."""
+    from demorec.rollout import load_task
+
+    load_task(config)
+    if options.executor == "ray":
+        import demorec.generate.on_ray  # noqa: F401  # MissingDependencyError without Ray
 
 
 def make_executor(options: RunOptions, folder: Path, run: RunFile, maker: str) -> Executor:
@@ -161,6 +172,12 @@ def make_executor(options: RunOptions, folder: Path, run: RunFile, maker: str) -
         workers=max(1, min(options.workers or available_cores(), missing)),
         recycle_after=options.recycle_after,
     )
+
+
+def _advice(number: int) -> str:
+    if number == errno.ENOMEM:
+        return _MORE_MEMORY
+    return "see whether the storage of the output folder is sound, then run the same command again"
 
 
 class _Driver:
@@ -202,7 +219,7 @@ class _Driver:
             if isinstance(report, Made):
                 self._made(report)
             elif isinstance(report, Lost):
-                self._again(report.plan, report.reason, "try fewer --workers or a machine with more memory")
+                self._again(report.plan, report.reason, _MORE_MEMORY)
             else:
                 self._raised(report)
 
@@ -231,11 +248,7 @@ class _Driver:
                 f"command again. {self._folder.kept}"
             )
         if report.errno is not None and report.exit_code != ConfigError.exit_code:
-            self._again(
-                report.plan,
-                report.message.rstrip("."),
-                "see whether the storage of the output folder is sound, then run the same command again",
-            )
+            self._again(report.plan, report.message.rstrip(".") or report.kind, _advice(report.errno))
             return
         if report.exit_code:
             wrong = ConfigError if report.exit_code == ConfigError.exit_code else GenerationError

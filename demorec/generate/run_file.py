@@ -15,7 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from demorec.config import GenerateConfig
-from demorec.errors import ConfigError
+from demorec.errors import ConfigError, resource_error
+from demorec.files import open_regular, read_json_limited
+from demorec.generate.options import MAX_EPISODES
 from demorec.plain import digest, from_plain, to_plain
 
 RUN_NAME = "run.json"
@@ -23,6 +25,10 @@ RUN_FORMAT = 1
 EPISODES, FAILED, UNFINISHED, DATASET = "episodes", "failed", "unfinished", "dataset"
 STARTING = "starting"
 """What a worker does before its first frame, once: it compiles, or loads, and fills caches that later episodes find."""
+
+
+MAX_RUN_FILE_BYTES = 2 << 30
+"""Above this run.json is not read: some million episodes, which take ten times as much memory."""
 
 
 class DamagedRunFileError(ConfigError):
@@ -94,8 +100,10 @@ class RunFile:
     Attributes:
         config: What decides the data.
         versions: package -> version, of what decides the bits.
-        num_episodes: How many successes are wanted.
-        attempts: Every finished attempt, ordered by episode and attempt.
+        num_episodes: How many successes were asked for last: of the episodes 0 to num_episodes - 1.
+        attempts: Every finished attempt at these episodes, ordered by episode and attempt.
+        beyond: The same of later episodes, which were made when more was asked for. They stay, and are no part of the
+            run: not of its digest, not of its dataset.
         sessions: Every start of the command.
         export: The dataset made from it, if any.
     """
@@ -104,6 +112,7 @@ class RunFile:
     versions: Mapping[str, str]
     num_episodes: int
     attempts: tuple[Attempt, ...] = ()
+    beyond: tuple[Attempt, ...] = ()
     sessions: tuple[Session, ...] = ()
     export: ExportRecord | None = None
 
@@ -141,15 +150,25 @@ class RunFile:
         lines += [f"{a.episode_index} {a.attempt} {int(a.success)} {a.digest}" for a in self.attempts]
         return hashlib.sha256("\n".join(lines).encode()).hexdigest()[:16]
 
+    @property
+    def known(self) -> tuple[Attempt, ...]:
+        """Every finished attempt, those beyond what was asked for included."""
+        return self.attempts + self.beyond
+
     def with_attempts(self, attempts: Iterable[Attempt]) -> RunFile:
-        """This run with these attempts, in order."""
-        return replace(self, attempts=tuple(sorted(attempts, key=lambda a: (a.episode_index, a.attempt))))
+        """This run with these attempts, in order; those of later episodes than asked for are `beyond`."""
+        ordered = sorted(attempts, key=lambda a: (a.episode_index, a.attempt))
+        return replace(
+            self,
+            attempts=tuple(a for a in ordered if a.episode_index < self.num_episodes),
+            beyond=tuple(a for a in ordered if a.episode_index >= self.num_episodes),
+        )
 
 
 def save_run_file(run: RunFile, folder: Path) -> None:
     """Replace run.json in one step: a reader or a crash sees the old or the new one, never a mixture."""
     plain = to_plain(run)
-    attempts = plain.pop("attempts")
+    attempts = plain.pop("attempts") + plain.pop("beyond")
     head = {
         "format": RUN_FORMAT,
         "config_digest": run.config_digest,
@@ -161,7 +180,8 @@ def save_run_file(run: RunFile, folder: Path) -> None:
     lines = ",\n".join("    " + json.dumps(line, allow_nan=False) for line in _episode_lines(run, attempts))
     text += ',\n  "episodes": [\n' + lines + "\n  ]\n}\n"
     part = folder / f"{RUN_NAME}.part"
-    with part.open("w") as file:
+    part.unlink(missing_ok=True)  # of a crash; whatever else has that name must not be written through
+    with part.open("x") as file:
         file.write(text)
         file.flush()
         os.fsync(file.fileno())
@@ -178,7 +198,7 @@ def load_run_file(folder: Path) -> RunFile:
     """
     path = folder / RUN_NAME
     try:
-        plain = json.loads(path.read_text())
+        plain = read_json_limited(path, MAX_RUN_FILE_BYTES)
         if not isinstance(plain, dict):
             raise ValueError("no JSON object")
         if plain.get("format", 0) > RUN_FORMAT:
@@ -186,10 +206,15 @@ def load_run_file(folder: Path) -> RunFile:
         attempts = [_attempt_line(line) for line in plain.pop("episodes") if line["state"] != "planned"]
         for derived in ("format", "config_digest", "digest", "complete"):
             plain.pop(derived)
-        return from_plain({**plain, "attempts": attempts}, RunFile)
+        run = from_plain({**plain, "attempts": attempts}, RunFile)
+        _refuse_impossible(run)
+        return run.with_attempts(run.attempts)
     except FileNotFoundError as error:
         raise ConfigError(f"No run.json, so this is no run of generate-dataset: {folder}") from error
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except OSError as error:
+        damaged = DamagedRunFileError(f"run.json is damaged ({error.strerror}): {path}")
+        raise resource_error(error, path) or damaged from error
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise DamagedRunFileError(f"run.json is damaged ({error}): {path}") from error
 
 
@@ -201,7 +226,7 @@ def recording_name(episode_index: int, attempt: int, *, success: bool) -> str:
 
 def sha256_of(path: Path) -> str:
     """SHA-256 (hex) of a file's bytes."""
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
@@ -212,6 +237,25 @@ def sync_folder(folder: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def _refuse_impossible(run: RunFile) -> None:
+    """Raise ValueError for numbers that generate-dataset never writes: others would be counted up to, for ever."""
+    if not 1 <= run.num_episodes <= MAX_EPISODES:
+        raise ValueError(f"num_episodes is {run.num_episodes}, allowed are 1 to {MAX_EPISODES:,}")
+    seen: set[tuple[int, int]] = set()
+    for line in run.attempts:
+        which = f"episode {line.episode_index}, attempt {line.attempt}"
+        if not 0 <= line.episode_index < MAX_EPISODES or not 0 <= line.attempt < run.config.max_attempts:
+            raise ValueError(f"a line is of {which}, beyond {MAX_EPISODES:,} or max_attempts")
+        if (line.episode_index, line.attempt) in seen:
+            raise ValueError(f"two lines are of {which}")
+        seen.add((line.episode_index, line.attempt))
+        place = f"{EPISODES if line.success else FAILED}/" + recording_name(
+            line.episode_index, line.attempt, success=line.success
+        )
+        if line.file != place and (line.file or line.success):
+            raise ValueError(f"the line of {which} names the file {line.file!r} instead of {place}")
 
 
 def _episode_lines(run: RunFile, attempts: list[dict[str, Any]]) -> Iterable[dict[str, Any]]:

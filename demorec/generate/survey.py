@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from demorec.errors import DemorecError
+from demorec.errors import DemorecError, resource_error
 from demorec.generate.plan import plain_differences
 from demorec.generate.recordings import Inspected, inspect_recording
 from demorec.generate.run_file import (
@@ -42,8 +42,8 @@ class Survey:
 
 
 def recordings_of(folder: Path) -> list[Path]:
-    """Every file in episodes/ and failed/."""
-    return sorted(path for place in (EPISODES, FAILED) for path in (folder / place).glob("*") if path.is_file())
+    """Everything in episodes/ and failed/ that is named as a recording, whatever it is."""
+    return sorted(path for place in (EPISODES, FAILED) for path in (folder / place).glob("*.mcap"))
 
 
 def survey(
@@ -55,10 +55,13 @@ def survey(
 ) -> Survey:
     """Verify every recording of a folder against run.json, or read it in full where run.json does not know it.
 
-    What is damaged, unfinished or of another run is moved to unfinished/; nothing is deleted.
+    What is damaged, unfinished, of another run or no file at all is moved to unfinished/; nothing is deleted.
+
+    Raises:
+        ResourceError: This machine cannot read one of them now; nothing is moved for that.
     """
-    known = {a.file: a for a in run.attempts if a.file}
-    kept = [a for a in run.attempts if not a.file]
+    known = {a.file: a for a in run.known if a.file}
+    kept = [a for a in run.known if not a.file]
     set_aside: dict[str, str] = {}
     num_adopted = 0
     files = recordings_of(folder)
@@ -72,8 +75,10 @@ def survey(
             elif path.stat().st_size != line.num_bytes or sha256_of(path) != line.sha256:
                 raise DemorecError("its bytes are not those that run.json knows")
             kept.append(line)
-        except (DemorecError, OSError) as error:
-            set_aside[file] = str(error)
+        except (DemorecError, OSError, MemoryError) as error:
+            if (lack := resource_error(error, path)) is not None:
+                raise lack from error
+            set_aside[file] = (error.strerror if isinstance(error, OSError) else None) or str(error)
             _set_aside(path, folder)
         progress(number + 1, len(files))
     return Survey(attempts=tuple(kept), set_aside=set_aside, num_adopted=num_adopted)

@@ -31,7 +31,7 @@ from mcap.records import (
     Statistics,
 )
 
-from demorec.errors import RecordingError
+from demorec.errors import DemorecError, RecordingError, ResourceError, resource_error
 from demorec.files import open_regular
 from demorec.recording.chunks import MAX_RECORD_BYTES, RECORD_HEAD, Block, ChunkPlace, blocks_of, chunk_content
 from demorec.recording.limits import LimitError, Limits
@@ -53,20 +53,26 @@ class Message(NamedTuple):
 
 @contextmanager
 def damage_as_recording_error(path: Path) -> Iterator[None]:
-    """Turn whatever a parser of damaged bytes raises into RecordingError."""
+    """Turn whatever a parser of damaged bytes raises into RecordingError, and a lack of memory into ResourceError."""
     try:
         yield
-    except RecordingError:
+    except (RecordingError, ResourceError):
         raise
     except LimitError as error:
         raise RecordingError(f"The recording is not read, {error}: {path}") from error
     except (OSError, MemoryError, ValueError, KeyError, IndexError, OverflowError, EOFError, struct.error) as error:
-        raise RecordingError(f"The recording is damaged ({_short(error)}): {path}") from error
+        raise _damage(error, path) from error
     except Exception as error:
         # The parsers' own errors (mcap, zstandard) share no base class but Exception.
         if type(error).__module__.split(".")[0] not in ("mcap", "zstandard", "zstd", "builtins"):
             raise
-        raise RecordingError(f"The recording is damaged ({_short(error)}): {path}") from error
+        raise _damage(error, path) from error
+
+
+def _damage(error: BaseException, path: Path) -> DemorecError:
+    if "not enough memory" in str(error):  # zstandard has no error of its own for that
+        error = MemoryError()
+    return resource_error(error, path) or RecordingError(f"The recording is damaged ({_short(error)}): {path}")
 
 
 def _short(error: BaseException) -> str:
@@ -90,7 +96,8 @@ class Container:
         try:
             self._file: BinaryIO = open_regular(path)
         except OSError as error:
-            raise RecordingError(f"The recording cannot be read ({error.strerror}): {path}") from error
+            unreadable = RecordingError(f"The recording cannot be read ({error.strerror}): {path}")
+            raise resource_error(error, path) or unreadable from error
         try:
             with damage_as_recording_error(path):
                 self._read_summary()

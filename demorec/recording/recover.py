@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from demorec.episode import frame_time_ns
-from demorec.errors import RecordingError
+from demorec.errors import RecordingError, resource_error
 from demorec.recording import channels, messages, metadata
 from demorec.recording.container import SalvagedMessage, SalvagedMetadata, salvage
 from demorec.recording.part_file import PartFile
@@ -120,7 +120,8 @@ def _items(source: Path) -> Iterator[SalvagedMessage | SalvagedMetadata | str | 
     try:
         yield from salvage(source)
     except OSError as error:
-        raise RecordingError(f"The file cannot be read ({error.strerror}): {source}") from error
+        unreadable = RecordingError(f"The file cannot be read ({error.strerror}): {source}")
+        raise resource_error(error, source) or unreadable from error
 
 
 def _survey(source: Path) -> _Survey:

@@ -97,14 +97,34 @@ def test_the_same_command_again_keeps_everything(tmp_path, reference):
     assert before == {p: p.stat().st_mtime_ns for p in (tmp_path / "run").rglob("*.mcap")}
 
 
-def test_more_episodes_extend_a_run_and_fewer_leave_it(tmp_path, reference):
-    run_fake(tmp_path / "run", num_episodes=3)
-    grown = run_fake(tmp_path / "run", num_episodes=8)
+def test_more_episodes_extend_a_run_and_fewer_are_the_run_that_they_would_have_been(tmp_path, reference):
+    out = tmp_path / "run"
+    alone = run_fake(out, num_episodes=3)
+    grown = run_fake(out, num_episodes=8)
     assert grown.run.digest == reference.run.digest
     assert len(grown.made) == len(expected_attempts(8)) - len(expected_attempts(3))
     heard = Remembers()
-    assert run_fake(tmp_path / "run", num_episodes=3, progress=heard).run.digest == reference.run.digest
-    assert "more than asked" in heard.said[0]
+    shrunk = run_fake(out, num_episodes=3, progress=heard)
+    assert shrunk.run.digest == alone.run.digest
+    assert shrunk.run.is_complete
+    assert attempts(shrunk) == expected_attempts(3)
+    assert num_finished(out) == num_finished(reference.folder), "what exists stays"
+    (said,) = heard.said
+    assert said.startswith("The folder holds 5 episodes beyond the 3 that are asked for now: they stay as recordings, ")
+    again = run_fake(out, num_episodes=8)
+    assert again.made == ()
+    assert again.run.digest == reference.run.digest
+
+
+def test_fewer_episodes_than_an_interrupted_run_wanted_are_enough(tmp_path):
+    """5000 were asked for and some were made; then 3 are asked for."""
+    out = tmp_path / "run"
+    with pytest.raises(GenerationError):
+        run_fake(out, num_episodes=5000, maker="die_always", workers=1)
+    assert 0 < num_finished(out) < 5000
+    result = run_fake(out, num_episodes=3)
+    assert result.run.is_complete
+    assert result.run.digest == run_fake(tmp_path / "alone", num_episodes=3).run.digest
 
 
 def test_another_config_is_refused_and_nothing_is_touched(tmp_path):

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 from dataclasses import replace
 
 import pytest
 from helpers_generate import expected_attempts
 
 from demorec.config import GenerateConfig
-from demorec.errors import ConfigError
+from demorec.errors import ConfigError, ResourceError
 from demorec.generate.run_file import (
     Attempt,
     DamagedRunFileError,
@@ -17,6 +19,7 @@ from demorec.generate.run_file import (
     RunFile,
     Session,
     load_run_file,
+    recording_name,
     save_run_file,
 )
 
@@ -28,7 +31,7 @@ def a_run() -> RunFile:
             attempt=attempt,
             seed=3,
             success=success,
-            file=f"{episode}",
+            file=f"{'episodes' if success else 'failed'}/{recording_name(episode, attempt, success=success)}",
             sha256="ab",
             digest=f"{episode} {attempt}",
             num_frames=5,
@@ -85,6 +88,108 @@ def test_every_damage_is_told_as_such(tmp_path, damage):
     assert path.read_text() != before
     with pytest.raises(DamagedRunFileError, match=r"run\.json is damaged"):
         load_run_file(tmp_path)
+
+
+def edit(path, change) -> None:
+    """Change run.json as JSON, and be sure that it is another one then."""
+    plain = json.loads(path.read_text())
+    before = json.dumps(plain)
+    change(plain)
+    assert json.dumps(plain) != before
+    path.write_text(json.dumps(plain))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda run: run.update(num_episodes=10**8), "num_episodes is 100000000, allowed are 1 to 10,000,000"),
+        (lambda run: run.update(num_episodes=10**18), "num_episodes is"),
+        (lambda run: run.update(num_episodes=0), "num_episodes is 0"),
+        (lambda run: run["episodes"][0].update(episode_index=10**7), "episode 10000000, attempt 0"),
+        (lambda run: run["episodes"][0].update(episode_index=-1), "episode -1"),
+        (lambda run: run["episodes"][0].update(attempt=10**9), "attempt 1000000000"),
+        (lambda run: run["episodes"][0].update(attempt=-1), "attempt -1"),
+        (lambda run: run["episodes"][0].update(episode_index=10**6), "names the file"),
+        (lambda run: run["episodes"][0].update(file="../../elsewhere.mcap"), "names the file '../../elsewhere.mcap'"),
+        (lambda run: run["episodes"][0].update(file=""), "names the file ''"),
+        (lambda run: run["episodes"].append(run["episodes"][0]), "two lines are of episode 0, attempt 0"),
+    ],
+)
+def test_numbers_that_no_run_has_are_damage(tmp_path, change, words):
+    run = a_run()
+    assert run.attempts[0].success, "the first line must be that of a recording in episodes/"
+    save_run_file(run, tmp_path)
+    edit(tmp_path / "run.json", change)
+    with pytest.raises(DamagedRunFileError) as error:
+        load_run_file(tmp_path)
+    assert words in str(error.value)
+
+
+def test_a_failed_attempt_may_have_no_recording(tmp_path):
+    run = a_run()
+    failed = next(line for line in run.attempts if not line.success)
+    run = run.with_attempts([replace(line, file="") if line is failed else line for line in run.attempts])
+    save_run_file(run, tmp_path)
+    assert load_run_file(tmp_path) == run
+
+
+def make_nested(path):
+    path.write_text("[" * 100_000)
+
+
+def make_huge(path):
+    with path.open("wb") as file:
+        file.truncate(1 << 40)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (make_nested, "nested too deeply"),
+        (make_huge, "larger than"),
+        (os.mkfifo, "a FIFO"),
+        (lambda path: path.mkdir(), "a folder"),
+    ],
+)
+def test_whatever_lies_in_its_place_is_told_at_once(tmp_path, make, words):
+    make(tmp_path / "run.json")
+    with pytest.raises(DamagedRunFileError, match=words):
+        load_run_file(tmp_path)
+
+
+@pytest.mark.parametrize("number", [errno.EMFILE, errno.EIO, errno.ENOMEM])
+def test_what_the_machine_lacks_is_no_damage(tmp_path, monkeypatch, number):
+    save_run_file(a_run(), tmp_path)
+
+    def fail(*_: object) -> str:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(os, "open", fail)
+    with pytest.raises(ResourceError, match="whether the file is sound is not known"):
+        load_run_file(tmp_path)
+
+
+def test_it_is_never_written_through_what_lies_in_the_way(tmp_path):
+    (tmp_path / "mine").write_text("mine")
+    (tmp_path / "run.json.part").symlink_to("mine")
+    save_run_file(a_run(), tmp_path)
+    assert (tmp_path / "mine").read_text() == "mine"
+    os.mkfifo(tmp_path / "run.json.part")
+    save_run_file(a_run(), tmp_path)
+    assert load_run_file(tmp_path) == a_run()
+
+
+def test_fewer_episodes_are_the_run_that_they_would_have_been_alone(tmp_path):
+    run = a_run()
+    fewer = replace(run, num_episodes=2).with_attempts(run.known)
+    alone = replace(run, num_episodes=2, attempts=tuple(line for line in run.attempts if line.episode_index < 2))
+    assert (fewer.digest, fewer.successes, fewer.given_up) == (alone.digest, alone.successes, alone.given_up)
+    assert fewer.is_complete
+    assert fewer.digest != run.digest
+    assert fewer.beyond == tuple(line for line in run.attempts if line.episode_index >= 2) != ()
+    save_run_file(fewer, tmp_path)
+    assert load_run_file(tmp_path) == fewer
+    assert replace(fewer, num_episodes=8).with_attempts(fewer.known) == run
 
 
 def test_a_newer_format_is_no_damage(tmp_path):

@@ -1,0 +1,175 @@
+"""How far a command is: a bar on a terminal, now and then a line in a log file (Slurm, nohup, CI)."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Self
+
+from tqdm import tqdm
+
+from demorec.cli.output import tell
+
+if TYPE_CHECKING:
+    from demorec.generate.run_file import Attempt, RunFile
+
+_QUIET_S = 10.0
+"""Shortest time between two lines, and before the first: what is over by then needs none."""
+_SHARE = 0.05
+"""Share of the whole after which the next line is due."""
+_LONGEST_S = 300.0
+"""Longest time without a line while something ends: in a run of days, a share takes hours."""
+
+
+class ProgressBar:
+    """Counts what is done of one job; a context manager.
+
+    On a terminal a bar. Elsewhere a line after ten seconds and then for every 5 % of the whole, but neither more often
+    than every ten seconds nor, while anything ends, less often than every five minutes.
+
+    Args:
+        title: What is being done, as in "exporting".
+        total: How many things there are; 0 when it is not known yet.
+        done: How many of them were done before.
+        unit: What one of them is called.
+        is_terminal: Whether a person watches (default: whether standard error is a terminal).
+        clock: Seconds, monotonic.
+    """
+
+    def __init__(
+        self,
+        title: str,
+        *,
+        total: int = 0,
+        done: int = 0,
+        unit: str = "episode",
+        is_terminal: bool | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._title, self._unit, self._clock = title, unit, clock
+        self._first, self.done, self.total = done, done, total
+        self._note = ""
+        self._started = self._told_at = clock()
+        self._told_done: int | None = None
+        watched = sys.stderr.isatty() if is_terminal is None else is_terminal
+        self._bar = tqdm(
+            desc=title, total=total, initial=done, unit=unit, disable=not watched, dynamic_ncols=True, file=sys.stderr
+        )
+        self._is_terminal = watched
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Take the bar off the terminal's last line; harmless when called twice."""
+        self._bar.close()
+
+    def advance(self) -> None:
+        """One more is done."""
+        self.set(self.done + 1)
+
+    def set(self, done: int, total: int | None = None) -> None:
+        """So many are done, of `total` if that is known only now."""
+        self.done = done
+        self.total = self.total if total is None else total
+        self._bar.total = self.total
+        self._bar.update(done - self._bar.n)
+        if not self._is_terminal and self._is_due():
+            self._told_at, self._told_done = self._clock(), done
+            tell(self._line())
+
+    def note(self, text: str) -> None:
+        """Something to be shown with the count from now on: "2 failed attempts"."""
+        self._note = text
+        self._bar.set_postfix_str(text)
+
+    def _is_due(self) -> bool:
+        waited = self._clock() - self._told_at
+        if waited < _QUIET_S or (self.total and self.done >= self.total):
+            return False
+        if self._told_done is None or waited >= _LONGEST_S:
+            return True
+        return self.done - self._told_done >= _SHARE * self.total
+
+    def _line(self) -> str:
+        passed = self._clock() - self._started
+        parts = [f"{self._title}: {self.done}"]
+        if self.total:
+            parts = [f"{self._title}: {self.done} of {self.total} {self._unit}s ({100 * self.done // self.total} %)"]
+        parts.append(f"{duration(passed)} passed")
+        if self.total and self.done > self._first:
+            parts.append(f"about {duration(passed * (self.total - self.done) / (self.done - self._first))} left")
+        if self._note:
+            parts.append(self._note)
+        return ", ".join(parts)
+
+
+class RunProgress:
+    """How a run goes (`demorec.generate.run.Progress`), one bar after another; a context manager.
+
+    `watch` is called with every attempt that has ended.
+    """
+
+    def __init__(self, *, watch: Callable[[Attempt], None] | None = None) -> None:
+        self._watch = watch
+        self._bar: ProgressBar | None = None
+        self._title = ""
+        self._failed = 0
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        if self._bar is not None:
+            self._bar.close()
+
+    def verifying(self, done: int, total: int) -> None:
+        """Recordings that are there already are being verified."""
+        self._show("verifying", total).set(done)
+
+    def checking(self, done: int, total: int) -> None:
+        """Run, recordings and dataset are being checked."""
+        self._show("checking", total, unit="item").set(done)
+
+    def exporting(self, done: int, total: int) -> None:
+        """Recordings are being exported."""
+        self._show("exporting", total).set(done)
+
+    def started(self, run: RunFile, workers: int) -> None:
+        """The work begins."""
+        self._show("generating", run.num_episodes, done=len(run.successes))
+
+    def ended(self, attempt: Attempt) -> None:
+        """An attempt has come to its end."""
+        if self._watch is not None:
+            self._watch(attempt)
+        assert self._bar is not None  # `started` comes first
+        if attempt.success:
+            self._bar.advance()
+        else:
+            self._failed += 1
+            self._bar.note(f"{self._failed} failed attempts")
+
+    def says(self, message: str) -> None:
+        """Something that a person should know."""
+        tell(message)
+
+    def _show(self, title: str, total: int, *, done: int = 0, unit: str = "episode") -> ProgressBar:
+        if self._bar is None or title != self._title:
+            if self._bar is not None:
+                self._bar.close()
+            self._title = title
+            self._bar = ProgressBar(title, total=total, done=done, unit=unit)
+        return self._bar
+
+
+def duration(seconds: float) -> str:
+    """Seconds in the unit that reads best."""
+    for unit, factor in (("days", 86400.0), ("h", 3600.0), ("min", 60.0)):
+        if seconds >= 2 * factor:
+            return f"{seconds / factor:.1f} {unit}"
+    return f"{seconds:.0f} s"

@@ -1,0 +1,187 @@
+"""What lies in a run's folder: whatever it is, it is refused, set aside or left alone, and never lost."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+import socket
+import sys
+from contextlib import chdir
+from pathlib import Path
+
+import helpers_generate
+import pytest
+from helpers_generate import Remembers, expected_attempts, run_fake
+
+from demorec.config import GenerateConfig
+from demorec.errors import ConfigError, GenerationError, MissingDependencyError, ResourceError
+from demorec.generate import survey
+from demorec.generate.options import RunOptions
+from demorec.generate.run import generate
+from demorec.generate.run_file import load_run_file
+
+
+def attempts(result) -> dict[tuple[int, int], bool]:
+    return {(a.episode_index, a.attempt): a.success for a in result.run.attempts}
+
+
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory):
+    """Of 8 episodes."""
+    return run_fake(tmp_path_factory.mktemp("reference") / "run")
+
+
+def content_of(folder: Path) -> dict[str, bytes | None]:
+    """Everything below a folder: relative path -> bytes, None for what is no file."""
+    return {str(p.relative_to(folder)): p.read_bytes() if p.is_file() else None for p in folder.rglob("*")}
+
+
+def refuse_a_fixed_layout(out: Path) -> None:
+    with pytest.raises(ConfigError, match="has no fixed layout"):
+        generate(GenerateConfig(fixed=True), RunOptions(out=out))
+
+
+def refuse_an_unknown_module(out: Path) -> None:
+    with pytest.raises(ConfigError, match="cannot be imported"):
+        generate(GenerateConfig(task="no_such_module:Task"), RunOptions(out=out))
+
+
+def refuse_ray(out: Path) -> None:
+    with pytest.raises(MissingDependencyError):
+        generate(GenerateConfig(), RunOptions(out=out, executor="ray"))
+
+
+@pytest.mark.parametrize("refuse", [refuse_a_fixed_layout, refuse_an_unknown_module, refuse_ray])
+@pytest.mark.parametrize("there", ["nothing", "an empty folder", "a run", "files of somebody"])
+def test_a_refused_request_writes_nothing(tmp_path, monkeypatch, refuse, there):
+    monkeypatch.setitem(sys.modules, "ray", None)  # not installed
+    monkeypatch.delitem(sys.modules, "demorec.generate.on_ray", raising=False)
+    out = tmp_path / "out"
+    if there == "a run":
+        run_fake(out, num_episodes=1)
+    elif there != "nothing":
+        out.mkdir()
+    if there == "files of somebody":
+        (out / "thesis.tex").write_text("mine")
+    before = content_of(tmp_path)
+    refuse(out)
+    assert content_of(tmp_path) == before
+
+
+def test_neither_another_run_nor_a_strangers_folder_is_touched(tmp_path):
+    run, stranger = tmp_path / "run", tmp_path / "stranger"
+    run_fake(run, num_episodes=1)
+    (run / ".lock").unlink()  # as after a copy that leaves such files out
+    stranger.mkdir()
+    (stranger / "thesis.tex").write_text("mine")
+    before = content_of(tmp_path)
+    for overwrite in (False, True):
+        with pytest.raises(ConfigError, match="of no run"):
+            run_fake(stranger, overwrite=overwrite)
+    with pytest.raises(ConfigError, match="holds another run"):
+        run_fake(run, seed=1)
+    assert content_of(tmp_path) == before
+
+
+def test_a_run_without_an_episode_claims_nothing(tmp_path):
+    out = tmp_path / "run"
+    with pytest.raises(GenerationError):
+        run_fake(out, seed=5, maker="raise_ours")
+    assert load_run_file(out).config.seed == 5
+    assert attempts(run_fake(out, num_episodes=2)) == expected_attempts(2)
+    with pytest.raises(ConfigError, match="holds another run"):
+        run_fake(out, seed=5)
+
+
+def make_folder(path: Path) -> None:
+    path.mkdir()
+    (path / "mine.txt").write_text("mine")
+
+
+def make_socket(path: Path) -> None:
+    with socket.socket(socket.AF_UNIX) as made, chdir(path.parent):  # an address of a socket may have 107 bytes
+        made.bind(path.name)
+
+
+def make_dangling_link(path: Path) -> None:
+    path.symlink_to("nowhere")
+
+
+@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize("make", [os.mkfifo, make_folder, make_socket, make_dangling_link])
+def test_whatever_has_the_name_of_a_recording_is_set_aside(tmp_path, reference, make, known):
+    out = tmp_path / "run"
+    shutil.copytree(reference.folder, out)
+    victim = out / reference.run.successes[3].file
+    victim.unlink()
+    make(victim)
+    if not known:
+        (out / "run.json").unlink()
+    heard = Remembers()
+    result = run_fake(out, progress=heard)
+    assert result.run.digest == reference.run.digest
+    assert len(result.made) == 1
+    assert victim.is_file()
+    aside = out / "unfinished" / victim.name
+    assert os.path.lexists(aside)
+    assert not aside.is_file()
+    assert [victim.name in said for said in heard.said] == [True]
+    if make is make_folder:
+        assert (aside / "mine.txt").read_text() == "mine"
+
+
+def test_other_files_among_the_recordings_stay_where_they_are(tmp_path, reference):
+    out = tmp_path / "run"
+    shutil.copytree(reference.folder, out)
+    (out / "episodes/notes.txt").write_text("mine")
+    run_fake(out)
+    assert (out / "episodes/notes.txt").read_text() == "mine"
+
+
+def test_a_folder_of_somebodys_episodes_is_no_run(tmp_path):
+    (tmp_path / "episodes").mkdir()
+    (tmp_path / "episodes/s01e01.mkv").write_text("mine")
+    (tmp_path / "notes.txt").write_text("mine")
+    before = content_of(tmp_path)
+    with pytest.raises(ConfigError, match=r"of no run \(notes.txt\)"):
+        run_fake(tmp_path)
+    assert content_of(tmp_path) == before
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, make_folder, make_socket, lambda path: path.symlink_to("run.json")])
+def test_a_lock_that_is_no_file_is_told(tmp_path, reference, make):
+    out = tmp_path / "run"
+    shutil.copytree(reference.folder, out)
+    (out / ".lock").unlink()
+    make(out / ".lock")
+    before = (out / "run.json").read_bytes()
+    with pytest.raises(ConfigError, match=r"The lock of the output folder is no file: remove it.*\.lock"):
+        run_fake(out)
+    assert (out / "run.json").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (OSError(errno.EMFILE, "Too many open files"), "ulimit -n"),
+        (OSError(errno.EIO, "Input/output error"), "storage"),
+        (MemoryError(), "too little memory"),
+    ],
+)
+@pytest.mark.parametrize("known", [True, False])
+def test_nothing_is_set_aside_for_what_the_machine_lacks(tmp_path, monkeypatch, reference, error, words, known):
+    out = tmp_path / "run"
+    shutil.copytree(reference.folder, out)
+    if not known:
+        (out / "run.json").unlink()
+    before = {path: data for path, data in content_of(out).items() if path != ".lock"}
+
+    def fail(path: Path) -> str:
+        raise error
+
+    monkeypatch.setattr(survey, "sha256_of", fail)
+    monkeypatch.setattr(helpers_generate, "read_text_limited", lambda path, limit: fail(path))
+    with pytest.raises(ResourceError, match=words):
+        run_fake(out)
+    assert {path: data for path, data in content_of(out).items() if path != ".lock"} == before

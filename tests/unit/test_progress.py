@@ -1,0 +1,102 @@
+"""Progress in a log file: lines that come rarely and say how long it will take, none in what is over soon."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from demorec.cli.progress import ProgressBar, RunProgress
+
+
+class Clock:
+    """A clock that stands still until it is told."""
+
+    def __init__(self) -> None:
+        self.now = 1000.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def lines_of(capsys, *, total: int, seconds_each: float, done: int = 0, note: str = "") -> list[str]:
+    """What a job prints whose things take so long each."""
+    clock = Clock()
+    with ProgressBar("generating", total=total, done=done, is_terminal=False, clock=clock) as bar:
+        if note:
+            bar.note(note)
+        for _ in range(done, total):
+            clock.now += seconds_each
+            bar.advance()
+    told = capsys.readouterr()
+    assert told.out == ""
+    return told.err.splitlines()
+
+
+@pytest.mark.parametrize(("total", "seconds_each"), [(3, 3.0), (9000, 0.001), (1, 500.0)])
+def test_what_is_over_soon_prints_nothing(capsys, total, seconds_each):
+    assert lines_of(capsys, total=total, seconds_each=seconds_each) == []
+
+
+def test_a_line_says_how_far_it_is_and_how_long_it_will_take(capsys):
+    lines = lines_of(capsys, total=40, seconds_each=5.0, note="2 failed attempts")
+    assert lines[0] == "generating: 2 of 40 episodes (5 %), 10 s passed, about 3.2 min left, 2 failed attempts"
+    assert lines[1].startswith("generating: 4 of 40 episodes (10 %), 20 s passed, about 3.0 min left")
+
+
+def test_what_was_done_before_does_not_count_for_the_time_that_is_left(capsys):
+    assert lines_of(capsys, total=104, done=100, seconds_each=10.0)[0] == (
+        "generating: 101 of 104 episodes (97 %), 10 s passed, about 30 s left"
+    )
+
+
+@pytest.mark.parametrize(
+    ("total", "seconds_each", "fewest", "most"),
+    [
+        (1000, 0.5, 19, 20),  # eight minutes: every 5 %
+        (100_000, 0.001, 8, 10),  # 100 s: every 10 s
+        (8640, 10.0, 287, 289),  # a day: every five minutes, and not every 10 s
+    ],
+)
+def test_there_is_neither_a_flood_nor_a_silence(capsys, total, seconds_each, fewest, most):
+    assert fewest <= len(lines_of(capsys, total=total, seconds_each=seconds_each)) <= most
+
+
+def test_a_total_that_is_not_known_is_not_told(capsys):
+    clock = Clock()
+    with ProgressBar("replaying", is_terminal=False, clock=clock) as bar:
+        clock.now += 10
+        bar.advance()
+    assert capsys.readouterr().err == "replaying: 1, 10 s passed\n"
+
+
+def test_a_total_may_be_known_only_later(capsys):
+    clock = Clock()
+    with ProgressBar("exporting", is_terminal=False, clock=clock) as bar:
+        clock.now += 20
+        bar.set(1, 3)
+    assert capsys.readouterr().err == "exporting: 1 of 3 episodes (33 %), 20 s passed, about 40 s left\n"
+
+
+def test_a_terminal_gets_a_bar_and_no_lines(capsys):
+    clock = Clock()
+    with ProgressBar("generating", total=3, is_terminal=True, clock=clock) as bar:
+        clock.now += 400
+        bar.advance()
+        bar.note("1 failed attempts")
+        bar.set(3)
+    told = capsys.readouterr().err
+    assert "3/3" in told
+    assert "1 failed attempts" in told
+    assert "passed" not in told
+
+
+def test_one_job_after_another_has_its_own_bar(capsys, monkeypatch):
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
+    with RunProgress() as progress:
+        progress.verifying(7, 7)
+        progress.exporting(1, 5)
+        progress.exporting(5, 5)
+        progress.checking(2, 6)
+    shown = re.findall(r"(\w+):[^\r\n]* (\d+/\d+) ", capsys.readouterr().err)
+    assert list(dict(shown).items()) == [("verifying", "7/7"), ("exporting", "5/5"), ("checking", "2/6")]
