@@ -15,6 +15,7 @@ from demorec.check.base import Measurement, check, worst
 from demorec.check.coverage import infos_by_task, largest_gap, start_vector, twins
 from demorec.episode import EpisodeInfo
 from demorec.errors import ConfigError, RecordingError
+from demorec.export.files import read_json
 from demorec.recording import Recording
 
 RUN_NAME = "run.json"
@@ -153,7 +154,7 @@ def run_dataset(run: RunFolder) -> Measurement | None:
     if not path.is_file():
         return None
     try:
-        episodes = int(json.loads(path.read_text())["total_episodes"])
+        episodes = int(read_json(path)["total_episodes"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ConfigError(f"info.json of the dataset cannot be used ({error}): {path}") from error
     successes = sum(1 for line in run.lines if line["success"])

@@ -9,7 +9,10 @@ from __future__ import annotations
 import inspect
 import logging
 import sys
+import tempfile
+import traceback
 from collections.abc import Sequence
+from importlib.metadata import version
 from pathlib import Path
 from types import NoneType
 from typing import Any, Protocol, cast, get_args
@@ -19,6 +22,7 @@ import tyro
 from demorec.cli.output import PrintableFormatter, say, tell
 from demorec.errors import DemorecError
 from demorec.registry import Registry, nearest_match
+from demorec.text import printable
 
 
 class Command(Protocol):
@@ -105,8 +109,6 @@ def main(argv: Sequence[str] | None = None) -> None:
             _fail(f"Unknown command {name!r}.{nearest_match(name, COMMANDS.rows)} See demorec --help.", 2)
         sys.exit(run_command(COMMANDS.load(name), args[1:], prog=f"demorec {name}"))
     if name == "--version":
-        from importlib.metadata import version
-
         say(f"demorec {version('demorec')}")
         return
     say(*_overview())
@@ -124,18 +126,9 @@ def run_command(command: type[Command], args: Sequence[str], *, prog: str) -> in
     handler = logging.StreamHandler()
     handler.setFormatter(PrintableFormatter("%(levelname)s: %(message)s"))
     logging.basicConfig(level=logging.WARNING, handlers=[handler])
+    logging.captureWarnings(True)  # so that Python's warnings, too, come through the formatter
     try:
-        find_defaults = getattr(command, "defaults", None)
-        with _flag_types:
-            parsed = tyro.cli(
-                cast(Any, command),
-                args=args,
-                prog=prog,
-                description=inspect.cleandoc(command.__doc__ or ""),
-                default=tyro.MISSING_NONPROP if find_defaults is None else find_defaults(args),
-                config=(tyro.conf.OmitArgPrefixes,),
-            )
-        return cast(Command, parsed).run()
+        return parse(command, args, prog=prog).run()
     except DemorecError as error:
         tell(f"{prog}: {error}")
         return error.exit_code
@@ -145,6 +138,48 @@ def run_command(command: type[Command], args: Sequence[str], *, prog: str) -> in
     except BrokenPipeError:
         sys.stderr.close()
         return 1
+    except Exception as error:
+        tell(f"{prog}: unexpected {type(error).__name__}, please report it with this file: {_keep_traceback()}")
+        return 1
+
+
+def parse(command: type[Command], args: Sequence[str], *, prog: str) -> Command:
+    """The command with its flags; SystemExit for --help and for flags that it does not have."""
+    shown = [printable(arg) for arg in args]
+    try:
+        return _parse(command, args, prog=prog, say_why=shown == list(args))
+    except SystemExit as end:
+        if shown != list(args) and end.code:
+            # tyro repeats what it does not understand as it is: it is asked once more, with all of it spelt out.
+            _parse(command, shown, prog=prog, say_why=True)
+            tell(f"{prog}: the flags are wrong, see --help.")
+        raise
+
+
+def _parse(command: type[Command], args: Sequence[str], *, prog: str, say_why: bool) -> Command:
+    find_defaults = getattr(command, "defaults", None)
+    with _flag_types:
+        parsed = tyro.cli(
+            cast(Any, command),
+            args=args,
+            prog=prog,
+            description=inspect.cleandoc(command.__doc__ or ""),
+            default=tyro.MISSING_NONPROP if find_defaults is None else find_defaults(args),
+            config=(tyro.conf.OmitArgPrefixes,),
+            console_outputs=say_why or "-h" in args or "--help" in args,
+        )
+    return cast(Command, parsed)
+
+
+def _keep_traceback() -> str:
+    """Where the traceback of the error that is being handled was written; its last line, when it cannot be."""
+    text = traceback.format_exc()
+    try:
+        with tempfile.NamedTemporaryFile("w", prefix="demorec-error-", suffix=".txt", delete=False) as file:
+            file.write(f"demorec {version('demorec')}, Python {sys.version}\n{' '.join(sys.argv)}\n\n{text}")
+        return file.name
+    except (OSError, UnicodeError):
+        return text.splitlines()[-1]
 
 
 def _overview() -> list[str]:
