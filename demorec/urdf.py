@@ -13,6 +13,59 @@ import numpy as np
 
 from demorec.geometry import Array, Pose
 
+MAX_BYTES = 4 << 20
+"""Of a URDF: the largest of pybullet_data has 32 kB."""
+_MAX_JOINTS = 500
+_MAX_SHAPES = 5000
+_SHAPE_SIZES = {"box": {"size": 3}, "sphere": {"radius": 1}, "cylinder": {"radius": 1, "length": 1}}
+"""Tag of a primitive -> its attributes, and how many numbers each has."""
+
+
+def parse_xml(text: str) -> ET.Element:
+    """The root of an XML text of unknown origin; ValueError for what is none, is very large or defines entities.
+
+    Entities can expand a small file without end; no URDF needs a document type.
+    """
+    if len(text) > MAX_BYTES:
+        raise ValueError(f"the URDF has {len(text):,} characters, allowed are {MAX_BYTES:,}")
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise ValueError("the URDF has a document type, which none needs")
+    try:
+        return ET.fromstring(text)
+    except ET.ParseError as error:
+        raise ValueError(f"the URDF is no XML ({error})") from error
+
+
+def check_primitives(text: str) -> None:
+    """ValueError unless a URDF can be used, and drawn without any other file: boxes, balls and cylinders alone."""
+    Urdf.parse(text)
+    robot = parse_xml(text)
+    shapes = robot.findall("link/visual")
+    if len(shapes) > _MAX_SHAPES:
+        raise ValueError(f"a URDF of {len(shapes)} shapes")
+    for visual in shapes:
+        origin = visual.find("origin")
+        if origin is not None:
+            _numbers(origin.get("xyz", "0 0 0"), 3)
+            _numbers(origin.get("rpy", "0 0 0"), 3)
+        for shape in visual.findall("geometry/*"):
+            if shape.tag not in _SHAPE_SIZES:
+                raise ValueError(f"a shape of the URDF is a {shape.tag[:20]!r}, allowed are {', '.join(_SHAPE_SIZES)}")
+            for name, count in _SHAPE_SIZES[shape.tag].items():
+                if min(_numbers(shape.get(name, ""), count)) < 0:
+                    raise ValueError(f"the {name} of a {shape.tag} of the URDF is negative")
+    for color in robot.iter("color"):
+        if not all(0 <= part <= 1 for part in _numbers(color.get("rgba", ""), 4)):
+            raise ValueError("a colour of the URDF is outside 0 to 1")
+
+
+def _numbers(text: str, count: int) -> list[float]:
+    """So many finite numbers; ValueError for others."""
+    values = [float(word) for word in text.split()]
+    if len(values) != count or not all(math.isfinite(value) for value in values):
+        raise ValueError(f"{text[:40]!r} of the URDF should be {count} numbers")
+    return values
+
 
 @dataclass(frozen=True, kw_only=True)
 class UrdfJoint:
@@ -50,17 +103,25 @@ class Urdf:
 
     @classmethod
     def parse(cls, text: str, *, scale: float = 1.0) -> Urdf:
-        """The same from its text; ValueError also when that is no XML."""
+        """The same from its text; ValueError also when that is no XML, or its joints are no tree."""
+        robot = parse_xml(text)
+        elements = robot.findall("joint")
+        if len(elements) > _MAX_JOINTS:
+            raise ValueError(f"a URDF of {len(elements)} joints")
         try:
-            robot = ET.fromstring(text)
-        except ET.ParseError as error:
-            raise ValueError(f"the URDF is no XML ({error})") from error
-        joints = tuple(_joint(element, scale) for element in robot.findall("joint"))
+            joints = tuple(_joint(element, scale) for element in elements)
+            links = [link.attrib["name"] for link in robot.findall("link")]
+        except (KeyError, AttributeError) as error:
+            raise ValueError(f"a joint or link of the URDF lacks something ({error})") from error
         children = {joint.child for joint in joints}
-        roots = [link.attrib["name"] for link in robot.findall("link") if link.attrib["name"] not in children]
+        roots = [link for link in links if link not in children]
         if len(roots) != 1:
-            raise ValueError(f"a URDF needs one root link, found {roots}")
-        return cls(joints=joints, root=roots[0])
+            raise ValueError(f"a URDF needs one root link, found {len(roots)}: {', '.join(roots[:5])}")
+        if len(children) < len(joints):
+            raise ValueError("two joints of a URDF carry the same link")
+        urdf = cls(joints=joints, root=roots[0])
+        urdf.link_poses({})  # every joint hangs, over others, on the root
+        return urdf
 
     def link_poses(self, joint_position: Mapping[str, float]) -> dict[str, Pose]:
         """Link name -> base_from_link for the given joint positions (rad, m); joints left out are at 0."""
@@ -100,7 +161,7 @@ def joint_motion(joint: UrdfJoint, position: float) -> Pose:
 def _joint(element: ET.Element, scale: float) -> UrdfJoint:
     def vector(tag: str, attribute: str, default: str) -> list[float]:
         child = element.find(tag)
-        return [float(v) for v in (default if child is None else child.get(attribute, default)).split()]
+        return _numbers(default if child is None else child.get(attribute, default), 3)
 
     kind = element.attrib["type"]
     axis = np.array(vector("axis", "xyz", "1 0 0"))

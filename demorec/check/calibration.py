@@ -11,8 +11,9 @@ from demorec.check.base import Measurement, check, worst
 from demorec.check.episode import RecordedEpisode
 from demorec.check.pictures_summary import Track
 from demorec.check.rows import displacement, matrices
+from demorec.errors import RecordingError
 from demorec.geometry import Array
-from demorec.recording import channels, messages
+from demorec.recording import channels
 from demorec.scene import Camera
 
 MIN_AREA = 30.0
@@ -34,7 +35,7 @@ def intrinsics(episode: RecordedEpisode) -> Measurement | None:
         if scan is None or not scan.first:
             found.append(Measurement(value=math.inf, detail=f"camera {camera.name} has no calibration"))
             continue
-        told = messages.read_camera_info(scan.first)
+        told = episode.recording.calibration(camera.name)
         settings = episode.recording.video_settings(camera.name)
         off = float(np.abs(told.intrinsics - camera.intrinsics).max())
         off = max(off, abs(told.width - settings.width), abs(told.height - settings.height))
@@ -62,7 +63,7 @@ def _expected(episode: RecordedEpisode, camera: Camera) -> Array:
         return np.broadcast_to(mounted, (episode.num_frames, 4, 4))
     try:
         link = episode.base_from_link(camera.mount, episode.columns.joint_position)
-    except KeyError:
+    except RecordingError:
         return np.full((episode.num_frames, 4, 4), np.inf)
     return np.asarray(episode.world_from_base @ link @ mounted)
 

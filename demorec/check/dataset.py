@@ -7,13 +7,14 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from demorec.episode import EpisodeInfo
 from demorec.errors import ExportError
+from demorec.export.files import read_table
 from demorec.export.layout import SIDECAR_DIR, DatasetInfo
 from demorec.export.reader import EpisodePlace, RowReader, episode_places, read_tasks
+from demorec.export.sidecar import EPISODE_SCHEMA
 from demorec.features import ACTION, ActionKind, action_names
 from demorec.validity import read_episode_info
 
@@ -57,10 +58,7 @@ class Dataset:
         names = ["episode_index", "success", "content_digest", "frame_stride", "episode_info"]
         rows: list[dict[str, Any]] = []
         for path in sorted((self.path / SIDECAR_DIR / "episodes").glob("*/*.parquet")):
-            try:
-                rows += pq.read_table(path, columns=names).to_pylist()
-            except (OSError, ValueError) as error:
-                raise ExportError(f"The sidecar's table cannot be read ({error}): {path}") from error
+            rows += read_table(path, names, schema=EPISODE_SCHEMA).to_pylist()
         return rows
 
     @cached_property

@@ -15,8 +15,10 @@ import numpy as np
 from demorec.check.base import Measurement, check, worst
 from demorec.check.dataset import Dataset
 from demorec.errors import ExportError
+from demorec.export.files import check_video, read_json
 from demorec.export.inspect import episode_digests
 from demorec.export.reader import PacketReader
+from demorec.geometry import Array
 
 
 @check(group="dataset", scope="dataset", measures="tables that cannot be read", warn=0)
@@ -106,7 +108,7 @@ def dataset_statistics(dataset: Dataset) -> Measurement | None:
         scale = np.maximum(deviation, 1e-4)
         true = {"min": values.min(axis=0), "max": values.max(axis=0), "mean": values.mean(axis=0), "std": deviation}
         for quantity, value in true.items():
-            told = np.asarray(said.get(quantity, np.inf), dtype=np.float64).reshape(-1)
+            told = _numbers(said.get(quantity, np.inf))
             off = np.abs(told - value) / scale if told.shape == value.shape else np.array([np.inf])
             found.append(Measurement(value=float(off.max()), detail=f"{quantity} of {name}"))
     return worst(*found)
@@ -115,9 +117,20 @@ def dataset_statistics(dataset: Dataset) -> Measurement | None:
 def _stats(dataset: Dataset) -> dict[str, Any]:
     path = dataset.path / "meta" / "stats.json"
     try:
-        return dict(json.loads(path.read_text()))
-    except (OSError, ValueError, TypeError) as error:
+        found = read_json(path)
+        if not isinstance(found, dict) or not all(isinstance(entry, dict) for entry in found.values()):
+            raise ValueError("it holds no object of objects")
+    except (OSError, ValueError) as error:
         raise ExportError(f"The statistics cannot be read ({error}): {path}") from error
+    return found
+
+
+def _numbers(value: Any) -> Array:
+    """(N,) numbers of an entry in the statistics, however nested; (0,) for what is none."""
+    try:
+        return np.asarray(value, dtype=np.float64).reshape(-1)
+    except (ValueError, TypeError, OverflowError):
+        return np.zeros(0)
 
 
 @check(
@@ -138,18 +151,27 @@ def dataset_picture_statistics(dataset: Dataset) -> Measurement | None:
             continue
         means = []
         for path in sorted((dataset.path / "videos" / key).glob("*/*.mp4")):
+            check_video(path)
             try:
-                with av.open(str(path)) as container:
+                with av.open(str(path), format="mp4") as container:
+                    _bound_pictures(container, dataset.info.features[key].shape)
                     for number, frame in enumerate(container.decode(video=0)):
                         if number % 10 == 0:
                             means.append(frame.to_ndarray(format="rgb24").mean(axis=(0, 1)) / 255)
             except (OSError, av.FFmpegError) as error:
                 raise ExportError(f"The video cannot be decoded ({error}): {path}") from error
-        said = np.asarray(stats.get(key, {}).get("mean", np.full(3, np.inf)), dtype=np.float64).reshape(-1)
+        said = _numbers(stats.get(key, {}).get("mean", np.full(3, np.inf)))
         if means:
             value = float(np.abs(np.mean(means, axis=0) - said).max()) if said.shape == (3,) else math.inf
             found.append(Measurement(value=value, detail=f"{key}, {len(means)} pictures"))
     return worst(*found)
+
+
+def _bound_pictures(container: Any, shape: tuple[int, ...]) -> None:
+    """Refuse to decode pictures much larger than the dataset says: a few bytes can announce gigabytes."""
+    height, width = shape[:2]
+    for stream in container.streams.video:
+        stream.codec_context.options = {"max_pixels": str((height + 128) * (width + 128))}
 
 
 @check(group="dataset", scope="dataset", measures="episodes on which dataset and sidecar disagree", warn=0)

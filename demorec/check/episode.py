@@ -19,12 +19,10 @@ from demorec.check.rows import inverse, link_matrices, matrices
 from demorec.episode import EpisodeColumns, EpisodeInfo, frame_time_ns
 from demorec.errors import RecordingError
 from demorec.geometry import Array
-from demorec.recording import Recording, channels, messages
+from demorec.recording import Recording
 from demorec.recording.container import Container
 from demorec.scene import Camera
 from demorec.urdf import Urdf
-
-ROBOT_DESCRIPTION = "/robot_description"
 
 _STAMP_FIRST = {
     "sensor_msgs/msg/JointState",
@@ -150,18 +148,15 @@ class RecordedEpisode:
     @cached_property
     def urdf(self) -> Urdf:
         """The robot's joint tree, from the URDF that the recording itself contains (already scaled)."""
-        found = self.scan.get(ROBOT_DESCRIPTION)
-        if found is None or not found.first:
-            raise RecordingError(f"The recording has no URDF of its robot on {ROBOT_DESCRIPTION}: {self.path}")
-        try:
-            return Urdf.parse(messages.read_string(found.first))
-        except (ValueError, KeyError, AttributeError) as error:
-            raise RecordingError(f"The URDF on {ROBOT_DESCRIPTION} cannot be used ({error}): {self.path}") from error
+        return Urdf.parse(self.recording.description())
 
     def base_from_link(self, link: str, joint_position: Array) -> Array:
-        """(T, 4, 4) by forward kinematics of (T, n_arm) or (T, n_joints) positions; KeyError for an unknown link."""
+        """(T, 4, 4) by forward kinematics of (T, n_arm) or (T, n_joints) positions; RecordingError: unknown link."""
         by_name = dict(zip(self.info.robot.joint_names, joint_position.T, strict=False))
-        return link_matrices(self.urdf, link, by_name, len(joint_position))
+        try:
+            return link_matrices(self.urdf, link, by_name, len(joint_position))
+        except KeyError as error:
+            raise RecordingError(f"The recorded URDF has no link {link!r}: {self.path}") from error
 
     @cached_property
     def world_from_base(self) -> Array:
@@ -191,10 +186,7 @@ class RecordedEpisode:
 
     def recorded_intrinsics(self, camera: str) -> Array:
         """(3, 3) K as the camera's own calibration message has it, which is what other programs read."""
-        found = self.scan.get(channels.camera_topic(camera, "camera_info"))
-        if found is None or not found.first:
-            raise RecordingError(f"The recording has no calibration of the camera {camera!r}: {self.path}")
-        return messages.read_camera_info(found.first).intrinsics
+        return self.recording.calibration(camera).intrinsics
 
     def pictures(self, camera: Camera) -> PictureSummary:
         """What the checks need of a camera's decoded pictures; decoded once."""

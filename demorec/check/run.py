@@ -14,6 +14,7 @@ from demorec.check.base import Measurement, check, worst
 from demorec.check.coverage import infos_by_task, largest_gap, start_vector, twins
 from demorec.episode import EpisodeInfo
 from demorec.errors import ConfigError, RecordingError, resource_error
+from demorec.export.files import read_json
 from demorec.files import open_regular, read_json_limited
 from demorec.recording import Recording
 
@@ -171,7 +172,7 @@ def run_dataset(run: RunFolder) -> Measurement | None:
     if not path.is_file():
         return None
     try:
-        episodes = int(read_json_limited(path, _MAX_JSON_BYTES)["total_episodes"])
+        episodes = int(read_json(path)["total_episodes"])
     except (OSError, ValueError, KeyError, TypeError, OverflowError) as error:
         raise ConfigError(f"info.json of the dataset cannot be used ({error}): {path}") from error
     successes = sum(1 for line in run.lines if line["success"] and line["episode_index"] < run.run["num_episodes"])

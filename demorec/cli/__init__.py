@@ -8,8 +8,11 @@ from __future__ import annotations
 
 import logging
 import sys
+import tempfile
 import textwrap
+import traceback
 from collections.abc import Sequence
+from importlib.metadata import version
 from typing import Protocol
 
 from demorec.cli.flags import parse, terminal_width
@@ -55,8 +58,6 @@ def main(argv: Sequence[str] | None = None) -> None:
             _fail(f"Unknown command {name!r}.{nearest_match(name, COMMANDS.rows)} See demorec --help.", 2)
         sys.exit(run_command(COMMANDS.load(name), args[1:], prog=f"demorec {name}"))
     if name == "--version":
-        from importlib.metadata import version
-
         say(f"demorec {version('demorec')}")
         return
     say(*_overview())
@@ -74,6 +75,7 @@ def run_command(command: type[Command], args: Sequence[str], *, prog: str) -> in
     handler = logging.StreamHandler()
     handler.setFormatter(PrintableFormatter("%(levelname)s: %(message)s"))
     logging.basicConfig(level=logging.WARNING, handlers=[handler])
+    logging.captureWarnings(True)  # so that Python's warnings, too, come through the formatter
     try:
         find_defaults = getattr(command, "defaults", None)
         defaults = None if find_defaults is None else find_defaults(args)
@@ -88,12 +90,24 @@ def run_command(command: type[Command], args: Sequence[str], *, prog: str) -> in
     except BrokenPipeError:
         sys.stderr.close()
         return 1
-    except (OSError, MemoryError, ImportError) as error:  # memory and files may run out in any line, an import too
-        lack = resource_error(error)
+    except Exception as error:
+        lack = resource_error(error)  # memory and files may run out in any line
         if lack is None:
-            raise
+            tell(f"{prog}: unexpected {type(error).__name__}, please report it with this file: {_keep_traceback()}")
+            return 1
         tell(f"{prog}: {lack}")
         return lack.exit_code
+
+
+def _keep_traceback() -> str:
+    """Where the traceback of the error that is being handled was written; its last line, when it cannot be."""
+    text = traceback.format_exc()
+    try:
+        with tempfile.NamedTemporaryFile("w", prefix="demorec-error-", suffix=".txt", delete=False) as file:
+            file.write(f"demorec {version('demorec')}, Python {sys.version}\n{' '.join(sys.argv)}\n\n{text}")
+        return file.name
+    except (OSError, UnicodeError):
+        return text.splitlines()[-1]
 
 
 def _overview() -> list[str]:

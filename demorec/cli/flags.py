@@ -32,7 +32,8 @@ from tyro.constructors import (
     StructTypeInfo,
 )
 
-from demorec.cli.output import say
+from demorec.cli.output import say, tell
+from demorec.text import printable
 
 FLAG_TYPES = tyro.constructors.ConstructorRegistry()
 
@@ -57,6 +58,18 @@ def parse(command: type, args: Sequence[str], *, prog: str, defaults: object) ->
     Raises:
         SystemExit: 0 after --help, 2 after a wrong flag, which was told.
     """
+    shown = [printable(arg) for arg in args]
+    try:
+        return _parse(command, args, prog=prog, defaults=defaults, say_why=shown == list(args))
+    except SystemExit as end:
+        if shown != list(args) and end.code:
+            # tyro repeats what it does not understand as it is: it is asked once more, with all of it spelt out.
+            _parse(command, shown, prog=prog, defaults=defaults, say_why=True)
+            tell(f"{prog}: the flags are wrong, see --help.")
+        raise
+
+
+def _parse(command: type, args: Sequence[str], *, prog: str, defaults: object, say_why: bool) -> Any:
     # tyro draws its boxes as the encoding allows, but knows that of Unicode by one spelling only.
     page = io.TextIOWrapper(io.BytesIO(), encoding=codecs.lookup(sys.stdout.encoding or "utf-8").name)
     try:
@@ -68,6 +81,7 @@ def parse(command: type, args: Sequence[str], *, prog: str, defaults: object) ->
                 description=inspect.cleandoc(command.__doc__ or ""),
                 default=MISSING_NONPROP if defaults is None else defaults,
                 config=(tyro.conf.OmitArgPrefixes,),
+                console_outputs=say_why or "-h" in args or "--help" in args,
             )
     except SystemExit:
         page.seek(0)

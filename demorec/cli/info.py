@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -163,9 +162,11 @@ def _run_lines(path: Path, run: RunFile) -> list[str]:
 
 
 def _dataset(path: Path) -> tuple[dict[str, Any], list[str]]:
+    from demorec.export.files import read_json
+
     file = path / "meta" / "info.json"
     try:
-        info: dict[str, Any] = json.loads(file.read_text())
+        info: dict[str, Any] = read_json(file)
         facts = [
             ("dataset", f"{path} (LeRobot {info['codebase_version']})"),
             ("episodes", str(info["total_episodes"])),
@@ -178,8 +179,8 @@ def _dataset(path: Path) -> tuple[dict[str, Any], list[str]]:
         rows = [("feature", "dtype", "shape", "names")]
         for name, feature in info["features"].items():
             shape = "x".join(map(str, feature["shape"]))
-            rows.append((name, feature["dtype"], shape, _names(feature.get("names"))))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, ZeroDivisionError) as error:
+            rows.append((name, str(feature["dtype"]), shape, _names(feature.get("names"))))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, ArithmeticError) as error:
         raise ConfigError(f"The dataset's info.json is damaged ({type(error).__name__}: {error}): {file}") from error
     return {"kind": "dataset", "path": str(path), "info": info}, [*_aligned(facts), "", *_aligned(rows)]
 

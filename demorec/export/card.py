@@ -13,14 +13,15 @@ from typing import Any
 import av
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 from PIL import Image
 
 from demorec.errors import ExportError
+from demorec.export.files import read_table
 from demorec.export.layout import IMAGE_PREFIX, SIDECAR_DIR, DatasetInfo, Feature
 from demorec.export.options import ExportOptions
 from demorec.export.reader import EpisodePlace, episode_places, read_tasks
+from demorec.export.sidecar import ATTEMPT_SCHEMA
 from demorec.export.staging import sync_file
 from demorec.export.writer import write_text
 from demorec.features import ACTION, EE_POSE, ENVIRONMENT_STATE, STATE, VELOCITY, ActionKind
@@ -159,7 +160,7 @@ class _Attempts:
 def _read_attempts(root: Path) -> _Attempts:
     columns = ["success", "failure_phase", "failure_reason", "object_x", "object_y", "goal_x", "goal_y"]
     files = sorted((root / SIDECAR_DIR / "attempts").glob("*/*.parquet"))
-    table = pa.concat_tables([pq.read_table(file, columns=columns) for file in files])
+    table = pa.concat_tables([read_table(file, columns, schema=ATTEMPT_SCHEMA) for file in files])
     coordinates = {name: table.column(name).to_numpy().astype(np.float64) for name in columns[3:]}
     reasons = [
         f"{reason} in phase {phase}" if phase else reason

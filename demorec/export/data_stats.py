@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from demorec.errors import ExportError
+from demorec.export.files import open_table
 from demorec.export.layout import Feature
 from demorec.export.stats import QUANTILES, Statistics, quantile_ranks
 from demorec.geometry import Array
@@ -71,7 +71,7 @@ def data_statistics(files: Iterable[Path], features: Mapping[str, Feature]) -> d
 
 def _batches(paths: Sequence[Path], names: list[str]) -> Iterator[list[NDArray[Any]]]:
     for path in paths:
-        with pq.ParquetFile(path) as file:
+        with open_table(path, names) as file:
             for batch in file.iter_batches(batch_size=_BATCH_ROWS, columns=names):
                 yield [column_numbers(batch.column(name)) for name in names]
 

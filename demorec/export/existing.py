@@ -5,16 +5,15 @@ Files that are there are never opened for writing; new episodes get new files, a
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-
-import pyarrow.parquet as pq
+from typing import Any
 
 from demorec.errors import ExportError
+from demorec.export.files import open_table, read_json, read_table
 from demorec.export.layout import (
     AUTOMATIC_FEATURES,
     INFO_PATH,
@@ -25,6 +24,7 @@ from demorec.export.layout import (
     Feature,
     FilePosition,
 )
+from demorec.export.reader import read_tasks
 from demorec.export.sidecar import CONFIGS_PATH, SidecarStart
 from demorec.export.stats import Statistics
 from demorec.export.writer import WriterStart
@@ -63,32 +63,27 @@ def open_existing(root: Path) -> Existing:
     episodes = frames = 0
     try:
         for path in tables:
-            table = pq.read_table(path, columns=["length"])
+            table = read_table(path, ["length"])
             episodes += table.num_rows
             frames += sum(table.column("length").to_pylist())
-        rows = sum(pq.read_metadata(path).num_rows for path in (root / "data").glob("*/*.parquet"))
-        tasks = pq.read_table(root / TASKS_PATH).to_pylist() if info.total_tasks else []
-        found = json.loads((root / STATS_PATH).read_text()) if (root / STATS_PATH).exists() else {}
-        configs = json.loads((root / CONFIGS_PATH).read_text()) if (root / CONFIGS_PATH).exists() else {}
-    except (OSError, ValueError) as error:
+        rows = sum(open_table(path).metadata.num_rows for path in (root / "data").glob("*/*.parquet"))
+        tasks = tuple(read_tasks(root)) if info.total_tasks else ()
+        found = read_json(root / STATS_PATH) if (root / STATS_PATH).exists() else {}
+        configs = read_json(root / CONFIGS_PATH) if (root / CONFIGS_PATH).exists() else {}
+        statistics = {key: part for key in info.video_keys if (part := _statistics(found, key, info)) is not None}
+        if not isinstance(configs, dict) or not all(isinstance(config, dict) for config in configs.values()):
+            raise ValueError(f"{CONFIGS_PATH} holds no configurations")
+    except (OSError, ValueError, TypeError, AttributeError) as error:
         raise ExportError(f"The dataset cannot be read ({error}): {root}") from error
     if (episodes, frames, rows) != (info.total_episodes, info.total_frames, info.total_frames):
         raise ExportError(
             f"The dataset is not whole: {INFO_PATH} counts {info.total_episodes} episodes of {info.total_frames} "
             f"frames, its tables have {episodes} of {frames} and {rows} data rows: {root}"
         )
-    statistics = {}
-    for key in info.video_keys:
-        part = Statistics.from_json(found.get(key, {}))
-        if part is not None:
-            # LeRobot's streaming writer counts pixels; as a weight beside ours a frame must count as one.
-            count = min(part.count, info.total_frames)
-            statistics[key] = Statistics(values=part.values, count=count, is_camera=True)
-    tasks.sort(key=lambda row: row["task_index"])
     writer = WriterStart(
         num_episodes=episodes,
         num_frames=frames,
-        tasks=tuple(row["task"] for row in tasks),
+        tasks=tasks,
         data=_after(root / "data", ".parquet", info.chunks_size),
         episodes=_after(root / "meta" / "episodes", ".parquet", info.chunks_size),
         videos={key: _after(root / "videos" / key, ".mp4", info.chunks_size) for key in info.video_keys},
@@ -102,6 +97,17 @@ def open_existing(root: Path) -> Existing:
         configs=configs,
     )
     return Existing(root=root, info=info, writer=writer, sidecar=sidecar)
+
+
+def _statistics(found: dict[str, Any], key: str, info: DatasetInfo) -> Statistics | None:
+    """Of a camera, as stats.json has them; ValueError and the like when it has something else."""
+    part = Statistics.from_json(found.get(key, {}))
+    if part is None:
+        return None
+    if any(value.shape != info.features[key].shape[-1:] for value in part.values.values()) or part.count < 0:
+        raise ValueError(f"the statistics of {key} are none of its pictures")
+    # LeRobot's streaming writer counts pixels; as a weight beside ours a frame must count as one.
+    return Statistics(values=part.values, count=min(part.count, info.total_frames), is_camera=True)
 
 
 def _after(folder: Path, suffix: str, chunks_size: int) -> FilePosition:

@@ -6,10 +6,9 @@ import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 
-import pyarrow.parquet as pq
-
 from demorec.errors import ExportError
 from demorec.export.digest import combined_digest, episode_digest
+from demorec.export.files import open_table, read_table
 from demorec.export.layout import INFO_PATH, SIDECAR_DIR, DatasetInfo
 from demorec.export.reader import PacketReader, RowReader, episode_places, read_tasks
 
@@ -58,11 +57,8 @@ def dataset_info(path: Path) -> DatasetSummary:
     files = [file for file in path.rglob("*") if file.is_file()]
     attempts = sorted((path / SIDECAR_DIR / "attempts").glob("*/*.parquet"))
     successes = sorted((path / SIDECAR_DIR / "episodes").glob("*/*.parquet"))
-    try:
-        num_attempts = sum(pq.read_metadata(file).num_rows for file in attempts) if attempts else None
-        columns = [pq.read_table(file, columns=["success"]).column("success") for file in successes]
-    except (OSError, ValueError) as error:
-        raise ExportError(f"The sidecar of the dataset cannot be read ({error}): {path}") from error
+    num_attempts = sum(open_table(file).metadata.num_rows for file in attempts) if attempts else None
+    columns = [read_table(file, ["success"]).column("success") for file in successes]
     return DatasetSummary(
         path=path,
         fps=info.fps,
@@ -78,7 +74,7 @@ def dataset_info(path: Path) -> DatasetSummary:
         ),
         num_files=len(files),
         num_bytes=sum(file.stat().st_size for file in files),
-        num_successes=sum(sum(column.to_pylist()) for column in columns) if columns else None,
+        num_successes=sum(column.to_pylist().count(True) for column in columns) if columns else None,
         num_attempts=num_attempts,
     )
 
@@ -111,7 +107,10 @@ def episode_digests(path: Path, info: DatasetInfo) -> list[str]:
                 for sample in packets.read(place):
                     pictures.update(sample)
                 videos[key] = pictures.hexdigest()
-            task = tasks[int(columns["task_index"][0, 0])]
+            task_index = int(columns["task_index"][0, 0]) if len(columns["task_index"]) else -1
+            if not 0 <= task_index < len(tasks):
+                raise ExportError(f"Episode {place.episode_index} has no task: {path}")
+            task = tasks[task_index]
             result.append(episode_digest(task, columns, videos))
     finally:
         for packets in cameras.values():

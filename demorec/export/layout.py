@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
+import reprlib
+import string
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -10,6 +13,7 @@ from typing import Any, Literal
 import pyarrow as pa
 
 from demorec.errors import ExportError
+from demorec.export.files import read_json
 
 CODEBASE_VERSION = "v3.0"
 MEBIBYTE = 2**20
@@ -84,11 +88,20 @@ class Feature:
         names = entry.get("names")
         if isinstance(names, dict):  # older recordings of real robots: {"motors": [...]}
             names = [name for group in names.values() for name in group]
+        shape, info = entry["shape"], entry.get("info")
+        if not isinstance(entry["dtype"], str):
+            raise ValueError("a feature without dtype")
+        if not isinstance(shape, list) or not 1 <= len(shape) <= 8 or not all(_is_count(n, 1, 1 << 24) for n in shape):
+            raise ValueError(f"a feature of shape {reprlib.repr(shape)}")
+        if entry["dtype"] == "video" and len(shape) != 3:
+            raise ValueError(f"a video of shape {reprlib.repr(shape)}")
+        if info is not None and not isinstance(info, dict):
+            raise ValueError("the info of a feature is no object")
         return cls(
-            dtype=entry["dtype"],
-            shape=tuple(entry["shape"]),
+            dtype=entry["dtype"],  # type: ignore[arg-type]
+            shape=tuple(shape),
             names=None if names is None else tuple(str(name) for name in names),
-            info=entry.get("info"),
+            info=info,
         )
 
 
@@ -171,7 +184,7 @@ class DatasetInfo:
         """
         path = root / INFO_PATH
         try:
-            data = json.loads(path.read_text())
+            data = read_json(path)
             version = data.pop("codebase_version")
             if version != CODEBASE_VERSION:
                 raise ExportError(
@@ -180,13 +193,62 @@ class DatasetInfo:
             data.pop("splits", None)
             features = {name: Feature.from_json(entry) for name, entry in data.pop("features").items()}
             known = {name: data.pop(name) for name in list(data) if name in _INFO_FIELDS}
+            info = cls(features=features, other=data, **known)
+            info._check()
         except OSError as error:
             raise ExportError(f"No LeRobot dataset, {INFO_PATH} cannot be read ({error.strerror}): {root}") from error
         except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise ExportError(f"{INFO_PATH} of the dataset is damaged ({error!r}): {root}") from error
-        return cls(features=features, other=data, **known)
+            raise ExportError(f"{INFO_PATH} of the dataset is damaged ({_words(error)}): {root}") from error
+        return info
+
+    def _check(self) -> None:
+        """ValueError for values that no dataset can have."""
+        for name, low in (
+            ("fps", 1),
+            ("total_episodes", 0),
+            ("total_frames", 0),
+            ("total_tasks", 0),
+            ("chunks_size", 1),
+        ):
+            if not _is_count(getattr(self, name), low, 1 << 40):
+                raise ValueError(f"{name} is {reprlib.repr(getattr(self, name))}")
+        for size in (self.data_files_size_in_mb, self.video_files_size_in_mb):
+            if isinstance(size, bool) or not isinstance(size, int | float) or not 0 < size < 1e9:
+                raise ValueError(f"files of {reprlib.repr(size)} MB")
+        if self.robot_type is not None and not isinstance(self.robot_type, str):
+            raise ValueError(f"robot_type is {reprlib.repr(self.robot_type)}")
+        for name in self.features:
+            if not name.isprintable() or name.startswith("/") or ".." in name.split("/"):
+                raise ValueError(f"a feature is called {name[:80]!r}")
+        for template in (self.data_path, self.video_path):
+            if template is not None:
+                _check_template(template)
 
 
+def _is_count(value: object, low: int, high: int) -> bool:
+    """A whole number from `low` to `high`; other writers have some as 30.0."""
+    return (
+        isinstance(value, int | float) and not isinstance(value, bool) and low <= value <= high and value == int(value)
+    )
+
+
+def _check_template(template: object) -> None:
+    """ValueError unless a template of paths stays in the dataset and fills in what every dataset does."""
+    if not isinstance(template, str) or not template.isprintable():
+        raise ValueError("a path that is no text")
+    parts = Path(template).parts
+    if Path(template).is_absolute() or ".." in parts:
+        raise ValueError(f"the path {template[:80]!r} leads out of the dataset")
+    for _, name, kind, conversion in string.Formatter().parse(template):
+        if name is not None and (name not in _PLACEHOLDERS or conversion or not re.fullmatch(r"(0?\dd)?", kind or "")):
+            raise ValueError(f"the path {template[:80]!r} has an unknown placeholder")
+
+
+def _words(error: BaseException) -> str:
+    return f"{error} is missing" if isinstance(error, KeyError) else str(error)[:300]
+
+
+_PLACEHOLDERS = ("chunk_index", "file_index", "video_key")
 _INFO_FIELDS = frozenset(
     (
         "fps", "robot_type", "total_episodes", "total_frames", "total_tasks", "chunks_size",

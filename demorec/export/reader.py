@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import reprlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,12 +11,16 @@ from typing import Any
 
 import av
 import numpy as np
-import pyarrow.parquet as pq
+import pyarrow as pa
 from numpy.typing import NDArray
 
 from demorec.errors import ExportError
 from demorec.export.data_stats import column_numbers
+from demorec.export.files import check_video, open_table, read_table
 from demorec.export.layout import TASKS_PATH, VIDEO_PATH, DatasetInfo, FilePosition
+
+_MOST = 1 << 40
+"""Above all rows, frames and seconds of any dataset."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,11 +49,8 @@ def episode_places(root: Path, info: DatasetInfo) -> Iterator[EpisodePlace]:
     for key in keys:
         columns += [f"videos/{key}/{name}" for name in ("chunk_index", "file_index", "from_timestamp")]
     for path in sorted((root / "meta" / "episodes").glob("*/*.parquet")):
-        try:
-            rows = pq.read_table(path, columns=columns).to_pylist()
-        except (OSError, ValueError) as error:
-            raise ExportError(f"The episodes' table cannot be read ({error}): {path}") from error
-        for row in rows:
+        for row in read_table(path, columns).to_pylist():
+            _check_place(row, path)
             yield EpisodePlace(
                 episode_index=row["episode_index"],
                 length=row["length"],
@@ -64,15 +67,36 @@ def episode_places(root: Path, info: DatasetInfo) -> Iterator[EpisodePlace]:
             )
 
 
+def _check_place(row: dict[str, Any], path: Path) -> None:
+    """ExportError for an episode's row with other values than positions can have."""
+    for name, value in row.items():
+        if name == "tasks":
+            is_good = isinstance(value, list) and all(isinstance(task, str) for task in value)
+        elif name.endswith("/from_timestamp"):
+            is_good = isinstance(value, float | int) and 0 <= value < _MOST
+        else:
+            is_good = isinstance(value, int) and 0 <= value < _MOST
+        if not is_good:
+            raise ExportError(f"The episodes' table has {reprlib.repr(value)} as {name}: {path}")
+
+
 def read_tasks(root: Path) -> list[str]:
-    """Instructions in the order of their indices."""
-    try:
-        rows = pq.read_table(root / TASKS_PATH).to_pylist()
-    except (OSError, ValueError) as error:
-        raise ExportError(f"The tasks' table cannot be read ({error}): {root / TASKS_PATH}") from error
-    rows.sort(key=lambda row: row["task_index"])
+    """Instructions in the order of their indices; ExportError when the table cannot be read."""
+    path = root / TASKS_PATH
+    table = read_table(path)
     # pandas names an index column that nobody named.
-    return [str(row["task"] if "task" in row else row["__index_level_0__"]) for row in rows]
+    column = next((name for name in ("task", "__index_level_0__") if name in table.column_names), None)
+    if (
+        column is None
+        or "task_index" not in table.column_names
+        or not pa.types.is_integer(table.schema.field("task_index").type)
+    ):
+        raise ExportError(f"The tasks' table has no task or no task_index: {path}")
+    rows = zip(table.column("task_index").to_pylist(), table.column(column).to_pylist(), strict=True)
+    return [str(task) for _, task in sorted(rows, key=lambda row: -1 if row[0] is None else row[0])]
+
+
+_NUMBERS = ("float32", "float64", "int64", "bool")
 
 
 class RowReader:
@@ -91,18 +115,20 @@ class RowReader:
         if place.data != self._position:
             self._position = place.data
             path = self._root / place.data.path(self._info.data_path)
-            try:
-                self._batches = pq.ParquetFile(path).iter_batches(batch_size=4096, columns=self.names)
-            except (OSError, ValueError) as error:
-                raise ExportError(f"The data file cannot be read ({error}): {path}") from error
+            table = open_table(path, self.names)
+            has_strings = any(feature.dtype == "string" for feature in self._info.features.values())
+            self._batches = table.iter_batches(batch_size=64 if has_strings else 4096, columns=self.names)
             self._held = {}
         while self._num_held() < place.length:
-            batch = next(self._batches, None)
+            try:
+                batch = next(self._batches, None)
+            except (OSError, ValueError, pa.ArrowException) as error:
+                raise ExportError(f"The data of episode {place.episode_index} cannot be read: {self._root}") from error
             if batch is None:
                 raise ExportError(
                     f"Episode {place.episode_index} has {place.length} frames, its data file ends before: {self._root}"
                 )
-            new = {name: _column(batch.column(name)) for name in self.names}
+            new = {name: self._column(name, batch.column(name)) for name in self.names}
             self._held = {
                 name: np.concatenate([self._held[name], values]) if self._held else values
                 for name, values in new.items()
@@ -110,6 +136,19 @@ class RowReader:
         rows = {name: values[: place.length] for name, values in self._held.items()}
         self._held = {name: values[place.length :] for name, values in self._held.items()}
         return rows
+
+    def _column(self, name: str, column: Any) -> NDArray[Any]:
+        """(N, D) of a feature; ExportError unless it is as info.json says."""
+        feature = self._info.features[name]
+        try:
+            values = _column(column)
+        except (ValueError, TypeError, pa.ArrowException) as error:
+            raise ExportError(f"The column {name} holds something else than numbers: {self._root}") from error
+        if feature.dtype in _NUMBERS and values.shape[1:] != (math.prod(feature.shape),):
+            raise ExportError(
+                f"The column {name} has {values.shape[1:]} values, expected {feature.shape}: {self._root}"
+            )
+        return values
 
     def _num_held(self) -> int:
         return len(next(iter(self._held.values()))) if self._held else 0
@@ -145,8 +184,9 @@ class PacketReader:
         path = self._root / position.path(self._template, self._key)
         if position != self._position:
             self.close()
+            check_video(path)
             try:
-                self._container = av.open(str(path))
+                self._container = av.open(str(path), format="mp4")
             except (OSError, av.FFmpegError) as error:
                 raise ExportError(f"The video cannot be opened ({error}): {path}") from error
             self._packets = _samples(self._container)

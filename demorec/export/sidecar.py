@@ -68,7 +68,7 @@ _CAMERA = pa.struct(
     ]
 )
 
-_EPISODE_SCHEMA = pa.schema(
+EPISODE_SCHEMA = pa.schema(
     [
         ("episode_index", pa.int64()),
         ("source", pa.string()),
@@ -96,7 +96,7 @@ _EPISODE_SCHEMA = pa.schema(
     ]
 )
 
-_ATTEMPT_SCHEMA = pa.schema(
+ATTEMPT_SCHEMA = pa.schema(
     [
         ("source", pa.string()),
         ("run_episode_index", pa.int64()),
@@ -276,8 +276,8 @@ class SidecarWriter:
         self._root = root
         self._start = start
         self._limit_mb, self._chunks_size = limit_mb, chunks_size
-        self._episodes = self._table(SIDECAR_EPISODES_PATH, _EPISODE_SCHEMA, start.episodes)
-        self._attempts = self._table(SIDECAR_ATTEMPTS_PATH, _ATTEMPT_SCHEMA, start.attempts)
+        self._episodes = self._table(SIDECAR_EPISODES_PATH, EPISODE_SCHEMA, start.episodes)
+        self._attempts = self._table(SIDECAR_ATTEMPTS_PATH, ATTEMPT_SCHEMA, start.attempts)
         self._camera_poses: RollingParquet | None = None
         self._episode_rows: list[dict[str, Any]] = []
         self._attempt_rows: list[dict[str, Any]] = []
@@ -340,13 +340,13 @@ class SidecarWriter:
     def _flush_episodes(self) -> None:
         if self._episode_rows:
             self._episodes.make_room(len(self._episode_rows))
-            self._episodes.write(pa.Table.from_pylist(self._episode_rows, schema=_EPISODE_SCHEMA))
+            self._episodes.write(pa.Table.from_pylist(self._episode_rows, schema=EPISODE_SCHEMA))
             self._episode_rows.clear()
 
     def _flush_attempts(self) -> None:
         if self._attempt_rows:
             self._attempts.make_room(len(self._attempt_rows))
-            self._attempts.write(pa.Table.from_pylist(self._attempt_rows, schema=_ATTEMPT_SCHEMA))
+            self._attempts.write(pa.Table.from_pylist(self._attempt_rows, schema=ATTEMPT_SCHEMA))
             self._attempt_rows.clear()
 
     def finish(self, export: Mapping[str, Any]) -> Mapping[str, Any]:

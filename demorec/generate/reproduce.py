@@ -6,23 +6,22 @@ compared episode by episode, since all that is left of its recordings is in it.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import pyarrow.parquet as pq
-
 from demorec.config import GenerateConfig, parse_config
 from demorec.errors import ConfigError
 from demorec.export import ExportOptions, export_lerobot
+from demorec.export.files import read_json, read_table
 from demorec.export.layout import SIDECAR_DIR
 from demorec.export.sidecar import CONFIGS_PATH, EXPORT_PATH
 from demorec.generate.options import RunOptions
 from demorec.generate.run import Progress, RunResult, generate
 from demorec.generate.run_file import DATASET, RUN_NAME, load_run_file
 from demorec.own_versions import version_differences
+from demorec.validity import read_episode_info
 
 Key = tuple[int, int]
 """(episode of the run, attempt)."""
@@ -120,8 +119,8 @@ def read_original(source: Path) -> Original:
 
 def _read_dataset(source: Path) -> Original:
     try:
-        configs = json.loads((source / CONFIGS_PATH).read_text())
-        made_with = json.loads((source / EXPORT_PATH).read_text())
+        configs = read_json(source / CONFIGS_PATH)
+        made_with = read_json(source / EXPORT_PATH)
         rows = _rows(source)
         if len(configs) != 1:
             raise ConfigError(
@@ -136,7 +135,7 @@ def _read_dataset(source: Path) -> Original:
         return Original(
             config=original,
             num_episodes=1 + max(row["run_episode_index"] for row in rows),
-            versions=json.loads(rows[0]["episode_info"])["versions"],
+            versions=read_episode_info(rows[0]["episode_info"]).versions,
             digests=_digests(rows),
             export=ExportOptions(
                 action=made_with["action"],
@@ -149,7 +148,7 @@ def _read_dataset(source: Path) -> Original:
                 verify=False,
             ),
         )
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
         raise ConfigError(f"The dataset does not say enough about itself ({error}): {source}") from error
 
 
@@ -165,4 +164,4 @@ def _rows(dataset: Path) -> list[dict[str, Any]]:
     """The sidecar's table of episodes."""
     files = sorted((dataset / SIDECAR_DIR / "episodes").rglob("*.parquet"))
     columns = ["run_episode_index", "attempt", "origin", "content_digest", "episode_info"]
-    return [row for file in files for row in pq.read_table(file, columns=columns).to_pylist()]
+    return [row for file in files for row in read_table(file, columns).to_pylist()]

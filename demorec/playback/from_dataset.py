@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -10,13 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 from rerun.experimental import LeRobotReader
 
 from demorec.assets import asset_path
 from demorec.episode import Check, EpisodeInfo, Outcome, frame_time_ns
 from demorec.errors import RecordingError
+from demorec.export.files import check_video, read_json, read_table
+from demorec.export.layout import DatasetInfo, Feature
 from demorec.features import ENVIRONMENT_STATE
 from demorec.geometry import Array, Pose
 from demorec.kinematics import ArmKinematics
@@ -48,15 +48,20 @@ def open_dataset_episode(root: Path, episode_index: int) -> Iterator[Episode]:
     """
     row = _episode_row(root, episode_index)
     try:
-        features = json.loads((root / "meta" / "info.json").read_text())
-        export = json.loads((root / _SIDECAR / "export.json").read_text())
+        described = DatasetInfo.load(root)
+        export = dict(read_json(root / _SIDECAR / "export.json"))
         info = read_episode_info(row["episode_info"])
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, TypeError) as error:
         raise RecordingError(f"The dataset cannot be read ({error}): {root}") from error
-    columns = [name for name, entry in features["features"].items() if entry["dtype"] not in ("video", "string")]
+    missing = {"observation.state", "action"} - described.features.keys()
+    if missing:
+        raise RecordingError(f"The dataset has no {' and no '.join(sorted(missing))}, so it cannot be shown: {root}")
+    columns = [name for name, feature in described.features.items() if feature.dtype not in ("video", "string")]
     data = _data(root, episode_index, columns)
-    num_frames = len(data["frame_index"])
-    fps = int(features["fps"])
+    num_frames = len(data["action"])
+    if not num_frames or data["observation.state"].shape[1] != len(info.robot.arm_joints) + 1:
+        raise RecordingError(f"The dataset has no rows of episode {episode_index}, or of another robot: {root}")
+    fps = int(described.fps)
     time_ns = np.array([frame_time_ns(index, fps) for index in range(num_frames)], dtype=np.int64)
     num_arm, num_fingers = len(info.robot.arm_joints), len(info.robot.gripper_joints)
     state = data["observation.state"]
@@ -73,12 +78,12 @@ def open_dataset_episode(root: Path, episode_index: int) -> Iterator[Episode]:
         time_ns=time_ns,
         joint_position=np.concatenate([state[:, :num_arm], fingers], axis=1),
         base_from_tcp=base_from_tcp,
-        object_poses=_object_poses(info, row, data, features, base_from_tcp),
+        object_poses=_object_poses(info, row, data, described, base_from_tcp),
         end_poses={item["name"]: np.array(item["world_from_object_end"]) for item in row["objects"]},
         world_from_camera=_camera_poses(root, episode_index),
         phase=_phases(row, num_frames),
         curves=_curves(info, data, base_from_tcp, time_ns, with_targets=export.get("action") == "joint"),
-        videos=_videos(root, episode_index, time_ns, features["features"]),
+        videos=_videos(root, episode_index, time_ns, described.features),
     )
 
 
@@ -88,11 +93,8 @@ def _rows(root: Path, table: str, columns: list[str] | None, episode_index: int 
         raise RecordingError(
             f"The dataset has no {table}: only datasets of demorec can be shown; rerun shows others: {root}"
         )
-    filters = None if episode_index is None else [("episode_index", "=", episode_index)]
-    try:
-        return [row for file in files for row in pq.read_table(file, columns=columns, filters=filters).to_pylist()]
-    except (OSError, ValueError) as error:
-        raise RecordingError(f"The dataset's table {table} cannot be read ({error}): {root}") from error
+    rows = [row for file in files for row in read_table(file, columns).to_pylist()]
+    return [row for row in rows if episode_index is None or row.get("episode_index") == episode_index]
 
 
 def _episode_row(root: Path, episode_index: int) -> dict[str, Any]:
@@ -105,7 +107,10 @@ def _data(root: Path, episode_index: int, columns: list[str]) -> dict[str, Array
     rows = _rows(root, "data", columns, episode_index)
     result = {}
     for name in columns:
-        values = np.array([row[name] for row in rows], dtype=np.float64)
+        try:
+            values = np.array([row[name] for row in rows], dtype=np.float64)
+        except (ValueError, TypeError, OverflowError) as error:
+            raise RecordingError(f"The column {name} holds something else than numbers: {root}") from error
         result[name] = values if values.ndim == 2 else values[:, None]
     return result
 
@@ -125,14 +130,14 @@ def _tcp_poses(info: EpisodeInfo, state: Array) -> Array:
 
 
 def _object_poses(
-    info: EpisodeInfo, row: dict[str, Any], data: dict[str, Array], features: dict[str, Any], base_from_tcp: Array
+    info: EpisodeInfo, row: dict[str, Any], data: dict[str, Array], described: DatasetInfo, base_from_tcp: Array
 ) -> dict[str, Array]:
     """Name -> (T, 7): recorded where the dataset has `observation.environment_state`, else as the hand carries them."""
     if ENVIRONMENT_STATE not in data:
         ends = {item["name"]: np.array(item["world_from_object_end"]) for item in row["objects"]}
         opening, target = data["observation.state"][:, -1], data["action"][:, -1]
-        return held_object_poses(info.scene, ends, base_from_tcp, opening, target, int(features["fps"]))
-    first = {name: column for column, name in enumerate(features["features"][ENVIRONMENT_STATE]["names"])}
+        return held_object_poses(info.scene, ends, base_from_tcp, opening, target, int(described.fps))
+    first = {name: column for column, name in enumerate(described.features[ENVIRONMENT_STATE].names or ())}
     base, values = info.scene.robot.world_from_base, data[ENVIRONMENT_STATE]
     result = {}
     for body in info.scene.movable:
@@ -199,13 +204,12 @@ def _curves(
 
 
 def _videos(
-    root: Path, episode_index: int, time_ns: NDArray[np.int64], features: dict[str, dict[str, Any]]
+    root: Path, episode_index: int, time_ns: NDArray[np.int64], features: dict[str, Feature]
 ) -> dict[str, Video]:
     result = {}
     for key, feature in features.items():
-        described = feature.get("info") or {}
-        codec = _CODECS.get(str(described.get("video.codec")))
-        if feature["dtype"] == "video" and codec is not None and not described.get("is_depth_map"):
+        codec = _CODECS.get(str((feature.info or {}).get("video.codec")))
+        if feature.is_video and codec is not None and not feature.is_depth:
             batches = partial(_video_batches, root, episode_index, key, time_ns)
             result[key.removeprefix(_IMAGES)] = Video(codec=codec, batches=batches)
     return result
@@ -215,7 +219,13 @@ def _video_batches(root: Path, episode_index: int, key: str, time_ns: NDArray[np
     """Coded pictures as Rerun's own reader of LeRobot datasets cuts them out of the mp4 files."""
     samples: list[tuple[int, bytes]] = []
     keyframes: set[int] = set()
-    for chunk in LeRobotReader(root).stream(episode_index):
+    for path in sorted((root / "videos" / key).glob("*/*.mp4")):
+        check_video(path)
+    try:
+        chunks = LeRobotReader(root).stream(episode_index)
+    except (ValueError, OSError, RuntimeError) as error:
+        raise RecordingError(f"Rerun cannot read the dataset ({' '.join(str(error).split())[:200]}): {root}") from error
+    for chunk in chunks:
         if chunk.entity_path.strip("/") != key or chunk.is_static:
             continue
         batch = chunk.to_record_batch()

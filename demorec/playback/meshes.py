@@ -24,7 +24,7 @@ from demorec.assets import mesh_path
 from demorec.errors import DemorecError, RecordingError
 from demorec.geometry import Pose
 from demorec.scene import Rgba
-from demorec.urdf import quat_from_rpy
+from demorec.urdf import parse_xml, quat_from_rpy
 
 MAX_TRIANGLES = 2500
 """Of one mesh file."""
@@ -85,7 +85,7 @@ def urdf_meshes(text: str, folder: Path | None, scale: float = 1.0) -> dict[str,
     Raises:
         RecordingError: A mesh file cannot be read.
     """
-    robot = ET.fromstring(text)
+    robot = parse_xml(text)
     materials = {
         name: rgba for element in robot.iter("material") if (name := element.get("name")) and (rgba := _rgba(element))
     }

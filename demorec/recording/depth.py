@@ -33,15 +33,15 @@ def encode_depth(metres: NDArray[np.float32]) -> bytes:
     return _HEAD.pack(0, 0.0, 0.0, width, height) + words[:count].astype("<u4").tobytes()
 
 
-def decode_depth(data: bytes) -> NDArray[np.float32]:
-    """Inverse of `encode_depth`, to half a millimetre; ValueError when the bytes are no RVL picture."""
+def decode_depth(data: bytes, size: tuple[int, int]) -> NDArray[np.float32]:
+    """Inverse of `encode_depth`, to half a millimetre; ValueError for no RVL picture of that (height, width)."""
     from demorec.recording import kernels
 
     if len(data) < _HEAD.size or (len(data) - _HEAD.size) % 4:
         raise ValueError(f"a depth picture of {len(data)} bytes")
     _, _, _, width, height = _HEAD.unpack_from(data)
-    if not 0 < width * height <= 1 << 26:
-        raise ValueError(f"a depth picture of {width}x{height} pixels")
+    if (height, width) != size:
+        raise ValueError(f"a depth picture of {width}x{height} pixels, expected {size[1]}x{size[0]}")
     words = np.frombuffer(data, dtype="<u4", offset=_HEAD.size).astype(np.uint32)
     flat = np.zeros(width * height, dtype=np.uint16)
     if not kernels.rvl_decode(words, flat):

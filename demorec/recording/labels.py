@@ -51,11 +51,13 @@ def encode_labels(segmentation: NDArray[np.int32]) -> bytes:
     return buffer.getvalue()
 
 
-def decode_labels(data: bytes) -> NDArray[np.int32]:
-    """Inverse of `encode_labels`; ValueError or OSError when the bytes are no such file."""
+def decode_labels(data: bytes, size: tuple[int, int]) -> NDArray[np.int32]:
+    """Inverse of `encode_labels`; ValueError or OSError when the bytes are no such file of that (height, width)."""
     with Image.open(io.BytesIO(data), formats=("PNG",)) as image:
         if image.mode != "I;16":
             raise ValueError(f"a segmentation picture of the kind {image.mode!r}")
+        if (image.height, image.width) != size:  # before anything is unpacked
+            raise ValueError(f"a segmentation picture of {image.width}x{image.height} pixels")
         return from_labels(np.asarray(image, dtype=np.uint16))
 
 

@@ -28,6 +28,8 @@ CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 LABEL_INFO = "vision_msgs/msg/LabelInfo"
 
+_MOST_PIXELS = 1 << 50
+"""Of one value in a histogram: sums of them stay exact in float64."""
 _LOG_LEVELS = {"info": 20, "warning": 30, "error": 40}
 
 
@@ -224,6 +226,8 @@ def read_pixel_statistics(data: bytes) -> PixelStatistics:
         message.u32()
     message.u32()
     values = message.integers()
+    if len(values) != 1 + 3 * 256 or not ((values >= 0) & (values < _MOST_PIXELS)).all():
+        raise ValueError("a histogram of other numbers than counts")
     return PixelStatistics(num_images=int(values[0]), counts=values[1:].reshape(3, 256))
 
 

@@ -28,6 +28,7 @@ from demorec.recording.labels import decode_labels, from_labels
 from demorec.recording.notebook import described, frame_table, html_page
 from demorec.recording.pixels import PixelCounter, PixelStatistics
 from demorec.recording.video import Rgb, VideoPacket, VideoSettings, decode, is_keyframe
+from demorec.urdf import check_primitives
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -213,7 +214,9 @@ class Recording:
         topic = channels.description_topic(body)
         for message in self._container.messages((topic,)):
             with damage_as_recording_error(self.path):
-                return messages.read_string(message.data)
+                text = messages.read_string(message.data)
+                check_primitives(text)
+                return text
         raise RecordingError(f"The recording has no description on {topic}: {self.path}")
 
     def joint_samples(self) -> Iterator[JointSample]:
@@ -270,17 +273,22 @@ class Recording:
         """Depth pictures, (H, W) float32 metres in steps of a millimetre, 0 where nothing was hit, one a frame."""
         if not self.has_depth(camera):
             raise RecordingError(f"The recording has no depth pictures of the camera {camera!r}: {self.path}")
-        topic = channels.camera_topic(camera, "depth")
-        for _, picture in self._pictures(topic, lambda data: decode_depth(messages.read_compressed_image(data))):
+        topic, size = channels.camera_topic(camera, "depth"), self._size(camera)
+        for _, picture in self._pictures(topic, lambda data: decode_depth(messages.read_compressed_image(data), size)):
             yield picture
 
     def segmentation(self, camera: str) -> Iterator[NDArray[np.int32]]:
         """Segmentation pictures, (H, W) int32 as in `CameraImages`, one a frame; `segment_names` tells what is what."""
         if not self.has_segmentation(camera):
             raise RecordingError(f"The recording has no segmentation pictures of the camera {camera!r}: {self.path}")
-        topic = channels.camera_topic(camera, "segmentation")
-        for _, labels in self._pictures(topic, lambda data: decode_labels(messages.read_compressed_image(data))):
+        topic, size = channels.camera_topic(camera, "segmentation"), self._size(camera)
+        for _, labels in self._pictures(topic, lambda data: decode_labels(messages.read_compressed_image(data), size)):
             yield labels
+
+    def _size(self, camera: str) -> tuple[int, int]:
+        """(height, width) of all pictures of a camera."""
+        settings = self.video_settings(camera)
+        return settings.height, settings.width
 
     def segment_names(self) -> dict[int, str]:
         """Segmentation value -> name of the body, or ROBOT/LINK; empty when no segmentation was recorded."""
@@ -331,6 +339,14 @@ class Recording:
             MissingDependencyError: pandas is not installed.
         """
         return frame_table(self)
+
+    def calibration(self, camera: str) -> messages.Calibration:
+        """What the calibration message of a camera says, which is what other programs go by."""
+        topic = channels.camera_topic(camera, "camera_info")
+        for message in self._container.messages((topic,)):
+            with damage_as_recording_error(self.path):
+                return messages.read_camera_info(message.data)
+        raise RecordingError(f"The recording has no calibration of the camera {camera!r}: {self.path}")
 
     def pixel_statistics(self, camera: str) -> PixelStatistics:
         """Histograms of a camera's pictures: as written, or counted now in a recording that a crash cut off."""

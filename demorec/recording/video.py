@@ -203,7 +203,7 @@ def decode(settings: VideoSettings, packets: Iterable[VideoPacket]) -> Iterator[
         RecordingError: A packet cannot be decoded, has another size, or pictures are missing at the end.
     """
     shape = (settings.height, settings.width, 3)
-    pictures = _decode_jpeg(packets) if settings.codec == "jpeg" else _decode_stream(settings, packets)
+    pictures = _decode_jpeg(settings, packets) if settings.codec == "jpeg" else _decode_stream(settings, packets)
     for picture in pictures:
         if picture.shape != shape:
             raise RecordingError(
@@ -213,18 +213,22 @@ def decode(settings: VideoSettings, packets: Iterable[VideoPacket]) -> Iterator[
         yield picture
 
 
-def _decode_jpeg(packets: Iterable[VideoPacket]) -> Iterator[Rgb]:
+def _decode_jpeg(settings: VideoSettings, packets: Iterable[VideoPacket]) -> Iterator[Rgb]:
     for packet in packets:
         try:
             with Image.open(io.BytesIO(packet.data), formats=("JPEG",)) as image:
+                if image.width * image.height > settings.width * settings.height:  # before anything is unpacked
+                    raise OSError(f"{image.width}x{image.height} pixels")
                 yield np.asarray(image.convert("RGB"))
-        except (OSError, SyntaxError) as error:
+        except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
             raise RecordingError(f"The picture of frame {packet.frame_index} is no valid JPEG ({error}).") from error
 
 
 def _decode_stream(settings: VideoSettings, packets: Iterable[VideoPacket]) -> Iterator[Rgb]:
     context = cast(av.VideoCodecContext, av.CodecContext.create(_decoder_name(settings.codec), "r"))
     context.thread_count = 1
+    # A few bytes can announce pictures of gigabytes; coded pictures are whole blocks of at most 128 pixels.
+    context.options = {"max_pixels": str((settings.width + 128) * (settings.height + 128))}
     num_packets = num_pictures = 0
     try:
         for packet in packets:
@@ -237,7 +241,7 @@ def _decode_stream(settings: VideoSettings, packets: Iterable[VideoPacket]) -> I
         for frame in context.decode(None):
             num_pictures += 1
             yield cast(Rgb, frame.to_ndarray(format="rgb24"))
-    except av.FFmpegError as error:
+    except (av.FFmpegError, ValueError) as error:
         raise RecordingError(f"The {settings.codec} video cannot be decoded near frame {num_pictures}.") from error
     if num_pictures != num_packets:
         raise RecordingError(f"{num_packets} packets of {settings.codec} video gave {num_pictures} pictures.")

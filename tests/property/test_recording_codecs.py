@@ -39,14 +39,14 @@ pictures = hnp.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=24)
 )
 def test_depth_is_exact_to_the_millimetre(millimetres: np.ndarray) -> None:
     metres = (millimetres / np.float32(1000)).astype(np.float32)
-    decoded = decode_depth(encode_depth(metres))
+    decoded = decode_depth(encode_depth(metres), metres.shape)
     assert decoded.shape == millimetres.shape
     assert np.array_equal(np.rint(decoded.astype(np.float64) * 1000), millimetres)
 
 
 def test_depth_beyond_its_range_counts_as_nothing_hit() -> None:
     metres = np.array([[np.nan, np.inf, -1.0, 65.6, 65.535, 0.0004, 0.0006, 1.2345]], dtype=np.float32)
-    found = decode_depth(encode_depth(metres))
+    found = decode_depth(encode_depth(metres), metres.shape)
     assert np.allclose(found, [[0, 0, 0, 0, 65.535, 0, 0.001, 1.234]], atol=1e-6)
 
 
@@ -68,7 +68,7 @@ def test_labels(bodies: np.ndarray, links: np.ndarray) -> None:
     height, width = bodies.shape
     values = np.where(links[:height, :width] == 7, -1, bodies + ((links[:height, :width] + 1) << 24 & 0x7F000000))
     values = values.astype(np.int32)
-    assert np.array_equal(decode_labels(encode_labels(values)), values)
+    assert np.array_equal(decode_labels(encode_labels(values), values.shape), values)
 
 
 def test_too_many_bodies_for_labels() -> None:
@@ -218,4 +218,4 @@ def test_pngs_of_others_are_refused() -> None:
     buffer = io.BytesIO()
     Image.new("RGB", (4, 4)).save(buffer, format="PNG")
     with pytest.raises(ValueError, match="of the kind 'RGB'"):
-        decode_labels(buffer.getvalue())
+        decode_labels(buffer.getvalue(), (4, 4))
