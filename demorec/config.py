@@ -20,6 +20,7 @@ from demorec.user_modules import modules_of
 from demorec.variation import PRESET_NAMES, Preset, Ranges
 
 MAX_PIXELS = 16_000_000
+MAX_PHYSICS_HZ = 10_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,13 +140,14 @@ class GenerateConfig:
         if len({camera_name(name) for name in self.cameras}) != len(self.cameras):
             raise ConfigError(f"A camera is named twice: {' '.join(self.cameras)}.")
         _check("seed", self.seed, 0, 2**63 - 1)
-        _check("physics-hz", self.physics_hz, 60, 10_000)
-        _check("fps", self.fps, 1, self.physics_hz)
+        _check("physics-hz", self.physics_hz, 60, MAX_PHYSICS_HZ)
+        _check("fps", self.fps, 1, MAX_PHYSICS_HZ)
         if self.physics_hz % self.fps:
-            divisors = [str(n) for n in range(5, self.physics_hz + 1) if self.physics_hz % n == 0]
+            steps = -(-self.physics_hz // self.fps)  # a frame, rounded up
+            other = f", or --physics-hz {steps * self.fps}" if steps * self.fps <= MAX_PHYSICS_HZ else ""
             raise ConfigError(
-                f"fps is {self.fps}, which does not divide the physics rate of {self.physics_hz} Hz."
-                f"{nearest_match(str(self.fps), divisors)} Allowed: {', '.join(divisors)}."
+                f"fps is {self.fps}, which does not divide the physics rate of {self.physics_hz} Hz: use "
+                f"{_nearest_divisors(self.physics_hz, self.fps)}{other}."
             )
         for name, value in (("width", self.width), ("height", self.height)):
             _check(name, value, 16, 8192)
@@ -226,6 +228,13 @@ def parse_config[T](data: dict[str, Any], cls: type[T], *, source: str) -> T:
         return from_plain(data, cls)
     except ValueError as error:
         raise ConfigError(f"{source}: {error}.") from error
+
+
+def _nearest_divisors(rate: int, wanted: int) -> str:
+    """In words, the divisors of a rate next to a wanted one that is none: "48 or 60" of 240 for 50."""
+    divisors = [n for n in range(1, rate + 1) if rate % n == 0]
+    below = [n for n in divisors if n < wanted][-1:]
+    return " or ".join(str(n) for n in below + [n for n in divisors if n > wanted][:1])
 
 
 def _check(name: str, value: float, low: float, high: float) -> None:

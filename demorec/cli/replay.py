@@ -201,9 +201,13 @@ def _summary(reports: Sequence[ReplayReport], good: int) -> str:
     parts = [f"{len(reports)} replayed, {sum(r.is_identical for r in reports)} identical, {good} as recorded"]
     if judged:
         parts.append(f"success {sum(bool(r.success) for r in judged)} of {len(judged)}")
-    worst = max(report.joint_error for report in reports)
-    objects = max(report.object_error for report in reports)
-    parts.append(f"largest difference {worst:.2g} rad, {objects * 1e3:.2g} mm")
+    largest = [
+        f"{max(report.joint_error for report in reports):.2g} rad",
+        f"gripper {max(report.gripper_error for report in reports) * 1e3:.2g} mm",
+    ]
+    if any(report.compares_objects for report in reports):
+        largest.append(f"objects {max(report.object_error for report in reports) * 1e3:.2g} mm")
+    parts.append(f"largest difference {', '.join(largest)}")
     return "; ".join(parts) + "."
 
 

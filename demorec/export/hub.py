@@ -19,8 +19,6 @@ def push_to_hub(folder: Path, repo_id: str, *, private: bool) -> str:
     """
     from huggingface_hub import HfApi, get_token
 
-    if "/" not in repo_id:
-        raise ExportError(f"--repo-id is {repo_id!r}, the Hub needs OWNER/NAME; the dataset is kept: {folder}")
     if get_token() is None:
         raise ExportError(
             "The dataset was not uploaded, there is no Hugging Face token: type hf auth login, or set HF_TOKEN, and "

@@ -85,11 +85,20 @@ class ExportOptions:
             raise ConfigError(f"fps is {self.fps}, it must be at least 1.")
         if self.workers < 0:
             raise ConfigError(f"workers is {self.workers}, it must be 0 (as many as pay) or more.")
-        if not re.fullmatch(r"[\w.-]+(/[\w.-]+)?", self.repo_id):
-            raise ConfigError(f"repo-id is {self.repo_id!r}, expected OWNER/NAME of letters, digits, dots and dashes.")
+        check_repo_id(self.repo_id)
         if self.data_files_mb <= 0 or self.video_files_mb <= 0 or self.files_per_chunk < 1:
             raise ConfigError("data-files-mb, video-files-mb and files-per-chunk must be above 0.")
         self.transcode.validate()
+
+
+def check_repo_id(repo_id: str) -> None:
+    """Raise ConfigError for what cannot be OWNER/NAME on the Hub; LeRobot takes a dataset's name apart at the slash."""
+    word = r"(?!.*(?:--|\.\.))[A-Za-z0-9_](?:[A-Za-z0-9_.-]*[A-Za-z0-9_])?"
+    if len(repo_id) > 96 or repo_id.endswith(".git") or not re.fullmatch(f"{word}/{word}", repo_id):
+        raise ConfigError(
+            f"repo-id is {repo_id!r}, but must be OWNER/NAME, for example me/cubes, of letters, digits and underscores "
+            "with single dots and dashes between them."
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,6 +146,8 @@ def parse_episodes(text: str) -> Callable[[int], bool]:
             parts.append(range(first, first + 1))
         else:
             parts.append(range(first, int(match[3]) if match[3] else 2**62, int(match[4] or 1)))
+        if not parts[-1]:
+            raise ConfigError(f"episodes is {text!r}, but {part.strip()} ends before it begins.")
     if not parts:
         return lambda index: True
     return lambda index: any(index in part for part in parts)

@@ -48,13 +48,13 @@ def frame_stride(recording_fps: int, fps: int | None) -> int:
     """How many frames of the recording make one of the dataset.
 
     Raises:
-        ExportError: The wanted fps does not divide that of the recording.
+        ConfigError: The wanted fps does not divide that of the recording.
     """
     if fps is None:
         return 1
     if recording_fps % fps:
         divisors = [str(n) for n in range(1, recording_fps + 1) if recording_fps % n == 0]
-        raise ExportError(
+        raise ConfigError(
             f"fps is {fps}, which does not divide the recordings' {recording_fps}: allowed are {', '.join(divisors)}."
         )
     return recording_fps // fps
@@ -65,7 +65,7 @@ def dataset_features(recording: Recording, options: ExportOptions) -> dict[str, 
 
     Raises:
         ConfigError: `options.features` names one that they do not give.
-        ExportError: The wanted fps does not divide that of the recording.
+        ConfigError: The wanted fps does not divide that of the recording.
     """
     info = recording.info
     stride = frame_stride(info.fps, options.fps)

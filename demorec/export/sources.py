@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from demorec.errors import ExportError
+from demorec.errors import ConfigError, ExportError
 from demorec.export.layout import IMAGE_PREFIX
 from demorec.export.options import ExportOptions
 from demorec.features import ENVIRONMENT_STATE, observation_names
@@ -31,7 +31,7 @@ def find_recordings(paths: Sequence[Path], *, include_failures: bool) -> list[So
     """The recordings in the given files, runs (folders with episodes/) and folders of recordings, in order.
 
     Raises:
-        ExportError: A path is missing, holds no recording, or the same recording is given twice.
+        ConfigError: A path is missing, holds no recording, or the same recording is given twice.
     """
     found: list[Source] = []
     for path in paths:
@@ -39,19 +39,19 @@ def find_recordings(paths: Sequence[Path], *, include_failures: bool) -> list[So
             found.append(Source(path=path))
             continue
         if not path.is_dir():
-            raise ExportError(f"No such recording or run: {path}")
+            raise ConfigError(f"No such recording or run: {path}")
         episodes = path / "episodes" if (path / "episodes").is_dir() else path
         failed = sorted((path / "failed").glob("*.mcap")) if (path / "failed").is_dir() else []
         of_path = [Source(path=file) for file in sorted(episodes.glob("*.mcap"))]
         of_path += [Source(path=file, is_chosen=include_failures) for file in failed]
         if not of_path:
-            raise ExportError(f"No finished recordings (*.mcap) in episodes/ of the folder: {path}")
+            raise ConfigError(f"No finished recordings (*.mcap) in episodes/ of the folder: {path}")
         found += sorted(of_path, key=_attempt_order)
     seen: set[Path] = set()
     for source in found:
         resolved = source.path.resolve()
         if resolved in seen:
-            raise ExportError(f"The same recording is given twice: {source.path}")
+            raise ConfigError(f"The same recording is given twice: {source.path}")
         seen.add(resolved)
     return found
 

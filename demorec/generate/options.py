@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from demorec.errors import ConfigError
+from demorec.export.options import check_repo_id
 
 MAX_EPISODES = 10_000_000
 
@@ -62,9 +63,7 @@ class RunOptions:
             if given:
                 raise ConfigError(f"{given[0]} is for Ray: add --executor ray, or leave it out.")
         if self.repo_id is not None:
-            owner, _, name = self.repo_id.partition("/")
-            if not owner or not name or "/" in name or any(c.isspace() for c in self.repo_id):
-                raise ConfigError(f"repo-id is {self.repo_id!r}, but must be OWNER/NAME, for example me/cubes.")
+            check_repo_id(self.repo_id)
             if not self.export:
                 raise ConfigError("--repo-id names the exported dataset, but --no-export leaves it out: drop one.")
 

@@ -33,26 +33,35 @@ def part_path(path: Path) -> Path:
 
 
 class _Disk:
-    """The file below the MCAP writer, unbuffered; it keeps the first error, which the writer may swallow."""
+    """The file below the MCAP writer, unbuffered.
+
+    It keeps the first error, stores nothing more after it and goes on as if it did: the writer, told of it, would print
+    a line for every message that is logged until the recorder looks at `error`.
+    """
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("wb", buffering=0)
+        self._position = self._end = 0  # as the writer knows them
         self.error: OSError | None = None
 
     def write(self, data: bytes) -> int:
-        """Write all of it."""
+        """Write all of it, unless an earlier write failed."""
         rest = memoryview(data)
         try:
-            while rest:
+            while rest and self.error is None:
                 rest = rest[self._file.write(rest) :]
         except OSError as error:
-            self.error = self.error or error
-            raise
+            self.error = error
+        self._position += len(data)
+        self._end = max(self._end, self._position)
         return len(data)
 
     def seek(self, offset: int, whence: int = 0) -> int:
         """As any file."""
-        return self._file.seek(offset, whence)
+        self._position = offset + (0, self._position, self._end)[whence]
+        if self.error is None:
+            self._file.seek(self._position)
+        return self._position
 
     def flush(self) -> None:
         """Nothing is buffered here."""

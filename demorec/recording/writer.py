@@ -20,6 +20,7 @@ from demorec.config import VideoConfig
 from demorec.episode import EpisodeInfo, Event, Frame, JointSample, Outcome, frame_time_ns
 from demorec.errors import RecordingError
 from demorec.recording import channels, messages, metadata
+from demorec.recording.frame_check import FrameCheck, check_joint_names
 from demorec.recording.part_file import PartFile
 from demorec.recording.pictures import CameraRecorder
 from demorec.recording.recover import can_be_made_again
@@ -71,15 +72,18 @@ class EpisodeWriter:
         overwrite: Whether a recording of that name may be replaced.
 
     Raises:
-        RecordingError: The file, or an unfinished one of that name, is there already; or it cannot be written. What a
-            killed replay or rendering of the same recording left is replaced.
+        RecordingError: The file, or an unfinished one of that name, is there already; or it cannot be written; or the
+            robot's joints are not those of its URDF. What a killed replay or rendering of the same recording left is
+            replaced.
         ConfigError: To be overwritten is what is no recording.
     """
 
     def __init__(
         self, path: Path, info: EpisodeInfo, *, video: VideoConfig | None = None, overwrite: bool = False
     ) -> None:
+        check_joint_names(info)
         self._info = info
+        self._check = FrameCheck(info)
         self._video = video or VideoConfig()
         self._tree = FrameTree(info)
         self._streams = [*channels.state_streams(info), channels.tf_stream(self._tree)]
@@ -105,7 +109,8 @@ class EpisodeWriter:
         """Add the next frame.
 
         Raises:
-            RecordingError: Frames out of order, pictures missing or of another size, or a full disk.
+            RecordingError: Frames out of order, vectors of another length, other objects or cameras than the scene's,
+                numbers that are not finite, pictures missing or of another size, or a full disk.
         """
         due = (self._num_frames, frame_time_ns(self._num_frames, self._info.fps))
         if (frame.frame_index, frame.time_ns) != due:
@@ -113,6 +118,7 @@ class EpisodeWriter:
                 f"Frame {frame.frame_index} at {frame.time_ns} ns came where frame {due[0]} at {due[1]} ns was due: "
                 "frames are written in order, one each."
             )
+        self._check(frame)
         if self._num_frames == 0:
             self._begin(frame)
         for camera in self._cameras.values():

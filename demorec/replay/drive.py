@@ -33,6 +33,7 @@ class ReplayReport:
         joint_error, joint_error_step: Largest difference of an arm joint, rad, and where.
         gripper_error: Largest difference of the opening, m.
         object_error, object_error_step, object_error_name: Largest distance of an object from its recorded place, m.
+        compares_objects: Whether the places of objects were recorded; a dataset has none.
         recorded_success, success: Of the task, then and now; None where that is not known or not judged.
         failed_checks: Conditions that do not hold now.
         unreachable: Steps whose pose inverse kinematics did not reach (the arm held its last target).
@@ -49,6 +50,7 @@ class ReplayReport:
     object_error: float
     object_error_step: int
     object_error_name: str
+    compares_objects: bool
     recorded_success: bool | None
     success: bool | None
     failed_checks: tuple[str, ...] = ()
@@ -204,6 +206,7 @@ def _report(comparison: _Comparison, *, checks: Sequence[Check], digest: str | N
         object_error=comparison.object[0],
         object_error_step=comparison.object[1],
         object_error_name=comparison.object[2],
+        compares_objects=bool(d.object_poses),
         recorded_success=d.recorded_success,
         success=not failed if checks else None,
         failed_checks=failed,

@@ -38,6 +38,11 @@ class Arm:
         self.spec = spec
         self.world_from_base = placement.world_from_base
         self._client = client
+        if len(spec.gripper_joints) != 2:
+            raise SceneError(
+                f"The robot {spec.name!r} has {len(spec.gripper_joints)} finger joints; only a parallel gripper with "
+                "2 can be simulated."
+            )
         try:
             with urdf_file(spec.urdf) as path:
                 self.body = client.loadURDF(

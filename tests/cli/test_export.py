@@ -47,7 +47,9 @@ def test_options_reach_the_export(run: Path, tmp_path: Path) -> None:
     ("arguments", "code", "message"),
     [
         (("--features", "observation.stat"), 2, "'observation.state'"),
-        (("--fps", "7"), 1, "does not divide"),
+        (("--fps", "7"), 2, "does not divide"),
+        (("--episodes", "5:2"), 2, "5:2 ends before it begins"),
+        (("--repo-id", "cubes"), 2, "must be OWNER/NAME"),
         (("--append", "--overwrite"), 2, "exclude each other"),
         (("--episodes", "x"), 2, "0:100"),
         (("--action", "velocity"), 2, "joint_increment"),
@@ -71,6 +73,12 @@ def test_a_dataset_in_the_way(run: Path, tmp_path: Path, capsys: pytest.CaptureF
     assert demorec("export", "lerobot", run, "--out", tmp_path / "d", "--no-verify", "--overwrite") == 2
     assert "it is not a LeRobot dataset" in capsys.readouterr().err
     assert (tmp_path / "d" / "thesis.txt").read_text() == "years of work"
+
+
+@pytest.mark.parametrize(("source", "message"), [("nothing", "No such recording"), ("", "No finished recordings")])
+def test_a_source_that_is_none(tmp_path: Path, capsys: pytest.CaptureFixture[str], source: str, message: str) -> None:
+    assert demorec("export", "lerobot", tmp_path / source, "--out", tmp_path / "d") == 2
+    assert message in capsys.readouterr().err
 
 
 def test_no_recordings_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from helpers_check import Spoilt, simulate, simulate_run
+from helpers_recording import make_episode
 
 from demorec.cli import main
 from demorec.errors import ConfigError
 from demorec.export.lerobot import export_lerobot
 from demorec.export.options import ExportOptions
-from demorec.recording import Recording
+from demorec.recording import EpisodeWriter, Recording
 from demorec.replay import ReplayOptions, ReplayReport, open_file, replay_all
 from demorec.tables import TASKS
 
@@ -166,3 +168,30 @@ def test_a_dataset_with_noise_still_succeeds(tmp_path: Path) -> None:
     export_lerobot([run], tmp_path / "ds", ExportOptions(verify=False, fps=10))
     assert _exit_code("replay", tmp_path / "ds") == 0
     assert _exit_code("check", tmp_path / "ds", "--no-pictures", "--replay", "2") == 0
+
+
+def test_what_a_dataset_differs_in_is_in_its_total(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = simulate_run(tmp_path / "run", 1, seed=5)
+    export_lerobot([run], tmp_path / "d", ExportOptions(verify=False))
+    assert _exit_code("replay", tmp_path / "d") == 0
+    episode, total = capsys.readouterr().out.splitlines()
+    (gripper,) = re.findall(r"gripper (\S+) mm", episode)
+    assert float(gripper) > 0
+    assert total.endswith(f"gripper {gripper} mm.")  # and nothing of objects, whose places a dataset does not hold
+    assert _exit_code("replay", run) == 0
+    assert capsys.readouterr().out.endswith("gripper 0 mm, objects 0 mm.\n")
+
+
+def test_a_robot_without_a_gripper_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    info, frames, outcome = make_episode(num_frames=3, cameras=())
+    info = replace(info, robot=replace(info.robot, gripper_joints=(), finger_links=()))
+    with EpisodeWriter(tmp_path / "e.mcap", info) as writer:
+        for frame in frames:
+            seen = frame.observation
+            arm = {f"joint_{name}": getattr(seen, f"joint_{name}")[:7] for name in ("position", "velocity", "effort")}
+            writer.write(replace(frame, observation=replace(seen, **arm)))
+        writer.finish(outcome)
+    assert _exit_code("replay", tmp_path / "e.mcap") == 1
+    said = capsys.readouterr().err
+    assert "has 0 finger joints" in said
+    assert len(said.splitlines()) == 1

@@ -21,7 +21,11 @@ from demorec.errors import ConfigError
         ({"cameras": ("front", "front")}, "named twice"),
         ({"cameras": ("front", "none")}, "stands alone"),
         ({"renderer": "tinny"}, "Did you mean 'tiny'"),
-        ({"fps": 50}, "does not divide"),
+        ({"fps": 50}, "use 48 or 60, or --physics-hz 250"),
+        ({"fps": 7}, "use 6 or 8, or --physics-hz 245"),
+        ({"fps": 9, "physics_hz": 9_998}, "use 2 or 4999, or --physics-hz 9999"),
+        ({"fps": 300}, "use 240, or --physics-hz 300"),
+        ({"fps": 7001, "physics_hz": 8000}, "use 4000 or 8000\\."),
         ({"fps": 0}, "fps is 0"),
         ({"width": 225}, "even"),
         ({"height": 0}, "height is 0"),
@@ -40,6 +44,11 @@ def test_impossible_values_are_refused(change: dict[str, Any], message: str) -> 
 
 def test_the_defaults_are_possible() -> None:
     GenerateConfig().validate()
+
+
+@pytest.mark.parametrize("fps", [1, 3, 48, 240])
+def test_every_divisor_of_the_physics_rate_is_possible(fps: int) -> None:
+    GenerateConfig(fps=fps).validate()
 
 
 def test_no_cameras() -> None:

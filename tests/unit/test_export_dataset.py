@@ -198,7 +198,7 @@ def test_fewer_frames_a_second(run: Path, tmp_path: Path, fps: int, stride: int,
 
 
 def test_fps_that_does_not_divide_is_refused(run: Path, tmp_path: Path) -> None:
-    with pytest.raises(ExportError, match="1, 2, 3, 5, 6, 10, 15, 30"):
+    with pytest.raises(ConfigError, match="1, 2, 3, 5, 6, 10, 15, 30"):
         export(run, tmp_path / "d", fps=20)
     assert list(tmp_path.iterdir()) == []
 
@@ -235,6 +235,12 @@ def test_wrong_episode_ranges(text: str) -> None:
         ExportOptions(episodes=text).validate()
 
 
+@pytest.mark.parametrize("text", ["5:2", "3:3", "0:2,9:4:2"])
+def test_empty_episode_ranges(text: str) -> None:
+    with pytest.raises(ConfigError, match="ends before it begins"):
+        ExportOptions(episodes=text).validate()
+
+
 def test_chosen_episodes(run: Path, tmp_path: Path) -> None:
     export(run, tmp_path / "d", episodes="1,3")
     assert [row["length"] for row in episode_rows(tmp_path / "d")] == [15, 9]
@@ -247,7 +253,7 @@ def test_recordings_of_several_runs_go_together(run: Path, tmp_path: Path) -> No
     other = make_run(tmp_path / "other", (7,))
     report = export([run, other / "episodes" / "episode_000000.mcap"], tmp_path / "d")
     assert (report.num_episodes, report.num_frames) == (5, 68)
-    with pytest.raises(ExportError, match="given twice"):
+    with pytest.raises(ConfigError, match="given twice"):
         export([run, recordings(run)[0]], tmp_path / "e")
 
 
@@ -497,7 +503,7 @@ def test_impossible_options(options: dict[str, object], message: str) -> None:
 
 
 def test_no_recordings(tmp_path: Path) -> None:
-    with pytest.raises(ExportError, match="No finished recordings"):
+    with pytest.raises(ConfigError, match="No finished recordings"):
         export(tmp_path, tmp_path / "d")
-    with pytest.raises(ExportError, match="No such recording"):
+    with pytest.raises(ConfigError, match="No such recording"):
         export(tmp_path / "nothing", tmp_path / "d")

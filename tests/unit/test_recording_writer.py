@@ -167,7 +167,7 @@ def test_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert not (tmp_path / "a.mcap").exists()
 
 
-def test_a_disk_that_fills_up_in_the_middle(tmp_path: Path) -> None:
+def test_a_disk_that_fills_up_in_the_middle(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     info, frames, outcome = make_episode(num_frames=60, width=320, height=240)
     writer = EpisodeWriter(tmp_path / "a.mcap", info, video=VideoConfig(codec="jpeg"))
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -178,3 +178,5 @@ def test_a_disk_that_fills_up_in_the_middle(tmp_path: Path) -> None:
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert names(tmp_path) == ["a.mcap.part"]
+    # The MCAP library prints a line to the terminal for every message that it cannot write.
+    assert capfd.readouterr().err == ""

@@ -1,0 +1,38 @@
+"""Names of datasets, judged by the library that LeRobot loads them with."""
+
+from __future__ import annotations
+
+import contextlib
+
+import pytest
+from huggingface_hub.errors import HFValidationError
+from huggingface_hub.utils import validate_repo_id
+from hypothesis import given
+from hypothesis import strategies as st
+
+from demorec.errors import ConfigError
+from demorec.export.options import check_repo_id
+
+words = st.text(st.sampled_from("aZ09_-.é "), min_size=0, max_size=6)
+
+
+@given(st.one_of(st.builds("{}/{}".format, words, words), words, st.builds("{}/{}/{}".format, words, words, words)))
+def test_what_is_accepted_is_what_the_hub_accepts(name: str) -> None:
+    hub = True
+    with contextlib.suppress(HFValidationError):
+        validate_repo_id(name)
+        hub = False
+    refused = hub or name.count("/") != 1  # LeRobot takes a name apart at the slash
+    try:
+        check_repo_id(name)
+    except ConfigError:
+        # Stricter than the Hub in one point: letters are those of ASCII, as the Hub's servers ask for.
+        assert refused or not name.isascii()
+    else:
+        assert not refused
+
+
+@pytest.mark.parametrize("name", ["me/cubes", "local/pick_place", "Foo-BAR_foo/bar.123", "a/b"])
+def test_usual_names_are_accepted(name: str) -> None:
+    check_repo_id(name)
+    validate_repo_id(name)

@@ -1,0 +1,125 @@
+"""Frames that do not fit their episode are refused when they are written, in a sentence."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers_recording import make_episode
+
+from demorec.episode import EpisodeInfo, Frame
+from demorec.errors import RecordingError
+from demorec.geometry import Pose
+from demorec.recording import EpisodeWriter
+
+NAN = float("nan")
+
+
+def observed(frame: Frame, **changes: Any) -> Frame:
+    return replace(frame, observation=replace(frame.observation, **changes))
+
+
+def moved(frame: Frame, **changes: Any) -> Frame:
+    return replace(frame, command=replace(frame.command, **changes))
+
+
+def with_nan(values: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    spoilt = values.copy()
+    spoilt[-1] = NAN
+    return spoilt
+
+
+def pose_of_nan(pose: Pose) -> Pose:
+    return Pose(position=with_nan(pose.position), quat_xyzw=pose.quat_xyzw)
+
+
+FAULTS: dict[str, tuple[Callable[[Frame], Frame], str]] = {
+    "seven joints for nine": (
+        lambda f: observed(f, joint_position=f.observation.joint_position[:7]),
+        r"joint vector of shape \(7,\), the robot's is \(9,\)",
+    ),
+    "a column": (
+        lambda f: observed(f, joint_effort=f.observation.joint_effort[:, None]),
+        r"joint vector of shape \(9, 1\)",
+    ),
+    "a target with fingers": (
+        lambda f: moved(f, joint_target=np.zeros(9)),
+        r"joint target of shape \(9,\), the robot's is \(7,\)",
+    ),
+    "a sample of another length": (
+        lambda f: replace(f, joint_samples=(replace(f.joint_samples[0], joint_velocity=np.zeros(3)),)),
+        r"joint vector of shape \(3,\)",
+    ),
+    "no objects": (lambda f: observed(f, object_poses={}), "poses of the objects none, the scene has cube"),
+    "an unknown object": (
+        lambda f: observed(f, object_poses={**f.observation.object_poses, "ball": Pose()}),
+        "poses of the objects ball, cube, the scene has cube",
+    ),
+    "an unknown camera": (
+        lambda f: replace(f, images={**f.images, "top": f.images["front"]}),
+        "pictures of the cameras front, top, the scene has front",
+    ),
+    "a NaN in a joint": (
+        lambda f: observed(f, joint_velocity=with_nan(f.observation.joint_velocity)),
+        "joint_velocity in its observation that is not finite",
+    ),
+    "an infinite opening": (
+        lambda f: observed(f, gripper_width=float("inf")),
+        "gripper_width in its observation that is not finite",
+    ),
+    "a NaN in a pose": (
+        lambda f: observed(f, base_from_tcp=pose_of_nan(f.observation.base_from_tcp)),
+        "base_from_tcp in its observation that is not finite",
+    ),
+    "a NaN in an object's pose": (
+        lambda f: observed(f, object_poses={n: pose_of_nan(p) for n, p in f.observation.object_poses.items()}),
+        "object_poses in its observation that is not finite",
+    ),
+    "a NaN in a command": (
+        lambda f: moved(f, joint_target=with_nan(f.command.joint_target)),
+        "joint_target in its command that is not finite",
+    ),
+    "a NaN in a sample": (
+        lambda f: replace(
+            f,
+            joint_samples=(replace(f.joint_samples[0], joint_effort=with_nan(f.joint_samples[0].joint_effort)),),
+        ),
+        "joint_effort in its joint sample at .* ns that is not finite",
+    ),
+    "a NaN in a camera's pose": (
+        lambda f: replace(
+            f, images={n: replace(i, world_from_camera=pose_of_nan(i.world_from_camera)) for n, i in f.images.items()}
+        ),
+        "world_from_camera in its picture of front that is not finite",
+    ),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_frame_that_does_not_fit_is_refused_at_once(fault: str, tmp_path: Path) -> None:
+    info, frames, _ = make_episode(num_frames=4, cameras=("front",), physics_rate_joints=True)
+    spoil, words = FAULTS[fault]
+    with EpisodeWriter(tmp_path / "e.mcap", info) as writer:
+        for frame in frames[:2]:
+            writer.write(frame)
+        with pytest.raises(RecordingError, match=f"^Frame 2 has .*{words}"):
+            writer.write(spoil(frames[2]))
+
+
+def renamed(info: EpisodeInfo, *names: str) -> EpisodeInfo:
+    return replace(info, robot=replace(info.robot, arm_joints=(*names, *info.robot.arm_joints[len(names) :])))
+
+
+@pytest.mark.parametrize(
+    ("names", "words"),
+    [(("elbow",), "has no joints elbow; those of its URDF are"), (("panda_joint2",), "the joints panda_joint2 twice")],
+)
+def test_joints_that_the_robot_does_not_have_are_refused(names: tuple[str, ...], words: str, tmp_path: Path) -> None:
+    info, _, _ = make_episode(num_frames=1, cameras=())
+    with pytest.raises(RecordingError, match=words):
+        EpisodeWriter(tmp_path / "e.mcap", renamed(info, *names))
+    assert not list(tmp_path.iterdir())  # refused before anything is written
