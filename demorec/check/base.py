@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from demorec.errors import DemorecError
+from demorec.errors import DemorecError, MissingDependencyError
 
 Level = Literal["pass", "warn", "fail", "skip"]
 Scope = Literal["recording", "run", "dataset"]
@@ -67,9 +67,11 @@ class Check:
         return f"{self.scope}, {self.group}: {self.measures}; {warn}fails above {self.fail:g}{unit}"
 
     def run(self, subject: object) -> Result:
-        """Measure and judge; an error of ours while reading is a failure of this check."""
+        """Measure and judge; an error of ours while reading is a failure of this check, a missing package is none."""
         try:
             found = self.measure(subject)
+        except MissingDependencyError as error:
+            return self.skipped(str(error))
         except DemorecError as error:
             return self._result("fail", Measurement(value=math.nan, detail=str(error)))
         if found is None:
