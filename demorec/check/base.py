@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from demorec.errors import DemorecError, resource_error
+from demorec.errors import DemorecError, MissingDependencyError, resource_error
 
 Level = Literal["pass", "warn", "fail", "skip"]
 Scope = Literal["recording", "run", "dataset"]
@@ -67,13 +67,15 @@ class Check:
         return f"{self.scope}, {self.group}: {self.measures}; {warn}fails above {self.fail:g}{unit}"
 
     def run(self, subject: object) -> Result:
-        """Measure and judge; an error of ours while reading is a failure of this check.
+        """Measure and judge; an error of ours while reading is a failure of this check, a missing package is none.
 
         Raises:
             ResourceError: This machine cannot measure it, which says nothing about the subject.
         """
         try:
             found = self.measure(subject)
+        except MissingDependencyError as error:
+            return self.skipped(str(error))
         except DemorecError as error:
             if (lack := resource_error(error)) is not None:
                 raise lack from error

@@ -14,10 +14,11 @@ import numpy as np
 
 from demorec.check.base import Measurement, check, worst
 from demorec.check.dataset import Dataset
-from demorec.errors import ExportError
+from demorec.errors import ExportError, MissingDependencyError
 from demorec.export.files import check_video, read_json
 from demorec.export.inspect import episode_digests
 from demorec.export.reader import PacketReader
+from demorec.export.verify import LEROBOT, lerobot_is_installed
 from demorec.geometry import Array
 
 
@@ -214,6 +215,8 @@ print(json.dumps({"episodes": dataset.num_episodes, "frames": len(dataset)}))
 )
 def dataset_opens(dataset: Dataset) -> Measurement:
     """LeRobot opens the dataset and reads first, middle and last frame, pictures included."""
+    if not lerobot_is_installed():
+        raise MissingDependencyError("Opening a dataset as a training does", "lerobot", f"pip install '{LEROBOT}'")
     with tempfile.TemporaryDirectory(prefix="demorec-check-") as cache:
         environment = {**os.environ, "HF_HUB_OFFLINE": "1", "HF_DATASETS_OFFLINE": "1", "HF_DATASETS_CACHE": cache}
         done = subprocess.run(

@@ -59,6 +59,8 @@ def _told(report: ExportReport) -> list[str]:
     lines += [f"Pictures coded anew: camera {what}." for what in report.transcoded]
     if report.verified_frames:
         lines.append(f"Verified: {report.verified_frames} frames read through LeRobot equal the recordings.")
+    if report.not_verified:
+        lines.append(f"Not verified: {report.not_verified}")
     lines.append(f"Content digest: {report.digest}")
     if report.url:
         lines.append(f"Uploaded to {report.url}")

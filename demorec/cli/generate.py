@@ -80,16 +80,18 @@ class Generate:
             result = generate(self.episodes, options, progress=progress)
         if result.interrupted:
             return self._interrupted(result)
-        export, checked = None, None
+        export, report, checked = None, None, None
         with RunProgress() as progress, terminate_as_interrupt():
             if options.export and result.run.successes:
                 from demorec.generate.export_step import export_run
 
                 assert options.repo_id is not None
-                export, _ = export_run(result.folder, repo_id=options.repo_id, progress=progress.exporting)
+                export, report = export_run(result.folder, repo_id=options.repo_id, progress=progress.exporting)
             if self.check and result.run.successes:
                 checked = check_run(result, progress=progress.checking)
         print_result(result, export, checked)
+        if report is not None and report.not_verified:
+            tell(f"Not verified: {report.not_verified}")
         return 1 if result.run.given_up or (checked is not None and checked.failures) else 0
 
     @contextmanager

@@ -105,7 +105,8 @@ def _card(root: Path, info: DatasetInfo, about: CardFacts, has_sheet: bool) -> I
     if has_sheet:
         yield from ("", f"![First to last picture of some episodes]({THUMBNAILS_PATH})")
     yield from ("", "## Use", "", "```python", "from lerobot.datasets import LeRobotDataset", "")
-    yield from (f'dataset = LeRobotDataset("{options.repo_id}")  # or with root="path/of/this/folder"', "```", "")
+    yield '# or with root="path/of/this/folder"; LeRobot\'s default backend, torchcodec, needs FFmpeg installed'
+    yield from (f'dataset = LeRobotDataset("{options.repo_id}", video_backend="pyav")', "```", "")
     yield from ("## Features", "", "| feature | type | shape | meaning |", "|---|---|---|---|")
     for key, item in info.features.items():
         yield f"| `{key}` | {item.dtype} | {list(item.shape)} | {_meaning(key, item, options)} |"

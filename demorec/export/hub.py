@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from demorec.errors import ExportError
+from demorec.errors import ExportError, MissingDependencyError
 from demorec.export.layout import CODEBASE_VERSION
 
 
@@ -16,9 +16,14 @@ def push_to_hub(folder: Path, repo_id: str, *, private: bool) -> str:
 
     Raises:
         ExportError: No token, no network, no right to write there; the folder stays as it is.
+        MissingDependencyError: The Hub's client, which comes with LeRobot, is not installed.
     """
-    from huggingface_hub import HfApi, get_token
-
+    try:
+        from huggingface_hub import HfApi, get_token
+    except ImportError as error:
+        raise MissingDependencyError(
+            f"Uploading the dataset, which is kept ({folder}),", "huggingface_hub", "pip install huggingface_hub"
+        ) from error
     if get_token() is None:
         raise ExportError(
             "The dataset was not uploaded, there is no Hugging Face token: type hf auth login, or set HF_TOKEN, and "

@@ -24,7 +24,7 @@ from demorec.export.readings import Reading, readings
 from demorec.export.sidecar import AttemptRecord, SidecarStart, SidecarWriter
 from demorec.export.sources import Source, find_recordings, places_of, refuse_differences
 from demorec.export.staging import CODED, staged_folder
-from demorec.export.verify import MAX_EPISODES, Sample, Verifier
+from demorec.export.verify import LEROBOT, MAX_EPISODES, Sample, Verifier, lerobot_is_installed
 from demorec.export.writer import DatasetWriter, WriterStart
 from demorec.replacing import shown
 
@@ -50,10 +50,11 @@ def export_lerobot(
     options.validate()
     found = find_recordings(sources, include_failures=options.include_failures)
     existing = open_existing(out) if options.append and out.exists() else None
+    verifies = options.verify and lerobot_is_installed()
     kind, replace_it = (DATASET, options.overwrite) if existing is None else (GROWING_DATASET, True)
     with (
         staged_folder(out, kind, replace=replace_it, sources=places_of(found)) as folder,
-        Verifier() if options.verify else nullcontext() as verifier,
+        Verifier() if verifies else nullcontext() as verifier,
     ):
         if existing is not None:
             link_files(existing.root, folder)
@@ -61,7 +62,8 @@ def export_lerobot(
         report = export.run(progress)
         if verifier is not None:
             report = replace(report, verified_frames=verifier.verify(folder, export.samples(), options))
-    report = replace(report, path=out)
+    why = f"LeRobot, which would verify the dataset, is not installed: pip install '{LEROBOT}'."
+    report = replace(report, path=out, not_verified=why if options.verify and not verifies else "")
     if options.push_to_hub:
         report = replace(report, url=push_to_hub(out, options.repo_id, private=not options.public))
     return report

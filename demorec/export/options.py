@@ -45,7 +45,7 @@ class ExportOptions:
     overwrite: bool = False
     """Replace the dataset that is there already; anything else than a dataset, or with anything else in it, is not."""
     verify: bool = True
-    """Open the finished dataset with the installed LeRobot and compare samples of it with the recordings."""
+    """Open the finished dataset with LeRobot, where that is installed, and compare samples with the recordings."""
     workers: int = 0
     """Processes that read recordings; 0: as many as pay."""
     push_to_hub: bool = False
@@ -112,7 +112,8 @@ class ExportReport:
         skipped_failures: Failed episodes that were left out.
         transcoded: Cameras whose pictures had to be coded anew, with the reason.
         left_out: Features that the dataset appended to does not have.
-        verified_frames: Frames that were compared through LeRobot; 0 when not asked for.
+        verified_frames: Frames that were compared through LeRobot; 0 when not asked for, or without LeRobot.
+        not_verified: Why LeRobot did not verify what was asked for, as a sentence, or "".
         digest: Of the content, as `dataset_digest`.
         url: Where it was uploaded to, or "".
     """
@@ -126,6 +127,7 @@ class ExportReport:
     transcoded: tuple[str, ...] = ()
     left_out: tuple[str, ...] = ()
     verified_frames: int = 0
+    not_verified: str = ""
     digest: str = ""
     url: str = ""
 

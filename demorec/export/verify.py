@@ -7,6 +7,7 @@ tables in a cache, which here is a temporary folder.
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import tempfile
 from collections.abc import Sequence
@@ -27,6 +28,9 @@ from demorec.export.transcode import reason_to_transcode
 from demorec.processes import SPAWN
 from demorec.recording import Recording
 
+LEROBOT = "lerobot[dataset]>=0.6.1,<0.7"
+"""What pip has to install for a verification; a test compares it with pyproject.toml."""
+
 MAX_EPISODES = 500
 """Samples are taken of so many episodes, spread evenly, if there are more."""
 
@@ -34,6 +38,11 @@ _TRANSCODED_TOLERANCE = 12.0
 """Mean absolute difference in levels (0..255) allowed of a picture that was coded anew; others must be equal."""
 _DEPTH_TOLERANCE = 6e-4
 """Metres; LeRobot rounds distances to millimetres."""
+
+
+def lerobot_is_installed() -> bool:
+    """Whether there is a LeRobot that could verify; tells it without loading it."""
+    return importlib.util.find_spec("lerobot") is not None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,0 +1,90 @@
+"""demorec without LeRobot and PyTorch: everything runs but their own work, and what they would do is named."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+from helpers_export import make_run
+
+from demorec.check.dataset import Dataset
+from demorec.cli import COMMANDS, main
+from demorec.errors import ExportError, MissingDependencyError
+from demorec.evaluate.policy import Policy
+from demorec.export import ExportOptions, export_lerobot
+from demorec.export.hub import push_to_hub
+from demorec.export.verify import LEROBOT
+from demorec.tables import CHECKS
+
+ROOT = Path(__file__).parents[2]
+ABSENT = ("lerobot", "torch", "torchvision", "torchcodec", "datasets", "pandas", "huggingface_hub", "accelerate")
+
+
+@pytest.fixture
+def light(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As if these packages were not installed: importing them fails, and none is found."""
+    for name in ("lerobot", "datasets", "huggingface_hub"):  # tyro and pyarrow look for others among the modules
+        monkeypatch.setitem(sys.modules, name, None)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_run(tmp_path_factory.mktemp("light") / "run", (6, 5))
+
+
+def test_the_lists_of_packages_agree() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    lines = (ROOT / "requirements-light.txt").read_text().splitlines()
+    assert [line for line in lines if not line.startswith("#")] == [
+        name for name in project["dependencies"] if name != LEROBOT
+    ]
+    assert LEROBOT in project["dependencies"]
+
+
+@pytest.mark.usefixtures("light")
+def test_an_export_says_that_nothing_was_verified(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["export", "lerobot", str(run), "--out", str(tmp_path / "d")])
+    assert ended.value.code == 0
+    out = capsys.readouterr().out
+    assert f"Not verified: LeRobot, which would verify the dataset, is not installed: pip install '{LEROBOT}'." in out
+    assert "Verified:" not in out
+
+
+def test_an_unwanted_verification_is_not_missed(run: Path, tmp_path: Path) -> None:
+    assert export_lerobot([run], tmp_path / "d", ExportOptions(verify=False)).not_verified == ""
+
+
+@pytest.mark.usefixtures("light")
+def test_what_needs_lerobot_names_it(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    dataset = tmp_path / "d"
+    export_lerobot([run], dataset, ExportOptions(verify=False))
+    result = CHECKS.load("dataset_opens").run(Dataset(dataset))
+    assert (result.level, "needs the package 'lerobot'" in result.detail) == ("skip", True)
+    monkeypatch.setitem(sys.modules, "torch", None)
+    with pytest.raises(MissingDependencyError, match="train"):
+        Policy(tmp_path)
+    with pytest.raises(MissingDependencyError, match="huggingface_hub") as error:
+        push_to_hub(dataset, "me/cubes", private=True)
+    assert str(dataset) in str(error.value)
+    assert not isinstance(error.value, ExportError)
+
+
+def test_no_module_but_the_plug_in_needs_them() -> None:
+    """In a fresh process, every module of the package, so every command, imports without them."""
+    code = f"""
+import importlib, pkgutil, sys
+sys.modules.update(dict.fromkeys({ABSENT!r}))
+import demorec
+for module in pkgutil.walk_packages(demorec.__path__, "demorec."):
+    if not module.name.startswith("demorec.lerobot_env") and module.name != "demorec.generate.on_ray":
+        importlib.import_module(module.name)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=300)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert "evaluate" in COMMANDS.names()
