@@ -14,7 +14,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from demorec.errors import ConfigError, MissingDependencyError, NotAllowedError, SceneError
-from demorec.user_modules import is_allowed, module_file
+from demorec.user_modules import import_root, is_allowed, module_file
 
 OWN_PREFIX = "demorec:"
 
@@ -108,4 +108,6 @@ def mesh_path(folder: Path, name: str) -> Path:
 
 def _top_folder(module: str) -> Path:
     """The folder of the outermost package that a module is in, or that of its file."""
-    return module_file(module.partition(".")[0]).parent
+    root = import_root(module)
+    package = root / module.partition(".")[0]
+    return package if module_file(module).is_relative_to(package) else root

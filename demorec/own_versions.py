@@ -19,7 +19,7 @@ from pathlib import Path
 from demorec.assets import allow_models, asset_path, mesh_path
 from demorec.errors import DemorecError
 from demorec.tables import load_robot
-from demorec.user_modules import is_allowed, module_file, split_name
+from demorec.user_modules import import_root, is_allowed, split_name
 
 SOURCE = "source of "
 """Begins the name of a digest among versions: "source of my_tasks"."""
@@ -89,9 +89,7 @@ def source_digest(module: str) -> str:
     Raises:
         ConfigError: The module cannot be found.
     """
-    top = module.partition(".")[0]
-    file = module_file(top)
-    root = file.parent.parent if file.stem == "__init__" else file.parent
+    top, root = module.partition(".")[0], import_root(module)
     is_installed = root.name in _INSTALLED or root == Path(ast.__file__).parent
     waiting, sources = [module], dict[str, Path]()
     while waiting:

@@ -102,5 +102,11 @@ def module_file(module: str) -> Path:
     return Path(spec.origin)
 
 
+def import_root(module: str) -> Path:
+    """The folder on the path in which a module was found; errors as of `module_file`."""
+    file = module_file(module)
+    return file.parents[module.count(".") + (file.stem == "__init__")]
+
+
 def _is_module_name(name: str) -> bool:
     return all(part.isidentifier() for part in name.split("."))

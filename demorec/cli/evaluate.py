@@ -36,6 +36,10 @@ class Evaluate:
     """Output folder of lerobot-train, or a pretrained_model folder."""
     task: str = "pick_place"
     """A name of `demorec list tasks`, or my_package.my_module:MyTask."""
+    robot: str = "panda"
+    """A name of `demorec list robots`, or my_package.my_module:MY_ARM."""
+    cameras: tuple[str, ...] = ()
+    """Those of your own that the policy sees, as my_package.my_module:MY_CAMERA; it names the others itself."""
     num_episodes: int = 50
     """How many scenes."""
     split: Literal["all", "train", "eval"] = "eval"
@@ -116,10 +120,11 @@ class Evaluate:
         plain: dict[str, Any] = {} if self.renderer is None else {"renderer": self.renderer}
         return GenerateConfig(
             task=self.task,
+            robot=self.robot,
             split=self.split,
             seed=self.seed,
             fps=self.fps,
-            cameras=(),
+            cameras=self.cameras,
             variation=self.variation,
             video=self.video,
             **plain,
@@ -131,7 +136,7 @@ class Evaluate:
 
         a, b = load_evaluation(first), load_evaluation(second)
         scenes_a, scenes_b = a.settings.config, b.settings.config
-        for name in ("task", "split", "seed", "variation"):
+        for name in ("task", "robot", "split", "seed", "variation"):
             there, here = getattr(scenes_a, name), getattr(scenes_b, name)
             if there != here:
                 raise ConfigError(f"The two were not tried on the same scenes: {name} is {there} and {here}.")

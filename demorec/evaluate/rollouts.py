@@ -35,6 +35,7 @@ from demorec.plain import from_plain, to_plain
 from demorec.recording import EpisodeWriter
 from demorec.replacing import Kind, check_replaceable, json_object, replaced_parts, settle_parts
 from demorec.rollout import prepare
+from demorec.tables import camera_name
 
 EVALUATION_NAME = "evaluation.json"
 POLICY_PHASE = "policy"
@@ -104,7 +105,7 @@ def settings_for(
 
     Args:
         policy: Folder of the policy.
-        config: The caller's own words: which scenes.
+        config: The caller's own words: which scenes; its cameras are those of their own that the policy may see.
         action, action_steps, episode_length: As of `Settings`; None: as trained, or the environment's.
         allowed: The user's own modules that may be imported for what the policy names.
 
@@ -120,7 +121,8 @@ def settings_for(
                 if name.startswith("observation.images.")}  # fmt: skip
     if pictures:
         (_, height, width), *_ = pictures.values()
-        of_policy = replace(config, cameras=tuple(pictures), width=width, height=height)
+        own = {camera_name(name): name for name in config.cameras}
+        of_policy = replace(config, cameras=tuple(own.get(name, name) for name in pictures), width=width, height=height)
         of_policy.check_names((*config.modules, *allowed))
         config = of_policy
     action = action or trained_action(checkpoint)

@@ -15,7 +15,7 @@ from helpers_check import Spoilt
 
 from demorec.cli import main
 from demorec.config import GenerateConfig
-from demorec.errors import NotAllowedError
+from demorec.errors import ConfigError, NotAllowedError
 from demorec.export import ExportOptions, export_lerobot
 from demorec.generate.recordings import inspect_recording
 from demorec.generate.run_file import RUN_NAME, RunFile, save_run_file
@@ -176,6 +176,19 @@ def test_harmful_names_are_one_sentence_even_if_their_module_is_allowed(name: st
 def test_what_can_be_no_module_is_refused(name: str, tmp_path: Path, capsys) -> None:
     assert exit_code("replay", tmp_path / "any.mcap", "--allow", name) == 2
     assert "--allow names a module or package, for example my_tasks, found" in capsys.readouterr().err
+
+
+def test_a_policy_sees_cameras_that_the_user_names(tmp_path: Path) -> None:
+    from demorec.evaluate.rollouts import settings_for
+
+    shape = {"type": "VISUAL", "shape": [3, 48, 64]}
+    inputs = {f"observation.images.{name}": shape for name in ("front", "top")}
+    (tmp_path / "config.json").write_text(json.dumps({"type": "act", "input_features": inputs}))
+    named = GenerateConfig(cameras=("my_robots:TOP",))
+    config = settings_for(tmp_path, named, action="joint").config
+    assert (config.cameras, config.width, config.height) == (("front", "my_robots:TOP"), 64, 48)
+    with pytest.raises(ConfigError, match="Unknown camera 'top'"):
+        settings_for(tmp_path, GenerateConfig(cameras=()), action="joint")
 
 
 def test_a_policy_cannot_name_the_code_of_its_steps_nor_its_cameras(tmp_path: Path, marker: Path) -> None:

@@ -171,6 +171,30 @@ def test_the_source_counts_with_what_it_imports_from_beside_it(folder: Path) -> 
     assert "my_robots" not in sys.modules  # read, not run
 
 
+@pytest.mark.parametrize("has_init", [True, False])
+def test_modules_in_packages_name_models_of_their_package(has_init: bool, folder: Path) -> None:
+    from demorec.assets import allow_models, asset_path, model_name
+
+    package = folder / "my_lab"
+    (package / "arms").mkdir(parents=True)
+    for place in (package, package / "arms") if has_init else ():
+        (place / "__init__.py").touch()
+    (package / "arms" / "xarm.py").write_text("from my_lab.arms import limits\n")
+    (package / "arms" / "limits.py").write_text("FORCE = 1.0\n")
+    shutil.copy(folder / "xarm6.urdf", package / "xarm6.urdf")
+    name = model_name("../xarm6.urdf", "my_lab.arms.xarm")
+    assert name == "my_lab.arms.xarm:../xarm6.urdf"
+    allow_models(["my_lab"])
+    assert asset_path(name) == package / "xarm6.urdf"
+    with pytest.raises(SceneError, match="lies outside of"):
+        asset_path("my_lab.arms.xarm:../../xarm6.urdf")
+    before = own_versions(["my_lab.arms.xarm"])
+    (package / "arms" / "limits.py").write_text("FORCE = 2.0\n")
+    forget("my_lab", "my_lab.arms")
+    assert own_versions(["my_lab.arms.xarm"]) != before
+    forget("my_lab", "my_lab.arms")
+
+
 @pytest.mark.parametrize("where", ["absolute", "pybullet_data", "absolute in pybullet_data"])
 def test_models_are_found_wherever_they_may_lie(where: str, folder: Path) -> None:
     from demorec.assets import data_folder, model_name

@@ -1,14 +1,19 @@
-"""The example of docs/tasks.md works as printed, for somebody outside of this repository."""
+"""The examples of docs/tasks.md work as printed, for somebody outside of this repository."""
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 
 import pytest
+from helpers_check import checked, simulate
 
 from demorec.config import EpisodePlan, GenerateConfig
+from demorec.recording import Recording
+from demorec.replay import ReplayOptions, open_file, replay_all
 from demorec.rollout import Rollout, make_world, prepare
+from demorec.tables import ROBOTS
 
 EXAMPLE = Path(__file__).parents[2] / "docs" / "tasks.md"
 
@@ -31,3 +36,25 @@ def test_the_documented_task_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     end = frames[-1].observation.object_poses[episode.info.scene.movable[0].name].position
     assert end[1] - start[1] == pytest.approx(0.15, abs=0.02)
     assert end[0] - start[0] == pytest.approx(0.0, abs=0.02)
+
+
+def test_the_documented_script_pushes_on_every_robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source = re.findall(r"```python\n(.*?)```", EXAMPLE.read_text(), re.DOTALL)[1]
+    assert source == (EXAMPLE.parents[1] / "examples" / "own_script" / "my_tasks.py").read_text()
+    (tmp_path / "my_pushing_tasks.py").write_text(source)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    for robot in ROBOTS.names():
+        path = simulate(tmp_path / f"{robot}.mcap", task="my_pushing_tasks:PushToMark", robot=robot, seed=3)
+        with Recording(path) as recording:
+            columns, outcome, scene = recording.columns(), recording.outcome, recording.info.scene
+        assert outcome is not None
+        assert outcome.success, outcome
+        assert list(dict.fromkeys(columns.phase)) == ["open", "approach", "descend", "push", "retreat"]
+        start, end = columns.object_poses["red_cube"][0], columns.object_poses["red_cube"][-1]
+        assert 0.09 < math.dist(start[:2], end[:2]) < 0.16
+        assert columns.object_poses["red_cube"][:, 2].max() < start[2] + 0.005  # pushed, not carried
+        assert math.dist(end[:2], scene.goals[0].onto_from_goal.position[:2]) < 0.02
+        options = ReplayOptions(allowed=("my_pushing_tasks",))
+        ((report, _),) = replay_all([open_file(path, options)], options)
+        assert report.is_identical
+        assert checked(path).level != "fail"
