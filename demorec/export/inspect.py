@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -81,6 +82,22 @@ def dataset_info(path: Path) -> DatasetSummary:
         num_successes=sum(sum(column.to_pylist()) for column in columns) if columns else None,
         num_attempts=num_attempts,
     )
+
+
+def check_tables(path: Path) -> None:
+    """Read the ends of all tables and the JSON files: whether any was emptied or cut off.
+
+    Raises:
+        ExportError: One was.
+    """
+    for file in sorted(path.rglob("*")):
+        try:
+            if file.suffix == ".parquet":
+                pq.read_metadata(file)
+            elif file.suffix == ".json":
+                json.loads(file.read_text())
+        except (OSError, ValueError) as error:
+            raise ExportError(f"The dataset is damaged ({error}): {file}") from error
 
 
 def dataset_digest(path: Path) -> str:

@@ -28,6 +28,7 @@ from demorec.generate.run_file import (
     DamagedRunFileError,
     RunFile,
     Session,
+    free_name,
     load_run_file,
     save_run_file,
 )
@@ -202,7 +203,7 @@ def _known_run(path: Path, asked: RunFile, *, progress: Progress, inspect: Inspe
             run = load_run_file(path)
         except DamagedRunFileError as error:
             # The recordings know what they are of; a run.json that nobody can read is kept for whoever wants to try.
-            damaged = _free_name(path / f"{RUN_NAME}.damaged")
+            damaged = free_name(path / f"{RUN_NAME}.damaged")
             run = _run_of_recordings(path, asked, inspect)
             (path / RUN_NAME).rename(damaged)
             progress.says(f"{error}. It is kept as {damaged.name}; the recordings are read instead.")
@@ -250,14 +251,6 @@ def _refuse_strangers(path: Path) -> None:
         raise ConfigError(
             f"The output folder holds files that are of no run ({shown(strangers)}): choose another --out: {path}"
         )
-
-
-def _free_name(path: Path) -> Path:
-    free, number = path, 0
-    while free.exists():
-        number += 1
-        free = path.with_name(f"{path.name}.{number}")
-    return free
 
 
 def _now() -> str:
