@@ -86,7 +86,9 @@ class Generate:
                 from demorec.generate.export_step import export_run
 
                 assert options.repo_id is not None
-                export, report = export_run(result.folder, repo_id=options.repo_id, progress=progress.exporting)
+                export, report = export_run(
+                    result.folder, repo_id=options.repo_id, progress=progress.exporting, says=progress.says
+                )
             if self.check and result.run.successes:
                 checked = check_run(result, progress=progress.checking)
         print_result(result, export, checked)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from demorec.errors import ExportError
 from demorec.export.digest import combined_digest, episode_digest
-from demorec.export.files import open_table, read_table
+from demorec.export.files import open_table, read_json, read_table
 from demorec.export.layout import INFO_PATH, SIDECAR_DIR, DatasetInfo
 from demorec.export.reader import PacketReader, RowReader, episode_places, read_tasks
 
@@ -77,6 +77,22 @@ def dataset_info(path: Path) -> DatasetSummary:
         num_successes=sum(column.to_pylist().count(True) for column in columns) if columns else None,
         num_attempts=num_attempts,
     )
+
+
+def check_tables(path: Path) -> None:
+    """Read the ends of all tables and the JSON files: whether any was emptied or cut off.
+
+    Raises:
+        ExportError: One was.
+    """
+    for file in sorted(path.rglob("*")):
+        try:
+            if file.suffix == ".parquet":
+                open_table(file)
+            elif file.suffix == ".json":
+                read_json(file)
+        except (OSError, ValueError) as error:
+            raise ExportError(f"The dataset is damaged ({error}): {file}") from error
 
 
 def dataset_digest(path: Path) -> str:

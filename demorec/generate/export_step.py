@@ -2,44 +2,68 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from demorec.errors import ExportError
-from demorec.export import ExportOptions, ExportReport, export_lerobot
+from demorec.errors import DemorecError, ExportError, resource_error
+from demorec.export import ExportOptions, ExportReport, dataset_digest, export_lerobot
+from demorec.export.inspect import check_tables
+from demorec.generate.contents import is_dataset_of_run
 from demorec.generate.lock import run_lock
-from demorec.generate.run_file import DATASET, ExportRecord, load_run_file, save_run_file
+from demorec.generate.run_file import (
+    DATASET,
+    UNFINISHED,
+    ExportRecord,
+    RunFile,
+    free_name,
+    load_run_file,
+    save_run_file,
+    sync_folder,
+)
 
 
 def export_run(
-    folder: Path, *, repo_id: str, progress: Callable[[int, int], None] = lambda done, total: None
+    folder: Path,
+    *,
+    repo_id: str,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    says: Callable[[str], None] = lambda message: None,
 ) -> tuple[ExportRecord, ExportReport | None]:
     """Export the successful episodes of a run to its dataset/, unless that is there already.
 
     Episodes beyond what was asked for last are left out. A dataset that this run made from other content is replaced;
-    one that it did not make is left alone.
+    one that it did not make is left alone. One that it made but that is damaged, or was changed since, is moved to
+    unfinished/, and made again.
+
+    Args:
+        folder: Of the run.
+        repo_id: Name of the dataset.
+        progress: Called after every recording.
+        says: Told what a person should know.
 
     Returns:
         What run.json says about the dataset now, and the export's own report if it was made just now.
 
     Raises:
-        ExportError: Somebody else's dataset is in the way, or the export failed.
+        ExportError: Somebody else's dataset, or a link to nothing, is in the way, or the export failed.
     """
     target = folder / DATASET
     with run_lock(folder):
         run = load_run_file(folder)
         present = run.export
-        if (
-            present is not None
-            and present.dataset_digest
-            and (present.run_digest, present.repo_id) == (run.digest, repo_id)
-            and target.is_dir()
-        ):
-            return present, None
-        if target.exists() and present is None:
-            raise ExportError(f"A dataset that this run did not make is in the way: move it elsewhere: {target}")
+        if os.path.lexists(target):
+            if not target.exists():
+                raise ExportError(f"The dataset is a link to something that is not there, mend or remove it: {target}")
+            if present is None:
+                raise ExportError(f"A dataset that this run did not make is in the way: move it elsewhere: {target}")
+            if not _is_as_made(target, present, run):
+                aside = _set_aside(target, folder)
+                says(f"{DATASET}/ is not as the run made it (damaged, or changed since); it was moved to {aside}.")
+            elif (present.run_digest, present.repo_id) == (run.digest, repo_id) and present.dataset_digest:
+                return present, None
         record = ExportRecord(run_digest=run.digest, repo_id=repo_id)
         # Written down before: after a crash in between, what is there is known to be ours.
         save_run_file(replace(run, export=record), folder)
@@ -54,3 +78,24 @@ def export_run(
         record = replace(record, dataset_digest=report.digest, seconds=round(time.process_time() - start, 3))
         save_run_file(replace(run, export=record), folder)
         return record, report
+
+
+def _is_as_made(dataset: Path, record: ExportRecord, run: RunFile) -> bool:
+    """Whether a dataset is whole and what the run wrote down about it, read back from all its files."""
+    if not record.dataset_digest:  # the export was killed: before, or after the dataset took its place
+        return is_dataset_of_run(dataset, run.config_digest)
+    try:
+        check_tables(dataset)
+        return dataset_digest(dataset) == record.dataset_digest
+    except (DemorecError, OSError, ValueError) as error:
+        if (lack := resource_error(error)) is not None:
+            raise lack from error
+        return False
+
+
+def _set_aside(dataset: Path, folder: Path) -> str:
+    aside = free_name(folder / UNFINISHED / DATASET)
+    aside.parent.mkdir(exist_ok=True)
+    dataset.rename(aside)
+    sync_folder(folder)
+    return aside.relative_to(folder).as_posix()

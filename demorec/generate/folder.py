@@ -28,6 +28,7 @@ from demorec.generate.run_file import (
     DamagedRunFileError,
     RunFile,
     Session,
+    free_name,
     load_run_file,
     save_run_file,
 )
@@ -182,7 +183,7 @@ def _begin_or_continue(path: Path, asked: RunFile, *, progress: Progress, inspec
     """Bring the folder and its run.json to what is known now."""
     run, damage = _known_run(path, asked, inspect=inspect)
     if damage:
-        kept = _free_name(path / f"{RUN_NAME}.damaged")
+        kept = free_name(path / f"{RUN_NAME}.damaged")
         (path / RUN_NAME).rename(kept)
         progress.says(f"{damage}. It is kept as {kept.name}; the recordings are read instead.")
     run = replace(run, num_episodes=asked.num_episodes)
@@ -287,14 +288,6 @@ def _refuse_strangers(path: Path) -> None:
         raise ConfigError(
             f"The output folder holds files that are of no run ({shown(strangers)}): choose another --out: {path}"
         )
-
-
-def _free_name(path: Path) -> Path:
-    free, number = path, 0
-    while free.exists():
-        number += 1
-        free = path.with_name(f"{path.name}.{number}")
-    return free
 
 
 def _now() -> str:

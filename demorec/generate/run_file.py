@@ -224,6 +224,15 @@ def recording_name(episode_index: int, attempt: int, *, success: bool) -> str:
     return f"episode_{episode_index:06d}{middle}.mcap"
 
 
+def free_name(path: Path) -> Path:
+    """The path itself, or with the first number behind it that nothing is called."""
+    free, number = path, 0
+    while os.path.lexists(free):
+        number += 1
+        free = path.with_name(f"{path.name}.{number}")
+    return free
+
+
 def sha256_of(path: Path) -> str:
     """SHA-256 (hex) of a file's bytes."""
     with open_regular(path) as file:

@@ -15,6 +15,7 @@ from demorec.generate.run_file import (
     UNFINISHED,
     Attempt,
     RunFile,
+    free_name,
     recording_name,
     sha256_of,
     sync_folder,
@@ -101,10 +102,5 @@ def _adopt(path: Path, run: RunFile, inspect: Inspector) -> Attempt:
 
 
 def _set_aside(path: Path, folder: Path) -> None:
-    target = folder / UNFINISHED / path.name
-    number = 0
-    while target.exists():
-        number += 1
-        target = folder / UNFINISHED / f"{path.name}.{number}"
-    path.rename(target)
+    path.rename(free_name(folder / UNFINISHED / path.name))
     sync_folder(path.parent)

@@ -507,3 +507,29 @@ def test_no_recordings(tmp_path: Path) -> None:
         export(tmp_path, tmp_path / "d")
     with pytest.raises(ConfigError, match="No such recording"):
         export(tmp_path / "nothing", tmp_path / "d")
+
+
+def test_append_refuses_episodes_that_are_there_already(run: Path, tmp_path: Path) -> None:
+    """By their content: neither the name of the recording nor its place matters."""
+    out, copies = tmp_path / "d", tmp_path / "copies"
+    export(run, out, episodes=":3")
+    before = files_of(out)
+    copies.mkdir()
+    for number, path in enumerate(recordings(run)[1:]):
+        shutil.copy(path, copies / f"other_{number}.mcap")
+    with pytest.raises(ConfigError, match="has 2 of these episodes already") as error:
+        export(copies, out, append=True)
+    assert "other_0.mcap (episode 1 of it), other_1.mcap (episode 2 of it)" in str(error.value)
+    assert "--allow-duplicates" in str(error.value)
+    assert files_of(out) == before
+    assert export(copies, out, append=True, allow_duplicates=True).num_episodes == 6
+    with pytest.raises(ConfigError, match="belongs to --append"):
+        export(run, tmp_path / "e", allow_duplicates=True)
+
+
+def test_append_knows_the_episodes_of_a_dataset_without_a_sidecar(run: Path, tmp_path: Path) -> None:
+    out = tmp_path / "d"
+    export(run, out, episodes=":2")
+    shutil.rmtree(out / "demorec")
+    with pytest.raises(ConfigError, match="has 1 of these episodes already"):
+        export(run, out, append=True, episodes="1:")

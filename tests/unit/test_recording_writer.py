@@ -180,3 +180,51 @@ def test_a_disk_that_fills_up_in_the_middle(tmp_path: Path, capfd: pytest.Captur
     assert names(tmp_path) == ["a.mcap.part"]
     # The MCAP library prints a line to the terminal for every message that it cannot write.
     assert capfd.readouterr().err == ""
+
+
+def leftover(folder: Path, origin: str) -> bytes:
+    """What a kill leaves of a derived recording after its first second."""
+    info, frames, _ = make_episode(num_frames=40, cameras=())
+    with EpisodeWriter(folder / "a.mcap", replace(info, origin=origin)) as writer:
+        write_all(writer, frames)
+    return (folder / "a.mcap.part").read_bytes()
+
+
+def test_what_a_killed_rendering_left_is_replaced_by_the_same_rendering(tmp_path: Path) -> None:
+    leftover(tmp_path, "render of 0123")
+    info, frames, outcome = make_episode(num_frames=5, cameras=())
+    with EpisodeWriter(tmp_path / "a.mcap", replace(info, origin="render of 0123")) as writer:
+        write_all(writer, frames, outcome)
+    assert names(tmp_path) == ["a.mcap"]
+    assert Recording(tmp_path / "a.mcap").num_frames == 5
+
+
+@pytest.mark.parametrize(("left", "new"), [("", ""), ("", "render of 0123"), ("render of 4567", "render of 0123")])
+def test_what_cannot_be_made_again_by_the_same_command_stays(tmp_path: Path, left: str, new: str) -> None:
+    before = leftover(tmp_path, left)
+    info, _, _ = make_episode(num_frames=5, cameras=())
+    with pytest.raises(RecordingError, match="unfinished recording"):
+        EpisodeWriter(tmp_path / "a.mcap", replace(info, origin=new))
+    assert (tmp_path / "a.mcap.part").read_bytes() == before
+
+
+def test_what_another_process_is_writing_is_left_alone(tmp_path: Path) -> None:
+    info, frames, outcome = make_episode(num_frames=40, cameras=())
+    info = replace(info, origin="render of 0123")
+    with EpisodeWriter(tmp_path / "a.mcap", info) as writer:
+        write_all(writer, frames)
+        for overwrite in (False, True):
+            with pytest.raises(RecordingError, match="Another process is writing"):
+                EpisodeWriter(tmp_path / "a.mcap", info, overwrite=overwrite)
+        writer.finish(outcome)
+    assert Recording(tmp_path / "a.mcap").num_frames == 40
+
+
+def test_a_writer_killed_before_its_first_frame_leaves_nothing_to_keep(tmp_path: Path) -> None:
+    info, frames, outcome = make_episode(num_frames=5, cameras=())
+    EpisodeWriter(tmp_path / "a.mcap", info).__exit__(None, None, None)
+    part = tmp_path / "a.mcap.part"
+    part.write_bytes(part.read_bytes()[:8])  # MCAP's magic alone
+    with EpisodeWriter(tmp_path / "a.mcap", info) as writer:
+        write_all(writer, frames, outcome)
+    assert names(tmp_path) == ["a.mcap"]

@@ -1,0 +1,119 @@
+"""The dataset of a run: made once, made again when it is damaged, deleted only with a proof that it is the run's."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+from helpers_export import export, files_of, make_run
+
+from demorec.config import GenerateConfig, deciding_versions
+from demorec.errors import ExportError
+from demorec.export import ExportOptions, dataset_digest
+from demorec.generate import export_step
+from demorec.generate.export_step import export_run
+from demorec.generate.run_file import RunFile, load_run_file, save_run_file
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of made-up episodes with its dataset, to be copied."""
+    folder = make_run(tmp_path_factory.mktemp("run") / "run", (5, 4))
+    save_run_file(RunFile(config=GenerateConfig(), versions=deciding_versions(), num_episodes=2), folder)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(export_step, "ExportOptions", unverified)
+        export_run(folder, repo_id="me/cubes")
+    return folder
+
+
+def unverified(**options: object) -> ExportOptions:
+    """LeRobot takes seconds to load and does not matter here."""
+    return ExportOptions(**{**options, "verify": False})  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def run(exported: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setattr(export_step, "ExportOptions", unverified)
+    return shutil.copytree(exported, tmp_path / "run")
+
+
+DAMAGED = (
+    "meta/info.json",
+    "meta/stats.json",
+    "meta/tasks.parquet",
+    "meta/episodes/chunk-000/file-000.parquet",
+    "data/chunk-000/file-000.parquet",
+    "videos/observation.images.wrist/chunk-000/file-000.mp4",
+    "demorec/episodes/chunk-000/file-000.parquet",
+    "demorec/camera_poses/chunk-000/file-000.parquet",
+    "demorec/configs.json",
+)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.6])
+@pytest.mark.parametrize("name", DAMAGED)
+def test_a_dataset_cut_by_a_power_failure_is_set_aside_and_made_again(run: Path, name: str, share: float) -> None:
+    good = files_of(run / "dataset")
+    digest = load_run_file(run).export.dataset_digest  # type: ignore[union-attr]
+    file = run / "dataset" / name
+    file.write_bytes(file.read_bytes()[: int(share * file.stat().st_size)])
+    bad = files_of(run / "dataset")
+    assert bad != good
+    said: list[str] = []
+    record, report = export_run(run, repo_id="me/cubes", says=said.append)
+    assert report is not None
+    assert record.dataset_digest == digest == dataset_digest(run / "dataset")
+    assert files_of(run / "unfinished" / "dataset") == bad
+    assert "moved to unfinished/dataset" in said[0]
+    assert export_run(run, repo_id="me/cubes") == (record, None)
+
+
+def test_a_whole_dataset_is_left_alone(run: Path) -> None:
+    before = files_of(run / "dataset")
+    times = {path: path.stat().st_mtime_ns for path in (run / "dataset").rglob("*")}
+    assert export_run(run, repo_id="me/cubes")[1] is None
+    assert files_of(run / "dataset") == before
+    assert {path: path.stat().st_mtime_ns for path in times} == times
+
+
+def test_a_dataset_that_was_appended_to_is_not_deleted(run: Path, tmp_path: Path) -> None:
+    other = make_run(tmp_path / "other", (6,), seed=1)
+    export(other, run / "dataset", append=True)
+    longer = files_of(run / "dataset")
+    export_run(run, repo_id="me/cubes")
+    assert files_of(run / "unfinished" / "dataset") == longer
+    assert json.loads((run / "dataset/meta/info.json").read_text())["total_episodes"] == 2
+
+
+@pytest.mark.parametrize("is_ours", [True, False])
+def test_after_a_kill_in_the_export_only_the_runs_own_dataset_is_replaced(run: Path, is_ours: bool) -> None:
+    """run.json knows that an export was begun, and not what came of it."""
+    plain = json.loads((run / "run.json").read_text())
+    plain["export"]["dataset_digest"] = ""
+    (run / "run.json").write_text(json.dumps(plain))
+    if is_ours:
+        configs = run / "dataset/demorec/configs.json"
+        (only,) = json.loads(configs.read_text()).values()
+        configs.write_text(json.dumps({load_run_file(run).config_digest: only}))
+    assert export_run(run, repo_id="me/cubes")[1] is not None
+    assert (run / "unfinished" / "dataset").exists() == (not is_ours)
+
+
+def test_a_link_to_nothing_is_told(run: Path) -> None:
+    shutil.rmtree(run / "dataset")
+    (run / "dataset").symlink_to(run / "nowhere")
+    with pytest.raises(ExportError, match="a link to something that is not there"):
+        export_run(run, repo_id="me/cubes")
+    assert (run / "dataset").is_symlink()
+
+
+def test_a_dataset_of_somebody_else_is_left_alone(run: Path) -> None:
+    plain = json.loads((run / "run.json").read_text())
+    plain["export"] = None
+    (run / "run.json").write_text(json.dumps(plain))
+    before = files_of(run / "dataset")
+    with pytest.raises(ExportError, match="did not make"):
+        export_run(run, repo_id="me/cubes")
+    assert files_of(run / "dataset") == before
