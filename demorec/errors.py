@@ -7,6 +7,7 @@ All arguments go to `super().__init__`, so that errors cross process borders (pi
 from __future__ import annotations
 
 import errno
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -62,6 +63,14 @@ _LACKS = {
 }
 
 
+_LINKER_WORDS = {
+    "failed to map segment": errno.ENOMEM,
+    os.strerror(errno.ENOMEM): errno.ENOMEM,
+    os.strerror(errno.EMFILE): errno.EMFILE,
+    os.strerror(errno.ENFILE): errno.ENFILE,
+}
+
+
 def resource_error(error: BaseException, path: Path | None = None) -> ResourceError | None:
     """What `error`, or one that it was raised from, says about the machine; None when it is about something else.
 
@@ -73,6 +82,8 @@ def resource_error(error: BaseException, path: Path | None = None) -> ResourceEr
         if isinstance(cause, ResourceError):
             return cause
         number = errno.ENOMEM if isinstance(cause, MemoryError) else getattr(cause, "errno", None)
+        if isinstance(cause, ImportError):  # of a shared library; the dynamic linker says why in words alone
+            number = next((number for words, number in _LINKER_WORDS.items() if words in str(cause)), None)
         if number in _LACKS:
             unknown = "." if path is None else f"; whether the file is sound is not known: {path}"
             return ResourceError(_LACKS[number] + unknown)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from tqdm import tqdm
 
@@ -53,10 +53,9 @@ class ProgressBar:
         self._started = self._told_at = clock()
         self._told_done: int | None = None
         watched = sys.stderr.isatty() if is_terminal is None else is_terminal
-        self._bar = tqdm(
-            desc=title, total=total, initial=done, unit=unit, disable=not watched, dynamic_ncols=True, file=sys.stderr
-        )
-        self._is_terminal = watched
+        self._bar: tqdm[Any] | None = None
+        if watched:
+            self._bar = tqdm(desc=title, total=total, initial=done, unit=unit, dynamic_ncols=True)
 
     def __enter__(self) -> Self:
         return self
@@ -66,7 +65,8 @@ class ProgressBar:
 
     def close(self) -> None:
         """Take the bar off the terminal's last line; harmless when called twice."""
-        self._bar.close()
+        if self._bar is not None:
+            self._bar.close()
 
     def advance(self) -> None:
         """One more is done."""
@@ -76,16 +76,18 @@ class ProgressBar:
         """So many are done, of `total` if that is known only now."""
         self.done = done
         self.total = self.total if total is None else total
-        self._bar.total = self.total
-        self._bar.update(done - self._bar.n)
-        if not self._is_terminal and self._is_due():
+        if self._bar is not None:
+            self._bar.total = self.total
+            self._bar.update(done - self._bar.n)
+        elif self._is_due():
             self._told_at, self._told_done = self._clock(), done
             tell(self._line())
 
     def note(self, text: str) -> None:
         """Something to be shown with the count from now on: "2 failed attempts"."""
         self._note = text
-        self._bar.set_postfix_str(text)
+        if self._bar is not None:
+            self._bar.set_postfix_str(text)
 
     def _is_due(self) -> bool:
         waited = self._clock() - self._told_at

@@ -9,17 +9,20 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import signal
+import sys
 import tempfile
 from collections.abc import Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from demorec.errors import ExportError
+from demorec.errors import DemorecError, ExportError, resource_error
 from demorec.export.depth import DEPTH_SUFFIX, code_values, quantised
 from demorec.export.layout import IMAGE_PREFIX
 from demorec.export.options import ExportOptions
@@ -40,6 +43,10 @@ _DEPTH_TOLERANCE = 6e-4
 """Metres; LeRobot rounds distances to millimetres."""
 
 
+_GRACE_S = 5.0
+"""How long the process may take to end by itself."""
+
+
 def lerobot_is_installed() -> bool:
     """Whether there is a LeRobot that could verify; tells it without loading it."""
     return importlib.util.find_spec("lerobot") is not None
@@ -54,20 +61,28 @@ class Sample:
 
 
 class Verifier:
-    """Context manager over the process that verifies; it starts loading LeRobot at once, while the export runs."""
+    """Context manager over the process that verifies; it starts loading LeRobot at once, while the export runs.
+
+    The process is ended with the context, whatever it does then: with too little memory, loading may never end.
+    """
 
     def __init__(self) -> None:
         self._cache = tempfile.TemporaryDirectory(prefix="demorec-verify-")
-        self._pool = ProcessPoolExecutor(
-            max_workers=1, mp_context=SPAWN, initializer=_prepare_process, initargs=(self._cache.name,)
-        )
-        self._loading: Future[None] = self._pool.submit(_load_lerobot)
+        self._pipe, theirs = SPAWN.Pipe()
+        self._process = SPAWN.Process(target=_serve, args=(theirs, self._cache.name), daemon=True)
+        self._process.start()
+        theirs.close()  # else the pipe would never report that the process is gone
 
     def __enter__(self) -> Verifier:
         return self
 
-    def __exit__(self, *exc: object) -> None:
-        self._pool.shutdown(wait=True, cancel_futures=True)
+    def __exit__(self, kind: type[BaseException] | None, *exc: object) -> None:
+        self._pipe.close()
+        if kind is not None:
+            self._process.terminate()
+        self._process.join(timeout=_GRACE_S)
+        self._process.kill()
+        self._process.join()
         self._cache.cleanup()
 
     def verify(self, root: Path, samples: Sequence[Sample], options: ExportOptions) -> int:
@@ -76,16 +91,41 @@ class Verifier:
         Raises:
             ExportError: LeRobot cannot open the dataset, or shows something else than the recordings.
         """
-        self._loading.result()
-        return self._pool.submit(_verify, root, tuple(samples), options).result()
+        try:
+            self._pipe.send((root, tuple(samples), options))
+            found = self._pipe.recv()
+        except (EOFError, OSError) as error:
+            self._process.join()
+            raise ExportError(
+                f"The new dataset was dropped: the process that verifies ended by itself (exit code "
+                f"{self._process.exitcode}), often for lack of memory; free some, or give --no-verify."
+            ) from error
+        if isinstance(found, DemorecError):
+            raise found
+        return int(found)
 
 
-def _prepare_process(cache: str) -> None:
+def _serve(pipe: Connection[Any, Any], cache: str) -> None:
+    """Life of the process: load LeRobot, verify what comes through the pipe, answer with a count or an error."""
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(1))  # an orderly end: libraries left semaphores
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; who exports ends us
     os.environ.update(HF_HUB_OFFLINE="1", HF_DATASETS_OFFLINE="1", HF_DATASETS_CACHE=cache)
+    answer: int | DemorecError
+    try:
+        import lerobot.datasets  # noqa: F401
 
-
-def _load_lerobot() -> None:
-    import lerobot.datasets  # noqa: F401
+        root, samples, options = pipe.recv()
+        answer = _verify(root, samples, options)
+    except EOFError:
+        return  # the export has ended without a dataset
+    except DemorecError as error:
+        answer = error
+    except Exception as error:
+        answer = resource_error(error) or ExportError(
+            f"The new dataset was dropped, it cannot be verified ({type(error).__name__}: {error})."
+        )
+    with suppress(OSError):
+        pipe.send(answer)
 
 
 def _verify(root: Path, samples: tuple[Sample, ...], options: ExportOptions) -> int:
@@ -94,7 +134,7 @@ def _verify(root: Path, samples: tuple[Sample, ...], options: ExportOptions) -> 
     try:
         dataset = LeRobotDataset(options.repo_id, root=root, video_backend="pyav", return_uint8=True)
     except Exception as error:  # whatever LeRobot says, the dataset must not be handed out
-        raise ExportError(
+        raise resource_error(error) or ExportError(
             f"The new dataset was dropped, LeRobot cannot open it ({type(error).__name__}: {error})."
         ) from error
     frames = 0

@@ -17,6 +17,8 @@ from demorec.errors import RecordingError, ResourceError, resource_error
         (OSError(errno.ENOMEM, "Cannot allocate memory"), "memory"),
         (OSError(errno.EMFILE, "Too many open files"), "ulimit -n"),
         (OSError(errno.ENFILE, "Too many open files in system"), "open on this machine"),
+        (ImportError("libtorch_cpu.so: failed to map segment from shared object"), "memory"),
+        (ImportError("libz.so: cannot open shared object file: Too many open files"), "ulimit -n"),
         (OSError(errno.EIO, "Input/output error"), "storage"),
     ],
 )
@@ -43,7 +45,7 @@ def test_what_the_machine_lacks_is_told_as_such_however_it_is_wrapped(tmp_path, 
 
 
 @pytest.mark.parametrize(
-    "error", [OSError(errno.ENOENT, "none"), OSError("?"), ValueError(), RecordingError("damaged")]
+    "error", [OSError(errno.ENOENT, "none"), OSError("?"), ValueError(), RecordingError("damaged"), ImportError("none")]
 )
 def test_every_other_error_is_left_alone(error):
     assert resource_error(error) is None

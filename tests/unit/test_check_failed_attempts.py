@@ -1,0 +1,96 @@
+"""Failed attempts that a run keeps are judged apart: what they recorded counts for nothing, a damaged file does."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from helpers_check import flip_bits
+from helpers_export import make_run
+
+from demorec.check.report import CheckOptions, SubjectReport, check_subjects, find_subjects
+from demorec.cli import main
+from demorec.cli.generate_report import check_run
+from demorec.config import GenerateConfig
+from demorec.generate.recordings import inspect_recording
+from demorec.generate.run import RunResult
+from demorec.generate.run_file import RunFile, Session, save_run_file
+
+FAILED = "failed/episode_000000.attempt_0.mcap"
+
+
+@pytest.fixture
+def run(tmp_path) -> Path:
+    """A run of one failed attempt, made up, so that checks of its physics fail."""
+    folder = make_run(tmp_path / "run", [], failures=[0], cameras=())
+    attempt = replace(inspect_recording(folder / FAILED).attempt, file=FAILED)
+    save_run_file(RunFile(config=GenerateConfig(), versions={}, num_episodes=1, attempts=(attempt,)), folder)
+    return folder
+
+
+def report_of(path: Path, file: Path) -> SubjectReport:
+    """What the check of `path` says about a file."""
+    (report,) = (r for r in check_subjects(find_subjects([path]), CheckOptions(pictures=False)) if r.path == file)
+    return report
+
+
+def check(capsys, *args: object) -> tuple[int, str]:
+    with pytest.raises(SystemExit) as ended:
+        main(["check", *map(str, args)])
+    return int(ended.value.code or 0), capsys.readouterr().out
+
+
+def test_what_a_failed_attempt_recorded_is_told_and_does_not_fail_the_run(capsys, run):
+    report = report_of(run, run / FAILED)
+    assert report.level == "fail"
+    assert not report.is_bad()
+    wrong = {result.check for result in report.results if result.level == "fail"}
+    code, out = check(capsys, run, "--only", *wrong)
+    assert code == 0
+    assert f"fail  failed attempt {run / FAILED}" in out
+    assert f"fail  {min(wrong)}" in out
+    assert "0 failed" in out
+    assert "Not counted: 1 failed attempts that fail checks of what they recorded." in out
+    code, out = check(capsys, run, "--only", *wrong, "--json")
+    assert code == 0
+    assert [item["failed_attempt"] for item in json.loads(out) if item["kind"] == "recording"] == [True]
+
+
+@pytest.mark.parametrize("of", ["file", "folder"])
+def test_named_directly_it_is_judged_as_any_recording(capsys, run, of):
+    path = run / FAILED if of == "file" else (run / FAILED).parent
+    assert report_of(path, run / FAILED).is_bad()
+    assert check(capsys, path)[0] == 1
+
+
+@pytest.mark.parametrize("damage", ["cut", "flipped"])
+def test_a_damaged_file_among_the_failed_attempts_fails(capsys, run, damage):
+    path = run / FAILED
+    good = path.read_bytes()
+    if damage == "cut":
+        path.write_bytes(good[:-100])
+    else:
+        flip_bits(path, path, offset=len(good) // 2)
+    assert path.read_bytes() != good
+    assert report_of(run, path).is_bad()
+    assert check(capsys, run)[0] == 1
+
+
+def test_a_recording_of_a_success_is_judged_in_full(tmp_path):
+    folder = make_run(tmp_path / "run", [12], cameras=())
+    path = folder / "episodes/episode_000000.mcap"
+    attempt = replace(inspect_recording(path).attempt, file="episodes/episode_000000.mcap")
+    save_run_file(RunFile(config=GenerateConfig(), versions={}, num_episodes=1, attempts=(attempt,)), folder)
+    assert report_of(folder, path).is_bad()
+
+
+def test_the_closing_table_counts_them_apart(run):
+    """What decides the exit code of generate-dataset."""
+    attempt = replace(inspect_recording(run / FAILED).attempt, file=FAILED)
+    known = RunFile(config=GenerateConfig(), versions={}, num_episodes=1, attempts=(attempt,))
+    result = RunResult(folder=run, run=known, session=Session(started=""), made=(), interrupted=False)
+    found = check_run(result, progress=lambda done, total: None)
+    assert found.failed_attempts == 1
+    assert not any(failure.startswith(Path(FAILED).name) for failure in found.failures)

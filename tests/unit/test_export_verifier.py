@@ -1,0 +1,46 @@
+"""The process that verifies a dataset: whatever becomes of it, the export ends, with a sentence."""
+
+from __future__ import annotations
+
+import signal
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+from helpers_verifier import die, lack_memory, never_end, never_listen
+
+from demorec.errors import ExportError, ResourceError
+from demorec.export import ExportOptions, verify
+from demorec.export.verify import Verifier
+
+
+def test_an_export_that_fails_does_not_wait_for_it(monkeypatch):
+    monkeypatch.setattr(verify, "_serve", never_end)
+    with suppress(KeyError), Verifier() as verifier:
+        process = verifier._process
+        assert process.is_alive()
+        raise KeyError
+    assert process.exitcode == -signal.SIGTERM
+
+
+def test_not_even_for_one_that_does_not_listen(monkeypatch):
+    monkeypatch.setattr(verify, "_GRACE_S", 0.1)
+    monkeypatch.setattr(verify, "_serve", never_listen)
+    with suppress(KeyError), Verifier() as verifier:
+        process = verifier._process
+        assert verifier._pipe.recv() == "deaf"
+        raise KeyError
+    assert process.exitcode == -signal.SIGKILL
+
+
+@pytest.mark.parametrize(
+    ("serve", "error", "words"),
+    [
+        (die, ExportError, r"ended by itself \(exit code 3\), often for lack of memory"),
+        (lack_memory, ResourceError, "too little memory"),
+    ],
+)
+def test_its_end_and_its_lack_of_memory_are_told(tmp_path: Path, monkeypatch, serve, error, words):
+    monkeypatch.setattr(verify, "_serve", serve)
+    with Verifier() as verifier, pytest.raises(error, match=words):
+        verifier.verify(tmp_path, [], ExportOptions())
