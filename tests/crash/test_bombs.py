@@ -12,14 +12,18 @@ import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 import zstandard
 from helpers_commands import MOST_BYTES, Commands
+from helpers_export import export
 from helpers_mcap import chunk_record, message_record, record, rewritten
 from helpers_recording import write_episode
 
-from demorec.errors import ConfigError, RecordingError
+from demorec.errors import ConfigError, ExportError, RecordingError
+from demorec.export.files import check_video
 from demorec.recording import Recording, recover
+from demorec.urdf import check_primitives
 
 
 @pytest.fixture(scope="module")
@@ -76,6 +80,7 @@ def test_a_small_recording_never_becomes_large(
     assert "DEMOREC_UNPACKED_MB" in said or "another size" in said
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bomb", BOMBS)
 def test_recovering_a_bomb_is_bounded(
     bomb: Callable[[Path, Path], None], good: Path, commands: Commands, tmp_path: Path
@@ -107,31 +112,30 @@ def test_pictures_that_compress_well_are_no_bomb(tmp_path: Path) -> None:
     """Black JPEG files beside a robot that stands still: the most that our own recordings unpack to."""
     from dataclasses import replace
 
-    import numpy as np
     from helpers_recording import make_episode
 
     from demorec.config import VideoConfig
     from demorec.episode import frame_time_ns
     from demorec.recording import EpisodeWriter
 
-    info, frames, outcome = make_episode(num_frames=1, cameras=("front", "wrist"), width=1280, height=720)
+    info, frames, outcome = make_episode(num_frames=1, cameras=("front", "wrist"), width=640, height=480)
     black = {
         name: replace(image, color=np.zeros_like(image.color), depth=np.zeros(image.color.shape[:2], dtype=np.float32))
         for name, image in frames[0].images.items()
     }
     path = tmp_path / "black.mcap"
     with EpisodeWriter(path, info, video=VideoConfig(codec="jpeg")) as writer:
-        for index in range(90):
+        for index in range(60):
             writer.write(
                 replace(frames[0], frame_index=index, time_ns=frame_time_ns(index, 30), images=black, events=())
             )
-        writer.finish(replace(outcome, num_frames=90))
+        writer.finish(replace(outcome, num_frames=60))
     with Recording(path) as recording:
         limits, places = recording._container._limits, recording._container._chunks
         unpacked = sum(place.uncompressed_size for place in places)
-        assert unpacked > 25 * path.stat().st_size
+        assert unpacked > 10 * path.stat().st_size
         assert unpacked < 200 * path.stat().st_size
-        assert recording.num_frames == 90
+        assert recording.num_frames == 60
         assert 16 * sum(count for _, count in recording.topics.values()) < path.stat().st_size
         for place in places:
             limits.check_chunk(place.uncompressed_size, place.length)
@@ -193,3 +197,89 @@ def test_files_without_checksums_are_read(good: Path, tmp_path: Path) -> None:
     assert struct.unpack("<I", path.read_bytes()[-12:-8]) == (0,)
     with Recording(path) as recording, Recording(good) as original:
         assert recording.digest() == original.digest()
+
+
+def _bomb_table(path: Path) -> None:
+    """Nine million rows of one value, which a dictionary makes small."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    schema = pq.read_schema(path)
+    rows = 9_000_000
+    arrays = [
+        pa.DictionaryArray.from_arrays(pa.array(np.zeros(rows, dtype=np.int8)), pa.array(["x" * 1000]))
+        if item.name == "task"
+        else pa.array(np.zeros(rows, dtype=np.int64))
+        for item in schema
+    ]
+    pq.write_table(pa.Table.from_arrays(arrays, names=schema.names), path, compression="zstd")
+
+
+def _bomb_strings(path: Path) -> None:
+    """One long string, in a hundred thousand rows."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    text = pa.DictionaryArray.from_arrays(pa.array(np.zeros(100_000, dtype=np.int8)), pa.array(["x" * 200_000]))
+    table = pa.Table.from_arrays([text, pa.array(np.zeros(100_000, dtype=np.int64))], names=["task", "task_index"])
+    pq.write_table(table, path, compression="zstd")
+
+
+@pytest.mark.parametrize("bomb", [_bomb_table, _bomb_strings])
+def test_tables_that_claim_very_much(
+    bomb: Callable[[Path], None], good: Path, commands: Commands, tmp_path: Path
+) -> None:
+    export([good], tmp_path / "dataset")
+    path = tmp_path / "dataset" / "meta" / "tasks.parquet"
+    bomb(path)
+    assert path.stat().st_size < 1_000_000
+    assert "The table" in commands.refused("check", tmp_path / "dataset", "--only", "dataset_readable")
+
+
+def test_a_video_that_claims_very_many_pictures(tmp_path: Path) -> None:
+    def box(kind: bytes, content: bytes) -> bytes:
+        return struct.pack(">I4s", 8 + len(content), kind) + content
+
+    for table in (
+        box(b"stsz", struct.pack(">III", 0, 1, 10**9)),
+        box(b"stsz", struct.pack(">IIIII", 0, 0, 2, 2**31, 2**31)),
+    ):
+        movie = box(b"moov", box(b"trak", box(b"mdia", box(b"minf", box(b"stbl", table)))))
+        path = tmp_path / "v.mp4"
+        path.write_bytes(box(b"ftyp", b"isom" + bytes(8)) + movie)
+        with pytest.raises(ExportError, match="The video claims"):
+            check_video(path)
+
+
+@pytest.mark.parametrize("name", ["meta/stats.json", "meta/tasks.parquet", "data/chunk-000/file-000.parquet"])
+def test_fifos_in_a_dataset(name: str, good: Path, commands: Commands, tmp_path: Path) -> None:
+    dataset = tmp_path / "dataset"
+    export([good], dataset)
+    (dataset / name).unlink()
+    os.mkfifo(dataset / name)
+    checks = ["--only", "dataset_readable", "dataset_statistics"]
+    assert "it is a FIFO" in commands.refused("check", dataset, *checks)
+    commands.refused("export", "lerobot", good, "--out", dataset, "--append", "--no-verify")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('<!DOCTYPE r [<!ENTITY a "b">]><robot/>', "has a document type"),
+        ("<robot>" + " " * (5 << 20) + "</robot>", "characters, allowed are"),
+        ('<robot><link name="a"/><joint name="j" type="fixed"/></robot>', "lacks something"),
+        (
+            """<robot><link name="r"/><link name="a"/><link name="b"/>
+            <joint name="j" type="fixed"><parent link="a"/><child link="b"/></joint>
+            <joint name="k" type="fixed"><parent link="b"/><child link="a"/></joint></robot>""",
+            "hang on no link",
+        ),
+        (
+            '<robot><link name="r"><visual><geometry><box size="1 nan 1"/></geometry></visual></link></robot>',
+            "should be 3 numbers",
+        ),
+    ],
+)
+def test_urdfs_that_are_none(text: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        check_primitives(text)

@@ -1,0 +1,199 @@
+"""Escape codes, line ends and marks that turn the direction of writing, in every field that a command prints."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from helpers_export import export
+from helpers_mcap import rewritten
+from helpers_recording import write_episode
+
+from demorec.cli import COMMANDS, main, run_command
+from demorec.generate.recordings import inspect_recording
+from demorec.generate.run_file import RunFile, save_run_file
+from demorec.recording import Recording
+
+HOSTILE = "\x1b[2Jx\n\u202ey\x9b31m"
+NAME = "\x1b[31mred\u202e.mcap"
+
+
+def _spoken(arguments: list[str | Path]) -> str:
+    """All that a command wrote, which must hold nothing that a terminal obeys but the ends of its lines."""
+    said = io.StringIO()
+    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said), contextlib.suppress(SystemExit):
+        main([str(argument) for argument in arguments])
+    text = said.getvalue()
+    assert text, arguments
+    for mark in ("\x1b", "\u202e", "\x9b", "\r"):
+        assert mark not in text, (arguments, text)
+    return text
+
+
+def _everywhere(value: Any) -> Any:
+    """JSON data with every string made hostile."""
+    if isinstance(value, dict):
+        return {key: _everywhere(child) for key, child in value.items()}
+    if isinstance(value, list):
+        return [_everywhere(child) for child in value]
+    return f"{value}{HOSTILE}" if isinstance(value, str) else value
+
+
+def _fields(info: dict[str, Any]) -> dict[str, Any]:
+    """A description whose free texts are hostile and whose references still fit."""
+    info["instruction"] += HOSTILE
+    info["task"] += HOSTILE
+    info["origin"] = f"replay of {HOSTILE}"
+    info["robot"]["name"] += HOSTILE
+    info["config_digest"] += HOSTILE
+    info["versions"] = {f"demorec{HOSTILE}": HOSTILE}
+    info["behaviour"] = {HOSTILE: 1.0}
+    return info
+
+
+@pytest.fixture(scope="module")
+def hostile(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a good recording, hostile copies of it, of a run and of a dataset."""
+    folder = tmp_path_factory.mktemp("hostile")
+    good = write_episode(folder / "good.mcap", num_frames=24, cameras=())
+    with Recording(good) as recording:
+        container = recording._container
+        episode, outcome = container.metadata("demorec.episode"), container.metadata("demorec.outcome")
+    assert episode is not None
+    assert outcome is not None
+    ended = json.loads(outcome["outcome"])
+    ended["success"], ended["failure_phase"], ended["failure_reason"] = False, HOSTILE, HOSTILE
+    ended["checks"][0]["name"] += HOSTILE
+    ended["checks"][0]["unit"] += HOSTILE
+    change = {
+        "demorec.episode": {"info": json.dumps(_fields(json.loads(episode["info"])))},
+        "demorec.outcome": {"outcome": json.dumps(ended)},
+    }
+    (folder / NAME).write_bytes(rewritten(good, change=change))
+    (folder / "version.mcap").write_bytes(rewritten(good, change={"demorec.episode": {"format_version": HOSTILE}}))
+    wrong = json.dumps(_everywhere(json.loads(episode["info"])))
+    (folder / "names.mcap").write_bytes(rewritten(good, change={"demorec.episode": {"info": wrong}}))
+    extra = json.dumps({**json.loads(episode["info"]), HOSTILE: 1})
+    (folder / "keys.mcap").write_bytes(rewritten(good, change={"demorec.episode": {"info": extra}}))
+
+    run = folder / "run"
+    (run / "episodes").mkdir(parents=True)
+    (run / "failed").mkdir()
+    shutil.copy(good, run / "episodes" / "episode_000000.mcap")
+    from dataclasses import replace
+
+    from demorec.config import GenerateConfig
+
+    attempt = replace(inspect_recording(good).attempt, file="episodes/episode_000000.mcap")
+    config = GenerateConfig(cameras=())
+    save_run_file(RunFile(config=config, versions={}, num_episodes=1, attempts=(attempt,)), run)
+    file = run / "run.json"
+    plain = json.loads(file.read_text())
+    plain["versions"] = {HOSTILE: HOSTILE}
+    plain["config"]["task"] += HOSTILE
+    plain["episodes"].append({**plain["episodes"][0], "episode_index": 1, "success": False, "state": "failed",
+                              "file": HOSTILE, "phase": HOSTILE, "reason": HOSTILE})  # fmt: skip
+    file.write_text(json.dumps(plain))
+
+    export([good], folder / "dataset")
+    file = folder / "dataset" / "meta" / "info.json"
+    plain = json.loads(file.read_text())
+    plain["robot_type"] += HOSTILE
+    plain["features"]["observation.state"]["names"][0] += HOSTILE
+    file.write_text(json.dumps(plain))
+    file = folder / "dataset" / "demorec" / "configs.json"  # which reproduce refuses
+    file.write_text(json.dumps(_everywhere(json.loads(file.read_text()))))
+    shutil.copytree(folder / "dataset", folder / "damaged")
+    file = folder / "damaged" / "meta" / "info.json"
+    plain = json.loads(file.read_text())
+    plain["features"][HOSTILE] = {"dtype": HOSTILE, "shape": [1], "names": [HOSTILE]}
+    file.write_text(json.dumps(plain))
+    return folder
+
+
+@pytest.mark.parametrize("name", [NAME, "version.mcap", "names.mcap", "keys.mcap"])
+def test_recordings(hostile: Path, name: str, tmp_path: Path) -> None:
+    path = hostile / name
+    for arguments in (
+        ["info", path], ["info", path, "--json"], ["check", path, "--verbose"], ["check", path, "--json"],
+        ["view", path, "--save", tmp_path / f"{NAME}.rrd"],
+        ["export", "lerobot", path, "--out", tmp_path / "out", "--no-verify"],
+        ["replay", path], ["render", path, "--cameras", HOSTILE, "--out", tmp_path / "new.mcap", "--workers", "1"],
+        ["recover", path, "--out", tmp_path / NAME], ["reproduce", path, "--out", tmp_path / "again"],
+    ):  # fmt: skip
+        _spoken(list(arguments))
+
+
+def test_that_the_fields_are_printed_at_all(hostile: Path) -> None:
+    text = _spoken(["info", hostile / NAME])
+    assert text.count("\\x1b[2Jx\\n\\u202ey\\x9b31m") >= 9
+    assert "\\x1b[31mred\\u202e.mcap" in text
+
+
+@pytest.mark.parametrize("name", ["run", "dataset", "damaged"])
+def test_runs_and_datasets(hostile: Path, name: str, tmp_path: Path) -> None:
+    path = hostile / name
+    for arguments in (
+        ["info", path], ["info", path, "--json"], ["check", path, "--no-pictures", "--verbose"],
+        ["view", path, "--save", tmp_path / "view.rrd"], ["replay", path],
+        ["export", "lerobot", hostile / "good.mcap", "--out", path, "--append", "--no-verify"],
+        ["reproduce", path, "--out", tmp_path / NAME],
+    ):  # fmt: skip
+        _spoken(list(arguments))
+
+
+def test_flags_and_names_on_the_command_line() -> None:
+    for arguments in (
+        [HOSTILE], ["list", HOSTILE], ["info", f"--{HOSTILE}=1"], ["info", HOSTILE], ["export", HOSTILE],
+        ["generate", f"--{HOSTILE}"], ["generate", "--seed", HOSTILE], ["generate", "--task", HOSTILE, "--out", "/x"],
+        ["check", "x", "--only", HOSTILE], ["check", "--workers", HOSTILE], ["view", "x", "--size", HOSTILE, "1"],
+    ):  # fmt: skip
+        _spoken(list(arguments))
+
+
+def test_warnings_of_python() -> None:
+    program = (
+        "import warnings, demorec.cli as cli\n"
+        "class Warns:\n"
+        "    'Warn.'\n"
+        "    def run(self):\n"
+        f"        warnings.warn({HOSTILE!r})\n"
+        "        return 0\n"
+        "cli.parse = lambda *_, **__: Warns()\n"
+        "cli.run_command(Warns, [], prog='demorec warns')\n"
+    )
+    done = subprocess.run([sys.executable, "-W", "always", "-c", program], capture_output=True, text=True, check=True)
+    assert "UserWarning: \\x1b[2Jx" in done.stderr
+    assert "\x1b" not in done.stderr
+
+
+def test_an_unforeseen_error_leaves_a_report(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    from dataclasses import dataclass
+
+    @dataclass(frozen=True, kw_only=True)
+    class Fails:
+        """Fail."""
+
+        def run(self) -> int:
+            """Fail as nothing of ours should."""
+            raise ZeroDivisionError(HOSTILE)
+
+    assert run_command(Fails, [], prog="demorec fails") == 1
+    err = capsys.readouterr().err
+    assert err.startswith("demorec fails: unexpected ZeroDivisionError, please report it with this file: ")
+    report = Path(err.strip().rsplit(" ", 1)[1])
+    assert "Traceback" in report.read_text()
+    report.unlink()
+    assert len(err.splitlines()) == 1
+
+
+def test_every_command_is_tried() -> None:
+    source = Path(__file__).read_text()
+    assert all(f'["{name}"' in source for name in COMMANDS.names() if name != "evaluate")
