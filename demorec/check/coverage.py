@@ -23,7 +23,11 @@ _MIN_VALUES = 10
 """A quantity with fewer distinct values was not drawn from a range."""
 _MAX_SHARE = 1 / 8
 """A value that more of the episodes share was chosen and not drawn."""
-_SIZE, _MARGIN, _PLOT = 360, 24, 84
+_SIZE, _LEFT, _TOP = 360, 56, 32
+_PLOT_WIDTH, _PLOT_HEIGHT, _PLOT_LEFT, _PLOT_BELOW = 140, 84, 44, 48
+_COLUMNS = 3
+_UNITS = {"x": "m", "y": "m", "size": "m", "mass": "kg", "yaw": "rad"}
+"""Last word of a quantity's name -> its unit."""
 
 
 def randomised(infos: Sequence[EpisodeInfo]) -> dict[str, Array]:
@@ -138,14 +142,15 @@ def draw_coverage(infos: Sequence[EpisodeInfo], path: Path) -> CoveragePicture:
         ConfigError: The file cannot be written; then none is there, or the one that was there before.
     """
     columns = randomised(infos)
-    rows = -(-max(len(columns), 1) // 3)
-    height = max(_SIZE + 2 * _MARGIN, rows * (_PLOT + 2 * _MARGIN) + _MARGIN)
-    image = Image.new("RGB", (_SIZE + 2 * _MARGIN + 3 * (140 + _MARGIN) + _MARGIN, height), "white")
+    rows = -(-max(len(columns), 1) // _COLUMNS)
+    height = _TOP + max(_SIZE + _PLOT_BELOW, rows * (_PLOT_HEIGHT + _PLOT_BELOW))
+    width = _LEFT + _SIZE + _COLUMNS * (_PLOT_LEFT + _PLOT_WIDTH) + _TOP
+    image = Image.new("RGB", (width, height), "white")
     draw = ImageDraw.Draw(image)
     _draw_map(draw, infos)
     for number, (name, values) in enumerate(columns.items()):
-        left = _SIZE + 3 * _MARGIN + (number % 3) * (140 + _MARGIN)
-        top = _MARGIN + (number // 3) * (_PLOT + 2 * _MARGIN)
+        left = _LEFT + _SIZE + (number % _COLUMNS) * (_PLOT_LEFT + _PLOT_WIDTH) + _PLOT_LEFT
+        top = _TOP + (number // _COLUMNS) * (_PLOT_HEIGHT + _PLOT_BELOW)
         _draw_histogram(draw, name, values, left, top)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -158,7 +163,7 @@ def draw_coverage(infos: Sequence[EpisodeInfo], path: Path) -> CoveragePicture:
 
 def _draw_map(draw: ImageDraw.ImageDraw, infos: Sequence[EpisodeInfo]) -> None:
     starts = [(info.scene.body(g.object), world_from_goal(info.scene, g)) for info in infos for g in info.scene.goals]
-    draw.rectangle((_MARGIN, _MARGIN, _MARGIN + _SIZE, _MARGIN + _SIZE), outline="grey")
+    draw.rectangle((_LEFT, _TOP, _LEFT + _SIZE, _TOP + _SIZE), outline="grey")
     if not starts:
         return
     points = np.array(
@@ -171,30 +176,52 @@ def _draw_map(draw: ImageDraw.ImageDraw, infos: Sequence[EpisodeInfo]) -> None:
     def place(x: float, y: float) -> tuple[float, float]:
         # From above, the robot at the bottom looking up: x up, y to the left.
         return (
-            _MARGIN + _SIZE / 2 - (y - middle[1]) / side * _SIZE,
-            _MARGIN + _SIZE / 2 - (x - middle[0]) / side * _SIZE,
+            _LEFT + _SIZE / 2 - (y - middle[1]) / side * _SIZE,
+            _TOP + _SIZE / 2 - (x - middle[0]) / side * _SIZE,
         )
 
+    for tick in _ticks(middle[0] - side / 2, middle[0] + side / 2):
+        _, v = place(tick, middle[1])
+        draw.line((_LEFT - 5, v, _LEFT, v), fill="black")
+        draw.text((_LEFT - 8, v), f"{tick:g}", fill="black", anchor="rm")
+    for tick in _ticks(middle[1] - side / 2, middle[1] + side / 2):
+        u, _ = place(middle[0], tick)
+        draw.line((u, _TOP + _SIZE, u, _TOP + _SIZE + 5), fill="black")
+        draw.text((u, _TOP + _SIZE + 8), f"{tick:g}", fill="black", anchor="mt")
+    draw.text((4, _TOP - 8), "x (m)", fill="black", anchor="lb")
+    draw.text((_LEFT + _SIZE / 2, _TOP + _SIZE + 26), "y (m)", fill="black", anchor="mt")
     for body, goal in starts:
         u, v = place(float(goal[0]), float(goal[1]))
         draw.ellipse((u - 4, v - 4, u + 4, v + 4), outline="grey")
         u, v = place(float(body.world_from_body.position[0]), float(body.world_from_body.position[1]))
         color = tuple(int(255 * channel) for channel in body.rgba[:3])
         draw.ellipse((u - 3, v - 3, u + 3, v + 3), fill=color)
-    draw.text(
-        (_MARGIN, 6), f"{len(infos)} episodes from above, {side:.2f} m wide: starts and (grey) goals", fill="black"
-    )
+    title = f"{len(infos)} episodes from above, the robot below: starts (dots), goals (rings)"
+    draw.text((_LEFT, _TOP - 8), title, fill="black", anchor="lb")
+
+
+def _ticks(low: float, high: float) -> list[float]:
+    """Three to eight round numbers in a range."""
+    rough = (high - low) / 8
+    power = 10.0 ** math.floor(math.log10(rough))
+    step = next(factor * power for factor in (1, 2, 5, 10) if factor * power >= rough)
+    return [round(number * step, 9) for number in range(math.ceil(low / step), math.floor(high / step) + 1)]
 
 
 def _draw_histogram(draw: ImageDraw.ImageDraw, name: str, values: Array, left: int, top: int) -> None:
     counts, edges = np.histogram(values, bins=14)
-    draw.text((left, top - 14), f"{name}: {edges[0]:.3g} .. {edges[-1]:.3g}", fill="black")
-    draw.rectangle((left, top, left + 140, top + _PLOT), outline="grey")
+    unit = _UNITS.get(name.rpartition(" ")[2])
+    bottom, most = top + _PLOT_HEIGHT, max(int(counts.max()), 1)
+    draw.text((left, top - 6), f"{name} ({unit})" if unit else name, fill="black", anchor="lb")
+    draw.rectangle((left, top, left + _PLOT_WIDTH, bottom), outline="grey")
     for number, count in enumerate(counts.tolist()):
-        bar = _PLOT * count / max(int(counts.max()), 1)
-        draw.rectangle(
-            (left + 10 * number + 1, top + _PLOT - bar, left + 10 * number + 8, top + _PLOT), fill=(70, 110, 180)
-        )
+        bar = _PLOT_HEIGHT * count / most
+        draw.rectangle((left + 10 * number + 1, bottom - bar, left + 10 * number + 8, bottom), fill=(70, 110, 180))
+    draw.text((left, bottom + 4), f"{edges[0]:.3g}", fill="black", anchor="lt")
+    draw.text((left + _PLOT_WIDTH, bottom + 4), f"{edges[-1]:.3g}", fill="black", anchor="rt")
+    draw.text((left - 4, top), str(most), fill="black", anchor="rt")
+    draw.text((left - 4, bottom), "0", fill="black", anchor="rb")
+    draw.text((left + _PLOT_WIDTH / 2, bottom + 18), "episodes per bin", fill="grey", anchor="mt")
 
 
 def infos_by_task(infos: Sequence[EpisodeInfo]) -> Mapping[str, list[EpisodeInfo]]:

@@ -1,35 +1,32 @@
-"""The dataset card: README.md, as the Hugging Face Hub shows it, and the sheet of thumbnails that it contains.
+"""The dataset card: README.md, as the Hugging Face Hub shows it.
 
 Everything in it is read back from the finished dataset, so it is right after an append too.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import av
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
-from PIL import Image
 
-from demorec.errors import ExportError
+from demorec.export.commands import making_commands
 from demorec.export.files import read_table
 from demorec.export.layout import IMAGE_PREFIX, SIDECAR_DIR, DatasetInfo, Feature
 from demorec.export.options import ExportOptions
-from demorec.export.reader import EpisodePlace, episode_places, read_tasks
+from demorec.export.reader import read_tasks
 from demorec.export.sidecar import ATTEMPT_SCHEMA
-from demorec.export.staging import sync_file
+from demorec.export.thumbnails import THUMBNAILS_PATH, write_thumbnails
 from demorec.export.writer import write_text
 from demorec.features import ACTION, EE_POSE, ENVIRONMENT_STATE, STATE, VELOCITY, ActionKind
 
 CARD_PATH = "README.md"
 SECOND_CARD_PATH = f"{SIDECAR_DIR}/README.md"
 """Where the card goes if the dataset has a README.md that demorec did not write."""
-THUMBNAILS_PATH = f"{SIDECAR_DIR}/thumbnails.jpg"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,7 +46,6 @@ class CardFacts:
 
 _MARK = "<!-- written by demorec, renewed at every export -->"
 _CELLS = 4
-_SHEET_EPISODES, _SHEET_MOMENTS, _SHEET_SIDE = 4, 5, 160
 
 _MEANING = {
     STATE: "joint positions (rad), gripper opening (m)",
@@ -75,7 +71,7 @@ _ACTION_MEANING: Mapping[ActionKind, str] = {
 
 def write_card(root: Path, info: DatasetInfo, about: CardFacts) -> None:
     """Write the card and the thumbnails of a finished dataset folder."""
-    has_sheet = _write_thumbnails(root, info)
+    has_sheet = write_thumbnails(root, info)
     there = root / CARD_PATH
     is_ours = not there.exists() or _MARK in there.read_text(errors="replace")
     path = there if is_ours else root / SECOND_CARD_PATH
@@ -126,7 +122,7 @@ def _card(root: Path, info: DatasetInfo, about: CardFacts, has_sheet: bool) -> I
         "cameras, per frame, world_from_camera, OpenCV axes), `attempts/` (failed ones too), `configs.json`."
     )
     yield ""
-    yield from _origin_section(about.configs)
+    yield from _origin_section(root, about)
 
 
 def _meaning(key: str, item: Feature, options: ExportOptions) -> str:
@@ -139,13 +135,18 @@ def _meaning(key: str, item: Feature, options: ExportOptions) -> str:
     return _MEANING.get(key, "filled in by LeRobot's rules")
 
 
-def _origin_section(configs: Mapping[str, Any]) -> Iterable[str]:
+def _origin_section(root: Path, about: CardFacts) -> Iterable[str]:
     yield "## Origin"
     yield ""
-    for digest, config in configs.items():
+    for digest, config in about.configs.items():
         chosen = ", ".join(f"{key} {config[key]}" for key in ("task", "robot", "renderer", "seed") if key in config)
         yield f"- configuration `{digest or 'unknown'}`: {chosen or 'not recorded'}"
     yield ""
+    commands = making_commands(root, about.configs, about.options)
+    if commands:
+        yield from ("Made by these commands:", "", "```sh", *commands, "```", "")
+        yield "This makes it again, from what this folder says about itself, and compares every episode to the bit:"
+        yield from ("", "```sh", "demorec reproduce path/of/this/folder --out copy", "```", "")
 
 
 # ------------------------------------------------------------------------------------------------------ success rates
@@ -218,50 +219,3 @@ def success_table(positions: NDArray[np.float64], success: NDArray[np.bool_]) ->
             here = (index[:, 0] == row) & (index[:, 1] == column)
             texts.append(f"{int(success[here].sum())} / {int(here.sum())}" if here.any() else "")
         yield f"| {span(0, row)} | " + " | ".join(texts) + " |"
-
-
-# --------------------------------------------------------------------------------------------------------- thumbnails
-
-
-def _write_thumbnails(root: Path, info: DatasetInfo) -> bool:
-    """A row per episode, from its first to its last picture; False for a dataset without cameras."""
-    key = next((name for name, item in info.features.items() if item.is_video and not item.is_depth), None)
-    if key is None:
-        return False
-    wanted = set(np.linspace(0, info.total_episodes - 1, _SHEET_EPISODES).round().astype(int).tolist())
-    places = [place for place in episode_places(root, info) if place.episode_index in wanted]
-    height, width, _ = info.features[key].shape
-    scale = _SHEET_SIDE / max(height, width)
-    size = max(1, round(width * scale)), max(1, round(height * scale))
-    sheet = Image.new("RGB", (size[0] * _SHEET_MOMENTS, size[1] * len(places)))
-    for row, place in enumerate(places):
-        moments = np.linspace(0, place.length - 1, _SHEET_MOMENTS).round().astype(int).tolist()
-        for column, picture in enumerate(_pictures(root, info, key, place, moments)):
-            sheet.paste(Image.fromarray(picture).resize(size, reducing_gap=1.0), (column * size[0], row * size[1]))
-    path = root / THUMBNAILS_PATH
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.unlink(missing_ok=True)
-    sheet.save(path, quality=85)
-    sync_file(path)
-    return True
-
-
-def _pictures(
-    root: Path, info: DatasetInfo, key: str, place: EpisodePlace, moments: Sequence[int]
-) -> Iterable[NDArray[np.uint8]]:
-    position, first = place.videos[key]
-    path = root / position.path(info.video_path or "", key)
-    try:
-        with av.open(str(path)) as container:
-            stream = container.streams.video[0]
-            stream.thread_type = "NONE"  # starting threads costs more than a few pictures
-            for moment in moments:
-                time = (first + moment) / info.fps
-                assert stream.time_base is not None
-                container.seek(round(time / stream.time_base), stream=stream)
-                for frame in container.decode(stream):
-                    if frame.time is not None and frame.time > time - 0.5 / info.fps:
-                        yield np.asarray(frame.to_ndarray(format="rgb24"), dtype=np.uint8)
-                        break
-    except (OSError, av.FFmpegError) as error:
-        raise ExportError(f"The finished video cannot be read back ({error}): {path}") from error

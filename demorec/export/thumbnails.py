@@ -1,0 +1,74 @@
+"""The sheet of thumbnails in a dataset's card: some episodes, each from its first to its last picture, labelled."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import av
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from demorec.errors import ExportError
+from demorec.export.layout import IMAGE_PREFIX, SIDECAR_DIR, DatasetInfo
+from demorec.export.reader import EpisodePlace, episode_places
+from demorec.export.staging import sync_file
+from demorec.text import printable
+
+THUMBNAILS_PATH = f"{SIDECAR_DIR}/thumbnails.jpg"
+
+_EPISODES, _MOMENTS, _SIDE, _LABEL = 4, 5, 160, 18
+
+
+def write_thumbnails(root: Path, info: DatasetInfo) -> bool:
+    """A labelled row per episode, from its first to its last picture; False for a dataset without cameras."""
+    key = next((name for name, item in info.features.items() if item.is_video and not item.is_depth), None)
+    if key is None:
+        return False
+    wanted = set(np.linspace(0, info.total_episodes - 1, _EPISODES).round().astype(int).tolist())
+    places = [place for place in episode_places(root, info) if place.episode_index in wanted]
+    height, width, _ = info.features[key].shape
+    scale = _SIDE / max(height, width)
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    sheet = Image.new("RGB", (size[0] * _MOMENTS, (size[1] + _LABEL) * len(places)), "white")
+    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(size=12)
+    for row, place in enumerate(places):
+        top = row * (size[1] + _LABEL)
+        label = f"episode {place.episode_index}, camera {key.removeprefix(IMAGE_PREFIX)}: {', '.join(place.tasks)}"
+        draw.text((4, top + 1), printable(label), fill="black", font=font)
+        moments = np.linspace(0, place.length - 1, _MOMENTS).round().astype(int).tolist()
+        for column, picture in enumerate(_pictures(root, info, key, place, moments)):
+            corner = column * size[0], top + _LABEL
+            sheet.paste(Image.fromarray(picture).resize(size, reducing_gap=1.0), corner)
+            time = f"{moments[column] / info.fps:.1f} s"
+            draw.text(
+                (corner[0] + 4, corner[1] + 2), time, fill="white", font=font, stroke_width=2, stroke_fill="black"
+            )
+    path = root / THUMBNAILS_PATH
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.unlink(missing_ok=True)
+    sheet.save(path, quality=85)
+    sync_file(path)
+    return True
+
+
+def _pictures(
+    root: Path, info: DatasetInfo, key: str, place: EpisodePlace, moments: Sequence[int]
+) -> Iterable[NDArray[np.uint8]]:
+    position, first = place.videos[key]
+    path = root / position.path(info.video_path or "", key)
+    try:
+        with av.open(str(path)) as container:
+            stream = container.streams.video[0]
+            stream.thread_type = "NONE"  # starting threads costs more than a few pictures
+            for moment in moments:
+                time = (first + moment) / info.fps
+                assert stream.time_base is not None
+                container.seek(round(time / stream.time_base), stream=stream)
+                for frame in container.decode(stream):
+                    if frame.time is not None and frame.time > time - 0.5 / info.fps:
+                        yield np.asarray(frame.to_ndarray(format="rgb24"), dtype=np.uint8)
+                        break
+    except (OSError, av.FFmpegError) as error:
+        raise ExportError(f"The finished video cannot be read back ({error}): {path}") from error

@@ -1,0 +1,61 @@
+"""The coverage picture: axes with round numbers and units."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers_recording import make_episode
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image, ImageDraw
+
+from demorec.check.coverage import _ticks, draw_coverage
+from demorec.geometry import Pose
+
+
+@given(st.floats(-5, 5), st.floats(1e-3, 10))
+def test_ticks_are_round_numbers_within_the_range(low, width):
+    ticks = _ticks(low, low + width)
+    assert 3 <= len(ticks) <= 9
+    assert low - 1e-9 <= min(ticks) <= max(ticks) <= low + width + 1e-9
+    step = np.diff(ticks).mean()
+    assert np.allclose(np.array(ticks) / step, np.round(np.array(ticks) / step), atol=1e-4)
+    assert f"{step:.3e}"[0] in "125"
+
+
+def test_every_axis_is_labelled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    info, _, _ = make_episode(num_frames=1)
+    random = np.random.default_rng(0)
+    infos = []
+    for _ in range(20):
+        x, y = random.uniform(0.3, 0.6), random.uniform(-0.2, 0.2)
+        bodies = [
+            replace(body, world_from_body=Pose.from_yaw((x, y, 0.02), x)) if body.name == "cube" else body
+            for body in info.scene.bodies
+        ]
+        infos.append(replace(info, scene=replace(info.scene, bodies=tuple(bodies))))
+    written: list[str] = []
+    write = ImageDraw.ImageDraw.text
+
+    def text(self, xy, text, *args, **options):
+        written.append(text)
+        write(self, xy, text, *args, **options)
+
+    monkeypatch.setattr(ImageDraw.ImageDraw, "text", text)
+    drawn = draw_coverage(infos, tmp_path / "c.png")
+    assert drawn.num_episodes == 20
+    for label in (
+        "x (m)",
+        "y (m)",
+        "0.4",
+        "-0.1",
+        "object x (m)",
+        "object y (m)",
+        "object yaw (rad)",
+        "episodes per bin",
+    ):
+        assert label in written
+    assert np.asarray(Image.open(tmp_path / "c.png")).std() > 1

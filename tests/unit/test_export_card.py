@@ -1,0 +1,90 @@
+"""The dataset card: commands that can be typed, thumbnails that say what they show."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers_export import export, make_run
+from helpers_recording import frame_number
+from PIL import Image
+
+from demorec.cli.export import Export
+from demorec.cli.flags import parse
+from demorec.cli.generate import Generate
+from demorec.config import GenerateConfig, VideoConfig
+from demorec.export.commands import flags
+from demorec.export.options import ExportOptions
+from demorec.variation import Ranges
+
+
+def commands_of(dataset: Path) -> list[str]:
+    lines = (dataset / "README.md").read_text().splitlines()
+    start = lines.index("Made by these commands:") + 3
+    return lines[start : lines.index("```", start)]
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        GenerateConfig(),
+        GenerateConfig(task="stack", robot="iiwa", seed=7, cameras=(), antialias=False, depth=True, split="train"),
+        GenerateConfig(
+            task="my_package.tasks:Mine",
+            cameras=("wrist",),
+            video=VideoConfig(codec="av1", crf=40, gop=10),
+            variation="full",
+            ranges=Ranges(cube_mass=(0.02, 0.5), distractors=(0, 3), joint_spread=0.1),
+        ),
+    ],
+)
+def test_the_flags_of_a_config_are_parsed_to_it(config):
+    words = shlex.split(" ".join(flags(config, GenerateConfig())))
+    assert parse(Generate, words, prog="generate-dataset", defaults=None).episodes == config
+
+
+def test_the_commands_of_a_card_make_the_dataset(tmp_path):
+    options = {"repo_id": "me/cubes", "action": "ee", "privileged": True, "episodes": "0:2", "license": "it's mine"}
+    export(make_run(tmp_path / "run", (6, 5, 7)), tmp_path / "d", **options)
+    generating, exporting = (shlex.split(command) for command in commands_of(tmp_path / "d"))
+    assert generating[0] == "generate-dataset"
+    made = parse(Generate, generating[1:], prog="", defaults=None)
+    assert made.episodes == GenerateConfig(task="pick_place", seed=0, video=VideoConfig(codec="h264"))
+    assert (made.options.num_episodes, made.options.export) == (2, False)
+    assert exporting[:2] == ["demorec", "export"]
+    parsed = parse(Export, exporting[2:], prog="", defaults=None)
+    assert parsed.options == ExportOptions(**options)
+    assert parsed.sources == (made.options.out,)
+    assert "demorec reproduce path/of/this/folder --out copy" in (tmp_path / "d" / "README.md").read_text()
+
+
+def test_an_appended_dataset_has_no_such_commands(tmp_path):
+    run = make_run(tmp_path / "run", (6, 5))
+    export(run, tmp_path / "d", episodes="0")
+    export(run, tmp_path / "d", episodes="1", append=True)
+    assert "Made by these commands" not in (tmp_path / "d" / "README.md").read_text()
+
+
+def test_thumbnails_are_labelled(tmp_path):
+    export(make_run(tmp_path / "run", (31, 16)), tmp_path / "d")
+    sheet = np.asarray(Image.open(tmp_path / "d" / "demorec" / "thumbnails.jpg")).astype(int)
+    assert sheet.shape == (2 * (18 + 120), 5 * 160, 3)
+    labels = [sheet[row * 138 : row * 138 + 18] for row in range(2)]
+    for label in labels:
+        assert label.max() > 240  # black on white
+        assert label.min() < 60
+    assert np.abs(labels[0] - labels[1]).max() > 100  # of another episode
+    small = [
+        sheet[18 + 138 * row : 138 * (row + 1), 160 * column : 160 * (column + 1)]
+        for row in (0, 1)
+        for column in range(5)
+    ]
+    assert [frame_number(np.asarray(Image.fromarray(p.astype(np.uint8)).resize((64, 48)))) for p in small[:5]] == [
+        0,
+        8,
+        15,
+        22,
+        30,
+    ]
