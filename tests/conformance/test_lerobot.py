@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers_docs import run_examples
 from helpers_export import data_table, episode_rows, export, make_run
 from helpers_recording import make_episode
 
@@ -361,3 +362,21 @@ def test_a_policy_trains_on_it(run: Path, tmp_path: Path, inputs: str) -> None:
     losses = [float(part.split("loss:")[1].split()[0]) for part in out.splitlines() if "loss:" in part]
     assert len(losses) >= 4
     assert np.isfinite(losses).all()
+
+
+@pytest.mark.parametrize("backend", ["as installed", "missing"])
+def test_the_example_of_the_readme_runs_without_a_warning(
+    dataset: Path,
+    capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+    backend: str,
+) -> None:
+    """Without FFmpeg, LeRobot's default video backend cannot be loaded and fills the screen with the reason."""
+    if backend == "missing":
+        monkeypatch.setitem(sys.modules, "torchcodec", None)
+    assert run_examples("README.md", "LeRobotDataset", {"recordings/demo/dataset": dataset}) == 1
+    assert caplog.records == []
+    printed = capsys.readouterr()
+    assert "pick up the red cube" in printed.out
+    assert printed.err == ""

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
+from helpers_docs import run_examples
 from helpers_sim import episode
 
 import demorec.gym_env
@@ -241,3 +242,8 @@ def test_every_task_is_registered_on_import() -> None:
     assert demorec.gym_env is not None
     for task in TASKS.names():
         assert gymnasium.spec(env_id(task)).kwargs["task"] == task
+
+
+def test_the_example_of_the_readme_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_examples("README.md", "gymnasium.make", {}) == 1
+    assert "(224, 224, 3) False" in capsys.readouterr().out

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import base64
 import io
-import re
 import sys
 from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers_docs import run_examples
 from helpers_recording import frame_number, make_episode, write_episode
 from PIL import Image
 
@@ -19,7 +19,6 @@ from demorec.errors import MissingDependencyError, RecordingError
 from demorec.recording import Recording, reader
 
 NUM_FRAMES = 47
-ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")
@@ -187,12 +186,8 @@ def test_recordings_without_pictures_or_frames_have_a_page_too(tmp_path):
         assert [dict(frame.images) for frame in recording] == [{}, {}, {}]
 
 
-def test_the_examples_of_the_document_run(path, capsys):
-    text = (ROOT / "docs" / "recording.md").read_text()
-    examples = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
-    assert examples
-    for example in examples:
-        code = re.sub(r'"recordings/[^"]*\.mcap"', repr(str(path)), example)
-        assert code != example
-        exec(compile(code, "docs/recording.md", "exec"), {})
+@pytest.mark.parametrize(("document", "number"), [("docs/recording.md", 2), ("README.md", 1)])
+def test_the_examples_of_the_documents_run(path, capsys, document, number):
+    recording = {"recordings/demo/episodes/episode_000000.mcap": path}
+    assert run_examples(document, "from demorec.recording import Recording", recording) == number
     assert capsys.readouterr().out
