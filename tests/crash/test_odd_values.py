@@ -1,6 +1,6 @@
 """Well-formed but odd input to every command: one sentence or success, never a traceback, never a hang.
 
-`odd_values` makes the cases, each from its number. The commands are run below the command line's own net for
+`helpers_odd` makes the cases, each from its number. The commands are run below the command line's own net for
 unforeseen errors, so that nothing hides in it.
 """
 
@@ -11,7 +11,7 @@ import io
 from collections import Counter
 
 import pytest
-from odd_values import Odd
+from helpers_odd import Odd
 
 from demorec.cli import COMMANDS, parse
 from demorec.errors import DemorecError
