@@ -82,7 +82,7 @@ def resource_error(error: BaseException, path: Path | None = None) -> ResourceEr
         if isinstance(cause, ResourceError):
             return cause
         number = errno.ENOMEM if isinstance(cause, MemoryError) else getattr(cause, "errno", None)
-        if isinstance(cause, ImportError):  # of a shared library; the dynamic linker says why in words alone
+        if isinstance(cause, ImportError | OSError) and number is None:  # the dynamic linker says why in words alone
             number = next((number for words, number in _LINKER_WORDS.items() if words in str(cause)), None)
         if number in _LACKS:
             unknown = "." if path is None else f"; whether the file is sound is not known: {path}"

@@ -144,6 +144,8 @@ def _run_lines(path: Path, run: RunFile) -> list[str]:
         ("cameras", f"{', '.join(config.cameras) or 'none'} at {config.width}x{config.height}, {config.video.codec}"),
         ("digest", run.digest),
     ]
+    if run.beyond:
+        facts.append(("beyond these", f"{len(run.beyond)} attempts at later episodes, of when more was asked for"))
     if run.export is not None:
         facts.append(("dataset", f"{path / 'dataset'} ({run.export.repo_id})"))
     rows = [("episode", "attempt", "outcome", "frames", "size", "file")]

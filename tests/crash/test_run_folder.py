@@ -14,6 +14,7 @@ import helpers_generate
 import pytest
 from helpers_generate import Remembers, expected_attempts, run_fake
 
+from demorec.cli import main
 from demorec.config import GenerateConfig
 from demorec.errors import ConfigError, GenerationError, MissingDependencyError, ResourceError
 from demorec.generate import survey
@@ -185,3 +186,17 @@ def test_nothing_is_set_aside_for_what_the_machine_lacks(tmp_path, monkeypatch, 
     with pytest.raises(ResourceError, match=words):
         run_fake(out)
     assert {path: data for path, data in content_of(out).items() if path != ".lock"} == before
+
+
+@pytest.mark.parametrize("command", ["info", "check", "reproduce"])
+@pytest.mark.parametrize("make", [os.mkfifo, lambda path: path.write_text("[" * 100_000)])
+def test_a_run_json_that_cannot_be_read_is_one_sentence_for_every_command(tmp_path, capsys, command, make):
+    make(tmp_path / "run.json")
+    out = ["--out", str(tmp_path / "copy")] if command == "reproduce" else []
+    with pytest.raises(SystemExit) as ended:
+        main([command, str(tmp_path), *out])
+    assert ended.value.code in (1, 2)
+    told = capsys.readouterr()
+    assert "Traceback" not in told.err
+    assert len((told.err or told.out).splitlines()) <= 8
+    assert not (tmp_path / "copy").exists()

@@ -19,6 +19,7 @@ from demorec.errors import RecordingError, ResourceError, resource_error
         (OSError(errno.ENFILE, "Too many open files in system"), "open on this machine"),
         (ImportError("libtorch_cpu.so: failed to map segment from shared object"), "memory"),
         (ImportError("libz.so: cannot open shared object file: Too many open files"), "ulimit -n"),
+        (OSError("libllvmlite.so: failed to map segment from shared object"), "memory"),
         (OSError(errno.EIO, "Input/output error"), "storage"),
     ],
 )

@@ -1,0 +1,56 @@
+"""Too little memory and too few files: told as such, and never as damage of what was to be read."""
+
+from __future__ import annotations
+
+import resource
+
+import pytest
+import zstandard
+from helpers_recording import write_episode
+
+from demorec.errors import RecordingError, ResourceError
+from demorec.generate.recordings import inspect_recording
+from demorec.recording import container
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError(),
+        zstandard.ZstdError("decompression error: Allocation error : not enough memory"),  # its words under ulimit -v
+        OSError("libllvmlite.so: failed to map segment from shared object"),
+    ],
+)
+def test_a_recording_for_which_memory_is_too_small_is_not_called_damaged(tmp_path, monkeypatch, error):
+    path = write_episode(tmp_path / "good.mcap", cameras=(), num_frames=5)
+
+    def fail(*_: object) -> bytes:
+        raise error
+
+    monkeypatch.setattr(container, "chunk_content", fail)
+    with pytest.raises(ResourceError, match="too little memory") as told:
+        inspect_recording(path)
+    assert "damaged" not in str(told.value)
+
+
+def test_other_errors_of_the_decompression_are_damage(tmp_path, monkeypatch):
+    path = write_episode(tmp_path / "good.mcap", cameras=(), num_frames=5)
+
+    def fail(*_: object) -> bytes:
+        raise zstandard.ZstdError("decompression error: Data corruption detected")
+
+    monkeypatch.setattr(container, "chunk_content", fail)
+    with pytest.raises(RecordingError, match="is damaged"):
+        inspect_recording(path)
+
+
+def test_nor_is_one_that_cannot_be_opened_for_too_many_open_files(tmp_path):
+    path = write_episode(tmp_path / "good.mcap", cameras=(), num_frames=5)
+    before = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (3, before[1]))
+    try:
+        with pytest.raises(ResourceError, match="Too few files may be open"):
+            inspect_recording(path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, before)
+    assert inspect_recording(path).attempt.num_frames == 5

@@ -1,0 +1,47 @@
+"""The commands at the end of a run: quoted for the shell, and only those that start."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+
+import pytest
+
+from demorec.cli import generate_report
+from demorec.cli.generate_report import next_commands
+from demorec.config import GenerateConfig
+from demorec.generate.run import RunResult
+from demorec.generate.run_file import ExportRecord, RunFile, Session
+
+
+def result_of(folder: Path, *, cameras: tuple[str, ...] = ("front",)) -> RunResult:
+    run = RunFile(config=GenerateConfig(cameras=cameras), versions={}, num_episodes=1)
+    return RunResult(folder=folder, run=run, session=Session(started=""), made=(), interrupted=False)
+
+
+EXPORT = ExportRecord(run_digest="12", repo_id="me/cubes")
+
+
+@pytest.mark.parametrize("folder", ["/data/cubes", "/my data/it's; rm -rf $HOME `x`"])
+def test_a_shell_reads_them_as_they_are_meant(monkeypatch, folder):
+    monkeypatch.setattr(generate_report.shutil, "which", lambda name: f"/bin/{name}")
+    view, check, train = (shlex.split(line) for line in next_commands(result_of(Path(folder)), EXPORT))
+    assert view == ["demorec", "view", folder]
+    assert check == ["demorec", "check", folder]
+    assert train[:3] == ["lerobot-train", "--dataset.repo_id=me/cubes", f"--dataset.root={folder}/dataset"]
+
+
+def test_a_program_that_is_not_on_the_path_is_given_by_its_own(monkeypatch):
+    monkeypatch.setattr(generate_report.shutil, "which", lambda name: None)
+    for line in next_commands(result_of(Path("/data")), EXPORT):
+        assert Path(shlex.split(line)[0]).is_file()
+
+
+@pytest.mark.parametrize("without", ["a dataset", "pictures", "torch"])
+def test_no_training_is_offered_that_would_not_start(monkeypatch, without):
+    if without == "torch":
+        monkeypatch.setattr(generate_report, "find_spec", lambda name: None)
+    result = result_of(Path("/data"), cameras=() if without == "pictures" else ("front",))
+    lines = next_commands(result, None if without == "a dataset" else EXPORT)
+    assert len(lines) == 2
+    assert "lerobot-train" not in " ".join(lines)
