@@ -26,20 +26,22 @@ _MOST = 50
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """Watch episodes in Rerun: recordings, runs, exported datasets.
+    """Watch episodes in Rerun: recordings, runs, exported datasets, and .rrd files of --save.
 
-    Opens a window. With --save, --screenshot or --web no screen is needed.
+    Opens a window. With --save, --screenshot or --web no screen is needed. Brings the ffmpeg that Rerun needs for
+    H.264; a bare `rerun FILE.rrd` plays H.264 only where there is an ffmpeg on the PATH.
 
     Examples:
       demorec view recordings/cubes
       demorec view episode_000003.mcap --screenshot cube.png --at 2.5
       demorec view datasets/cubes --episodes 0:10 --web
       demorec view recordings/cubes --save cubes.rrd
+      demorec view cubes-0000.rrd
       demorec view original.mcap replayed.mcap --compare
     """
 
     paths: Positional[tuple[Path, ...]]
-    """Recordings, runs, datasets, or folders of recordings."""
+    """Recordings, runs, datasets, folders of recordings, or .rrd files."""
     compare: bool = False
     """Lay two episodes over each other: the same streams in the same views, and the distance between them."""
     episodes: str = ""
@@ -67,6 +69,8 @@ class View:
         """Convert, then show, save, photograph or serve."""
         self._validate()
         allow_models(allowed_modules(self.allow))
+        if any(path.suffix == ".rrd" for path in self.paths):
+            return self._show_rrd()
         from demorec.playback.glyphs import DrawableText
         from demorec.playback.save import numbered, save, save_comparison, save_each
         from demorec.playback.sources import find_episodes, select
@@ -132,9 +136,25 @@ class View:
         for target, kind in kinds:
             check_replaceable(target, kind, overwrite=self.overwrite, sources=places_read(self.paths))
 
+    def _show_rrd(self) -> int:
+        others = [path for path in self.paths if path.suffix != ".rrd"]
+        if others:
+            raise ConfigError(f".rrd files are shown in a call of their own, without others: {others[0]}")
+        if self.compare or self.save is not None or self.episodes or self.include_failures:
+            raise ConfigError("An .rrd file is shown as it is: --compare, --save and --episodes are for recordings.")
+        for path in self.paths:
+            if not path.is_file():
+                raise ConfigError(f"There is no such file: {path}")
+        self._check_targets(())
+        return self._show(self.paths, ())
+
     def _show(self, files: Sequence[Path], sources: Sequence[Source]) -> int:
         if self.screenshot is not None:
-            self._photograph(files, sources)
+            from demorec.playback.viewer import screenshot
+
+            width, height = self.size
+            screenshot(files, self.screenshot, seconds=self._second(sources), width=width, height=height)
+            say(f"{width}x{height}: {self.screenshot}")
             return 0
         if self.web:
             from demorec.playback.viewer import serve_web
@@ -147,15 +167,15 @@ class View:
         show(files)
         return 0
 
-    def _photograph(self, files: Sequence[Path], sources: Sequence[Source]) -> None:
-        from demorec.playback.viewer import screenshot
+    def _second(self, sources: Sequence[Source]) -> float | None:
+        """When the screenshot is taken; None leaves it to the viewer, which knows how long an .rrd file is."""
+        from demorec.playback.viewer import moment
 
-        assert self.screenshot is not None
-        with sources[0].open() as episode:
-            middle = episode.duration / 2
-        width, height = self.size
-        screenshot(files, self.screenshot, seconds=middle if self.at is None else self.at, width=width, height=height)
-        say(f"{width}x{height}: {self.screenshot}")
+        ends = []
+        for source in sources[: 2 if self.compare else 1]:
+            with source.open() as episode:
+                ends.append(max(episode.num_frames - 1, 0) / episode.info.fps)
+        return moment(self.at, max(ends)) if ends else self.at
 
 
 def _size(path: Path) -> str:

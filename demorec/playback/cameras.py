@@ -18,7 +18,7 @@ from demorec.scene import Camera
 _CODECS = {"h264": rr.VideoCodec.H264, "av1": rr.VideoCodec.AV1}
 _PICTURES_AT_ONCE = 64
 _FRUSTUM_METRES = {"world": 0.22}
-_FRUSTUM_ON_ROBOT = 0.08
+_FRUSTUM_ON_ROBOT = 0.04
 
 
 def log_cameras(recording: rr.RecordingStream, paths: Paths, episode: Episode) -> None:

@@ -10,17 +10,18 @@ from demorec.geometry import Array
 from demorec.playback.episode import Curves, Episode
 from demorec.playback.paths import Paths
 from demorec.playback.scene import log_episode
-from demorec.playback.summary import properties
+from demorec.playback.summary import entry, properties
 from demorec.playback.times import indexes
 
-_ORANGE = (1.0, 0.62, 0.25, 1.0)
+_ORANGE = (1.0, 0.62, 0.25, 0.6)
+"""Translucent, so that an episode that lies exactly where the other one does hides nothing of it."""
 DIFFERENCES = "/differences"
 
 
 def new_comparison(a: Episode, b: Episode) -> rr.RecordingStream:
     """An empty Rerun recording named after both."""
     recording = rr.RecordingStream("demorec-compare", recording_id=f"{a.identity}-{b.identity}")
-    recording.send_recording_name(f"A {a.name}, B {b.name}")
+    recording.send_recording_name(f"A {entry(a)}, B {entry(b)}")
     recording.send_property("a", rr.AnyValues(**properties(a)))
     recording.send_property("b", rr.AnyValues(**properties(b)))
     return recording

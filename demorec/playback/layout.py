@@ -18,11 +18,12 @@ _FLOOR = 3.0
 """Bodies wider than this (metres) are the floor, which would only hide the grid."""
 
 
-def episode_layout(episode: Episode) -> rrb.Blueprint:
-    """The layout of one episode, or of all that have its streams."""
+def episode_layout(episode: Episode, *, is_alone: bool = False) -> rrb.Blueprint:
+    """The layout of one episode, or of all that have its streams; one that is alone needs no list of episodes."""
     paths = Paths()
     return _blueprint(
         episode,
+        is_alone=is_alone,
         three_d=_view_3d(episode, [paths], f"{episode.info.task}: the world"),
         cameras=_camera_views(episode, paths),
         curves=_curve_views([paths], episode),
@@ -46,6 +47,7 @@ def comparison_layout(a: Episode, b: Episode) -> rrb.Blueprint:
         pictures.append(rrb.Horizontal(*views))
     return _blueprint(
         a,
+        is_alone=True,
         three_d=_view_3d(a, roots, "A (white) and B (orange)"),
         cameras=pictures,
         curves=_curve_views(roots, a),
@@ -66,6 +68,7 @@ def comparison_layout(a: Episode, b: Episode) -> rrb.Blueprint:
 def _blueprint(
     episode: Episode,
     *,
+    is_alone: bool,
     three_d: rrb.View,
     cameras: list[rrb.View | rrb.Container],
     curves: rrb.Container,
@@ -81,10 +84,11 @@ def _blueprint(
     bottom = rrb.Horizontal(*columns, column_shares=[2.6, *([1] * (len(columns) - 1))])
     parts, shares = [top, bottom], [5.0, 2.6]
     if states:
-        parts, shares = [top, *states, bottom], [5.0, 0.95 if more_curves is None else 1.4, 2.4]
+        parts, shares = [top, *states, bottom], [4.6, 0.95 if more_curves is None else 1.4, 2.9]
     return rrb.Blueprint(
         rrb.Vertical(*parts, row_shares=shares),
         rrb.TimePanel(state="collapsed", timeline=SECONDS, fps=float(episode.info.fps), loop_mode="all"),
+        rrb.BlueprintPanel(state="collapsed" if is_alone else "expanded"),
         rrb.SelectionPanel(state="hidden"),
         auto_layout=False,
         auto_views=False,
@@ -128,14 +132,14 @@ def _view_3d(episode: Episode, roots: list[Paths], name: str) -> rrb.Spatial3DVi
 
 
 def _eye(episode: Episode) -> tuple[Array, Array]:
-    """Where the 3D view looks from and to: at the gripper's way from the side, far enough to see the front camera."""
+    """Where the 3D view looks from and to: at the gripper's way from the side, with the arm in the picture."""
     base = episode.info.scene.robot.world_from_base
     points = base.apply(episode.base_from_tcp[:, :3])
     middle = (points.min(axis=0) + points.max(axis=0)) / 2 if len(points) else base.apply((0.5, 0.0, 0.2))
-    target = 0.6 * middle + 0.4 * base.apply((0.3, 0.0, 0.4))
+    target = 0.7 * middle + 0.3 * base.apply((0.2, 0.0, 0.4))
     side = base.rotation[:, 1]
     forward = base.rotation[:, 0]
-    return target + 0.2 * forward - 1.4 * side + (0.0, 0.0, 0.55), target
+    return target + 0.15 * forward - 1.05 * side + (0.0, 0.0, 0.42), target
 
 
 def _camera_views(episode: Episode, paths: Paths) -> list[rrb.View | rrb.Container]:
@@ -167,7 +171,9 @@ def _curve_views(roots: list[Paths], episode: Episode) -> rrb.Container:
             contents=[paths.curves(name) for paths in roots for name in shown],
             name=title,
             axis_x=rrb.TimeAxis(link=rrb.components.LinkAxis.LinkToGlobal),
-            plot_legend=rrb.PlotLegend(visible=len(episode.curves[shown[0]].names) * len(shown) * len(roots) <= 8),
+            plot_legend=rrb.PlotLegend(
+                rrb.Corner2D.RightTop if len(episode.curves[shown[0]].names) > 3 else rrb.Corner2D.LeftBottom
+            ),
         )
 
     joints = [
@@ -187,4 +193,4 @@ def _curve_views(roots: list[Paths], episode: Episode) -> rrb.Container:
     if tabs:
         columns.append(rrb.Tabs(*tabs, active_tab=0))
     columns += [item for item in side if item is not None]
-    return rrb.Horizontal(*columns, column_shares=[1.4, *([1.0] * (len(columns) - 1))] if tabs else None)
+    return rrb.Horizontal(*columns, column_shares=[1.8, *([1.0] * (len(columns) - 1))] if tabs else None)

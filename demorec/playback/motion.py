@@ -9,10 +9,10 @@ from demorec.episode import Event
 from demorec.geometry import Array
 from demorec.playback.episode import Curves, Episode
 from demorec.playback.paths import Paths
-from demorec.playback.style import FORCE, MEASURED, SECOND, TARGET, Color, dimmed, phase_colors, series_colors
+from demorec.playback.style import ASKED, FORCE, MEASURED, SECOND, TARGET, Color, phase_colors, series_colors
 from demorec.playback.times import indexes, seconds_only
 
-_WIDTHS = {"target": 1.2, "gripper target": 1.2}
+_WIDTHS = {"target": 0.7, "gripper target": 1.2}
 
 
 def log_ee_path(recording: rr.RecordingStream, paths: Paths, episode: Episode) -> None:
@@ -38,9 +38,9 @@ def log_curves(
         recording.log(
             entity,
             rr.SeriesLines(
-                names=[f"{label}{curve}" for curve in _curve_names(name, curves)],
+                names=_curve_names(name, curves, label, is_second=is_second),
                 colors=_curve_colors(name, curves, is_second=is_second),
-                widths=[_WIDTHS.get(name, 2.0)] * len(curves.names),
+                widths=[0.7 if is_second and len(curves.names) > 1 else _WIDTHS.get(name, 2.0)] * len(curves.names),
             ),
             static=True,
         )
@@ -56,22 +56,26 @@ def _scalars(values: Array) -> rr.ComponentColumnList:
     return rr.Scalars.columns(scalars=values)
 
 
-def _curve_names(name: str, curves: Curves) -> list[str]:
+def _curve_names(name: str, curves: Curves, label: str, *, is_second: bool) -> list[str]:
+    """What a legend lists: curves of one name share a line, since it has room for eight."""
     short = [curve.removeprefix("panda_") for curve in curves.names]
-    return [f"{curve} target" for curve in short] if name == "target" else short
+    if name == "target":
+        short = ["target"] * len(short)
+    elif is_second and len(short) > 1:
+        return [label.strip()] * len(short)
+    return [f"{label}{curve}" for curve in short]
 
 
 def _curve_colors(name: str, curves: Curves, *, is_second: bool) -> list[Color]:
     if is_second:
-        return [SECOND] if len(curves.names) == 1 else dimmed(series_colors(len(curves.names)))
+        return [SECOND if len(curves.names) == 1 else ASKED] * len(curves.names)
     if name == "gripper":
         return [MEASURED]
     if name == "gripper target":
         return [TARGET]
     if name == "force":
         return [FORCE]
-    colors = series_colors(len(curves.names))
-    return dimmed(colors) if name == "target" else colors
+    return [ASKED] * len(curves.names) if name == "target" else series_colors(len(curves.names))
 
 
 def log_phases(recording: rr.RecordingStream, paths: Paths, episode: Episode) -> None:

@@ -62,13 +62,13 @@ def _log_pose(recording: rr.RecordingStream, entity: str, position: Array, quat_
 
 
 def as_mesh3d(mesh: Mesh, tint: Rgba | None = None) -> rr.Mesh3D:
-    """For Rerun; `tint` multiplies the colours."""
-    colors = mesh.colors if tint is None else np.rint(mesh.colors * np.array(tint)).astype(np.uint8)
+    """For Rerun; `tint` multiplies the colours and, as the only way to do so, makes the mesh translucent."""
     return rr.Mesh3D(
         vertex_positions=mesh.vertices,
         vertex_normals=mesh.normals,
         triangle_indices=mesh.triangles,
-        vertex_colors=colors,
+        vertex_colors=mesh.colors,
+        albedo_factor=None if tint is None else list(tint),
     )
 
 

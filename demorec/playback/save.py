@@ -28,7 +28,7 @@ def save(source: Source, target: Path) -> None:
         DemorecError: The episode cannot be read, or the file cannot be written.
     """
     with _partial(target) as part:
-        _save_episode(source, part)
+        _save_episode(source, part, is_alone=True)
 
 
 def numbered(target: Path, count: int) -> list[Path]:
@@ -49,7 +49,7 @@ def save_each(sources: Sequence[Source], folder: Path) -> list[Path]:
     """
     files = [folder / f"{index:06d}.rrd" for index in range(len(sources))]
     for source, file in zip(sources, files, strict=True):
-        _save_episode(source, file)
+        _save_episode(source, file, is_alone=len(sources) == 1)
     return files
 
 
@@ -65,10 +65,10 @@ def save_comparison(a: Source, b: Source, target: Path) -> None:
             log_comparison(recording, first, second)
 
 
-def _save_episode(source: Source, target: Path) -> None:
+def _save_episode(source: Source, target: Path, *, is_alone: bool) -> None:
     with source.open() as episode:
         recording = new_recording(episode)
-        with _saving(recording, target, episode_layout(episode)):
+        with _saving(recording, target, episode_layout(episode, is_alone=is_alone)):
             log_episode(recording, episode)
 
 

@@ -12,7 +12,7 @@ from demorec.playback.episode import Episode
 from demorec.playback.motion import log_curves, log_ee_path, log_events, log_phases
 from demorec.playback.paths import Paths
 from demorec.playback.robot import log_robot
-from demorec.playback.summary import properties, summary
+from demorec.playback.summary import entry, properties, summary
 from demorec.scene import Rgba
 
 
@@ -39,7 +39,7 @@ def log_episode(
 def new_recording(episode: Episode) -> rr.RecordingStream:
     """An empty Rerun recording with the episode's name and properties."""
     recording = rr.RecordingStream(application_id(episode), recording_id=f"{episode.name}-{episode.identity}")
-    recording.send_recording_name(f"{episode.name}: {episode.verdict}")
+    recording.send_recording_name(entry(episode))
     recording.send_property("episode", rr.AnyValues(**properties(episode)))
     return recording
 

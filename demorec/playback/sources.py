@@ -13,6 +13,8 @@ from demorec.playback.episode import Episode
 from demorec.playback.from_dataset import dataset_episodes, open_dataset_episode
 from demorec.playback.from_recording import open_recording
 
+_MCAP_MAGIC = b"\x89MCAP0\r\n"
+
 
 @dataclass(frozen=True, kw_only=True)
 class Source:
@@ -42,8 +44,17 @@ def find_episodes(paths: Sequence[Path], *, include_failures: bool = False) -> l
 def _sources(path: Path, include_failures: bool) -> list[Source]:
     if not path.exists():
         raise ConfigError(f"There is no such file or folder: {path}")
+    if path.suffix == ".part":
+        raise ConfigError(f"The recording is not finished; demorec recover makes one of what there is: {path}")
     if path.is_file():
+        if path.suffix != ".mcap" and not _is_mcap(path):
+            raise ConfigError(
+                "Recordings (.mcap), runs, exported datasets, folders of recordings and Rerun's .rrd files can be "
+                f"shown, this file is none of them: {path}"
+            )
         return [_recording(path)]
+    if not path.is_dir():
+        raise ConfigError(f"This is neither a file nor a folder: {path}")
     if (path / "meta" / "info.json").is_file():
         return [
             Source(name=f"{path}: episode {index}", open=partial(open_dataset_episode, path, index))
@@ -54,10 +65,19 @@ def _sources(path: Path, include_failures: bool) -> list[Source]:
         files += sorted((path / "failed").glob("*.mcap"))
     if files:
         return [_recording(file) for file in files]
-    hint = " Its failures are shown with --include-failures." if any((path / "failed").glob("*.mcap")) else ""
+    hint = ""
+    if any((path / "failed").glob("*.mcap")):
+        hint = " Its failures are shown with --include-failures."
+    elif below := sorted(folder.parent.name for folder in path.glob("*/episodes")):
+        hint = f" It holds runs, name one: {', '.join(below[:5])}{', ...' if below[5:] else ''}."
     raise ConfigError(
         f"The folder holds no recording (*.mcap), run (episodes/) or dataset (meta/info.json).{hint} {path}"
     )
+
+
+def _is_mcap(path: Path) -> bool:
+    with path.open("rb") as file:
+        return file.read(len(_MCAP_MAGIC)) == _MCAP_MAGIC
 
 
 def _recording(path: Path) -> Source:

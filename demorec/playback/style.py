@@ -33,6 +33,8 @@ PHASES: tuple[Color, ...] = (
 
 MEASURED: Color = (86, 180, 233)
 TARGET: Color = (255, 170, 60)
+ASKED: Color = (235, 235, 235)
+"""Of the targets of all joints over what the joints did, and of a second episode's joints over those of the first."""
 SECOND: Color = (255, 140, 60)
 FORCE: Color = (240, 90, 90)
 GOAL: Color = (60, 230, 120)
@@ -42,11 +44,6 @@ FRUSTUM: Color = (255, 200, 60)
 def series_colors(count: int) -> list[Color]:
     """One colour a curve."""
     return [SERIES[index % len(SERIES)] for index in range(count)]
-
-
-def dimmed(colors: Iterable[Color]) -> list[Color]:
-    """The same colours, nearer to grey: of targets beside the measured values."""
-    return [(r // 2 + 60, g // 2 + 60, b // 2 + 60) for r, g, b in colors]
 
 
 def phase_colors(phases: Iterable[str]) -> dict[str, Color]:

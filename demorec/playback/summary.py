@@ -2,7 +2,20 @@
 
 from __future__ import annotations
 
+import re
+
 from demorec.playback.episode import Episode
+
+_OF_A_RUN = re.compile(r"episode_0*(?P<number>\d+)(?:\.attempt_(?P<attempt>\d+))?")
+
+
+def entry(episode: Episode) -> str:
+    """A few characters for the viewer's narrow list: "3 ok", "0.1 FAIL place" (the attempt after the dot)."""
+    match = _OF_A_RUN.fullmatch(episode.name)
+    name = episode.name if match is None else ".".join(part for part in match.groups() if part is not None)
+    if episode.outcome is None:
+        return f"{name} ?"
+    return f"{name} ok" if episode.outcome.success else f"{name} FAIL {episode.outcome.failure_phase}".rstrip()
 
 
 def properties(episode: Episode) -> dict[str, str | int | float | bool]:
@@ -31,7 +44,7 @@ def properties(episode: Episode) -> dict[str, str | int | float | bool]:
 
 
 def summary(episode: Episode) -> str:
-    """Markdown: task, outcome and its checks."""
+    """Markdown: task, outcome and its checks, the failed ones first."""
     info = episode.info
     lines = [
         f"**{info.instruction}**",
@@ -46,7 +59,7 @@ def summary(episode: Episode) -> str:
         lines += ["", info.origin]
     if episode.outcome is not None and episode.outcome.checks:
         lines += ["", "| | check | value | limit |", "|---|---|---|---|"]
-        for check in episode.outcome.checks:
+        for check in sorted(episode.outcome.checks, key=lambda check: check.passed):
             mark = "✓" if check.passed else "**✗**"
             unit = f" {check.unit}" if check.unit else ""
             lines.append(f"| {mark} | {check.name} | {check.value:.3g}{unit} | {check.limit:.3g}{unit} |")

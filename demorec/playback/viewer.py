@@ -166,6 +166,12 @@ class HeadlessViewer:
         if len(recordings) > 1:
             client.set_location(min(recordings, key=lambda recording: str(recording.store_id)).location)
 
+    @property
+    def end(self) -> float:
+        """Seconds of the last row of the recording in front; 0 when it has no such time line."""
+        first = min(self.client.get_state().recordings, key=lambda recording: str(recording.store_id))
+        return max((line.end / 1e9 for line in first.timelines if line.name == SECONDS), default=0.0)
+
     def seek(self, seconds: float) -> None:
         """Pause at a time of the episode, and wait until the picture has settled (videos are decoded)."""
         for recording in self.client.get_state().recordings:
@@ -220,14 +226,28 @@ class HeadlessViewer:
         return self.client.get_state()
 
 
-def screenshot(recordings: Sequence[Path], target: Path, *, seconds: float, width: int, height: int) -> None:
-    """A picture of the viewer with .rrd files at a time of the episode.
+def moment(seconds: float | None, end: float) -> float:
+    """A time of an episode that lasts until `end`, seconds; by default its middle.
 
     Raises:
+        ConfigError: It is outside of the episode.
+    """
+    if seconds is None:
+        return end / 2
+    if not 0.0 <= seconds <= end + 1e-9:
+        raise ConfigError(f"--at is {seconds:g}, allowed are 0 to {end:.3f} s, the episode's last frame.")
+    return seconds
+
+
+def screenshot(recordings: Sequence[Path], target: Path, *, seconds: float | None, width: int, height: int) -> None:
+    """A picture of the viewer with .rrd files at a time of the first of them, by default its middle.
+
+    Raises:
+        ConfigError: The time is outside of it.
         DemorecError: The viewer cannot work here, or a view reports an error.
     """
     with HeadlessViewer(*recordings, width=width, height=height) as viewer:
-        viewer.seek(seconds)
+        viewer.seek(moment(seconds, viewer.end))
         errors = [report for report in viewer.reports() if report.severity == "error"]
         if errors:
             raise RecordingError(f"The view {errors[0].view!r} cannot be drawn: {errors[0].message}.")

@@ -56,6 +56,50 @@ def test_bad_requests_are_one_sentence(
     assert len(said.strip().splitlines()) == 1
 
 
+@pytest.mark.parametrize(
+    ("name", "flags", "words"),
+    [
+        ("video.mp4", (), "this file is none of them"),
+        ("cut.mcap.part", (), "demorec recover"),
+        ("folder", (), "The folder holds no recording"),
+        ("runs", (), "It holds runs, name one: cubes"),
+        ("saved.rrd", ("--compare",), "is shown as it is"),
+        ("nothing.rrd", (), "There is no such file"),
+        ("episode.mcap", ("--screenshot", "x.png", "--at", "-1"), "--at is -1, allowed are 0 to 0.133 s"),
+        ("episode.mcap", ("--screenshot", "x.png", "--at", "999"), "--at is 999, allowed are 0 to 0.133 s"),
+        ("episode.mcap", ("--screenshot", "x.png", "--at", "nan"), "--at is nan, allowed are 0 to 0.133 s"),
+    ],
+)
+def test_what_cannot_be_shown_is_said(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    name: str,
+    flags: tuple[str, ...],
+    words: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for file in ("video.mp4", "cut.mcap.part", "saved.rrd"):
+        Path(file).write_bytes(b"0123456789")
+    Path("folder").mkdir()
+    Path("runs/cubes/episodes").mkdir(parents=True)
+    write_episode(Path("episode.mcap"), num_frames=5, cameras=())
+    assert view(name, *flags) == 2
+    said = capsys.readouterr().err
+    assert words in said
+    assert len(said.strip().splitlines()) == 1
+
+
+@pytest.mark.viewer
+def test_a_saved_file_is_shown(run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    need_vulkan()
+    assert view(run_folder, "--episodes", "0", "--save", tmp_path / "x.rrd") == 0
+    assert view(tmp_path / "x.rrd", "--screenshot", tmp_path / "x.png") == 0
+    assert num_colors(pixels((tmp_path / "x.png").read_bytes())) > 200
+    assert view(tmp_path / "x.rrd", "--screenshot", tmp_path / "y.png", "--at", "2") == 2
+    assert "allowed are 0 to 1.467 s" in capsys.readouterr().err
+
+
 def test_damage_is_one_sentence_and_leaves_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = write_episode(tmp_path / "e.mcap", num_frames=5)
     path.write_bytes(path.read_bytes()[:-2000])

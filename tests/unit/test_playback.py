@@ -26,6 +26,7 @@ from demorec.playback.robot import joint_columns, robot_model
 from demorec.playback.save import save, save_comparison
 from demorec.playback.sources import find_episodes, select
 from demorec.playback.style import segment_colors
+from demorec.playback.summary import entry, summary
 from demorec.recording import EpisodeWriter, Recording
 from demorec.scene import Body, Shape
 from demorec.urdf import Urdf
@@ -324,3 +325,28 @@ def test_failures_are_shown_when_asked_for(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="--include-failures"):
         find_episodes([tmp_path])
     assert len(find_episodes([tmp_path], include_failures=True)) == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "success", "expected"),
+    [
+        ("episode_000003.mcap", True, "3 ok"),
+        ("episode_000000.attempt_1.mcap", False, "0.1 FAIL place"),
+        ("replayed.mcap", True, "replayed ok"),
+    ],
+)
+def test_entries_of_the_list_are_short(tmp_path: Path, name: str, success: bool, expected: str) -> None:
+    write_episode(tmp_path / name, num_frames=3, cameras=(), success=success)
+    with find_episodes([tmp_path / name])[0].open() as episode:
+        assert entry(episode) == expected
+
+
+def test_failed_checks_come_first(tmp_path: Path) -> None:
+    write_episode(tmp_path / "e.mcap", num_frames=3, cameras=(), success=False)
+    with find_episodes([tmp_path / "e.mcap"])[0].open() as episode:
+        assert episode.outcome is not None
+        checks = episode.outcome.checks
+        shown = replace(episode, outcome=replace(episode.outcome, checks=(replace(checks[0], passed=True), *checks)))
+        marks = [line[2] for line in summary(shown).splitlines() if line.startswith(("| \u2713", "| **"))]
+    assert sorted(marks) == marks
+    assert len(set(marks)) == 2
