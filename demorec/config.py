@@ -203,15 +203,6 @@ def _deciding_versions() -> tuple[tuple[str, str], ...]:
     return tuple((name, version(name)) for name in ("demorec", "pybullet", "numpy", "numba", "av"))
 
 
-def load_toml[T](path: Path, cls: type[T]) -> T:
-    """Read a config file.
-
-    Raises:
-        ConfigError: No such file, no TOML, or unknown, missing or mistyped keys (all of them in one message).
-    """
-    return parse_config(read_toml(path), cls, source=str(path))
-
-
 def read_toml(path: Path) -> dict[str, Any]:
     """The plain tables of a TOML file; ConfigError when it cannot be read."""
     try:

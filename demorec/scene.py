@@ -159,6 +159,10 @@ class RobotPlacement:
     gripper_width: float
 
 
+POSITION_GAIN = 0.2
+"""Of the arm joints' position control: the share of the error that is gone after a physics step."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Physics:
     """Engine parameters, all set at every reset (PyBullet leaks some into later clients)."""

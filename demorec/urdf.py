@@ -91,14 +91,30 @@ class UrdfJoint:
 
 @dataclass(frozen=True, kw_only=True)
 class Urdf:
-    """The joint tree of a URDF, lengths multiplied by `scale`."""
+    """The joint tree of a URDF, lengths multiplied by `scale`; ValueError when the joints make no tree."""
 
     joints: tuple[UrdfJoint, ...]
     root: str
 
+    def __post_init__(self) -> None:
+        below: dict[str, list[UrdfJoint]] = {}
+        for joint in self.joints:
+            below.setdefault(joint.parent, []).append(joint)
+        reached, waiting, strays = {self.root}, [self.root], []
+        while waiting:
+            for joint in below.pop(waiting.pop(), ()):
+                if joint.child in reached:
+                    strays.append(joint)
+                reached.add(joint.child)
+                waiting.append(joint.child)
+        strays += [joint for joints in below.values() for joint in joints]
+        if strays:
+            names = ", ".join(joint.name for joint in strays)
+            raise ValueError(f"the joints of a URDF make one tree, but these do not belong to it: {names}")
+
     @classmethod
     def load(cls, path: Path, *, scale: float = 1.0) -> Urdf:
-        """Read the joints of a URDF file; ValueError when it has no single root link."""
+        """Read the joints of a URDF file; ValueError when they are no tree with one root link."""
         return cls.parse(path.read_text(), scale=scale)
 
     @classmethod
@@ -133,8 +149,6 @@ class Urdf:
                 moved = joint_motion(joint, joint_position.get(joint.name, 0.0))
                 poses[joint.child] = poses[joint.parent] @ joint.parent_from_joint @ moved
             waiting = [joint for joint in waiting if joint.child not in poses]
-            if not ready:
-                raise ValueError(f"the joints {[joint.name for joint in waiting]} hang on no link")
         return poses
 
     def path_to(self, link: str) -> tuple[UrdfJoint, ...]:

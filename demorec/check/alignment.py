@@ -9,10 +9,9 @@ import numpy as np
 from demorec.check.base import Measurement, check
 from demorec.check.episode import RecordedEpisode
 from demorec.geometry import Array
+from demorec.scene import POSITION_GAIN
 
 MAX_LAG = 5
-SERVO_GAIN = 0.2
-"""Of the simulated joints' position control: the share of the error that is gone after a physics step."""
 
 
 def measured_lag(before: Array, after: Array) -> tuple[float, float] | None:
@@ -44,8 +43,8 @@ def servo_response(commands: Array, *, start: Array, substeps: int) -> Array:
     The targets move linearly from one command to the next over `substeps` physics steps, and each step takes the
     joint by the servo's gain towards them: what `demorec.sim` does, without forces.
     """
-    keep = 1.0 - SERVO_GAIN
-    powers = SERVO_GAIN * keep ** np.arange(substeps - 1, -1, -1)
+    keep = 1.0 - POSITION_GAIN
+    powers = POSITION_GAIN * keep ** np.arange(substeps - 1, -1, -1)
     share = np.arange(1, substeps + 1) / substeps
     from_new, from_old = float((powers * share).sum()), float((powers * (1 - share)).sum())
     out = np.empty_like(commands)

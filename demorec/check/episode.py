@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
@@ -200,8 +199,3 @@ def _stamp(data: bytes) -> int:
         seconds, nanoseconds = struct.unpack_from("<iI", data, 4)
         return int(seconds) * 1_000_000_000 + int(nanoseconds)
     return -1
-
-
-def goal_objects(info: EpisodeInfo) -> Iterator[str]:
-    """Names of the objects that have a goal, in order."""
-    yield from dict.fromkeys(goal.object for goal in info.scene.goals)

@@ -37,6 +37,8 @@ def mp4_samples(
     ends = [0, *accumulate(lengths.tolist())]
     units = [data[a:b] for a, b in pairwise(ends)]
     samples = [mp4_sample(codec, unit) for unit in units]
+    if not all(samples):
+        raise ExportError(f"A packet of the {codec} video holds no picture.")
     sizes = np.array([len(sample) for sample in samples], dtype=np.int64)
     return b"".join(samples), sizes, np.array([is_keyframe(codec, unit) for unit in units], dtype=np.bool_)
 
@@ -62,10 +64,10 @@ def _h264_samples(data: bytes, lengths: NDArray[np.int64]) -> tuple[bytes, NDArr
     sizes = stops - starts
     if sizes.min() < 1:
         return None
-    heads = sizes.astype(">u4").tobytes()
-    parts: list[bytes] = []
+    view, heads = memoryview(data), sizes.astype(">u4").tobytes()
+    parts: list[bytes | memoryview] = []
     for number, (start, stop) in enumerate(zip(starts.tolist(), stops.tolist(), strict=True)):
-        parts += (heads[4 * number : 4 * number + 4], data[start:stop])
+        parts += (heads[4 * number : 4 * number + 4], view[start:stop])
     is_idr = (values[starts] & 31) == _H264_IDR
     return b"".join(parts), np.add.reduceat(sizes + 4, first), np.logical_or.reduceat(is_idr, first)
 

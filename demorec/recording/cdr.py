@@ -75,11 +75,6 @@ class CdrWriter:
         self.u32(len(raw) + 1)
         self._data += raw + b"\x00"
 
-    def octets(self, value: bytes) -> None:
-        """A sequence of uint8."""
-        self.u32(len(value))
-        self._data += value
-
     def time(self, time_ns: int) -> None:
         """builtin_interfaces/Time."""
         self.i32(time_ns // _NANOSECONDS)

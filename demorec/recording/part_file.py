@@ -79,7 +79,7 @@ class _Disk:
 
 
 class PartFile:
-    """Writes messages, metadata and attachments through foxglove-sdk's MCAP writer, unbuffered below it.
+    """Writes messages and metadata through foxglove-sdk's MCAP writer, unbuffered below it.
 
     Args:
         path: The finished file.
@@ -168,11 +168,6 @@ class PartFile:
         """Add a metadata record."""
         with self._disk_errors():
             self._mcap.write_metadata(name, dict(values))
-
-    def attach(self, name: str, media_type: str, data: bytes) -> None:
-        """Add an attachment."""
-        with self._disk_errors():
-            self._mcap.attach(log_time=0, create_time=0, name=name, media_type=media_type, data=data)
 
     def flush(self) -> None:
         """End the chunk; when this returns, what was logged is with the operating system and survives this process.

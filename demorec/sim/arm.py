@@ -11,10 +11,9 @@ from demorec.episode import Action, RobotSpec
 from demorec.errors import DemorecError, SceneError
 from demorec.geometry import Array, Pose
 from demorec.kinematics import ArmKinematics
-from demorec.scene import RobotPlacement
+from demorec.scene import POSITION_GAIN, RobotPlacement
 from demorec.sim.urdf_file import urdf_file
 
-POSITION_GAIN = 0.2
 FINGER_SPEED = 0.1
 """Of each finger, m/s."""
 FINGER_STIFFNESS, FINGER_DAMPING = 30_000.0, 1_000.0

@@ -1,4 +1,4 @@
-"""A PyBullet client without PyBullet's chatter.
+"""A PyBullet client without PyBullet's chatter, freed whoever forgets to.
 
 PyBullet prints its build time while it is imported and "argv[0]=" when it connects, from C and onto the same
 streams as our tables and JSON.
@@ -7,8 +7,11 @@ streams as our tables and JSON.
 from __future__ import annotations
 
 import ctypes
+import functools
+import inspect
 import os
 import sys
+import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -40,10 +43,42 @@ def _silence() -> Iterator[None]:
         os.close(nowhere)
 
 
-def connect() -> Any:
-    """A new `BulletClient` without a window."""
+class BulletClient:
+    """One simulation of this process: PyBullet's functions, each bound to it at its first use.
+
+    It is freed by `disconnect`, else when nothing refers to it any more, at the latest before the interpreter ends
+    (`pybullet_utils` has a client that is freed so late that PyBullet is gone, and that binds at every call).
+
+    Args:
+        connection_mode: `pybullet.DIRECT`: without a window.
+    """
+
+    def __init__(self, connection_mode: int) -> None:
+        import pybullet
+
+        self._number: int = pybullet.connect(connection_mode)
+        self._free = weakref.finalize(self, pybullet.disconnect, physicsClientId=self._number)
+
+    def __getattr__(self, name: str) -> Any:
+        import pybullet
+
+        attribute = getattr(pybullet, name)
+        if inspect.isbuiltin(attribute):
+            attribute = functools.partial(attribute, physicsClientId=self._number)
+        setattr(self, name, attribute)
+        return attribute
+
+    def disconnect(self) -> None:
+        """Free the simulation; harmless when called twice."""
+        free = self._free
+        vars(self).clear()  # PyBullet gives the number to the next client, which these functions must not reach
+        self._number, self._free = -1, free
+        free()
+
+
+def connect() -> BulletClient:
+    """A new client without a window."""
     with _silence():
         import pybullet
-        from pybullet_utils.bullet_client import BulletClient
 
         return BulletClient(pybullet.DIRECT)

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from demorec.config import GenerateConfig, VideoConfig, load_toml
+from demorec.config import GenerateConfig, VideoConfig, parse_config, read_toml
 from demorec.episode import frame_time_ns
 from demorec.errors import ConfigError
 
@@ -67,18 +67,18 @@ def test_broken_config_files_are_named(tmp_path: Path, text: str, message: str) 
     path = tmp_path / "run.toml"
     path.write_text(text)
     with pytest.raises(ConfigError, match=message):
-        load_toml(path, GenerateConfig)
+        parse_config(read_toml(path), GenerateConfig, source=str(path))
 
 
 def test_a_missing_config_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="cannot be read"):
-        load_toml(tmp_path / "none.toml", GenerateConfig)
+        read_toml(tmp_path / "none.toml")
 
 
 def test_a_config_file_is_read(tmp_path: Path) -> None:
     path = tmp_path / "run.toml"
     path.write_text('seed = 3\ncameras = ["wrist"]\n[video]\ncodec = "av1"\n')
-    config = load_toml(path, GenerateConfig)
+    config = parse_config(read_toml(path), GenerateConfig, source=str(path))
     assert (config.seed, config.cameras, config.video.codec) == (3, ("wrist",), "av1")
 
 

@@ -104,6 +104,51 @@ def test_pictures_put_aside_are_written_the_same_and_cleared_away(tmp_path: Path
         assert list(aside.iterdir()) == []
 
 
+@pytest.mark.parametrize("codec", ["h264", "av1"])
+def test_the_same_pictures_give_the_same_file_without_a_date_or_a_version(tmp_path: Path, codec: str) -> None:
+    video, _ = coded(codec, 5)
+    for name in ("a.mp4", "b.mp4"):
+        writer = Mp4Writer(tmp_path / name, video, fps=30)
+        writer.add(video)
+        writer.close()
+    data = (tmp_path / "a.mp4").read_bytes()
+    assert data == (tmp_path / "b.mp4").read_bytes()
+    assert b"Lavf" not in data
+    with av.open(str(tmp_path / "a.mp4")) as container:
+        assert "creation_time" not in container.metadata | container.streams.video[0].metadata
+
+
+def test_colours_are_described_as_in_the_recording(tmp_path: Path) -> None:
+    """H.273: primaries 1 are those of BT.709, transfer 13 that of sRGB, matrix 6 that of BT.601, range 1 is narrow."""
+    for codec in ("h264", "av1"):
+        video, _ = coded(codec, 3)
+        writer = Mp4Writer(tmp_path / f"{codec}.mp4", video, fps=30)
+        writer.add(video)
+        writer.close()
+        with av.open(str(tmp_path / f"{codec}.mp4")) as container:
+            context = container.streams.video[0].codec_context
+            found = (context.color_primaries, context.color_trc, context.colorspace, context.color_range)
+        assert found == (1, 13, 6, 1)
+
+
+def test_pictures_that_are_none_are_refused(tmp_path: Path) -> None:
+    _, units = encoded("av1", 3)
+    for nothing in (b"", b"\x12\x00"):  # the second is a temporal delimiter alone
+        with pytest.raises(ExportError, match="no picture"):
+            video_of("av1", [*units, nothing])
+    garbage = video_of("h264", [SHORT + NAL["sps"] + SHORT + NAL["idr"]])
+    with pytest.raises(ExportError, match=r"cannot be written.*a\.mp4"):
+        Mp4Writer(tmp_path / "a.mp4", garbage, fps=30)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_that_cannot_be_written_is_an_error_of_the_system(tmp_path: Path) -> None:
+    video, _ = coded("h264", 3)
+    (tmp_path / "a.unfinished").mkdir()
+    with pytest.raises(OSError, match="directory"):
+        Mp4Writer(tmp_path / "a.mp4", video, fps=30)
+
+
 def samples_of(video: CodedVideo) -> list[bytes]:
     assert isinstance(video.samples, bytes)
     ends = np.cumsum(video.sizes).tolist()

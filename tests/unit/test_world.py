@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -206,6 +208,38 @@ def test_close_twice_is_harmless():
     world = World(PANDA)
     world.close()
     world.close()
+
+
+def test_a_client_that_nobody_refers_to_is_freed():
+    client = connect()
+    is_connected = client.isConnected
+    assert is_connected()
+    del client
+    assert not is_connected()
+
+
+def test_a_disconnected_client_does_not_reach_the_next_one():
+    """PyBullet gives the number of a client to the next one."""
+    client = connect()
+    assert client.isConnected()
+    client.disconnect()
+    client.disconnect()
+    other = connect()
+    assert not client.isConnected()
+    assert other.isConnected()
+    other.disconnect()
+
+
+def test_a_world_that_nobody_closed_is_silent_at_the_end():
+    """The later a module is cleared away, the longer it keeps what it holds: this one longer than PyBullet."""
+    program = """
+import os
+from demorec.sim.robots.panda import PANDA
+from demorec.sim.world import World
+os.kept = World(PANDA)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
 def test_connecting_prints_nothing(capfd):

@@ -1,0 +1,64 @@
+"""Joint trees: whatever joints a URDF names, reading it ends, and a path leads from the root to its link."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from demorec.urdf import Urdf
+
+links = st.integers(0, 6).map("link{}".format)
+
+
+def urdf_text(pairs: list[tuple[str, str]]) -> str:
+    """A URDF with a fixed joint for every (parent, child)."""
+    names = sorted({name for pair in pairs for name in pair} | {"root"})
+    joints = [
+        f'<joint name="joint{n}" type="fixed"><parent link="{parent}"/><child link="{child}"/></joint>'
+        for n, (parent, child) in enumerate(pairs)
+    ]
+    return f"<robot name='r'>{''.join(f'<link name="{name}"/>' for name in names)}{''.join(joints)}</robot>"
+
+
+@given(st.lists(st.tuples(st.one_of(links, st.just("root")), links), max_size=8))
+def test_any_joints_are_a_tree_or_refused(pairs: list[tuple[str, str]]) -> None:
+    try:
+        urdf = Urdf.parse(urdf_text(pairs))
+    except ValueError:
+        return
+    for link in {child for _, child in pairs}:
+        path = urdf.path_to(link)
+        assert [joint.parent for joint in path] == ["root", *(joint.child for joint in path[:-1])]
+        assert path[-1].child == link
+    assert len({child for _, child in pairs}) == len(pairs)
+    assert set(urdf.link_poses({})) == {"root", *(child for _, child in pairs)}
+
+
+@given(st.lists(st.integers(0, 10**6), max_size=20), st.randoms())
+def test_every_tree_is_read(choices: list[int], random: object) -> None:
+    """Link n hangs on one of the links before it; the joints stand in the file in any order."""
+    names = ["root", *(f"link{n}" for n in range(len(choices)))]
+    parents = {names[n + 1]: names[choice % (n + 1)] for n, choice in enumerate(choices)}
+    pairs = [(parent, child) for child, parent in parents.items()]
+    random.shuffle(pairs)  # type: ignore[attr-defined]
+    urdf = Urdf.parse(urdf_text(pairs))
+    for name in names[1:]:
+        expected = [name]
+        while expected[-1] != "root":
+            expected.append(parents[expected[-1]])
+        assert [joint.child for joint in urdf.path_to(name)] == expected[-2::-1]
+
+
+@pytest.mark.parametrize(
+    "pairs",
+    [
+        [("root", "a"), ("b", "c"), ("c", "b")],  # a circle beside the tree
+        [("root", "a"), ("b", "a"), ("a", "b")],  # a circle that hangs in the tree
+        [("root", "a"), ("root", "b"), ("a", "c"), ("b", "c")],  # a link of two joints
+        [("a", "a")],
+    ],
+)
+def test_joints_that_are_no_tree_are_named(pairs: list[tuple[str, str]]) -> None:
+    with pytest.raises(ValueError, match=r"one tree.*joint"):
+        Urdf.parse(urdf_text(pairs))
