@@ -20,6 +20,7 @@ import numpy as np
 
 from demorec.config import EpisodePlan, GenerateConfig, VideoConfig
 from demorec.episode import CameraImages, EpisodeInfo, Frame, Outcome
+from demorec.geometry import Array
 from demorec.recording import EpisodeWriter, video
 from demorec.render import Renderer, RenderSetup
 from demorec.rollout import Rollout, make_renderer, make_world, prepare
@@ -59,9 +60,9 @@ class TimedRenderer:
         with self._clock.stage("rendering"):
             self._renderer.setup(setup)
 
-    def render(self) -> dict[str, CameraImages]:
+    def render(self, poses: Array) -> dict[str, CameraImages]:
         with self._clock.stage("rendering"):
-            return self._renderer.render()
+            return self._renderer.render(poses)
 
     def close(self) -> None:
         pass

@@ -24,7 +24,8 @@ import psutil
 from demorec.config import EpisodePlan, GenerateConfig
 from demorec.errors import RenderError
 from demorec.geometry import Array, Pose
-from demorec.render import Renderer, RenderSetup
+from demorec.render import Renderer
+from demorec.render.painter import Painter
 from demorec.rollout import Episode, Rollout, make_world, prepare
 from demorec.scene import Camera
 from demorec.sim.world import World
@@ -67,26 +68,21 @@ def run_episode(world: World, episode: Episode) -> list[State]:
     ]
 
 
-def setup_for(world: World, cameras: tuple[Camera, ...], *, antialias: bool, everything: bool) -> RenderSetup:
-    return RenderSetup(
-        client=world.client,
-        cameras=cameras,
-        mounts=world.mounts(),
-        light=world.scene.light,
-        textures=world.textures,
-        depth=everything,
-        segmentation=everything,
-        antialias=antialias,
-    )
+def painter_for(
+    renderer: Renderer, world: World, cameras: tuple[Camera, ...], *, antialias: bool, everything: bool
+) -> Painter:
+    painter = Painter(renderer)
+    painter.setup(world, cameras, depth=everything, segmentation=everything, antialias=antialias)
+    return painter
 
 
-def measure(renderer: Renderer, world: World, states: list[State]) -> float:
+def measure(painter: Painter, world: World, states: list[State]) -> float:
     """CPU milliseconds a picture over the states; placing the robot is not counted."""
     spent = 0.0
     for state in states:
         world.set_state(joint_position=state.joint_position, object_poses=state.object_poses)
         start = time.process_time()
-        renderer.render()
+        painter.images()
         spent += time.process_time() - start
     return 1e3 * spent / len(states)
 
@@ -112,12 +108,12 @@ def table(renderers: list[str], sizes: list[tuple[int, int]], rounds: int, frame
                     chosen = states[first : first + frames]
                     for variant in variants:
                         with RENDERERS.load(variant.renderer)() as renderer:
-                            renderer.setup(
-                                setup_for(world, cameras, antialias=variant.antialias, everything=variant.everything)
+                            painter = painter_for(
+                                renderer, world, cameras, antialias=variant.antialias, everything=variant.everything
                             )
-                            measure(renderer, world, chosen[:1])  # what is made once a scene
+                            measure(painter, world, chosen[:1])  # what is made once a scene
                             few = chosen if variant.renderer == "raster" else chosen[:: max(1, frames // 4)]
-                            times[variant].append(measure(renderer, world, few) / len(cameras))
+                            times[variant].append(measure(painter, world, few) / len(cameras))
                 name = " + ".join(camera.name for camera in cameras)
                 print(f"\n{width}x{height} {name}: CPU ms a picture (times faster than tiny)")
                 for variant in variants:
@@ -132,14 +128,14 @@ def draw_for(renderer_name: str, size: tuple[int, int], seconds: float, ready: A
     episode = plan(width=size[0], height=size[1])
     with make_world(episode.info) as world, RENDERERS.load(renderer_name)() as renderer:
         states = run_episode(world, episode)
-        renderer.setup(setup_for(world, episode.info.scene.cameras, antialias=True, everything=False))
-        renderer.render()
+        painter = painter_for(renderer, world, episode.info.scene.cameras, antialias=True, everything=False)
+        painter.images()
         ready.wait()
         count, end = 0, time.perf_counter() + seconds
         while time.perf_counter() < end:
             state = states[(count // 2) % len(states)]
             world.set_state(joint_position=state.joint_position, object_poses=state.object_poses)
-            count += len(renderer.render())
+            count += len(painter.images())
         counts.put(count / seconds)
 
 
@@ -169,10 +165,10 @@ def memory(pictures: int, resets: int) -> bool:
         states = run_episode(world, episode)
         for number in range(resets):
             world.reset(plan(number, width=224, height=224).info.scene)
-            renderer.setup(setup_for(world, episode.info.scene.cameras, antialias=True, everything=True))
+            painter = painter_for(renderer, world, episode.info.scene.cameras, antialias=True, everything=True)
             for step in range(pictures // resets // len(episode.info.scene.cameras)):
                 world.set_state(joint_position=states[(number + step) % len(states)].joint_position)
-                renderer.render()
+                painter.images()
             gc.collect()
             sizes.append(process.memory_info().rss / 2**20)
     settled, last = sizes[resets // 5], sizes[-1]

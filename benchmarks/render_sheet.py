@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
-from render import plan, run_episode, setup_for
+from render import painter_for, plan, run_episode
 
 from demorec.errors import RenderError
 from demorec.rollout import make_world
@@ -35,8 +35,8 @@ def main() -> int:
                 with RENDERERS.load(name)() as renderer:
                     for width, height in SIZES:
                         cameras = tuple(replace(c, width=width, height=height) for c in episode.info.scene.cameras)
-                        renderer.setup(setup_for(world, cameras, antialias=True, everything=False))
-                        for images in renderer.render().values():
+                        painter = painter_for(renderer, world, cameras, antialias=True, everything=False)
+                        for images in painter.images().values():
                             wide = round(TILE_HEIGHT * width / height)
                             nearest = Image.Resampling.NEAREST if height < TILE_HEIGHT else Image.Resampling.LANCZOS
                             row.append(np.asarray(Image.fromarray(images.color).resize((wide, TILE_HEIGHT), nearest)))

@@ -27,9 +27,9 @@ from demorec.episode import Action, CameraImages, Check, EpisodeInfo, Observatio
 from demorec.errors import ConfigError, SceneError
 from demorec.features import ActionKind, ObservationRows
 from demorec.geometry import Array
-from demorec.render import Renderer, RenderSetup
+from demorec.render.painter import Painter
 from demorec.rollout import Episode, make_world, prepare
-from demorec.scene import Camera, Scene
+from demorec.scene import Scene
 from demorec.sim.world import World
 from demorec.tables import CAMERAS, RENDERERS, TASKS
 from demorec.variation import Preset
@@ -182,8 +182,8 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         self.action_space = _box(action_bounds(info.robot, action, fps=config.fps))
         self._resources = ExitStack()
         self._world: World | None = None
-        self._renderer: Renderer | None = None
-        self._viewer: Renderer | None = None
+        self._painter: Painter | None = None
+        self._viewer: Painter | None = None
         self._viewer_is_set_up = False
         self._situation: Situation | None = None
 
@@ -247,9 +247,13 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
             self._world = self._resources.enter_context(make_world(info))
         self.world.reset(info.scene)
         if info.scene.cameras:
-            if self._renderer is None:
-                self._renderer = self._resources.enter_context(RENDERERS.load(self.config.renderer)())
-            self._renderer.setup(self._render_setup(self.episode.cameras))
+            self._painter = self._painter or self._new_painter()
+            self._painter.setup(
+                self.world,
+                self.episode.cameras,
+                true_from_recorded=self.episode.true_from_recorded,
+                antialias=self.config.antialias,
+            )
         self._viewer_is_set_up = False
         self._held = 0
         self._steps = 0
@@ -280,21 +284,20 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
             return None
         if self._situation is None:
             raise RuntimeError("the environment has no episode yet: call reset first")
-        if self._viewer is None:
-            self._viewer = self._resources.enter_context(RENDERERS.load(self.config.renderer)())
+        self._viewer = self._viewer or self._new_painter()
         if not self._viewer_is_set_up:
             width, height = self._render_size
             camera = CAMERAS.load(self._render_camera).camera(
                 self._render_camera, self.info.robot, width=width, height=height
             )
-            self._viewer.setup(self._render_setup((camera,)))
+            self._viewer.setup(self.world, (camera,), antialias=self.config.antialias)
             self._viewer_is_set_up = True
-        return self._viewer.render()[self._render_camera].color
+        return self._viewer.images()[self._render_camera].color
 
     def close(self) -> None:
         """Free the simulator and the renderers; harmless when called twice."""
         self._resources.close()
-        self._world = self._renderer = self._viewer = self._situation = None
+        self._world = self._painter = self._viewer = self._situation = None
 
     # ------------------------------------------------------------------------------------------------ parts
 
@@ -322,15 +325,8 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         # A round object has no yaw, so that its vector is shorter.
         return len({tuple(_lengths(info, privileged=True).values()) for info in infos}) == 1
 
-    def _render_setup(self, cameras: tuple[Camera, ...]) -> RenderSetup:
-        return RenderSetup(
-            client=self.world.client,
-            cameras=cameras,
-            mounts=self.world.mounts(),
-            light=self.info.scene.light,
-            antialias=self.config.antialias,
-            textures=self.world.textures,
-        )
+    def _new_painter(self) -> Painter:
+        return Painter(self._resources.enter_context(RENDERERS.load(self.config.renderer)()))
 
     def _look(self, command: Action | None) -> Situation:
         checks = self.episode.task.evaluate(self.world)
@@ -338,19 +334,11 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         return Situation(
             frame_index=self._steps,
             observation=self.world.observe(),
-            images=self._images(),
+            images={} if self._painter is None else self._painter.images(),
             command=command,
             checks=checks,
             is_success=self._held >= SUCCESS_FRAMES,
         )
-
-    def _images(self) -> dict[str, CameraImages]:
-        if self._renderer is None:
-            return {}
-        images = self._renderer.render()
-        for name, error in self.episode.true_from_recorded.items():
-            images[name] = replace(images[name], world_from_camera=images[name].world_from_camera @ error)
-        return images
 
     def _observation(self, situation: Situation) -> dict[str, Any]:
         vectors = features.observation_vectors(

@@ -10,24 +10,25 @@ import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
 from demorec.assets import allow_models
 from demorec.config import EpisodePlan, GenerateConfig, VideoConfig, read_toml
-from demorec.episode import CameraImages, EpisodeInfo, Frame, Outcome
+from demorec.episode import EpisodeInfo, Outcome
 from demorec.errors import ConfigError, DemorecError, NotAllowedError, RecordingError
 from demorec.geometry import Pose, look_at
 from demorec.plain import digest, from_plain
 from demorec.recording import EpisodeWriter, Recording
 from demorec.recording.frames import frames_of
 from demorec.registry import nearest_match
-from demorec.render import Renderer, RenderSetup
+from demorec.render import Renderer
+from demorec.render.painter import Drawable, Painter
+from demorec.render.recorded import RecordedWorld
 from demorec.rollout import prepare
 from demorec.scene import Camera, Scene
 from demorec.seeding import generator
-from demorec.sim.world import World
 from demorec.tables import CAMERAS, RENDERERS, camera_name
 from demorec.tasks.vary import vary_looks
 from demorec.user_modules import split_name
@@ -249,46 +250,28 @@ def _check_size(camera: Camera) -> None:
             raise ConfigError(f"The {what} of the camera {camera.name!r} is {value}: it must be even, 16 to 8192.")
 
 
-class Painter:
-    """Draws the present state of a world as a view asks for; a context manager that keeps the renderer warm.
+def view_painter(renderer: Renderer, world: Drawable, view: View, config: Mapping[str, Any]) -> Painter:
+    """A painter that draws a world as a view and the config of a recording ask for.
 
     Args:
-        renderer: Row of the renderers' table.
+        renderer: Entered.
+        world: In the view's scene.
+        view: Where the cameras are.
+        config: Tells depth, segmentation and antialiasing.
+
+    Raises:
+        RenderError: The renderer cannot draw a shape or camera.
     """
-
-    def __init__(self, renderer: str) -> None:
-        self._renderer: Renderer = RENDERERS.load(renderer)()
-        self._errors: Mapping[str, Pose] = {}
-
-    def __enter__(self) -> Self:
-        self._renderer.__enter__()
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        self._renderer.__exit__(*exc)
-
-    def setup(self, world: World, view: View, config: Mapping[str, Any]) -> None:
-        """Take over a world that was just reset to the view's scene; `config` is that of a recording."""
-        self._errors = view.true_from_recorded
-        self._renderer.setup(
-            RenderSetup(
-                client=world.client,
-                cameras=view.true_cameras,
-                mounts=world.mounts(),
-                light=view.scene.light,
-                textures=world.textures,
-                depth=bool(config.get("depth", False)),
-                segmentation=bool(config.get("segmentation", False)),
-                antialias=bool(config.get("antialias", True)),
-            )
-        )
-
-    def images(self) -> dict[str, CameraImages]:
-        """Camera name -> images, with the poses at which the cameras are believed to be."""
-        images = self._renderer.render()
-        for name, error in self._errors.items():
-            images[name] = replace(images[name], world_from_camera=images[name].world_from_camera @ error)
-        return images
+    painter = Painter(renderer)
+    painter.setup(
+        world,
+        view.true_cameras,
+        true_from_recorded=view.true_from_recorded,
+        depth=bool(config.get("depth", False)),
+        segmentation=bool(config.get("segmentation", False)),
+        antialias=bool(config.get("antialias", True)),
+    )
+    return painter
 
 
 def drawing_config(info: EpisodeInfo, options: RerenderOptions) -> dict[str, Any]:
@@ -341,15 +324,17 @@ def rerender(source: Path, out: Path, options: RerenderOptions, *, overwrite: bo
             origin=f"render of {recording.digest()[:16]}",
         )
         out.parent.mkdir(parents=True, exist_ok=True)
+        world = RecordedWorld(
+            info.robot, view.scene, joint_position=columns.joint_position, object_poses=columns.object_poses
+        )
         with (
-            World(info.robot, fps=info.fps) as world,
-            Painter(str(config.get("renderer", "raster"))) as painter,
+            RENDERERS.load(str(config.get("renderer", "raster")))() as renderer,
             EpisodeWriter(out, new_info, video=video, overwrite=overwrite) as writer,
         ):
-            world.reset(view.scene)
-            painter.setup(world, view, config)
+            painter = view_painter(renderer, world, view, config)
             for frame in frames_of(recording, columns):
-                writer.write(replace(frame, images=_draw(world, painter, frame)))
+                world.frame = frame.frame_index
+                writer.write(replace(frame, images=painter.images()))
             writer.finish(_outcome(recording))
         compared, differing = _compare(recording, out, options)
     return RerenderReport(
@@ -360,12 +345,6 @@ def rerender(source: Path, out: Path, options: RerenderOptions, *, overwrite: bo
         compared=compared,
         differing=differing,
     )
-
-
-def _draw(world: World, painter: Painter, frame: Frame) -> dict[str, CameraImages]:
-    observation = frame.observation
-    world.set_state(joint_position=observation.joint_position, object_poses=observation.object_poses)
-    return painter.images()
 
 
 def _outcome(recording: Recording) -> Outcome:

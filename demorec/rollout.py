@@ -21,13 +21,14 @@ import numpy as np
 
 from demorec.assets import allow_models, model_name
 from demorec.config import EpisodePlan, GenerateConfig, deciding_versions
-from demorec.episode import Action, CameraImages, EpisodeInfo, Frame, Outcome, frame_time_ns
+from demorec.episode import Action, EpisodeInfo, Frame, Outcome, frame_time_ns
 from demorec.errors import ConfigError
 from demorec.features import NOISE_LETS_GO
 from demorec.geometry import Array, Pose
 from demorec.motion import angle_between
 from demorec.plain import digest, to_plain
-from demorec.render import Renderer, RenderSetup
+from demorec.render import Renderer
+from demorec.render.painter import Painter
 from demorec.scene import Camera, Scene
 from demorec.seeding import Purpose, generator
 from demorec.sim.world import World
@@ -223,18 +224,15 @@ class Rollout:
         """Yield one frame per control step; SceneError or RenderError when the scene cannot be built or drawn."""
         world, info, config = self.world, self.episode.info, self.episode.plan.config
         world.reset(info.scene)
-        if self.renderer is not None:
-            self.renderer.setup(
-                RenderSetup(
-                    client=world.client,
-                    cameras=self.episode.cameras,
-                    mounts=world.mounts(),
-                    light=info.scene.light,
-                    textures=world.textures,
-                    depth=config.depth,
-                    segmentation=config.segmentation,
-                    antialias=config.antialias,
-                )
+        painter = None if self.renderer is None else Painter(self.renderer)
+        if painter is not None:
+            painter.setup(
+                world,
+                self.episode.cameras,
+                true_from_recorded=self.episode.true_from_recorded,
+                depth=config.depth,
+                segmentation=config.segmentation,
+                antialias=config.antialias,
             )
         expert = Expert(world, self.episode.behaviour)
         noise = ActionNoise(
@@ -256,7 +254,7 @@ class Rollout:
                 command=noise.command(step),
                 phase=step.phase,
                 events=step.events,
-                images=self._images(),
+                images={} if painter is None else painter.images(),
                 joint_samples=world.joint_samples,
                 is_deliberate_miss=step.is_deliberate_miss,
             )
@@ -269,15 +267,6 @@ class Rollout:
         elif gave_up:
             stopped = (gave_up[0].phase, gave_up[0].reason)
         self.outcome = self._judge(expert, num_frames, stopped)
-
-    def _images(self) -> dict[str, CameraImages]:
-        """Pictures from where the cameras are, with the poses at which they are believed to be."""
-        if self.renderer is None:
-            return {}
-        images = self.renderer.render()
-        for name, error in self.episode.true_from_recorded.items():
-            images[name] = replace(images[name], world_from_camera=images[name].world_from_camera @ error)
-        return images
 
     def _steps(self, expert: Expert, gave_up: list[GaveUp]) -> Iterator[Step]:
         """The script; when the expert gives up, one step more, which carries the events that say why."""

@@ -251,6 +251,11 @@ class Scene:
         raise KeyError(name)
 
     @property
+    def fixed(self) -> tuple[Body, ...]:
+        """The bodies that stand still; worlds load and number them first, then the robot, then what is movable."""
+        return tuple(body for body in self.bodies if not body.movable)
+
+    @property
     def movable(self) -> tuple[Body, ...]:
         """The bodies whose poses are recorded at every frame."""
         return tuple(body for body in self.bodies if body.movable)

@@ -50,8 +50,8 @@ RENDERERS: Registry[type[Renderer]] = Registry(
     kind="renderer",
     rows={
         "raster": "demorec.render.raster:RasterRenderer",
-        "tiny": "demorec.render.tiny:TinyRenderer",
-        "egl": "demorec.render.egl:EglRenderer",
+        "tiny": "demorec.sim.renderers.tiny:TinyRenderer",
+        "egl": "demorec.sim.renderers.egl:EglRenderer",
     },
 )
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
@@ -150,6 +150,17 @@ class Urdf:
                 poses[joint.child] = poses[joint.parent] @ joint.parent_from_joint @ moved
             waiting = [joint for joint in waiting if joint.child not in poses]
         return poses
+
+    def depth_first(self) -> tuple[UrdfJoint, ...]:
+        """Every joint below the root, in the order in which PyBullet numbers the links that hang on them."""
+
+        def below(link: str) -> Iterator[UrdfJoint]:
+            for joint in self.joints:
+                if joint.parent == link:
+                    yield joint
+                    yield from below(joint.child)
+
+        return tuple(below(self.root))
 
     def path_to(self, link: str) -> tuple[UrdfJoint, ...]:
         """The joints from the root to `link`; KeyError when there is no such link."""

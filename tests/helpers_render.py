@@ -12,9 +12,12 @@ import pybullet_data
 from numpy.typing import NDArray
 from pybullet_utils.bullet_client import BulletClient
 
+from demorec.episode import CameraImages
 from demorec.geometry import Pose, look_at
-from demorec.render import RenderSetup
-from demorec.scene import Camera
+from demorec.render import Mount, Renderer, RenderSetup, VisualBody
+from demorec.scene import Camera, RobotPlacement, Scene, Texture
+from demorec.sim.renderers.client_renderer import view_matrix
+from demorec.sim.visuals import body_poses, shape_rows, visual_bodies
 
 DATA = pybullet_data.getDataPath()
 
@@ -39,9 +42,33 @@ def camera(width: int = 224, height: int = 224, **changes: Any) -> Camera:
     return replace(base, **changes)
 
 
-def setup(client: Any, *cameras: Camera, **changes: Any) -> RenderSetup:
-    """A setup with depth and segmentation."""
-    return RenderSetup(**({"client": client, "cameras": cameras, "depth": True, "segmentation": True} | changes))
+def setup(client: Any, *cameras: Camera, textures: dict[int, Texture] | None = None, **changes: Any) -> RenderSetup:
+    """A setup of a client's bodies, with depth and segmentation."""
+    bodies = visual_bodies(client, shape_rows(client), names={}, textures=textures or {})
+    return RenderSetup(**({"bodies": bodies, "cameras": cameras, "depth": True, "segmentation": True} | changes))
+
+
+class ClientWorld:
+    """A client as a `demorec.render.painter.Drawable`."""
+
+    def __init__(self, client: Any) -> None:
+        self.client = client
+        home = RobotPlacement(name="none", world_from_base=Pose(), joint_position=(), gripper_width=0.0)
+        self.scene = Scene(robot=home, bodies=())
+
+    def visuals(self) -> tuple[VisualBody, ...]:
+        return visual_bodies(self.client, shape_rows(self.client), names={}, textures={})
+
+    def mounts(self) -> dict[str, Mount]:
+        return {}
+
+    def poses(self) -> Any:
+        return body_poses(self.client)
+
+
+def draw(renderer: Renderer, client: Any) -> dict[str, CameraImages]:
+    """What a renderer that was set up for a client sees in its present state."""
+    return renderer.render(body_poses(client))
 
 
 def add(client: Any, kind: str, size: tuple[float, ...], pose: Pose | None = None, **visual: Any) -> int:
@@ -183,15 +210,13 @@ def panda_cameras(width: int, height: int) -> tuple[Camera, Camera]:
     return front, wrist
 
 
-def panda_mounts(bodies: dict[str, Any]) -> dict[str, tuple[int, int]]:
+def panda_mounts(bodies: dict[str, Any]) -> dict[str, Mount]:
     """Where the wrist camera is."""
-    return {"hand": (bodies["panda"], 8)}
+    return {"hand": Mount(body=bodies["panda"], link=8)}
 
 
 def centred_tiny_segmentation(client: Any, cam: Camera, world_from_camera: Pose) -> NDArray[np.int32]:
     """TinyRenderer's segmentation with its half pixel taken out: it samples pixels at their corner."""
-    from demorec.render.tiny import _view_matrix
-
     projection = np.array(
         client.computeProjectionMatrixFOV(math.degrees(cam.fov_y), cam.width / cam.height, cam.near, cam.far)
     )
@@ -201,7 +226,7 @@ def centred_tiny_segmentation(client: Any, cam: Camera, world_from_camera: Pose)
     _, _, _, _, labels = client.getCameraImage(
         cam.width,
         cam.height,
-        viewMatrix=_view_matrix(world_from_camera),
+        viewMatrix=view_matrix(world_from_camera),
         projectionMatrix=projection.tolist(),
         flags=client.ER_SEGMENTATION_MASK_OBJECT_AND_LINKINDEX,
         renderer=client.ER_TINY_RENDERER,

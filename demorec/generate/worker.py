@@ -20,6 +20,7 @@ from demorec.episode import CameraImages, EpisodeInfo
 from demorec.errors import ConfigError, SceneError
 from demorec.generate.recordings import inspect_recording
 from demorec.generate.run_file import EPISODES, FAILED, STARTING, UNFINISHED, Attempt, recording_name, sync_folder
+from demorec.geometry import Array
 from demorec.own_versions import version_differences
 from demorec.recording import EpisodeWriter
 from demorec.render import Renderer, RenderSetup
@@ -141,9 +142,9 @@ class _Stopwatch:
         with _measured(self._seconds, RENDERING):
             self._renderer.setup(setup)
 
-    def render(self) -> dict[str, CameraImages]:
+    def render(self, poses: Array) -> dict[str, CameraImages]:
         with _measured(self._seconds, RENDERING):
-            return self._renderer.render()
+            return self._renderer.render(poses)
 
     def close(self) -> None:
         """Left to the workshop, which owns the renderer."""

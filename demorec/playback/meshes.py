@@ -9,7 +9,6 @@ from __future__ import annotations
 import functools
 import hashlib
 import tempfile
-import xml.etree.ElementTree as ET
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,7 +23,7 @@ from demorec.assets import mesh_path
 from demorec.errors import DemorecError, RecordingError
 from demorec.geometry import Pose
 from demorec.scene import Rgba
-from demorec.urdf import parse_xml, quat_from_rpy
+from demorec.urdf_shapes import UrdfShape, read_links
 
 MAX_TRIANGLES = 2500
 """Of one mesh file."""
@@ -84,55 +83,30 @@ def urdf_meshes(text: str, folder: Path | None, scale: float = 1.0) -> dict[str,
 
     Raises:
         RecordingError: A mesh file cannot be read.
+        ValueError: The text is no URDF.
     """
-    robot = parse_xml(text)
-    materials = {
-        name: rgba for element in robot.iter("material") if (name := element.get("name")) and (rgba := _rgba(element))
-    }
     links = {}
-    for link in robot.findall("link"):
-        meshes = [
-            mesh
-            for visual in link.findall("visual")
-            if (mesh := _visual_mesh(visual, folder, scale, materials)) is not None
-        ]
+    for link in read_links(text, scale=scale):
+        meshes = [mesh for shape in link.visuals if (mesh := _shape_mesh(shape, folder)) is not None]
         if meshes:
-            links[link.attrib["name"]] = joined(meshes)
+            links[link.name] = joined(meshes)
     return links
 
 
-def _visual_mesh(visual: ET.Element, folder: Path | None, scale: float, materials: dict[str, Rgba]) -> Mesh | None:
-    rgba: Rgba = (1.0, 1.0, 1.0, 1.0)
-    material = visual.find("material")
-    if material is not None:
-        rgba = _rgba(material) or materials.get(material.get("name", ""), rgba)
-    pose = Pose()
-    origin = visual.find("origin")
-    if origin is not None:
-        pose = Pose(
-            position=np.array(_numbers(origin.get("xyz", "0 0 0"))) * scale,
-            quat_xyzw=quat_from_rpy(_numbers(origin.get("rpy", "0 0 0"))),
-        )
-    shape = visual.find("geometry/*")
-    if shape is None:
-        return None
-    size = np.full(3, scale)
-    if shape.tag == "mesh":
-        size = size * np.array(_numbers(shape.get("scale", "1 1 1")))
-        mesh = mesh_file(_mesh_path(folder, shape.attrib["filename"]))
-    elif shape.tag == "box":
-        mesh = of_trimesh(trimesh.creation.box(extents=_numbers(shape.attrib["size"])))
-    elif shape.tag == "sphere":
-        mesh = sphere_mesh(float(shape.attrib["radius"]))
-    elif shape.tag in ("cylinder", "capsule"):
-        mesh = of_trimesh(
-            trimesh.creation.cylinder(
-                radius=float(shape.attrib["radius"]), height=float(shape.attrib["length"]), sections=32
-            )
-        )
-    else:
-        return None
-    return mesh.placed(pose, size, rgba)
+def _shape_mesh(shape: UrdfShape, folder: Path | None) -> Mesh | None:
+    scale: NDArray[np.float64] = np.ones(3)
+    match shape.kind:
+        case "mesh":
+            mesh, scale = mesh_file(_mesh_path(folder, shape.file)), np.array(shape.size)
+        case "box":
+            mesh = of_trimesh(trimesh.creation.box(extents=shape.size))
+        case "sphere":
+            mesh = sphere_mesh(shape.size[0])
+        case "cylinder" | "capsule":
+            mesh = of_trimesh(trimesh.creation.cylinder(radius=shape.size[0], height=shape.size[1], sections=32))
+        case "plane":
+            return None
+    return mesh.placed(shape.link_from_shape, scale, shape.rgba or (1.0, 1.0, 1.0, 1.0))
 
 
 def sphere_mesh(radius: float) -> Mesh:
@@ -231,15 +205,3 @@ def of_trimesh(mesh: Any, rgba: NDArray[np.uint8] | None = None) -> Mesh:
         triangles=np.asarray(shaded.faces, dtype=np.uint32),
         colors=np.tile(color, (len(shaded.vertices), 1)),
     )
-
-
-def _rgba(material: ET.Element) -> Rgba | None:
-    color = material.find("color")
-    if color is None:
-        return None
-    r, g, b, a = _numbers(color.attrib["rgba"])
-    return (r, g, b, a)
-
-
-def _numbers(text: str) -> list[float]:
-    return [float(word) for word in text.split()]

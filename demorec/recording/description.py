@@ -18,6 +18,7 @@ from demorec.geometry import Array, Pose
 from demorec.recording.shapes import Primitive, fit_primitives
 from demorec.scene import Body, Rgba
 from demorec.urdf import quat_from_rpy
+from demorec.urdf_shapes import UrdfShape, read_links
 
 _WHITE: Rgba = (1.0, 1.0, 1.0, 1.0)
 
@@ -30,25 +31,16 @@ def robot_description(urdf: str, scale: float) -> str:
         SceneError: The URDF or one of its meshes cannot be read.
     """
     path = asset_path(urdf)
-    source = ET.parse(path).getroot()
-    colors = {
-        name: color
-        for material in source.iter("material")
-        if (name := material.get("name")) and (color := _color(material)) is not None
-    }
+    text = path.read_text()
+    source = ET.fromstring(text)
     robot = ET.Element("robot", name=source.get("name", "robot"))
-    for link in source.findall("link"):
-        target = ET.SubElement(robot, "link", name=link.attrib["name"])
-        visuals = link.findall("visual")
+    for link in read_links(text, scale=scale):
+        target = ET.SubElement(robot, "link", name=link.name)
         # Collision shapes are simpler to begin with; their pose may differ from the picture's.
-        shapes = link.findall("collision") if len(link.findall("collision")) == len(visuals) else visuals
-        for visual, shape in zip(visuals, shapes, strict=True):
-            material = visual.find("material")
-            rgba = _WHITE
-            if material is not None:
-                rgba = _color(material) or colors.get(material.get("name", ""), _WHITE)
-            for primitive, pose in _primitives(shape, path.parent, scale):
-                _add_visual(target, primitive, pose, rgba)
+        shapes = link.collisions if len(link.collisions) == len(link.visuals) else link.visuals
+        for visual, shape in zip(link.visuals, shapes, strict=True):
+            for primitive in _primitives(shape, path.parent):
+                _add_visual(target, primitive, shape.link_from_shape, visual.rgba or _WHITE)
     for joint in source.findall("joint"):
         robot.append(_joint(joint, scale))
     return _text(robot)
@@ -85,34 +77,21 @@ def _body_primitives(body: Body) -> Iterator[tuple[Primitive, Pose]]:
             yield primitive, shape.body_from_mesh
     else:
         path = asset_path(shape.file)
-        for link in ET.parse(path).getroot().findall("link"):
-            for visual in link.findall("visual"):
-                yield from _primitives(visual, path.parent, shape.scale)
+        for link in read_links(path.read_text(), scale=shape.scale):
+            for visual in link.visuals:
+                for primitive in _primitives(visual, path.parent):
+                    yield primitive, visual.link_from_shape
 
 
-def _primitives(element: ET.Element, folder: Path, scale: float) -> Iterator[tuple[Primitive, Pose]]:
-    """The geometry of a <visual> or <collision> as primitives in a frame, and that frame in the link's."""
-    origin = element.find("origin")
-    pose = Pose()
-    if origin is not None:
-        xyz = np.array([float(v) * scale for v in origin.get("xyz", "0 0 0").split()])
-        pose = Pose(position=xyz, quat_xyzw=quat_from_rpy([float(v) for v in origin.get("rpy", "0 0 0").split()]))
-    geometry = element.find("geometry")
-    for shape in () if geometry is None else geometry:
-        center = (0.0, 0.0, 0.0)
-        if shape.tag == "box":
-            size = tuple(float(v) * scale for v in shape.attrib["size"].split())
-            yield Primitive(kind="box", center=center, axis=2, size=size, volume=0.0), pose
-        elif shape.tag == "sphere":
-            size = (float(shape.attrib["radius"]) * scale,)
-            yield Primitive(kind="sphere", center=center, axis=2, size=size, volume=0.0), pose
-        elif shape.tag in ("cylinder", "capsule"):
-            size = (float(shape.attrib["radius"]) * scale, float(shape.attrib["length"]) * scale)
-            yield Primitive(kind="cylinder", center=center, axis=2, size=size, volume=0.0), pose
-        elif shape.tag == "mesh":
-            own = tuple(float(v) * scale for v in shape.get("scale", "1 1 1").split())
-            for primitive in _mesh_primitives(mesh_path(folder, shape.attrib["filename"]), own):
-                yield primitive, pose
+def _primitives(shape: UrdfShape, folder: Path) -> Iterator[Primitive]:
+    """A shape of a URDF as primitives in its own frame."""
+    center = (0.0, 0.0, 0.0)
+    if shape.kind == "mesh":
+        yield from _mesh_primitives(mesh_path(folder, shape.file), shape.size)
+    elif shape.kind in ("box", "sphere"):
+        yield Primitive(kind=shape.kind, center=center, axis=2, size=shape.size, volume=0.0)
+    elif shape.kind in ("cylinder", "capsule"):
+        yield Primitive(kind="cylinder", center=center, axis=2, size=shape.size, volume=0.0)
 
 
 @functools.lru_cache(maxsize=256)
@@ -188,14 +167,6 @@ def _joint(source: ET.Element, scale: float) -> ET.Element:
             for bound in ("lower", "upper"):
                 copy.set(bound, _numbers([float(child.get(bound, "0")) * scale]))
     return joint
-
-
-def _color(material: ET.Element) -> Rgba | None:
-    color = material.find("color")
-    if color is None:
-        return None
-    r, g, b, a = (float(v) for v in color.attrib["rgba"].split())
-    return (r, g, b, a)
 
 
 def _numbers(values: Sequence[float]) -> str:

@@ -68,18 +68,11 @@ def segment_names(info: EpisodeInfo) -> Iterator[tuple[int, str]]:
     PyBullet does: depth first, in the order of the URDF's joints.
     """
     yield BACKGROUND, "background"
-    fixed = [body.name for body in info.scene.bodies if not body.movable]
+    fixed = [body.name for body in info.scene.fixed]
     for index, name in enumerate([*fixed, info.robot.name, *(body.name for body in info.scene.movable)]):
         if index != len(fixed):
             yield index, name
             continue
         urdf = Urdf.load(asset_path(info.robot.urdf))
-        for link_index, link in enumerate(_depth_first(urdf, urdf.root), start=-1):
+        for link_index, link in enumerate([urdf.root, *(joint.child for joint in urdf.depth_first())], start=-1):
             yield index + ((link_index + 1) << _LINK_SHIFT), f"{name}/{link}"
-
-
-def _depth_first(urdf: Urdf, link: str) -> Iterator[str]:
-    yield link
-    for joint in urdf.joints:
-        if joint.parent == link:
-            yield from _depth_first(urdf, joint.child)

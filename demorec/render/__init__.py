@@ -1,52 +1,116 @@
-"""Pictures of a world's state: colour, depth, segmentation, through any of several renderers."""
+"""Pictures of bodies whose shapes and poses are plain data: colour, depth, segmentation, by any of several renderers.
+
+Where shapes and poses come from does not matter to a renderer: from the simulator (`demorec.sim.world.World`) or from a
+recording (`demorec.render.recorded.RecordedWorld`). `demorec.render.painter` brings the two together.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Literal, Protocol
 
 from demorec.episode import CameraImages
-from demorec.scene import Camera, Light, Texture
+from demorec.geometry import Array, Pose
+from demorec.scene import Camera, Light, Rgba, Texture
+
+VisualKind = Literal["box", "sphere", "cylinder", "capsule", "mesh", "plane"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Visual:
+    """One shape that can be seen.
+
+    Attributes:
+        link: Number of the link that carries it; the body's base is -1.
+        kind: Which geometry; decides what `size` means.
+        size: box: (x, y, z) full extents, metres; sphere: (radius,); cylinder and capsule: (radius, length) along z;
+            mesh: (x, y, z) factors by which the file is scaled; plane (z = 0, without end): ().
+        file: mesh: path of an OBJ, STL or COLLADA file; otherwise "".
+        link_from_shape: Pose in the frame whose pose `Renderer.render` is given for the link.
+        rgba: Colour, 0..1; nothing is drawn with alpha 0.
+    """
+
+    link: int
+    kind: VisualKind
+    size: tuple[float, ...]
+    file: str = ""
+    link_from_shape: Pose
+    rgba: Rgba
+
+
+@dataclass(frozen=True, kw_only=True)
+class VisualBody:
+    """All that can be seen of one body.
+
+    Attributes:
+        name: For messages.
+        num_links: Beside the base.
+        is_fixed: Whether physics cannot move its base.
+        visuals: Its shapes.
+        texture: Procedural texture that covers them, or None.
+    """
+
+    name: str
+    num_links: int
+    is_fixed: bool
+    visuals: tuple[Visual, ...]
+    texture: Texture | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mount:
+    """A link that can carry cameras.
+
+    Attributes:
+        body, link: Numbers of the body and of its link; the base is -1.
+        link_from_mount: Pose of the mount's frame in the one whose pose `Renderer.render` is given; None: the same.
+    """
+
+    body: int
+    link: int
+    link_from_mount: Pose | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
 class RenderSetup:
-    """What a renderer needs to know about a freshly built world.
+    """What a renderer needs to know about a scene, but for where things are.
 
     Attributes:
-        client: The PyBullet client (`BulletClient`) that holds the scene.
+        bodies: What can be seen. Segmentation pictures number a body by its place here.
         cameras: The cameras to draw, in order.
-        mounts: mount name -> (body index, link index) of the links that carry cameras; base link is -1.
+        mounts: Mount name -> the link that carries its cameras.
         light: Light and sky.
         depth, segmentation: Whether these are drawn beside colour.
         antialias: Whether edges are smoothed, where the renderer can.
-        textures: body index -> procedural texture, of the bodies that have one (`World.textures`): PyBullet cannot
-            be asked for the pixels of a texture that was set on a shape.
     """
 
-    client: Any
+    bodies: tuple[VisualBody, ...]
     cameras: tuple[Camera, ...]
-    mounts: Mapping[str, tuple[int, int]] = field(default_factory=dict)
+    mounts: Mapping[str, Mount] = field(default_factory=dict)
     light: Light = field(default_factory=Light)
     depth: bool = False
     segmentation: bool = False
     antialias: bool = True
-    textures: Mapping[int, Texture] = field(default_factory=dict)
 
 
 class Renderer(Protocol):
-    """Draws the present state of a PyBullet client; a context manager, warm across scenes.
+    """Draws bodies; a context manager, warm across scenes.
 
-    `setup` is called after each reset of the scene, `render` at each frame. Pictures are a function of the
-    client's state, the light and the cameras alone, on one type of machine.
+    `setup` is called for each scene and whenever its looks change, `render` at each frame. Pictures are a function of
+    setup and poses alone, on one type of machine.
     """
 
     def setup(self, setup: RenderSetup) -> None:
-        """Take over a freshly built scene; RenderError names a shape or mesh that cannot be drawn."""
+        """Take over a scene; RenderError names a shape, mesh or camera that cannot be drawn."""
 
-    def render(self) -> dict[str, CameraImages]:
-        """Camera name -> images of the present state, in the order of the cameras."""
+    def render(self, poses: Array) -> dict[str, CameraImages]:
+        """Camera name -> images, in the order of the cameras.
+
+        Args:
+            poses: (n, 7) position (metres) and quaternion xyzw in the world: of each body in turn its base, then its
+                links; `first_rows` tells where each body begins.
+        """
 
     def close(self) -> None:
         """Free what is held; harmless when called twice."""
@@ -54,6 +118,15 @@ class Renderer(Protocol):
     def __enter__(self) -> Renderer: ...
 
     def __exit__(self, *exc: object) -> None: ...
+
+
+def first_rows(bodies: Sequence[VisualBody]) -> list[int]:
+    """Row of each body's base in the poses that `Renderer.render` is given; link n is n + 1 rows below it."""
+    rows, count = [], 0
+    for body in bodies:
+        rows.append(count)
+        count += 1 + body.num_links
+    return rows
 
 
 def prepare(renderer: str) -> None:

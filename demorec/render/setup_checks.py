@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
 from demorec.errors import RenderError
-from demorec.geometry import Pose
-from demorec.render import RenderSetup
+from demorec.geometry import Array, Pose
+from demorec.render import RenderSetup, first_rows
 from demorec.scene import Camera
 
 MAX_SAMPLES = 1 << 28
@@ -44,17 +42,12 @@ def check_camera(camera: Camera, *, antialias: bool) -> None:
         raise RenderError(f"Camera {camera.name!r} has a field of view of {camera.fov_y} rad: allowed is 0 to pi.")
 
 
-def world_from_camera(setup: RenderSetup, camera: Camera) -> Pose:
-    """Present pose of a camera, OpenCV axes."""
+def world_from_camera(setup: RenderSetup, camera: Camera, poses: Array) -> Pose:
+    """Pose of a camera, OpenCV axes, with `poses` as `Renderer.render` is given them."""
     if camera.mount == "world":
         return camera.mount_from_camera
-    body, link = setup.mounts[camera.mount]
-    if link < 0:
-        position, quat = setup.client.getBasePositionAndOrientation(body)
-        inertial = setup.client.getDynamicsInfo(body, -1)
-        centre = Pose(position=np.array(inertial[3]), quat_xyzw=np.array(inertial[4]))
-        world_from_mount = Pose(position=np.array(position), quat_xyzw=np.array(quat)) @ centre.inverse()
-    else:
-        state = setup.client.getLinkState(body, link, computeForwardKinematics=True)
-        world_from_mount = Pose(position=np.array(state[4]), quat_xyzw=np.array(state[5]))
+    mount = setup.mounts[camera.mount]
+    row = poses[first_rows(setup.bodies)[mount.body] + 1 + mount.link]
+    world_from_link = Pose(position=row[:3], quat_xyzw=row[3:])
+    world_from_mount = world_from_link if mount.link_from_mount is None else world_from_link @ mount.link_from_mount
     return world_from_mount @ camera.mount_from_camera

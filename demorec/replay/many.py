@@ -13,11 +13,12 @@ from demorec.episode import Frame, Outcome
 from demorec.errors import ConfigError
 from demorec.plain import from_plain
 from demorec.recording import EpisodeWriter
+from demorec.render.painter import Painter
 from demorec.replay.demonstration import Demonstration, ReplayOptions
 from demorec.replay.drive import ReplayReport, replay
-from demorec.rerender import Painter, recorded_view
+from demorec.rerender import recorded_view, view_painter
 from demorec.sim.world import World
-from demorec.tables import TASKS
+from demorec.tables import RENDERERS, TASKS
 
 
 def replay_all(
@@ -81,15 +82,16 @@ def record_replay(
     video = from_plain(config.get("video", {}), VideoConfig)
     num_frames = 0
     with ExitStack() as stack:
-        painter = None
+        renderer = None
         if info.scene.cameras:
-            painter = stack.enter_context(Painter(str(config.get("renderer", "raster"))))
+            renderer = stack.enter_context(RENDERERS.load(str(config.get("renderer", "raster")))())
+        painter: Painter | None = None
         writer = stack.enter_context(EpisodeWriter(path, info, video=video, overwrite=overwrite))
 
         def sink(frame: Frame) -> None:
-            nonlocal num_frames
-            if painter is not None and num_frames == 0:
-                painter.setup(world, view, config)
+            nonlocal num_frames, painter
+            if renderer is not None and painter is None:
+                painter = view_painter(renderer, world, view, config)  # the world is in its scene only now
             num_frames += 1
             images = {} if painter is None else painter.images()
             writer.write(replace(d.labelled(frame), images=images))

@@ -2,14 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
-from pathlib import Path
 from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
-from PIL import Image
 
 from demorec.assets import asset_path
 from demorec.errors import DemorecError, SceneError
@@ -69,21 +62,6 @@ def add_body(client: Any, body: Body) -> int:
         if not body.collides:
             client.setCollisionFilterGroupMask(index, link, 0, 0)
     return int(index)
-
-
-def cover(client: Any, index: int, pixels: NDArray[np.uint8]) -> None:
-    """Cover all faces of a body with a picture (H, W, 3)."""
-    descriptor, name = tempfile.mkstemp(suffix=".png", prefix="demorec_texture_")
-    path = Path(name)
-    try:
-        # PyBullet takes textures from files only.
-        with os.fdopen(descriptor, "wb") as file:
-            Image.fromarray(pixels).save(file, format="png")
-        texture = int(client.loadTexture(name))
-    finally:
-        path.unlink()
-    for link in range(-1, client.getNumJoints(index)):
-        client.changeVisualShape(index, link, textureUniqueId=texture)
 
 
 def _geometry(client: Any, shape: Shape, *, length_name: str) -> dict[str, Any]:

@@ -15,12 +15,13 @@ import numpy as np
 from demorec.episode import Action, JointSample, Observation, RobotSpec, frame_time_ns
 from demorec.errors import ConfigError, SceneError
 from demorec.geometry import Array, Pose
-from demorec.scene import Body, Physics, Scene, Texture
+from demorec.render import Mount, VisualBody
+from demorec.scene import Body, Physics, Scene
 from demorec.sim.arm import Arm
-from demorec.sim.bodies import add_body, cover
+from demorec.sim.bodies import add_body
 from demorec.sim.client import connect
 from demorec.sim.hold import ConstraintHold
-from demorec.textures import texture_pixels
+from demorec.sim.visuals import ShapeRows, base_from_inertial, body_poses, shape_rows, visual_bodies
 
 SETTLE_SECONDS = 0.1
 """Physics time before the first frame, so that objects rest on their support."""
@@ -39,13 +40,13 @@ class World:
         self.robot = robot
         self.fps = fps
         self.client: Any = connect()
-        self.textures: dict[int, Texture] = {}
-        """Body index -> procedural texture, of the bodies that have one; empty for a scene without cameras."""
         self.joint_samples: tuple[JointSample, ...] = ()
         """Of the last control step, both ends left out."""
         self._sample_joints = sample_joints
         self._closed = False
         self._scene: Scene | None = None
+        self._shape_rows: ShapeRows = ()
+        self._visuals: tuple[VisualBody, ...] = ()
 
     def __enter__(self) -> Self:
         return self
@@ -84,38 +85,23 @@ class World:
         self._substeps = scene.physics.hz // self.fps
         self._steps = 0
         self.joint_samples = ()
-        self.textures = {}
+        self._shape_rows, self._visuals = (), ()
         self.client.resetSimulation()
         _set_engine(self.client, scene.physics)
         self._bodies: dict[str, int] = {}
         self._specs: dict[str, Body] = {body.name: body for body in scene.bodies}
-        # Fixed order: what stands still, the robot, what moves.
-        for body in scene.bodies:
-            if not body.movable:
-                self._bodies[body.name] = self._add(body)
+        for body in scene.fixed:
+            self._bodies[body.name] = add_body(self.client, body)
         self.arm = Arm(self.client, self.robot, scene.robot)
-        for body in scene.bodies:
-            if body.movable:
-                self._bodies[body.name] = self._add(body)
-        self._inertial = {
-            name: Pose(position=np.array(row[3]), quat_xyzw=np.array(row[4]))
-            for name, index in self._bodies.items()
-            for row in [self.client.getDynamicsInfo(index, -1)]
-        }
+        for body in scene.movable:
+            self._bodies[body.name] = add_body(self.client, body)
+        self._inertial = {name: base_from_inertial(self.client, index) for name, index in self._bodies.items()}
         movable = [self._bodies[body.name] for body in scene.movable]
         self._hold = ConstraintHold(self.client, self.arm, movable) if scene.hold == "constraint" else None
         self.arm.command(self._stay())
         for _ in range(round(SETTLE_SECONDS * scene.physics.hz)):
             self.arm.drive(self.arm.target)
             self.client.stepSimulation()
-
-    def _add(self, body: Body) -> int:
-        index = add_body(self.client, body)
-        # Nothing but pictures needs textures.
-        if body.texture is not None and self.scene.cameras:
-            cover(self.client, index, texture_pixels(body.texture))
-            self.textures[index] = body.texture
-        return index
 
     def _stay(self) -> Action:
         q = self.arm.target
@@ -175,9 +161,31 @@ class World:
         """PyBullet's index of a body of the scene; KeyError when there is none."""
         return self._bodies[name]
 
-    def mounts(self) -> dict[str, tuple[int, int]]:
-        """Robot link name -> (body index, link index), for cameras."""
-        return {name: (self.arm.body, link) for name, link in self.arm.links.items()}
+    def visuals(self) -> tuple[VisualBody, ...]:
+        """What can be seen, in the order of loading; the same object as long as no colour or shape is changed.
+
+        Raises:
+            RenderError: A shape that no renderer draws.
+        """
+        rows = shape_rows(self.client)
+        if rows != self._shape_rows or not self._visuals:
+            names = {index: name for name, index in self._bodies.items()} | {self.arm.body: self.robot.name}
+            textures = {self._bodies[body.name]: body.texture for body in self.scene.bodies if body.texture is not None}
+            self._shape_rows = rows
+            self._visuals = visual_bodies(self.client, rows, names=names, textures=textures)
+        return self._visuals
+
+    def mounts(self) -> dict[str, Mount]:
+        """Links of the robot, by name, for cameras."""
+        to_base = base_from_inertial(self.client, self.arm.body).inverse()
+        return {
+            name: Mount(body=self.arm.body, link=link, link_from_mount=to_base if link == -1 else None)
+            for name, link in self.arm.links.items()
+        }
+
+    def poses(self) -> Array:
+        """(n, 7) poses of all bodies and links now, as `demorec.render.Renderer.render` takes them."""
+        return body_poses(self.client)
 
     def pose(self, name: str) -> Pose:
         """`world_from_body` of a body of the scene."""

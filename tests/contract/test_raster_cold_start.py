@@ -27,7 +27,7 @@ scenes.add(client, "mesh", (1.0, 1.0, 1.0), fileName=scenes.DATA + "/franka_pand
 scenes.add(client, "sphere", (0.08,), mass=1.0)
 with RasterRenderer() as raster:
     raster.setup(scenes.setup(client, scenes.camera(160, 120)))
-    image = raster.render()["front"]
+    image = scenes.draw(raster, client)["front"]
 kernels = [
     value
     for module in (antialias, records, shade, still, triangles, vertices)

@@ -95,7 +95,7 @@ def test_pictures_have_the_promised_shapes(stage: Stage, width: int, height: int
     scenes.add(stage.client, "box", (0.2, 0.2, 0.2))
     camera = scenes.camera(width, height)
     stage.renderer.setup(scenes.setup(stage.client, camera))
-    images = stage.renderer.render()["front"]
+    images = scenes.draw(stage.renderer, stage.client)["front"]
     assert images.color.shape == (height, width, 3)
     assert images.color.dtype == np.uint8
     assert images.color.flags.c_contiguous
@@ -107,7 +107,7 @@ def test_pictures_have_the_promised_shapes(stage: Stage, width: int, height: int
     assert images.segmentation.dtype == np.int32
     assert images.world_from_camera == camera.mount_from_camera
     stage.renderer.setup(scenes.setup(stage.client, camera, depth=False, segmentation=False))
-    images = stage.renderer.render()["front"]
+    images = scenes.draw(stage.renderer, stage.client)["front"]
     assert images.depth is None
     assert images.segmentation is None
 
@@ -116,7 +116,7 @@ def test_several_cameras_come_in_order(stage: Stage) -> None:
     scenes.add(stage.client, "box", (0.2, 0.2, 0.2))
     one, two = scenes.camera(name="b"), scenes.camera(64, 48, name="a")
     stage.renderer.setup(scenes.setup(stage.client, one, two))
-    images = stage.renderer.render()
+    images = scenes.draw(stage.renderer, stage.client)
     assert list(images) == ["b", "a"]
     assert images["a"].color.shape == (48, 64, 3)
 
@@ -176,7 +176,7 @@ def test_every_mesh_format_is_drawn_as_tiny_draws_it(stage: Stage, file: str) ->
 
 def _render(renderer: Renderer, client: Any, camera: Any, **changes: Any) -> Any:
     renderer.setup(scenes.setup(client, camera, **changes))
-    return renderer.render()[camera.name]
+    return scenes.draw(renderer, client)[camera.name]
 
 
 def test_depth_of_a_table_is_the_planes(stage: Stage) -> None:
@@ -253,13 +253,13 @@ def test_links_have_their_numbers_and_follow_their_joints(stage: Stage) -> None:
     bodies = scenes.panda_scene(stage.client)
     front, wrist = scenes.panda_cameras(160, 120)
     stage.renderer.setup(scenes.setup(stage.client, front, wrist, mounts=scenes.panda_mounts(bodies)))
-    before = stage.renderer.render()
+    before = scenes.draw(stage.renderer, stage.client)
     links = {
         int(v) >> 24 for v in np.unique(before["front"].segmentation) if v >= 0 and v & 0xFFFFFF == bodies["panda"]
     }
     assert {0, 1, 2, 3, 4, 5, 6, 9} <= links
     scenes.pose_panda(stage.client, bodies, 1.0)
-    after = stage.renderer.render()
+    after = scenes.draw(stage.renderer, stage.client)
     assert (before["front"].segmentation != after["front"].segmentation).mean() > 0.005
     state = stage.client.getLinkState(bodies["panda"], 8, computeForwardKinematics=1)
     hand = Pose(position=np.array(state[4]), quat_xyzw=np.array(state[5]))
@@ -273,14 +273,14 @@ def test_the_same_state_gives_the_same_bits(stage: Stage) -> None:
     cameras = scenes.panda_cameras(96, 96)
     stage.renderer.setup(scenes.setup(stage.client, *cameras, mounts=scenes.panda_mounts(bodies)))
     scenes.pose_panda(stage.client, bodies, 0.7)
-    first = stage.renderer.render()
+    first = scenes.draw(stage.renderer, stage.client)
     for t in (0.0, 2.0, 4.0):
         scenes.pose_panda(stage.client, bodies, t)
-        stage.renderer.render()
+        scenes.draw(stage.renderer, stage.client)
     scenes.pose_panda(stage.client, bodies, 0.7)
-    again = stage.renderer.render()
+    again = scenes.draw(stage.renderer, stage.client)
     stage.renderer.setup(scenes.setup(stage.client, *cameras, mounts=scenes.panda_mounts(bodies)))
-    anew = stage.renderer.render()
+    anew = scenes.draw(stage.renderer, stage.client)
     for name, images in first.items():
         for other in (again, anew):
             assert np.array_equal(images.color, other[name].color)
@@ -321,7 +321,7 @@ def test_raster_sees_what_tiny_sees(antialias: bool) -> None:
     raster.setup(scenes.setup(client, *cameras, mounts=scenes.panda_mounts(bodies), antialias=antialias))
     for t in (0.0, 1.5):
         scenes.pose_panda(client, bodies, t)
-        images = raster.render()
+        images = scenes.draw(raster, client)
         for camera in cameras:
             mine = images[camera.name]
             labels = mine.segmentation

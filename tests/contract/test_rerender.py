@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -131,3 +133,43 @@ def test_several_processes_give_the_same(filmed: Path, tmp_path: Path) -> None:
         )
     assert _exit_code("render", tmp_path / "in", "--out", tmp_path / "out", "--workers", 2) == 0
     assert sorted(path.name for path in (tmp_path / "out").glob("*.mcap")) == ["0.mcap", "1.mcap"]
+
+
+WITHOUT_SIMULATOR = """
+import sys
+sys.modules["pybullet"] = sys.modules["pybullet_utils"] = None  # importing either is an ImportError now
+from demorec.cli import main
+main(sys.argv[1:])
+"""
+
+
+USING_IT = "from demorec.sim.client import connect; connect()"
+
+
+@pytest.mark.parametrize(("robot", "task"), [("panda", "pick_shapes"), ("iiwa", "tutorial")])
+def test_the_recording_alone_is_drawn_without_a_simulator(robot: str, task: str, tmp_path: Path) -> None:
+    # Both arms, one of them scaled; primitives, meshes and URDFs; textures, segmentation, a camera on the hand.
+    config = {"robot": robot, "task": task, "variation": "full", "segmentation": True, "max_episode_seconds": 2.0}
+    source = simulate(tmp_path / "e.mcap", seed=4, cameras=("front", "wrist"), width=64, height=64, **config)
+    command = ("render", source, "--out", tmp_path / "again.mcap")
+    done = subprocess.run(
+        [sys.executable, "-c", WITHOUT_SIMULATOR, *map(str, command)], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert "2 of 2 unchanged cameras give the recorded pictures to the bit" in done.stdout
+    with Recording(source) as a, Recording(tmp_path / "again.mcap") as b:
+        for camera in a.cameras:
+            assert [p.data for p in a.packets(camera)] == [p.data for p in b.packets(camera)]
+            assert np.array_equal(a.columns().world_from_camera[camera], b.columns().world_from_camera[camera])
+            pairs = zip(a.segmentation(camera), b.segmentation(camera), strict=True)
+            assert all(np.array_equal(one, two) for one, two in pairs)
+
+
+def test_blocking_the_simulator_does_block_it() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", WITHOUT_SIMULATOR.replace("main(sys.argv[1:])", "") + USING_IT],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert "pybullet" in done.stderr

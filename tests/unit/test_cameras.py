@@ -49,8 +49,8 @@ def test_front_sees_every_place_where_objects_go_and_the_hand_above(world):
 
 def test_wrist_sees_the_space_between_the_fingers(world):
     camera = cameras_of(world)["wrist"]
-    body, link = world.mounts()[camera.mount]
-    state = world.client.getLinkState(body, link, computeForwardKinematics=True)
+    mount = world.mounts()[camera.mount]
+    state = world.client.getLinkState(mount.body, mount.link, computeForwardKinematics=True)
     pose = Pose(position=np.array(state[4]), quat_xyzw=np.array(state[5])) @ camera.mount_from_camera
     tcp = world.arm.world_from_tcp()
     half = world.robot.gripper_max_width / 2

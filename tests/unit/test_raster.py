@@ -11,6 +11,7 @@ import pytest
 
 from demorec.errors import RenderError
 from demorec.geometry import Pose, look_at
+from demorec.render.painter import Painter
 from demorec.render.raster import RasterRenderer, renderer
 from demorec.render.raster.kernels import antialias, records, shade, still, triangles, vertices
 from demorec.scene import Light, Texture
@@ -26,7 +27,7 @@ def client() -> Any:
 def picture(client: Any, camera: Any, **changes: Any) -> Any:
     with RasterRenderer() as raster:
         raster.setup(scenes.setup(client, camera, **changes))
-        return raster.render()[camera.name]
+        return scenes.draw(raster, client)[camera.name]
 
 
 def same(one: Any, two: Any) -> bool:
@@ -51,7 +52,7 @@ def test_keeping_what_stands_still_changes_no_bit(client: Any, antialias: bool) 
             client.resetBasePositionAndOrientation(
                 bodies[cube], random.uniform((0.1, -0.4, 0.0), (0.8, 0.4, 0.7)), quat / np.sqrt((quat**2).sum())
             )
-        one, two = kept.render()["front"], redrawn.render()["front"]
+        one, two = scenes.draw(kept, client)["front"], scenes.draw(redrawn, client)["front"]
         assert same(one, two)
         distinct.add(one.color.tobytes())
     assert len(distinct) == 25
@@ -62,14 +63,14 @@ def test_other_scenes_before_change_no_bit(client: Any) -> None:
     setup = scenes.setup(client, *scenes.panda_cameras(96, 96), mounts=scenes.panda_mounts(bodies))
     fresh = RasterRenderer()
     fresh.setup(setup)
-    expected = fresh.render()
+    expected = scenes.draw(fresh, client)
     used = RasterRenderer()
     other = scenes.connect()
     scenes.add(other, "sphere", (0.2,))
     used.setup(scenes.setup(other, scenes.camera(64, 64)))
-    used.render()
+    scenes.draw(used, other)
     used.setup(setup)
-    assert all(same(images, used.render()[name]) for name, images in expected.items())
+    assert all(same(images, scenes.draw(used, client)[name]) for name, images in expected.items())
     other.disconnect()
 
 
@@ -82,7 +83,7 @@ def test_the_rehearsal_compiles_all_that_scenes_need(client: Any) -> None:
                     client, *scenes.panda_cameras(96, 64), mounts=scenes.panda_mounts(bodies), antialias=smooth
                 )
             )
-            raster.render()
+            scenes.draw(raster, client)
     kernels = [
         value
         for module in (antialias, records, shade, still, triangles, vertices)
@@ -99,11 +100,11 @@ def test_the_rehearsal_compiles_all_that_scenes_need(client: Any) -> None:
 @pytest.mark.parametrize("mass", [0.0, 1.0])
 def test_changed_colours_are_noticed(client: Any, mass: float) -> None:
     body = scenes.add(client, "box", (0.3, 0.3, 0.3), rgbaColor=[1, 0, 0, 1], mass=mass)
-    raster = RasterRenderer()
-    raster.setup(scenes.setup(client, scenes.camera(64, 64)))
-    red = raster.render()["front"]
+    painter = Painter(RasterRenderer())
+    painter.setup(scenes.ClientWorld(client), (scenes.camera(64, 64),), segmentation=True)
+    red = painter.images()["front"]
     client.changeVisualShape(body, -1, rgbaColor=[0, 0, 1, 1])
-    blue = raster.render()["front"]
+    blue = painter.images()["front"]
     seen = red.segmentation == body
     assert red.color[seen].mean(0).argmax() == 0
     assert blue.color[seen].mean(0).argmax() == 2
@@ -113,9 +114,9 @@ def test_what_stood_still_and_was_moved_is_noticed(client: Any) -> None:
     body = scenes.add(client, "box", (0.2, 0.2, 0.2))
     raster = RasterRenderer()
     raster.setup(scenes.setup(client, scenes.camera(64, 64)))
-    before = raster.render()["front"]
+    before = scenes.draw(raster, client)["front"]
     client.resetBasePositionAndOrientation(body, [0.2, 0.0, 0.0], [0, 0, 0, 1])
-    after = raster.render()["front"]
+    after = scenes.draw(raster, client)["front"]
     assert not np.array_equal(before.segmentation, after.segmentation)
     assert same(after, picture(client, scenes.camera(64, 64)))
 
@@ -230,8 +231,8 @@ def test_exact_draws_all_triangles_and_levels_stay_close(client: Any) -> None:
     coarse, exact = RasterRenderer(), RasterRenderer(exact=True)
     coarse.setup(setup)
     exact.setup(setup)
-    for name, images in exact.render().items():
-        other = coarse.render()[name]
+    for name, images in scenes.draw(exact, client).items():
+        other = scenes.draw(coarse, client)[name]
         assert (images.segmentation == other.segmentation).mean() > 0.99
         both = images.segmentation == other.segmentation
         assert np.quantile(np.abs(images.depth - other.depth)[both], 0.99) < 5e-3
@@ -248,7 +249,7 @@ def test_a_camera_inside_a_mesh_clips_more_than_there_is_room_for(client: Any) -
             raster.setup(scenes.setup(client, camera, antialias=smooth))
             for height in (0.0, 29.99, 30.0005):
                 client.resetBasePositionAndOrientation(body, [0, 0, -height], [0, 0, 0, 1])
-                images = raster.render()["front"]
+                images = scenes.draw(raster, client)["front"]
                 assert np.isfinite(images.depth).all()
 
 

@@ -14,7 +14,7 @@ from demorec.episode import Action
 from demorec.errors import ConfigError, SceneError
 from demorec.geometry import Pose
 from demorec.plain import from_json, to_json
-from demorec.scene import Body, Scene, Shape
+from demorec.scene import Body, Scene, Shape, Texture
 from demorec.sim.client import connect
 from demorec.sim.robots.panda import PANDA
 from demorec.sim.world import World
@@ -56,7 +56,7 @@ def test_observation_agrees_with_the_simulator(world, scene):
     assert seen.object_poses["red_cube"] == Pose(position=np.array(position), quat_xyzw=np.array(quat))
     assert set(seen.object_poses) == {"red_cube"}
     state = world.client.getLinkState(
-        world.arm.body, world.mounts()["panda_grasptarget"][1], computeForwardKinematics=1
+        world.arm.body, world.mounts()["panda_grasptarget"].link, computeForwardKinematics=1
     )
     assert np.abs(seen.base_from_tcp.position - state[4]).max() < 1e-6
     assert abs(seen.gripper_width - 0.08) < 1e-3
@@ -246,3 +246,22 @@ def test_connecting_prints_nothing(capfd):
     connect().disconnect()
     captured = capfd.readouterr()
     assert captured.out == captured.err == ""
+
+
+def test_visuals_are_read_anew_when_a_colour_is_changed(world, scene):
+    world.reset(scene)
+    before = world.visuals()
+    assert world.visuals() is before
+    cube = world.body_index("red_cube")
+    assert before[cube].name == "red_cube"
+    world.client.changeVisualShape(cube, -1, rgbaColor=[0.0, 0.0, 1.0, 1.0])
+    assert world.visuals()[cube].visuals[0].rgba == (0.0, 0.0, 1.0, 1.0)
+    world.reset(scene)
+    assert world.visuals() == before
+
+
+def test_textures_are_told_whether_or_not_the_scene_has_cameras(world, scene):
+    texture = Texture(pattern="checker", colors=((1.0, 1.0, 1.0), (0.0, 0.0, 0.0)))
+    covered = tuple(dataclasses.replace(body, texture=texture) for body in scene.bodies)
+    world.reset(dataclasses.replace(scene, bodies=covered, cameras=()))
+    assert [body.texture for body in world.visuals() if body.name != PANDA.name] == [texture] * len(covered)

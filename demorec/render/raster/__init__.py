@@ -1,6 +1,6 @@
 """The default renderer: a rasteriser on the CPU, compiled with numba, that redraws only what moved.
 
-From PyBullet's visual shapes (`shapes`) to meshes (`mesh`, `mesh_files`, `primitives`, `decimate`, `textures`),
+From visual shapes (`shapes`) to meshes (`mesh`, `mesh_files`, `primitives`, `decimate`, `textures`),
 merged into the arrays (`batch`) that the compiled loops read (`kernels`); `stage` holds what the cameras of a step
 share, `canvas` one camera's buffers, `view` its picture, `renderer` the whole.
 """

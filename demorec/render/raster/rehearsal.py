@@ -17,26 +17,18 @@ from demorec.render.raster.view import View
 from demorec.scene import Camera, Light
 
 
-class _Client:
-    """As much of a PyBullet client as a stage asks: two bodies at rest."""
-
-    def getNumJoints(self, body: int) -> int:
-        return 0
-
-    def getBasePositionAndOrientation(self, body: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        return (0.0, 0.0, 0.15 * body), (0.0, 0.0, 0.0, 1.0)
-
-
 def _instance(body: int, mesh: Mesh, *, stands: bool, texture: Any = None) -> Instance:
     return Instance(
         body=body,
         link=-1,
+        row=body,
         model=Model(key=str(body), mesh=mesh),
         scale=np.ones(3),
         link_from_shape=np.eye(4)[:3].copy(),
         color=np.ones(3),
         texture=texture,
         stands=stands,
+        has_links=False,
         centre=np.zeros(3),
         radius=0.2,
     )
@@ -58,11 +50,12 @@ def rehearse() -> None:
         mount="world",
         mount_from_camera=look_at((0.8, 0, 0.5), (0, 0, 0)),
     )
-    stage = Stage(_Client(), instances, light, shadow_size=64, caster_faces=[None, None])
+    stage = Stage(instances, light, shadow_size=64, caster_faces=[None, None])
+    poses = np.array([[0.0, 0.0, 0.15 * body, 0.0, 0.0, 0.0, 1.0] for body in range(2)])
     batch = make_batch(instances, [None, None], specular=light.specular)
     for antialias in (True, False):
         for keep_still in (True, False):
             canvas = Canvas(camera, batch, stage, light, antialias=antialias, depth=True, segmentation=True)
             view = View(canvas, stage, keep_still=keep_still)
-            stage.update()
+            stage.update(poses)
             view.draw(camera.mount_from_camera)

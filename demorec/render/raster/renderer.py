@@ -8,12 +8,13 @@ import math
 from typing import Self
 
 from demorec.episode import CameraImages
+from demorec.geometry import Array
 from demorec.render import RenderSetup
 from demorec.render.raster.batch import Batch, make_batch
 from demorec.render.raster.cache import folder_lock
 from demorec.render.raster.canvas import Canvas
 from demorec.render.raster.kernels.jit import compiled_folder
-from demorec.render.raster.shapes import Instance, ModelStore, VisualShapes, read_instances, visual_shapes
+from demorec.render.raster.shapes import Instance, ModelStore, make_instances
 from demorec.render.raster.stage import Stage
 from demorec.render.raster.view import View
 from demorec.render.setup_checks import check_setup, world_from_camera
@@ -43,7 +44,6 @@ class RasterRenderer:
         self._keep_still = keep_still
         self._store = ModelStore()
         self._setup: RenderSetup | None = None
-        self._shapes: VisualShapes = ()
         self._views: list[View] = []
         self._stage: Stage | None = None
         warm_up()
@@ -56,27 +56,20 @@ class RasterRenderer:
 
     def close(self) -> None:
         """Free buffers, meshes and textures; harmless when called twice."""
-        self._setup, self._stage, self._views, self._shapes = None, None, [], ()
+        self._setup, self._stage, self._views = None, None, []
         self._store = ModelStore()
 
     def setup(self, setup: RenderSetup) -> None:
-        """Take over a freshly built scene.
+        """Take over a scene.
 
         Raises:
             RenderError: A shape, mesh, texture or camera that cannot be drawn, by name.
         """
         check_setup(setup)
         self._setup = setup
-        self._take_over(visual_shapes(setup.client))
-
-    def _take_over(self, shapes: VisualShapes) -> None:
-        setup = self._setup
-        assert setup is not None
-        self._shapes = shapes
-        instances = read_instances(setup.client, shapes, setup.textures, self._store)
+        instances = make_instances(setup.bodies, self._store)
         largest = max((camera.height for camera in setup.cameras), default=0)
         self._stage = Stage(
-            setup.client,
             instances,
             setup.light,
             shadow_size=shadow_size(largest),
@@ -105,24 +98,14 @@ class RasterRenderer:
         pixels = 2 * instance.radius * float(camera.intrinsics[1, 1]) / distance
         return power_of_two(FACES_PER_PIXEL * pixels)
 
-    def render(self) -> dict[str, CameraImages]:
-        """Camera name -> images of the client's present state.
-
-        Raises:
-            RuntimeError: `setup` was not called.
-            RenderError: A shape or texture that was changed since cannot be drawn.
-        """
+    def render(self, poses: Array) -> dict[str, CameraImages]:
+        """Camera name -> images, with poses (n, 7) as of `Renderer.render`; RuntimeError without a scene."""
         setup, stage = self._setup, self._stage
         if setup is None or stage is None:
             raise RuntimeError("the renderer has no scene: call setup first")
-        shapes = visual_shapes(setup.client)
-        if shapes != self._shapes:
-            self._take_over(shapes)  # a colour, texture or shape was changed
-            stage = self._stage
-            assert stage is not None
-        stage.update()
+        stage.update(poses)
         return {
-            camera.name: view.draw(world_from_camera(setup, camera))
+            camera.name: view.draw(world_from_camera(setup, camera, poses))
             for camera, view in zip(setup.cameras, self._views, strict=True)
         }
 

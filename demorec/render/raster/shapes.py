@@ -1,19 +1,18 @@
-"""What is in the scene: PyBullet's visual shapes as instances of meshes."""
+"""What is in the scene: visual shapes as instances of meshes."""
 
 from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from demorec.assets import asset_path
 from demorec.errors import DemorecError, RenderError
-from demorec.geometry import Pose
+from demorec.render import Visual, VisualBody, first_rows
 from demorec.render.raster import primitives
 from demorec.render.raster.decimate import decimated
 from demorec.render.raster.mesh import Floats, Mesh
@@ -23,10 +22,6 @@ from demorec.render.raster.pieces import Piece, make_piece
 from demorec.render.raster.textures import Picture, load_picture, palette_colors
 from demorec.scene import Texture
 from demorec.textures import texture_pixels
-
-VisualShapes = tuple[tuple[Any, ...], ...]
-"""As PyBullet tells them: body, link, kind, dimensions, file, position, orientation, colour. Of textures it knows
-only those of mesh files; those set by `changeVisualShape` come in `RenderSetup.textures`."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -80,24 +75,28 @@ class Instance:
     """One visual shape of the scene.
 
     Attributes:
-        body, link: PyBullet's numbers; the base is link -1.
+        body, link: Numbers as of `RenderSetup.bodies`; the base is link -1.
+        row: Of its link in the poses that are drawn.
         model: Its mesh.
         scale: (3,) of the mesh.
-        link_from_shape: (3, 4); for a base: from the inertial frame, in which PyBullet tells its pose.
+        link_from_shape: (3, 4).
         color: (3,) 0..1.
         texture: Picture, or None.
         stands: Whether physics cannot move it.
+        has_links: Whether its body has links that reach around its base.
         centre, radius: Bounding sphere in the shape's frame.
     """
 
     body: int
     link: int
+    row: int
     model: Model
     scale: Floats
     link_from_shape: Floats
     color: Floats
     texture: Picture | None
     stands: bool
+    has_links: bool
     centre: Floats
     radius: float
 
@@ -190,85 +189,58 @@ def _source_digest(path: Path) -> str:
     return digest.hexdigest()
 
 
-def visual_shapes(client: Any) -> VisualShapes:
-    """Every visual shape of every body, as PyBullet tells them; equal results look equal."""
-    return tuple(
-        shape
-        for number in range(client.getNumBodies())
-        for shape in client.getVisualShapeData(client.getBodyUniqueId(number))
-    )
-
-
-def read_instances(
-    client: Any, shapes: VisualShapes, textures: Mapping[int, Texture], store: ModelStore
-) -> list[Instance]:
+def make_instances(bodies: Sequence[VisualBody], store: ModelStore) -> list[Instance]:
     """The instances of the scene, those that stand still first.
-
-    Args:
-        textures: body -> procedural texture, of the bodies that have one.
 
     Raises:
         RenderError: A shape or texture that cannot be drawn, with the body and link that it belongs to.
     """
     instances = []
-    dynamics: dict[int, tuple[Any, ...]] = {}
-    for shape in shapes:
-        body, link, kind, size, file, position, orientation, rgba = shape[:8]
-        if rgba[3] == 0:
-            continue  # invisible
-        if body not in dynamics:
-            dynamics[body] = client.getDynamicsInfo(body, -1)
-        try:
-            model, scale = _model(client, kind, size, file.decode(), store)
-            texture = _texture(model, textures.get(body), store)
-        except DemorecError as error:
-            raise RenderError(f"Body {body} ({_name(client, body)!r}), link {link}: {error}") from error
-        place = Pose(position=np.array(position), quat_xyzw=np.array(orientation))
-        if link == -1:
-            inertial = Pose(position=np.array(dynamics[body][3]), quat_xyzw=np.array(dynamics[body][4]))
-            place = inertial.inverse() @ place
-        centre, radius = model.bounding_sphere(scale)
-        instances.append(
-            Instance(
-                body=body,
-                link=link,
-                model=model,
-                scale=scale,
-                link_from_shape=place.matrix()[:3].copy(),
-                color=np.array(rgba[:3], dtype=np.float64),
-                texture=texture,
-                stands=link == -1 and dynamics[body][0] == 0,
-                centre=centre,
-                radius=radius,
+    for number, (body, row) in enumerate(zip(bodies, first_rows(bodies), strict=True)):
+        for visual in body.visuals:
+            if visual.rgba[3] == 0:
+                continue  # invisible
+            try:
+                model, scale = _model(visual, store)
+                texture = _texture(model, body.texture, store)
+            except DemorecError as error:
+                raise RenderError(f"Body {number} ({body.name!r}), link {visual.link}: {error}") from error
+            centre, radius = model.bounding_sphere(scale)
+            instances.append(
+                Instance(
+                    body=number,
+                    link=visual.link,
+                    row=row + 1 + visual.link,
+                    model=model,
+                    scale=scale,
+                    link_from_shape=visual.link_from_shape.matrix()[:3].copy(),
+                    color=np.array(visual.rgba[:3], dtype=np.float64),
+                    texture=texture,
+                    stands=visual.link == -1 and body.is_fixed,
+                    has_links=body.num_links > 0,
+                    centre=centre,
+                    radius=radius,
+                )
             )
-        )
     return sorted(instances, key=lambda instance: not instance.stands)
 
 
-def _name(client: Any, body: int) -> str:
-    return str(client.getBodyInfo(body)[1].decode())
-
-
-def _model(client: Any, kind: int, size: tuple[float, ...], file: str, store: ModelStore) -> tuple[Model, Floats]:
+def _model(visual: Visual, store: ModelStore) -> tuple[Model, Floats]:
     """The model and its scale."""
-    one = np.ones(3)
-    if kind == client.GEOM_MESH:
-        path = Path(file)
-        return store.file(path if path.is_absolute() or path.exists() else asset_path(file)), np.array(size)
-    if kind == client.GEOM_BOX:
-        return store.primitive("box", 1.0, 1.0, 1.0), np.array(size)
-    if kind == client.GEOM_SPHERE:
-        return store.primitive("sphere", 1.0), one * size[0]
-    if kind == client.GEOM_CYLINDER:
-        return store.primitive("cylinder", 1.0, 1.0), np.array([size[1], size[1], size[0]])
-    if kind == client.GEOM_CAPSULE:
-        return store.primitive("capsule", size[1], size[0]), one
-    if kind == client.GEOM_PLANE:
-        return store.primitive("plane"), one
-    raise RenderError(
-        f"a visual shape of PyBullet's kind {kind} cannot be drawn by the raster renderer: use a mesh, box, sphere, "
-        "cylinder, capsule or plane, or --renderer tiny."
-    )
+    one, size = np.ones(3), visual.size
+    match visual.kind:
+        case "mesh":
+            return store.file(Path(visual.file)), np.array(size)
+        case "box":
+            return store.primitive("box", 1.0, 1.0, 1.0), np.array(size)
+        case "sphere":
+            return store.primitive("sphere", 1.0), one * size[0]
+        case "cylinder":
+            return store.primitive("cylinder", 1.0, 1.0), np.array([size[0], size[0], size[1]])
+        case "capsule":
+            return store.primitive("capsule", size[0], size[1]), one
+        case "plane":
+            return store.primitive("plane"), one
 
 
 def _texture(model: Model, texture: Texture | None, store: ModelStore) -> Picture | None:

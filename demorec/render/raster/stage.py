@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +31,6 @@ class Stage:
     """The scene's instances, their poses at this step and the shadow that they cast.
 
     Args:
-        client: PyBullet client.
         instances: Those that stand still first.
         light: Direction, colour and strengths.
         shadow_size: Texels along the side of the shadow map; a multiple of the tile.
@@ -41,27 +39,19 @@ class Stage:
 
     def __init__(
         self,
-        client: Any,
         instances: Sequence[Instance],
         light: Light,
         *,
         shadow_size: int,
         caster_faces: Sequence[int | None],
     ) -> None:
-        self.client = client
         self.instances = tuple(instances)
         self.num_still = sum(instance.stands for instance in instances)
         n = len(instances)
         self.link_from_shape = np.array([i.link_from_shape for i in instances]).reshape(n, 3, 4)
         self.centre = np.array([i.centre for i in instances]).reshape(n, 3)
         self.radius = np.array([i.radius for i in instances])
-        bodies = sorted({instance.body for instance in instances})
-        self._bodies = [(body, list(range(client.getNumJoints(body)))) for body in bodies]
-        row_of, count = {}, 0
-        for body, links in self._bodies:
-            row_of[body] = count
-            count += 1 + len(links)
-        self._rows = np.array([row_of[i.body] + i.link + 1 for i in instances], dtype=np.int64)
+        self._rows = np.array([i.row for i in instances], dtype=np.int64)
         self.pose: Floats = np.zeros((n, 7))
         self.world_from_shape = np.zeros((n, 3, 4))
         self.shadow_from_shape = np.zeros((n, 3, 4))
@@ -69,8 +59,7 @@ class Stage:
         self.light_table = _light_table(light)
         self.still_version = 0
         """Grows when something of what stands still was moved after all."""
-        self._still_pose = b""
-        self.read_poses()
+        self._still_pose: bytes | None = None
 
         direction = np.asarray(light.direction, dtype=np.float64)
         length = math.sqrt(float((direction * direction).sum()))
@@ -78,7 +67,8 @@ class Stage:
             raise RenderError(f"The light's direction is {light.direction}: it needs a finite length above 0.")
         self.light = direction / length
         self.shadow_size = shadow_size
-        self.shadow_from_world, self.texel = self._fit_shadow()
+        self.shadow_from_world: Floats = np.zeros((3, 4))
+        self.texel = 0.0
         casts = [instance.radius < LARGE and light.shadow > 0 for instance in instances]
         self._casters = caster_geometry(instances, caster_faces, casts)
         tiles = shadow_size >> layout.TILE_SHIFT
@@ -88,31 +78,17 @@ class Stage:
         self._bounds = np.array([shadow_size, 0, shadow_size, 0], dtype=np.int64)
         self._no_ids = np.zeros(1, dtype=np.int32)
 
-    def read_poses(self) -> None:
-        """Ask PyBullet where everything is."""
-        client = self.client
-        rows: list[tuple[float, ...]] = []
-        for body, links in self._bodies:
-            position, quat = client.getBasePositionAndOrientation(body)
-            rows.append(position + quat)
-            if links:
-                states = client.getLinkStates(body, links, computeForwardKinematics=1)
-                rows += [state[4] + state[5] for state in states]
-        if rows:
-            self.pose = np.array(rows)[self._rows]
-
     def _fit_shadow(self) -> tuple[Floats, float]:
         """(3, 4) world to shadow map (texels, texels, metres), and metres a texel.
 
         The region depends on what stands still alone: a shadow must not change because something moved elsewhere.
         """
         low, high = np.full(3, np.inf), np.full(3, -np.inf)
-        jointed = {body for body, links in self._bodies if links}
         for number, instance in enumerate(self.instances):
             if not instance.stands or instance.radius >= LARGE:
                 continue
             place = np.array(self.pose[number, :3])
-            reach = REACH if instance.body in jointed else instance.radius
+            reach = REACH if instance.has_links else instance.radius
             low, high = np.minimum(low, place - reach), np.maximum(high, place + reach)
         if not np.isfinite(low).all():
             low, high = np.full(3, -1.0), np.full(3, 1.0)
@@ -133,9 +109,18 @@ class Stage:
             matrix[row, 3] = offset - float((axis * centre).sum()) * factor
         return matrix, 1 / scale
 
-    def update(self) -> None:
-        """Take over the present poses and draw the shadow map: what stands still once, what moves each time."""
-        self.read_poses()
+    def update(self, poses: Floats) -> None:
+        """Take over poses, as `Renderer.render` is given them, and draw the shadow map.
+
+        What stands still is drawn once, what moves each time.
+        """
+        self.pose = poses[self._rows]
+        still_pose = self.pose[: self.num_still].tobytes()
+        still_moved = still_pose != self._still_pose
+        if still_moved:
+            self._still_pose = still_pose
+            self.still_version += 1
+            self.shadow_from_world, self.texel = self._fit_shadow()
         place_instances(
             self.pose,
             self.link_from_shape,
@@ -145,11 +130,8 @@ class Stage:
             self.shadow_from_shape,
             self.light_in_shape,
         )
-        still_pose = self.pose[: self.num_still].tobytes()
         bounds = self._bounds
-        if still_pose != self._still_pose:
-            self._still_pose = still_pose
-            self.still_version += 1
+        if still_moved:
             self.still_heights.fill(BELOW)
             self._draw(0, self.num_still, self.still_heights, mark=False)
             self.heights[:] = self.still_heights

@@ -1,0 +1,99 @@
+"""The one place where a world and a renderer meet: what is drawn, by which cameras, and where these are believed to be.
+
+Generation, environments, replay and re-rendering draw through it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Protocol
+
+from demorec.episode import CameraImages
+from demorec.geometry import Array, Pose
+from demorec.render import Mount, Renderer, RenderSetup, VisualBody
+from demorec.scene import Camera, Scene
+
+
+class Drawable(Protocol):
+    """What can be drawn: a simulated world, or a recorded one."""
+
+    @property
+    def scene(self) -> Scene:
+        """Its light is drawn; its cameras are where they are believed to be."""
+
+    def visuals(self) -> tuple[VisualBody, ...]:
+        """What can be seen at present."""
+
+    def mounts(self) -> Mapping[str, Mount]:
+        """The links that can carry cameras."""
+
+    def poses(self) -> Array:
+        """(n, 7) where everything is at present, as `Renderer.render` takes it."""
+
+
+class Painter:
+    """Draws a world through a renderer, which it leaves open.
+
+    Args:
+        renderer: Entered; kept warm from one world to the next.
+    """
+
+    def __init__(self, renderer: Renderer) -> None:
+        self._renderer = renderer
+        self._world: Drawable | None = None
+        self._setup: RenderSetup | None = None
+        self._true_from_recorded: Mapping[str, Pose] = {}
+
+    def setup(
+        self,
+        world: Drawable,
+        cameras: tuple[Camera, ...],
+        *,
+        true_from_recorded: Mapping[str, Pose] | None = None,
+        depth: bool = False,
+        segmentation: bool = False,
+        antialias: bool = True,
+    ) -> None:
+        """Take over a world in a new scene.
+
+        Args:
+            world: What is drawn from now on.
+            cameras: Where the cameras really are.
+            true_from_recorded: Camera name -> calibration error, of the cameras that have one.
+            depth, segmentation: Whether these are drawn beside colour.
+            antialias: Whether edges are smoothed, where the renderer can.
+
+        Raises:
+            RenderError: The renderer cannot draw a shape or camera.
+        """
+        self._world = world
+        self._true_from_recorded = true_from_recorded or {}
+        self._setup = RenderSetup(
+            bodies=world.visuals(),
+            cameras=cameras,
+            mounts=world.mounts(),
+            light=world.scene.light,
+            depth=depth,
+            segmentation=segmentation,
+            antialias=antialias,
+        )
+        self._renderer.setup(self._setup)
+
+    def images(self) -> dict[str, CameraImages]:
+        """Camera name -> images of the world's present state, with the poses at which the cameras are believed to be.
+
+        Raises:
+            RuntimeError: `setup` was not called.
+            RenderError: A shape that was changed since cannot be drawn.
+        """
+        if self._world is None or self._setup is None:
+            raise RuntimeError("the painter has no world: call setup first")
+        bodies = self._world.visuals()
+        if bodies != self._setup.bodies:  # a colour or shape was changed
+            self._setup = replace(self._setup, bodies=bodies)
+            self._renderer.setup(self._setup)
+        images = self._renderer.render(self._world.poses())
+        for name, error in self._true_from_recorded.items():
+            images[name] = replace(images[name], world_from_camera=images[name].world_from_camera @ error)
+        return images

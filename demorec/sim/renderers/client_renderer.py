@@ -1,0 +1,134 @@
+"""What PyBullet's renderers have in common: a client of their own, and pictures through its `getCameraImage`."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.episode import CameraImages
+from demorec.errors import RenderError
+from demorec.geometry import Array, Pose
+from demorec.render import RenderSetup
+from demorec.render.setup_checks import check_setup, world_from_camera
+from demorec.scene import Camera
+from demorec.sim.renderers.mirror import SceneMirror
+
+# OpenCV's camera axes (y down, z forward) to OpenGL's (y up, z backward).
+_GL_FROM_CV = np.array([1.0, -1.0, -1.0])
+_NOTHING_HIT = 1.0 - 1e-7
+"""Depth buffer value of the background (TinyRenderer's is one float32 step below 1)."""
+
+
+class ClientRenderer(ABC):
+    """Draws the shapes of a setup in a client of its own; a context manager."""
+
+    def __init__(self) -> None:
+        self._client: Any = None
+        self._setup: RenderSetup | None = None
+        self._mirror: SceneMirror | None = None
+
+    @abstractmethod
+    def _connect(self) -> Any:
+        """A new client that can draw; RenderError when there can be none."""
+
+    @abstractmethod
+    def _disconnect(self, client: Any) -> None:
+        """Give the client up."""
+
+    @abstractmethod
+    def _renderer_flag(self, client: Any) -> int:
+        """Which of PyBullet's renderers draws."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Free the client; harmless when called twice."""
+        if self._client is not None:
+            self._disconnect(self._client)
+        self._client = self._setup = self._mirror = None
+
+    def setup(self, setup: RenderSetup) -> None:
+        """Take over a scene.
+
+        Raises:
+            RenderError: PyBullet cannot draw here, or cannot draw a camera or load a shape.
+        """
+        check_setup(setup)
+        if self._client is None:
+            self._client = self._connect()
+            _require_numpy(self._client)
+        self._setup = setup
+        self._mirror = SceneMirror(self._client, setup)
+
+    def render(self, poses: Array) -> dict[str, CameraImages]:
+        """Camera name -> images, with poses (n, 7) as of `Renderer.render`; RuntimeError without a scene."""
+        if self._setup is None or self._mirror is None:
+            raise RuntimeError("the renderer has no scene: call setup first")
+        self._mirror.follow(poses)
+        return {camera.name: self._draw(self._setup, self._mirror, camera, poses) for camera in self._setup.cameras}
+
+    def _draw(self, setup: RenderSetup, mirror: SceneMirror, camera: Camera, poses: Array) -> CameraImages:
+        client = self._client
+        pose = world_from_camera(setup, camera, poses)
+        light = setup.light
+        _, _, rgba, depth, segmentation = client.getCameraImage(
+            camera.width,
+            camera.height,
+            viewMatrix=view_matrix(pose),
+            projectionMatrix=client.computeProjectionMatrixFOV(
+                np.degrees(camera.fov_y), camera.width / camera.height, camera.near, camera.far
+            ),
+            lightDirection=light.direction,
+            lightColor=light.color,
+            lightDistance=3.0,
+            lightAmbientCoeff=light.ambient,
+            lightDiffuseCoeff=light.diffuse,
+            lightSpecularCoeff=light.specular,
+            shadow=int(light.shadow > 0),
+            flags=client.ER_SEGMENTATION_MASK_OBJECT_AND_LINKINDEX
+            if setup.segmentation
+            else client.ER_NO_SEGMENTATION_MASK,
+            renderer=self._renderer_flag(client),
+        )
+        shape = (camera.height, camera.width)
+        color = np.ascontiguousarray(np.reshape(rgba, (*shape, 4))[:, :, :3], dtype=np.uint8)
+        # PyBullet's background is always white.
+        color[np.reshape(depth, shape) >= _NOTHING_HIT] = [round(255 * v) for v in light.sky_color]
+        return CameraImages(
+            color=color,
+            depth=_metric_depth(np.reshape(depth, shape), camera) if setup.depth else None,
+            segmentation=mirror.original_labels(np.reshape(segmentation, shape)) if setup.segmentation else None,
+            world_from_camera=pose,
+        )
+
+
+def _require_numpy(client: Any) -> None:
+    """Raise RenderError unless PyBullet returns pictures as arrays."""
+    if not client.isNumpyEnabled():
+        raise RenderError(
+            "PyBullet was compiled without NumPy, which makes pictures unusably slow: install numpy and setuptools "
+            "first, then run pip install --no-build-isolation --no-cache-dir --force-reinstall --no-deps pybullet "
+            "(or use uv, whose settings in pyproject.toml see to it)."
+        )
+
+
+def view_matrix(world_from_camera: Pose) -> list[float]:
+    """OpenGL's camera_from_world, column by column."""
+    inverse = world_from_camera.inverse()
+    matrix: Array = inverse.matrix()
+    matrix[:3] *= _GL_FROM_CV[:, None]
+    return [float(v) for v in matrix.T.reshape(-1)]
+
+
+def _metric_depth(buffer: NDArray[np.float32], camera: Camera) -> NDArray[np.float32]:
+    """OpenGL's depth buffer (0..1) in metres along the optical axis; 0 where nothing is hit."""
+    near, far = camera.near, camera.far
+    metres = near * far / (far - (far - near) * buffer.astype(np.float64))
+    return np.where(buffer >= _NOTHING_HIT, 0.0, metres).astype(np.float32)

@@ -1,0 +1,115 @@
+"""A PyBullet client filled with shapes to be drawn, apart from any simulation.
+
+PyBullet's renderers draw what a client holds. In a client of its own a renderer works whenever it is started, from a
+recording as well as beside a simulation, and keeps out of the latter. (The EGL plugin could not do otherwise: it sees
+only bodies that were loaded after it, and no second client of the process.)
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from demorec.errors import RenderError
+from demorec.geometry import Array, Pose
+from demorec.render import RenderSetup, Visual, first_rows
+from demorec.scene import Texture
+from demorec.textures import texture_pixels
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Copy:
+    """One visual shape: the row of its pose, its number in segmentation pictures, and its body in the client."""
+
+    row: int
+    segment: int
+    link_from_shape: Pose
+    index: int
+
+
+class SceneMirror:
+    """Fills a client with the visual shapes of a setup, and puts them where they are wanted.
+
+    Args:
+        client: The client that is filled; emptied first.
+        setup: The scene.
+
+    Raises:
+        RenderError: PyBullet cannot load one of the shapes.
+    """
+
+    def __init__(self, client: Any, setup: RenderSetup) -> None:
+        self._client = client
+        client.resetSimulation()
+        self._copies: list[_Copy] = []
+        for number, (body, row) in enumerate(zip(setup.bodies, first_rows(setup.bodies), strict=True)):
+            texture = None if body.texture is None else _load_texture(client, body.texture)
+            for visual in body.visuals:
+                if visual.kind == "plane":
+                    continue  # PyBullet draws none that is made like this
+                try:
+                    index = _add(client, visual, texture)
+                except Exception as error:  # PyBullet raises its own bare pybullet.error
+                    raise RenderError(
+                        f"PyBullet cannot draw body {number} ({body.name!r}), link {visual.link} "
+                        f"({visual.file or visual.kind}: {error})."
+                    ) from error
+                self._copies.append(
+                    _Copy(
+                        row=row + 1 + visual.link,
+                        segment=number + ((visual.link + 1) << 24),
+                        link_from_shape=visual.link_from_shape,
+                        index=index,
+                    )
+                )
+
+    def follow(self, poses: Array) -> None:
+        """Put every shape where `poses`, as `Renderer.render` is given them, say."""
+        for item in self._copies:
+            row = poses[item.row]
+            pose = Pose(position=row[:3], quat_xyzw=row[3:]) @ item.link_from_shape
+            self._client.resetBasePositionAndOrientation(item.index, pose.position.tolist(), pose.quat_xyzw.tolist())
+
+    def original_labels(self, labels: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Segmentation of the client in the numbers of the setup: body + ((link + 1) << 24)."""
+        table = np.full(max((item.index for item in self._copies), default=0) + 2, -1, dtype=np.int32)
+        for item in self._copies:
+            table[item.index] = item.segment
+        bodies = np.where(labels >= 0, labels & 0xFFFFFF, len(table) - 1)
+        return np.asarray(table[bodies], dtype=np.int32)
+
+
+def _add(client: Any, visual: Visual, texture: int | None) -> int:
+    """A body of one visual shape; returns its index."""
+    geometry: dict[str, Any] = {"rgbaColor": visual.rgba}
+    match visual.kind:
+        case "mesh":
+            geometry |= {"shapeType": client.GEOM_MESH, "fileName": visual.file, "meshScale": visual.size}
+        case "box":
+            geometry |= {"shapeType": client.GEOM_BOX, "halfExtents": [v / 2 for v in visual.size]}
+        case "sphere":
+            geometry |= {"shapeType": client.GEOM_SPHERE, "radius": visual.size[0]}
+        case "cylinder" | "capsule":
+            kind = client.GEOM_CYLINDER if visual.kind == "cylinder" else client.GEOM_CAPSULE
+            geometry |= {"shapeType": kind, "radius": visual.size[0], "length": visual.size[1]}
+    index = int(client.createMultiBody(0, -1, client.createVisualShape(**geometry)))
+    if texture is not None:
+        client.changeVisualShape(index, -1, textureUniqueId=texture)
+    return index
+
+
+def _load_texture(client: Any, texture: Texture) -> int:
+    """PyBullet takes pixels only by way of a file."""
+    descriptor, name = tempfile.mkstemp(suffix=".png", prefix="demorec_texture_")
+    os.close(descriptor)
+    try:
+        Image.fromarray(texture_pixels(texture)).save(name)
+        return int(client.loadTexture(name))
+    finally:
+        os.unlink(name)  # noqa: PTH108
