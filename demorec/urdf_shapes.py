@@ -68,7 +68,8 @@ def read_links(text: str, *, scale: float = 1.0) -> tuple[UrdfLink, ...]:
         scale: Uniform scale.
 
     Raises:
-        ValueError: The text is no XML that may be read (`parse_xml`), or a shape lacks a size or has one that is no number.
+        ValueError: The text is no XML that may be read (`parse_xml`), or a shape lacks a size or has one that is no
+            number.
     """
     robot = parse_xml(text)
     colors = {
