@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,10 +14,6 @@ from demorec.playback.layout import comparison_layout, episode_layout
 from demorec.playback.scene import log_episode, new_recording
 from demorec.playback.sources import Source
 from demorec.replacing import RERUN_FILE, written_whole
-
-_END = b"RRF2FOOT"
-"""What the last bytes of a complete .rrd file contain: Rerun writes the table of contents there at last."""
-_END_BYTES = 12
 
 
 def save(source: Source, target: Path) -> None:
@@ -49,7 +44,8 @@ def save_each(sources: Sequence[Source], folder: Path) -> list[Path]:
     """
     files = [folder / f"{index:06d}.rrd" for index in range(len(sources))]
     for source, file in zip(sources, files, strict=True):
-        _save_episode(source, file, is_alone=len(sources) == 1)
+        with _refusals_told(file):
+            _save_episode(source, file, is_alone=len(sources) == 1)
     return files
 
 
@@ -74,30 +70,32 @@ def _save_episode(source: Source, target: Path, *, is_alone: bool) -> None:
 
 @contextmanager
 def _saving(recording: rr.RecordingStream, target: Path, layout: rr.blueprint.Blueprint) -> Iterator[None]:
-    """Write what is logged in the block; RecordingError when not all of it is in the file at the end.
+    """Write what is logged in the block, with its layout; OSError when that is not possible.
 
-    Rerun writes in a thread of its own, which ends at the first error and keeps the reason to its log.
+    An episode is gathered in memory and written from here: Rerun's own thread for files keeps it to its log when the
+    disk is full, or has the program wait for ever.
     """
+    stream = recording.binary_stream()
+    recording.send_blueprint(layout, make_active=False, make_default=True)
     try:
-        recording.save(target, default_blueprint=layout)
-        try:
-            yield
-            recording.flush()
-        finally:
-            recording.disconnect()
-    except RuntimeError as error:
-        raise RecordingError(f"The file cannot be written (is the disk full?): {target}") from error
-    with target.open("rb") as file:
-        file.seek(max(-_END_BYTES, -file.seek(0, os.SEEK_END)), os.SEEK_END)
-        if _END not in file.read():
-            raise RecordingError(f"The file was cut off while it was written (is the disk full?): {target}")
+        yield
+        data = stream.read()
+    finally:
+        recording.disconnect()
+    assert data is not None  # there is a layout, at least
+    target.write_bytes(data)
 
 
 @contextmanager
 def _partial(target: Path) -> Iterator[Path]:
     """A name beside the target, renamed when the block ends well and removed when not."""
+    with _refusals_told(target), written_whole(target, RERUN_FILE) as part:
+        yield part
+
+
+@contextmanager
+def _refusals_told(target: Path) -> Iterator[None]:
     try:
-        with written_whole(target, RERUN_FILE) as part:
-            yield part
+        yield
     except OSError as error:
         raise RecordingError(f"The file cannot be written ({error.strerror or error}): {target}") from error

@@ -45,7 +45,7 @@ def folder_lock(folder: Path) -> Iterator[None]:
     import fcntl
 
     try:
-        file = (folder / "lock").open("w")
+        file = (folder / "lock").open("a")
     except OSError:
         yield
         return
