@@ -197,8 +197,8 @@ def _begin_or_continue(path: Path, asked: RunFile, *, progress: Progress, inspec
     if run.beyond:
         more = len({line.episode_index for line in run.beyond})
         progress.says(
-            f"The folder holds {more} episodes beyond the {run.num_episodes} that are asked for now: they stay as "
-            "recordings, outside of the run's digest and dataset."
+            f"Beyond what is asked for now ({run.num_episodes}), the folder holds recordings of later episodes "
+            f"({more}): they stay, outside of the run's digest and dataset."
         )
     folder = RunFolder(path, run)
     folder.save()

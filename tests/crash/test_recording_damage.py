@@ -273,7 +273,7 @@ def test_a_foreign_mcap_file(tmp_path: Path) -> None:
 
 
 def test_a_folder_and_a_missing_file(tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match="it is a folder"):
+    with pytest.raises(RecordingError, match="it is a folder, not a regular file"):
         Recording(tmp_path)
     with pytest.raises(RecordingError, match="No such file"):
         Recording(tmp_path / "nothing.mcap")

@@ -110,7 +110,7 @@ def test_more_episodes_extend_a_run_and_fewer_are_the_run_that_they_would_have_b
     assert attempts(shrunk) == expected_attempts(3)
     assert num_finished(out) == num_finished(reference.folder), "what exists stays"
     (said,) = heard.said
-    assert said.startswith("The folder holds 5 episodes beyond the 3 that are asked for now: they stay as recordings, ")
+    assert "asked for now (3), the folder holds recordings of later episodes (5): they stay, outside of" in said
     again = run_fake(out, num_episodes=8)
     assert again.made == ()
     assert again.run.digest == reference.run.digest
