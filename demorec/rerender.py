@@ -303,6 +303,7 @@ def rerender(source: Path, out: Path, options: RerenderOptions, *, overwrite: bo
     Raises:
         RecordingError: The source is damaged or empty, or `out` is there already.
         ConfigError: The options cannot be.
+        SceneError: A model file of the scene is missing or broken.
         RenderError: The renderer cannot draw the scene.
     """
     if out.resolve() == source.resolve():
