@@ -133,11 +133,7 @@ class Urdf:
         roots = [link for link in links if link not in children]
         if len(roots) != 1:
             raise ValueError(f"a URDF needs one root link, found {len(roots)}: {', '.join(roots[:5])}")
-        if len(children) < len(joints):
-            raise ValueError("two joints of a URDF carry the same link")
-        urdf = cls(joints=joints, root=roots[0])
-        urdf.link_poses({})  # every joint hangs, over others, on the root
-        return urdf
+        return cls(joints=joints, root=roots[0])
 
     def link_poses(self, joint_position: Mapping[str, float]) -> dict[str, Pose]:
         """Link name -> base_from_link for the given joint positions (rad, m); joints left out are at 0."""

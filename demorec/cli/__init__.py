@@ -77,10 +77,7 @@ def run_command(command: type[Command], args: Sequence[str], *, prog: str) -> in
     logging.basicConfig(level=logging.WARNING, handlers=[handler])
     logging.captureWarnings(True)  # so that Python's warnings, too, come through the formatter
     try:
-        find_defaults = getattr(command, "defaults", None)
-        defaults = None if find_defaults is None else find_defaults(args)
-        parsed: Command = parse(command, args, prog=prog, defaults=defaults)
-        return parsed.run()
+        return parse_command(command, args, prog=prog).run()
     except DemorecError as error:
         tell(f"{prog}: {error}")
         return error.exit_code
@@ -97,6 +94,13 @@ def run_command(command: type[Command], args: Sequence[str], *, prog: str) -> in
             return 1
         tell(f"{prog}: {lack}")
         return lack.exit_code
+
+
+def parse_command(command: type[Command], args: Sequence[str], *, prog: str) -> Command:
+    """The command with its flags; SystemExit for --help and for flags that it does not have."""
+    find_defaults = getattr(command, "defaults", None)
+    parsed: Command = parse(command, args, prog=prog, defaults=None if find_defaults is None else find_defaults(args))
+    return parsed
 
 
 def _keep_traceback() -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import platform
 import sys
 import time
@@ -33,7 +34,7 @@ from demorec.generate.run_file import (
     save_run_file,
 )
 from demorec.generate.survey import Inspector, recordings_of, survey
-from demorec.replacing import check_replaceable, has_unsettled_parts, replaced_parts, settle_parts, shown
+from demorec.replacing import check_replaceable, files_below, has_unsettled_parts, replaced_parts, settle_parts, shown
 
 if TYPE_CHECKING:
     from demorec.generate.run import Progress, RunResult
@@ -167,12 +168,18 @@ def open_run(
 
 def _check_request(path: Path, asked: RunFile, options: RunOptions, *, inspect: Inspector) -> bool:
     """Refuse what does not fit the folder; tell whether a run that is there shall be replaced. Only reads."""
-    if options.overwrite and _holds_a_run(path):
+    if options.overwrite and _would_replace(path):
         check_replaceable(path, RUN, overwrite=True)
         return True
     _refuse_strangers(path)
     _known_run(path, asked, inspect=inspect)
     return False
+
+
+def _would_replace(path: Path) -> bool:
+    """Whether anything is where the run will be, be it of a run or not."""
+    parts = [path / name for name in PARTS if os.path.lexists(path / name)]
+    return any(not part.is_dir() or any(files_below(part)) for part in parts)
 
 
 def _holds_a_run(path: Path) -> bool:

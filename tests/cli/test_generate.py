@@ -28,7 +28,10 @@ def run(capsys, *args: str) -> tuple[int, str, str]:
         (["--renderer", "rastr"], "Unknown renderer 'rastr'. Did you mean 'raster'?"),
         (["--num-episodes", "0"], "num-episodes is 0, allowed are 1 to 10,000,000."),
         (["--num_episodes", "-3"], "num-episodes is -3"),
-        (["--fps", "31"], "fps is 31, which does not divide the physics rate of 240 Hz. Did you mean '30'?"),
+        (
+            ["--fps", "31"],
+            "fps is 31, which does not divide the physics rate of 240 Hz: use 30 or 40, or --physics-hz 248.",
+        ),
         (["--width", "225"], "width is 225, but yuv420p video needs even sizes: use 224 or 226."),
         (["--height", "8"], "height is 8, allowed are 16 to 8192."),
         (["--crf", "52"], "video.crf is 52, allowed are 0 to 51."),

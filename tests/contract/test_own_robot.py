@@ -106,7 +106,8 @@ def test_the_robot_does_a_task_and_replays(folder: Path, tmp_path: Path) -> None
 
 
 def test_a_run_is_not_gone_on_with_when_its_task_was_edited(folder: Path, tmp_path: Path) -> None:
-    (folder / "my_tasks.py").write_text("SPEED = 1.0\n")
+    source = "from demorec.tasks.pick_place import PickPlace\n\n\nclass Mine(PickPlace):\n    speed = 1.0\n"
+    (folder / "my_tasks.py").write_text(source)
     config = GenerateConfig(task="my_tasks:Mine", cameras=())
 
     def go(num_episodes: int) -> int:
@@ -115,7 +116,7 @@ def test_a_run_is_not_gone_on_with_when_its_task_was_edited(folder: Path, tmp_pa
 
     assert go(1) == 1
     assert go(2) == 2
-    (folder / "my_tasks.py").write_text("SPEED = 2.0\n")
+    (folder / "my_tasks.py").write_text(source.replace("1.0", "2.0"))
     forget("my_tasks")
     with pytest.raises(ConfigError, match=r"holds another run \(the source of my_tasks has changed\)"):
         go(3)

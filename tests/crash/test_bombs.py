@@ -272,7 +272,7 @@ def test_fifos_in_a_dataset(name: str, good: Path, commands: Commands, tmp_path:
             """<robot><link name="r"/><link name="a"/><link name="b"/>
             <joint name="j" type="fixed"><parent link="a"/><child link="b"/></joint>
             <joint name="k" type="fixed"><parent link="b"/><child link="a"/></joint></robot>""",
-            "hang on no link",
+            "make one tree",
         ),
         (
             '<robot><link name="r"><visual><geometry><box size="1 nan 1"/></geometry></visual></link></robot>',

@@ -13,7 +13,7 @@ from collections import Counter
 import pytest
 from helpers_odd import Odd
 
-from demorec.cli import COMMANDS, parse
+from demorec.cli import COMMANDS, parse_command
 from demorec.errors import DemorecError
 from demorec.text import printable
 
@@ -29,7 +29,7 @@ def answer(arguments: list[str]) -> int | str:
     said = io.StringIO()
     try:
         with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
-            code: int | str = parse(COMMANDS.load(name), rest, prog=f"demorec {name}").run()
+            code: int | str = parse_command(COMMANDS.load(name), rest, prog=f"demorec {name}").run()
     except DemorecError as error:
         code = str(error)
         assert code, "a refusal without words"
