@@ -178,7 +178,7 @@ def be_today(args: argparse.Namespace) -> None:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     from demorec.config import GenerateConfig
-    from demorec.rollout import Rollout, make_renderer, make_world, prepare
+    from demorec.loop import ScriptAgent, Session, make_renderer, make_world, prepare
 
     config = GenerateConfig(
         renderer="tiny", width=args.size, height=args.size, seed=args.seed, cameras=tuple(args.cameras)
@@ -202,8 +202,8 @@ def be_today(args: argparse.Namespace) -> None:
         for index in range(args.first, args.first + args.episodes):
             before, num_frames = os.times(), 0
             episode = prepare(EpisodePlan(config=config, episode_index=index))
-            rollout = Rollout(world, episode, renderer)
-            for frame in rollout:
+            session = Session.of_episode(world, episode, renderer)
+            for frame in session.run(ScriptAgent(episode)):
                 num_frames += 1
                 state = np.append(frame.observation.joint_position[:7], frame.observation.gripper_width)
                 action = np.append(frame.action.joint_target, frame.action.gripper_target)
@@ -215,7 +215,7 @@ def be_today(args: argparse.Namespace) -> None:
                         **{f"observation.images.{name}": image.color for name, image in frame.images.items()},
                     }
                 )
-            if rollout.outcome is not None and rollout.outcome.success:
+            if session.outcome is not None and session.outcome.success:
                 dataset.save_episode()
             else:
                 dataset.clear_episode_buffer()

@@ -13,7 +13,7 @@ import matplotlib
 import numpy as np
 
 from demorec.config import EpisodePlan, GenerateConfig
-from demorec.rollout import Rollout, make_world, prepare
+from demorec.loop import ScriptAgent, Session, make_world, prepare
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -32,7 +32,7 @@ def main() -> None:
     out: Path = parser.parse_args().out
     episode = prepare(EpisodePlan(config=GenerateConfig(cameras=(), variation="none"), episode_index=0))
     with make_world(episode.info) as world:
-        frames = list(Rollout(world, episode))
+        frames = list(Session.of_episode(world, episode).run(ScriptAgent(episode)))
     fps = episode.info.fps
     times = np.arange(len(frames)) / fps
     height = np.array([frame.observation.base_from_tcp.position[2] for frame in frames])

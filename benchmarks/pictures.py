@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from demorec.config import EpisodePlan, GenerateConfig
-from demorec.rollout import Rollout, make_renderer, make_world, prepare
+from demorec.loop import ScriptAgent, Session, make_renderer, make_world, prepare
 from demorec.tables import TASKS
 
 Picture = NDArray[np.uint8]
@@ -27,7 +27,7 @@ def grasp_and_end(config: GenerateConfig, index: int) -> tuple[Picture, Picture,
     """The front camera's picture when something is first held and at the end of an episode, and its instruction."""
     episode = prepare(EpisodePlan(config=config, episode_index=index))
     with make_world(episode.info) as world, make_renderer(episode.info) as renderer:
-        frames = list(Rollout(world, episode, renderer))
+        frames = list(Session.of_episode(world, episode, renderer).run(ScriptAgent(episode)))
     held = next(frame for frame in frames if frame.phase in CARRYING)
     return held.images["front"].color, frames[-1].images["front"].color, episode.info.instruction
 

@@ -21,9 +21,9 @@ import numpy as np
 from demorec.config import EpisodePlan, GenerateConfig, VideoConfig
 from demorec.episode import CameraImages, EpisodeInfo, Frame, Outcome
 from demorec.geometry import Array
+from demorec.loop import ScriptAgent, Session, make_renderer, make_world, prepare
 from demorec.recording import EpisodeWriter, video
 from demorec.render import Renderer, RenderSetup
-from demorec.rollout import Rollout, make_renderer, make_world, prepare
 
 WAYS = [VideoConfig(codec=codec, gop=gop) for codec in ("h264", "av1") for gop in (2, 10, 30)]
 
@@ -95,10 +95,10 @@ def measure(
     """Simulate, draw and record one episode; its frames are kept in `kept` where that is given."""
     episode = prepare(plan)
     with make_world(episode.info) as world, make_renderer(episode.info) as renderer:
-        rollout = Rollout(world, episode, TimedRenderer(renderer, clock) if renderer else None)
+        session = Session.of_episode(world, episode, TimedRenderer(renderer, clock) if renderer else None)
         path = folder / f"{plan.episode_index}.mcap"
         with EpisodeWriter(path, episode.info, video=plan.config.video) as writer:
-            iterator = iter(rollout)
+            iterator = session.run(ScriptAgent(episode))
             while True:
                 with clock.stage("simulation"):
                     frame = next(iterator, None)
@@ -108,10 +108,9 @@ def measure(
                     writer.write(frame)
                 if kept is not None:
                     kept.append(frame)
-            assert rollout.outcome is not None
             with clock.stage("recorder"):
-                writer.finish(rollout.outcome)
-    return episode.info, rollout.outcome
+                writer.finish(session.outcome)
+    return episode.info, session.outcome
 
 
 def raw_bytes(frames: list[Frame]) -> int:

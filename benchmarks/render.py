@@ -24,9 +24,9 @@ import psutil
 from demorec.config import EpisodePlan, GenerateConfig
 from demorec.errors import RenderError
 from demorec.geometry import Array, Pose
+from demorec.loop import Episode, ScriptAgent, Session, make_world, prepare
 from demorec.render import Renderer
 from demorec.render.painter import Painter
-from demorec.rollout import Episode, Rollout, make_world, prepare
 from demorec.scene import Camera
 from demorec.sim.world import World
 from demorec.tables import RENDERERS
@@ -64,15 +64,15 @@ def run_episode(world: World, episode: Episode) -> list[State]:
     """Every frame of an episode, without pictures."""
     return [
         State(frame.observation.joint_position, dict(frame.observation.object_poses))
-        for frame in Rollout(world, episode)
+        for frame in Session.of_episode(world, episode).run(ScriptAgent(episode))
     ]
 
 
 def painter_for(
     renderer: Renderer, world: World, cameras: tuple[Camera, ...], *, antialias: bool, everything: bool
 ) -> Painter:
-    painter = Painter(renderer)
-    painter.setup(world, cameras, depth=everything, segmentation=everything, antialias=antialias)
+    painter = Painter(renderer, cameras, depth=everything, segmentation=everything, antialias=antialias)
+    painter.setup(world)
     return painter
 
 

@@ -12,7 +12,7 @@ from PIL import Image
 from render import painter_for, plan, run_episode
 
 from demorec.errors import RenderError
-from demorec.rollout import make_world
+from demorec.loop import make_world
 from demorec.tables import RENDERERS
 
 SIZES = ((96, 96), (224, 224), (640, 480))

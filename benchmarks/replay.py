@@ -16,10 +16,10 @@ from pathlib import Path
 
 from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.config import EpisodePlan, GenerateConfig
+from demorec.loop import ScriptAgent, Session, make_renderer, make_world, prepare
 from demorec.recording import EpisodeWriter, Recording
 from demorec.replay import ReplayOptions, open_file, replay_all
 from demorec.rerender import RerenderOptions, rerender
-from demorec.rollout import Rollout, make_renderer, make_world, prepare
 
 
 def generate(path: Path, config: GenerateConfig, index: int) -> None:
@@ -29,11 +29,10 @@ def generate(path: Path, config: GenerateConfig, index: int) -> None:
         make_renderer(episode.info) as renderer,
         EpisodeWriter(path, episode.info, video=config.video) as writer,
     ):
-        rollout = Rollout(world, episode, renderer)
-        for frame in rollout:
+        session = Session.of_episode(world, episode, renderer)
+        for frame in session.run(ScriptAgent(episode)):
             writer.write(frame)
-        assert rollout.outcome is not None
-        writer.finish(rollout.outcome)
+        writer.finish(session.outcome)
 
 
 def main() -> None:

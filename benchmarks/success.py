@@ -18,7 +18,7 @@ from typing import Any
 from demorec.config import EpisodePlan, GenerateConfig
 from demorec.episode import Outcome
 from demorec.errors import SceneError
-from demorec.rollout import Rollout, make_world, prepare
+from demorec.loop import ScriptAgent, Session, make_world, prepare
 from demorec.tables import ROBOTS, TASKS
 
 
@@ -28,19 +28,19 @@ def measure(config: GenerateConfig, *, first: int, episodes: int) -> dict[str, A
     unplaceable: list[int] = []
     warm_up = prepare(EpisodePlan(config=config, episode_index=first))
     with make_world(warm_up.info) as world:
-        for _ in Rollout(world, warm_up):  # compiles the kinematics
+        for _ in Session.of_episode(world, warm_up).run(ScriptAgent(warm_up)):  # compiles the kinematics
             pass
         started = time.process_time()
         for index in range(first, first + episodes):
             try:
-                run = Rollout(world, prepare(EpisodePlan(config=config, episode_index=index)))
+                episode = prepare(EpisodePlan(config=config, episode_index=index))
             except SceneError:
                 unplaceable.append(index)
                 continue
-            for _ in run:
+            session = Session.of_episode(world, episode)
+            for _ in session.run(ScriptAgent(episode)):
                 pass
-            assert run.outcome is not None
-            outcomes[index] = run.outcome
+            outcomes[index] = session.outcome
         seconds = time.process_time() - started
     done = list(outcomes.values())
     successes = [outcome for outcome in done if outcome.success]

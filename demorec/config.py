@@ -108,7 +108,7 @@ class GenerateConfig:
         """Raise ConfigError unless all that it names may be loaded.
 
         A config that was read from a recording, a run, a dataset or a policy must pass this before anything is made
-        of it: `demorec.rollout.prepare` imports what its plan's config names.
+        of it: `demorec.loop.prepare` imports what its plan's config names.
 
         Args:
             allowed: The user's own modules and packages that may be imported.

@@ -36,7 +36,7 @@ ActionKind = Literal["joint", "joint_increment", "ee", "ee_delta"]
 NOISE_LETS_GO = 0.3
 """Share of the exploration noise on the executed commands that goes away within 1/30 s, when none is added.
 
-Known to both sides: `demorec.rollout.ActionNoise` makes the noise so, and the increments below contain this return.
+Known to both sides: `demorec.loop.noise.ActionNoise` makes the noise so, and the increments below contain this return.
 """
 
 NEAR = 0.02

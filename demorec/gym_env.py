@@ -21,14 +21,15 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from demorec import features
-from demorec.acting import ActionDecoder, action_bounds, check_action_kind
 from demorec.config import EpisodePlan, GenerateConfig
-from demorec.episode import Action, CameraImages, Check, EpisodeInfo, Observation
+from demorec.episode import CameraImages, Check, EpisodeInfo, Frame, Observation
 from demorec.errors import ConfigError, SceneError
 from demorec.features import ActionKind, ObservationRows
 from demorec.geometry import Array
+from demorec.loop import Decision, Episode, Session, make_world, prepare
+from demorec.loop.actions import ActionDecoder, action_bounds, check_action_kind
+from demorec.render import Renderer
 from demorec.render.painter import Painter
-from demorec.rollout import Episode, make_world, prepare
 from demorec.scene import Scene
 from demorec.sim.world import World
 from demorec.tables import CAMERAS, RENDERERS, TASKS
@@ -38,6 +39,9 @@ SUCCESS_FRAMES = 5
 """For how many frames in a row every check of the task must hold."""
 SECONDS_PER_GOAL = 15.0
 """Time limit for each object to be moved, about twice what the expert takes."""
+
+POLICY_PHASE = "policy"
+"""Phase of every frame: whoever acts from outside tells none."""
 
 PROBED_SCENES = 16
 """How many scenes are looked at to tell whether the number of objects varies."""
@@ -59,7 +63,7 @@ class Situation:
         frame_index: Control steps since the reset.
         observation: Now.
         images: camera name -> images now.
-        command: What was sent in the step that led here; None after a reset.
+        last_frame: The frame of the step that led here, with what was commanded; None after a reset.
         checks: The task's conditions with the values found now.
         is_success: Whether all of them have held for `SUCCESS_FRAMES` frames.
     """
@@ -67,7 +71,7 @@ class Situation:
     frame_index: int
     observation: Observation
     images: Mapping[str, CameraImages]
-    command: Action | None
+    last_frame: Frame | None
     checks: tuple[Check, ...]
     is_success: bool
 
@@ -182,9 +186,10 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         self.action_space = _box(action_bounds(info.robot, action, fps=config.fps))
         self._resources = ExitStack()
         self._world: World | None = None
-        self._painter: Painter | None = None
+        self._renderer: Renderer | None = None
+        self._viewer_renderer: Renderer | None = None
         self._viewer: Painter | None = None
-        self._viewer_is_set_up = False
+        self._session: Session | None = None
         self._situation: Situation | None = None
 
     # ------------------------------------------------------------------------------------------------ what it is at
@@ -245,35 +250,37 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
             )
         if self._world is None:
             self._world = self._resources.enter_context(make_world(info))
-        self.world.reset(info.scene)
+        painter = None
         if info.scene.cameras:
-            self._painter = self._painter or self._new_painter()
-            self._painter.setup(
-                self.world,
+            self._renderer = self._renderer or self._new_renderer()
+            painter = Painter(
+                self._renderer,
                 self.episode.cameras,
                 true_from_recorded=self.episode.true_from_recorded,
                 antialias=self.config.antialias,
             )
-        self._viewer_is_set_up = False
+        session = Session(self._world, info.scene, self.episode.task, painter=painter)
+        session.reset()
+        self._session = session
+        self._viewer = None
         self._held = 0
-        self._steps = 0
-        self._decoder = ActionDecoder(self.world, self._action_kind)
-        self._situation = self._look(None)
+        self._decoder = ActionDecoder(self._world, self._action_kind)
+        self._situation = self._look(session, None)
         return self._observation(self._situation), {"is_success": False, "episode_index": index}
 
     def step(self, action: NDArray[np.floating]) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """One control step; ValueError for an action of a wrong shape or with a value that is no number."""
-        if self._situation is None:
+        if self._session is None:
             raise RuntimeError("the environment has no episode yet: call reset first")
         values = np.asarray(action, dtype=np.float64)
         if values.shape != self.action_space.shape or not np.isfinite(values).all():
             raise ValueError(f"An action has shape {self.action_space.shape} and finite values, found {values!r}.")
         command = self._decoder.command(values)
-        self.world.apply(command)
-        self._steps += 1
-        self._situation = self._look(command)
+        frame = self._session.frame(Decision(action=command, command=command, phase=POLICY_PHASE))
+        self._session.step(command)
+        self._situation = self._look(self._session, frame)
         success = self._situation.is_success
-        truncated = not success and self._steps >= self._max_episode_steps
+        truncated = not success and self._session.frame_index >= self._max_episode_steps
         reward = 1.0 if success else 0.0
         information = {"is_success": success, "episode_index": self.episode.plan.episode_index}
         return self._observation(self._situation), reward, success, truncated, information
@@ -284,20 +291,20 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
             return None
         if self._situation is None:
             raise RuntimeError("the environment has no episode yet: call reset first")
-        self._viewer = self._viewer or self._new_painter()
-        if not self._viewer_is_set_up:
+        if self._viewer is None:
+            self._viewer_renderer = self._viewer_renderer or self._new_renderer()
             width, height = self._render_size
             camera = CAMERAS.load(self._render_camera).camera(
                 self._render_camera, self.info.robot, width=width, height=height
             )
-            self._viewer.setup(self.world, (camera,), antialias=self.config.antialias)
-            self._viewer_is_set_up = True
+            self._viewer = Painter(self._viewer_renderer, (camera,), antialias=self.config.antialias)
+            self._viewer.setup(self.world)
         return self._viewer.images()[self._render_camera].color
 
     def close(self) -> None:
         """Free the simulator and the renderers; harmless when called twice."""
         self._resources.close()
-        self._world = self._painter = self._viewer = self._situation = None
+        self._world = self._renderer = self._viewer_renderer = self._viewer = self._session = self._situation = None
 
     # ------------------------------------------------------------------------------------------------ parts
 
@@ -325,17 +332,18 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         # A round object has no yaw, so that its vector is shorter.
         return len({tuple(_lengths(info, privileged=True).values()) for info in infos}) == 1
 
-    def _new_painter(self) -> Painter:
-        return Painter(self._resources.enter_context(RENDERERS.load(self.config.renderer)()))
+    def _new_renderer(self) -> Renderer:
+        renderer: Renderer = self._resources.enter_context(RENDERERS.load(self.config.renderer)())
+        return renderer
 
-    def _look(self, command: Action | None) -> Situation:
-        checks = self.episode.task.evaluate(self.world)
+    def _look(self, session: Session, last_frame: Frame | None) -> Situation:
+        checks = session.checks()
         self._held = self._held + 1 if all(check.passed for check in checks) else 0
         return Situation(
-            frame_index=self._steps,
-            observation=self.world.observe(),
-            images={} if self._painter is None else self._painter.images(),
-            command=command,
+            frame_index=session.frame_index,
+            observation=session.observation,
+            images=session.images,
+            last_frame=last_frame,
             checks=checks,
             is_success=self._held >= SUCCESS_FRAMES,
         )

@@ -19,14 +19,14 @@ from demorec.config import EpisodePlan, GenerateConfig, VideoConfig, read_toml
 from demorec.episode import EpisodeInfo, Outcome
 from demorec.errors import ConfigError, DemorecError, NotAllowedError, RecordingError
 from demorec.geometry import Pose, look_at
+from demorec.loop import prepare
 from demorec.plain import digest, from_plain
 from demorec.recording import EpisodeWriter, Recording
 from demorec.recording.frames import frames_of
 from demorec.registry import nearest_match
 from demorec.render import Renderer
-from demorec.render.painter import Drawable, Painter
+from demorec.render.painter import Painter
 from demorec.render.recorded import RecordedWorld
-from demorec.rollout import prepare
 from demorec.scene import Camera, Scene
 from demorec.seeding import generator
 from demorec.tables import CAMERAS, RENDERERS, camera_name
@@ -250,28 +250,22 @@ def _check_size(camera: Camera) -> None:
             raise ConfigError(f"The {what} of the camera {camera.name!r} is {value}: it must be even, 16 to 8192.")
 
 
-def view_painter(renderer: Renderer, world: Drawable, view: View, config: Mapping[str, Any]) -> Painter:
-    """A painter that draws a world as a view and the config of a recording ask for.
+def view_painter(renderer: Renderer, view: View, config: Mapping[str, Any]) -> Painter:
+    """A painter that draws worlds in a view's scene as the view and the config of a recording ask for.
 
     Args:
         renderer: Entered.
-        world: In the view's scene.
         view: Where the cameras are.
         config: Tells depth, segmentation and antialiasing.
-
-    Raises:
-        RenderError: The renderer cannot draw a shape or camera.
     """
-    painter = Painter(renderer)
-    painter.setup(
-        world,
+    return Painter(
+        renderer,
         view.true_cameras,
         true_from_recorded=view.true_from_recorded,
         depth=bool(config.get("depth", False)),
         segmentation=bool(config.get("segmentation", False)),
         antialias=bool(config.get("antialias", True)),
     )
-    return painter
 
 
 def drawing_config(info: EpisodeInfo, options: RerenderOptions) -> dict[str, Any]:
@@ -332,7 +326,8 @@ def rerender(source: Path, out: Path, options: RerenderOptions, *, overwrite: bo
             RENDERERS.load(str(config.get("renderer", "raster")))() as renderer,
             EpisodeWriter(out, new_info, video=video, overwrite=overwrite) as writer,
         ):
-            painter = view_painter(renderer, world, view, config)
+            painter = view_painter(renderer, view, config)
+            painter.setup(world)
             for frame in frames_of(recording, columns):
                 world.frame = frame.frame_index
                 writer.write(replace(frame, images=painter.images()))

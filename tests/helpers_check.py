@@ -22,12 +22,12 @@ from demorec.config import EpisodePlan, GenerateConfig
 from demorec.episode import CameraImages, EpisodeColumns, EpisodeInfo, Frame, Outcome
 from demorec.generate.recordings import inspect_recording
 from demorec.generate.run_file import RunFile, save_run_file
+from demorec.loop import ScriptAgent, Session, make_renderer, make_world, prepare
 from demorec.recording import EpisodeWriter, Recording
 from demorec.recording.container import Container
 from demorec.recording.frame_check import FrameCheck
 from demorec.recording.frames import decoded_images, frames_of
 from demorec.recording.part_file import PartFile
-from demorec.rollout import Rollout, make_renderer, make_world, prepare
 
 Pictures = list[dict[str, CameraImages]]
 
@@ -43,11 +43,10 @@ def simulate(path: Path, *, episode_index: int = 0, **config: Any) -> Path:
         make_renderer(episode.info) as renderer,
         EpisodeWriter(path, episode.info, video=plan.config.video) as writer,
     ):
-        rollout = Rollout(world, episode, renderer)
-        for frame in rollout:
+        session = Session.of_episode(world, episode, renderer)
+        for frame in session.run(ScriptAgent(episode)):
             writer.write(frame)
-        assert rollout.outcome is not None
-        writer.finish(rollout.outcome)
+        writer.finish(session.outcome)
     return path
 
 

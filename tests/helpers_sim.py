@@ -6,7 +6,7 @@ from typing import Any
 
 from demorec.config import EpisodePlan, GenerateConfig
 from demorec.episode import Frame, Outcome
-from demorec.rollout import Episode, Rollout, make_renderer, make_world, prepare
+from demorec.loop import Episode, ScriptAgent, Session, make_renderer, make_world, prepare
 from demorec.sim.world import World
 
 
@@ -22,7 +22,6 @@ def run(prepared: Episode, world: World | None = None) -> tuple[list[Frame], Out
         with make_world(prepared.info) as fresh:
             return run(prepared, fresh)
     with make_renderer(prepared.info) as renderer:
-        rollout = Rollout(world, prepared, renderer)
-        frames = list(rollout)
-    assert rollout.outcome is not None
-    return frames, rollout.outcome
+        session = Session.of_episode(world, prepared, renderer)
+        frames = list(session.run(ScriptAgent(prepared)))
+    return frames, session.outcome

@@ -83,9 +83,9 @@ class Evaluate:
             raise ConfigError(f"num-episodes is {self.num_episodes}, allowed are 1 to 1000000.")
         if self.workers is not None and self.workers < 1:
             raise ConfigError(f"workers is {self.workers}, at least 1 is needed.")
-        from demorec.acting import check_action_kind
         from demorec.evaluate.rollouts import evaluate, settings_for
         from demorec.generate.options import available_cores
+        from demorec.loop.actions import check_action_kind
 
         settings = settings_for(
             self.policy,

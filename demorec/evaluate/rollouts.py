@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from demorec.config import EpisodePlan, GenerateConfig
-from demorec.episode import Frame, Outcome, frame_time_ns
+from demorec.episode import Outcome
 from demorec.errors import ConfigError, DemorecError
 from demorec.evaluate.policy import Policy, check_steps, find_checkpoint, policy_summary, trained_action
 from demorec.evaluate.progress import Progress, factors_of
@@ -30,15 +30,14 @@ from demorec.generate.executor import Lost, Raised
 from demorec.generate.local import LocalExecutor
 from demorec.generate.plan import plain_differences
 from demorec.generate.run_file import EPISODES, FAILED, Attempt
-from demorec.gym_env import DemorecEnv, Situation
+from demorec.gym_env import DemorecEnv
+from demorec.loop import prepare
 from demorec.plain import from_plain, to_plain
 from demorec.recording import EpisodeWriter
 from demorec.replacing import Kind, check_replaceable, json_object, replaced_parts, settle_parts
-from demorec.rollout import prepare
 from demorec.tables import camera_name
 
 EVALUATION_NAME = "evaluation.json"
-POLICY_PHASE = "policy"
 MAKE_ROLLOUT = "demorec.evaluate.rollouts:make_rollout"
 
 
@@ -207,13 +206,12 @@ def make_rollout(plan: EpisodePlan, folder: Path) -> Attempt:
     path = folder / name
     with EpisodeWriter(path, info, video=plan.config.video, overwrite=True) as recording:
         terminated = truncated = False
-        after = env.situation
         while not (terminated or truncated):
-            before = after
             observation, _, terminated, truncated, _ = env.step(policy.act(observation, info.instruction))
-            after = env.situation
-            recording.write(_frame(before, after, fps=info.fps))
+            assert env.situation.last_frame is not None  # since it is no situation after a reset
+            recording.write(env.situation.last_frame)
             progress.watch(env.world)
+        after = env.situation
         phase, reason = ("", "") if terminated else progress.failure(after)
         outcome = Outcome(
             success=terminated,
@@ -238,20 +236,6 @@ def make_rollout(plan: EpisodePlan, folder: Path) -> Attempt:
         num_bytes=stats.num_bytes,
         phase=phase,
         reason=reason,
-    )
-
-
-def _frame(before: Situation, after: Situation, *, fps: int) -> Frame:
-    """Frame t: what was seen at t, and the command that then led to t + 1."""
-    assert after.command is not None  # since it is no situation after a reset
-    return Frame(
-        frame_index=before.frame_index,
-        time_ns=frame_time_ns(before.frame_index, fps),
-        observation=before.observation,
-        action=after.command,
-        command=after.command,
-        phase=POLICY_PHASE,
-        images=before.images,
     )
 
 

@@ -144,7 +144,7 @@ def generate(
 
 def _refuse_impossible(config: GenerateConfig, options: RunOptions) -> None:
     """Raise what the first worker would raise, before anything is written."""
-    from demorec.rollout import load_task
+    from demorec.loop import load_task
 
     load_task(config)
     if options.executor == "ray":

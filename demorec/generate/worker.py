@@ -16,15 +16,15 @@ from dataclasses import replace
 from pathlib import Path
 
 from demorec.config import EpisodePlan
-from demorec.episode import CameraImages, EpisodeInfo
+from demorec.episode import CameraImages, EpisodeInfo, Frame, Outcome
 from demorec.errors import ConfigError, SceneError
 from demorec.generate.recordings import inspect_recording
 from demorec.generate.run_file import EPISODES, FAILED, STARTING, UNFINISHED, Attempt, recording_name, sync_folder
 from demorec.geometry import Array
+from demorec.loop import ScriptAgent, Session, make_renderer, make_world, prepare
 from demorec.own_versions import version_differences
 from demorec.recording import EpisodeWriter
 from demorec.render import Renderer, RenderSetup
-from demorec.rollout import Rollout, make_renderer, make_world, prepare
 from demorec.sim.world import World
 
 SIMULATION, RENDERING, RECORDING = "simulation", "rendering", "recording"
@@ -41,51 +41,35 @@ def make_episode(plan: EpisodePlan, folder: Path) -> Attempt:
         DemorecError: No trustworthy recording could be made, for a reason that another attempt would not mend.
         OSError: The folder cannot be written to.
     """
-    seconds = dict.fromkeys(STAGES, 0.0)
+    clock = _Stopwatch(SIMULATION if _workshop.is_warm else STARTING)
     with _scratch_folder(folder) as scratch:
         path = scratch / recording_name(plan.episode_index, plan.attempt, success=False)
         try:
-            _record(plan, path, seconds)
+            _record(plan, path, clock)
         except SceneError as error:
             for part in scratch.iterdir():
                 part.unlink()
-            return _without_scene(plan, str(error), seconds)
-        with _measured(seconds, RECORDING):
+            return _without_scene(plan, str(error), clock.seconds())
+        with clock.stage(RECORDING):
             attempt = inspect_recording(path).attempt
             file = f"{EPISODES if attempt.success else FAILED}/" + recording_name(
                 plan.episode_index, plan.attempt, success=attempt.success
             )
             path.replace(folder / file)
             sync_folder((folder / file).parent)
-    return replace(attempt, file=file, seconds=seconds)
+    return replace(attempt, file=file, seconds=clock.seconds())
 
 
-def _record(plan: EpisodePlan, path: Path, seconds: dict[str, float]) -> None:
-    before_first_frame = SIMULATION if _workshop.is_warm else STARTING
-    with _measured(seconds, before_first_frame):
-        episode = prepare(plan)
-        _check_versions(plan, episode.info.versions)
-        world, renderer = _workshop.equip(episode.info)
-    rollout = Rollout(world, episode, _Stopwatch(renderer, seconds) if renderer else None)
-    with EpisodeWriter(path, episode.info, video=plan.config.video) as recording:
-        frames = iter(rollout)
-        stage = before_first_frame
-        while True:
-            rendering_before = seconds[RENDERING]
-            with _measured(seconds, stage):
-                frame = next(frames, None)
-            if stage == STARTING:
-                seconds[RENDERING] = rendering_before
-            else:
-                seconds[stage] -= seconds[RENDERING] - rendering_before
-            stage = SIMULATION
-            if frame is None:
-                break
-            with _measured(seconds, RECORDING):
-                recording.write(frame)
-        assert rollout.outcome is not None  # set when the frames are exhausted
-        with _measured(seconds, RECORDING):
-            recording.finish(rollout.outcome)
+def _record(plan: EpisodePlan, path: Path, clock: _Stopwatch) -> None:
+    episode = prepare(plan)
+    _check_versions(plan, episode.info.versions)
+    world, renderer = _workshop.equip(episode.info)
+    session = Session.of_episode(world, episode, _TimedRenderer(renderer, clock) if renderer else None)
+    with EpisodeWriter(path, episode.info, video=plan.config.video) as writer:
+        recording = _TimedWriter(writer, clock)
+        for frame in session.run(ScriptAgent(episode)):
+            recording.write(frame)
+        recording.finish(session.outcome)
 
 
 def _check_versions(plan: EpisodePlan, here: Mapping[str, str]) -> None:
@@ -132,18 +116,51 @@ _workshop = _Workshop()
 
 
 class _Stopwatch:
+    """CPU seconds by stage. What happens outside every `stage` belongs to the simulation once a frame was recorded.
+
+    Args:
+        before_first_frame: What it belongs to until then: SIMULATION, or STARTING, which includes the first drawing.
+    """
+
+    def __init__(self, before_first_frame: str) -> None:
+        self._seconds = dict.fromkeys(STAGES, 0.0)
+        self._stage = before_first_frame
+        self._since = time.process_time()
+
+    def seconds(self) -> dict[str, float]:
+        """Stage -> seconds until now."""
+        self._switch(self._stage)
+        return dict(self._seconds)
+
+    @contextmanager
+    def stage(self, stage: str) -> Iterator[None]:
+        """Count what is done within for another stage."""
+        outer = self._switch(STARTING if (self._stage, stage) == (STARTING, RENDERING) else stage)
+        try:
+            yield
+        finally:
+            self._switch(SIMULATION if stage == RECORDING else outer)
+
+    def _switch(self, stage: str) -> str:
+        now = time.process_time()
+        self._seconds[self._stage] = self._seconds.get(self._stage, 0.0) + now - self._since
+        self._since, before, self._stage = now, self._stage, stage
+        return before
+
+
+class _TimedRenderer:
     """A renderer whose CPU seconds are counted."""
 
-    def __init__(self, renderer: Renderer, seconds: dict[str, float]) -> None:
+    def __init__(self, renderer: Renderer, clock: _Stopwatch) -> None:
         self._renderer = renderer
-        self._seconds = seconds
+        self._clock = clock
 
     def setup(self, setup: RenderSetup) -> None:
-        with _measured(self._seconds, RENDERING):
+        with self._clock.stage(RENDERING):
             self._renderer.setup(setup)
 
     def render(self, poses: Array) -> dict[str, CameraImages]:
-        with _measured(self._seconds, RENDERING):
+        with self._clock.stage(RENDERING):
             return self._renderer.render(poses)
 
     def close(self) -> None:
@@ -154,6 +171,22 @@ class _Stopwatch:
 
     def __exit__(self, *exc: object) -> None:
         self.close()
+
+
+class _TimedWriter:
+    """A writer whose CPU seconds are counted."""
+
+    def __init__(self, writer: EpisodeWriter, clock: _Stopwatch) -> None:
+        self._writer = writer
+        self._clock = clock
+
+    def write(self, frame: Frame) -> None:
+        with self._clock.stage(RECORDING):
+            self._writer.write(frame)
+
+    def finish(self, outcome: Outcome) -> None:
+        with self._clock.stage(RECORDING):
+            self._writer.finish(outcome)
 
 
 @contextmanager
@@ -173,15 +206,6 @@ def _scratch_folder(folder: Path) -> Iterator[Path]:
     finally:
         with suppress(OSError):
             scratch.rmdir()
-
-
-@contextmanager
-def _measured(seconds: dict[str, float], stage: str) -> Iterator[None]:
-    start = time.process_time()
-    try:
-        yield
-    finally:
-        seconds[stage] = seconds.get(stage, 0.0) + time.process_time() - start
 
 
 def _without_scene(plan: EpisodePlan, reason: str, seconds: dict[str, float]) -> Attempt:

@@ -33,21 +33,19 @@ class Drawable(Protocol):
 
 
 class Painter:
-    """Draws a world through a renderer, which it leaves open.
+    """Draws worlds, one after the other, through a renderer, which it leaves open.
 
     Args:
         renderer: Entered; kept warm from one world to the next.
+        cameras: Where the cameras really are.
+        true_from_recorded: Camera name -> calibration error, of the cameras that have one.
+        depth, segmentation: Whether these are drawn beside colour.
+        antialias: Whether edges are smoothed, where the renderer can.
     """
 
-    def __init__(self, renderer: Renderer) -> None:
-        self._renderer = renderer
-        self._world: Drawable | None = None
-        self._setup: RenderSetup | None = None
-        self._true_from_recorded: Mapping[str, Pose] = {}
-
-    def setup(
+    def __init__(
         self,
-        world: Drawable,
+        renderer: Renderer,
         cameras: tuple[Camera, ...],
         *,
         true_from_recorded: Mapping[str, Pose] | None = None,
@@ -55,28 +53,28 @@ class Painter:
         segmentation: bool = False,
         antialias: bool = True,
     ) -> None:
-        """Take over a world in a new scene.
+        self._renderer = renderer
+        self._cameras = cameras
+        self._true_from_recorded = true_from_recorded or {}
+        self._depth, self._segmentation, self._antialias = depth, segmentation, antialias
+        self._world: Drawable | None = None
+        self._setup: RenderSetup | None = None
 
-        Args:
-            world: What is drawn from now on.
-            cameras: Where the cameras really are.
-            true_from_recorded: Camera name -> calibration error, of the cameras that have one.
-            depth, segmentation: Whether these are drawn beside colour.
-            antialias: Whether edges are smoothed, where the renderer can.
+    def setup(self, world: Drawable) -> None:
+        """Take over a world in a new scene; it is drawn from now on.
 
         Raises:
             RenderError: The renderer cannot draw a shape or camera.
         """
         self._world = world
-        self._true_from_recorded = true_from_recorded or {}
         self._setup = RenderSetup(
             bodies=world.visuals(),
-            cameras=cameras,
+            cameras=self._cameras,
             mounts=world.mounts(),
             light=world.scene.light,
-            depth=depth,
-            segmentation=segmentation,
-            antialias=antialias,
+            depth=self._depth,
+            segmentation=self._segmentation,
+            antialias=self._antialias,
         )
         self._renderer.setup(self._setup)
 

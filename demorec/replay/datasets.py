@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from demorec.episode import Action
 from demorec.errors import ConfigError
-from demorec.features import ACTION, STATE, ActionKind, joint_target_from_increment, pose_from_delta
-from demorec.geometry import Array, Pose
+from demorec.features import ACTION, STATE
 from demorec.replay.demonstration import Demonstration, ReplayOptions
-from demorec.sim.world import World
 
 
 def dataset_demonstrations(
@@ -48,12 +43,12 @@ def dataset_demonstrations(
         if kind is None:
             raise ConfigError(f"The dataset's actions are none that demorec writes, so they cannot be replayed: {path}")
         state = rows[STATE].astype(np.float64)
-        actions = rows[ACTION].astype(np.float64)
         yield Demonstration(
             name=f"{path.name}_episode_{number:06d}",
             info=info,
             fps=dataset.info.fps,
-            commands=partial(dataset_commands, actions, kind),
+            actions=rows[ACTION].astype(np.float64),
+            action_kind=kind,
             joint_position=state[:, :-1],
             joint_velocity=None,
             gripper_width=state[:, -1],
@@ -62,36 +57,3 @@ def dataset_demonstrations(
             tolerance=1e-6,
             digest=str(row["content_digest"]),
         )
-
-
-def dataset_commands(actions: Array, kind: ActionKind, world: World) -> Iterator[Action]:
-    """What to send for the rows of a dataset's action column; a NaN target where IK finds nothing.
-
-    Args:
-        actions: (T, D).
-        kind: What they are (`demorec.features.action_vectors`).
-        world: At the episode's start.
-    """
-    kinematics = world.arm.kinematics
-    num_arm = len(world.robot.arm_joints)
-    target = world.arm.target.copy()
-    pose = world.observe().base_from_tcp
-    for row in actions:
-        gripper = float(row[-1])
-        if kind == "joint":
-            target = row[:num_arm].copy()
-        elif kind == "joint_increment":
-            target = joint_target_from_increment(target, row)
-        else:
-            if kind == "ee":
-                quat = row[3:7] / math.sqrt(float((row[3:7] * row[3:7]).sum()))
-                pose = Pose(position=row[:3], quat_xyzw=quat)
-            else:
-                pose = pose_from_delta(pose, row)
-            found = kinematics.inverse(pose, start=target)
-            if found is None:
-                nothing = np.full(num_arm, np.nan)
-                yield Action(joint_target=nothing, gripper_target=gripper, base_from_tcp_target=pose)
-                continue
-            target = found
-        yield Action(joint_target=target, gripper_target=gripper, base_from_tcp_target=kinematics.forward(target))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,10 +10,10 @@ import numpy as np
 
 from demorec.episode import Action, Check, EpisodeInfo, Frame
 from demorec.errors import ConfigError, RecordingError
+from demorec.features import ActionKind
 from demorec.geometry import Array
 from demorec.recording import Recording
 from demorec.recording.frames import command_at, frames_of
-from demorec.sim.world import World
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,7 +59,9 @@ class Demonstration:
         name: Of the file or of the dataset's episode.
         info: The recorded scene and robot.
         fps: Commands a second.
-        commands: (world at its start) -> what to send, one a step; built late, since IK needs the start.
+        commands: What to send, one a step; of a recording.
+        actions: (T, D) what to send is decoded from these; of a dataset.
+        action_kind: What `actions` mean; None where `commands` tell.
         joint_position: (T, n) recorded before each command; n = n_joints, or n_arm of a dataset.
         joint_velocity: (T, n_joints), or None.
         gripper_width: (T,) m.
@@ -76,31 +78,20 @@ class Demonstration:
     name: str
     info: EpisodeInfo
     fps: int
-    commands: Callable[[World], Iterator[Action]]
     joint_position: Array
     joint_velocity: Array | None
     gripper_width: Array
     object_poses: Mapping[str, Array]
     recorded_success: bool | None
+    commands: tuple[Action, ...] = ()
+    actions: Array | None = None
+    action_kind: ActionKind | None = None
     final_state_digest: str = ""
     tolerance: float = 0.0
     source: Path | None = None
     digest: str = ""
     recorded: tuple[Frame, ...] = ()
     recorded_checks: tuple[Check, ...] = ()
-
-    def labelled(self, frame: Frame) -> Frame:
-        """A frame of the replay with the recorded label, phase and events of the same frame, if there is one."""
-        if frame.frame_index >= len(self.recorded):
-            return frame
-        then = self.recorded[frame.frame_index]
-        return replace(
-            frame,
-            action=then.action,
-            phase=then.phase,
-            events=then.events,
-            is_deliberate_miss=then.is_deliberate_miss,
-        )
 
     @property
     def num_steps(self) -> int:
@@ -131,7 +122,7 @@ def open_demonstration(recording: Recording, options: ReplayOptions) -> Demonstr
         name=recording.path.name,
         info=info,
         fps=fps,
-        commands=lambda world: (command_at(columns, int(row)) for row in sent),
+        commands=tuple(command_at(columns, int(row)) for row in sent),
         joint_position=columns.joint_position[rows],
         joint_velocity=None if options.states else columns.joint_velocity[rows],
         gripper_width=columns.gripper_width[rows],

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from demorec.episode import Action, Check, Frame, frame_time_ns
+from demorec.episode import Action, Frame, Outcome
 from demorec.geometry import Array
+from demorec.loop import Decision, Session
+from demorec.loop.actions import ActionDecoder
 from demorec.recording.frames import pose_of
+from demorec.render.painter import Painter
 from demorec.replay.demonstration import Demonstration, ReplayOptions
 from demorec.seeding import generator
 from demorec.sim.world import World
@@ -66,11 +69,10 @@ class _Comparison:
     joint: tuple[float, int] = (0.0, 0)
     gripper: float = 0.0
     object: tuple[float, int, str] = (0.0, 0, "")
-    unreachable: int = 0
 
-    def take(self, step: int, world: World) -> None:
-        """Compare the world's present state with the recorded one of a step."""
-        d, seen = self.demonstration, world.observe()
+    def take(self, frame: Frame) -> None:
+        """Compare what is seen now with what was recorded at that step."""
+        d, seen, step = self.demonstration, frame.observation, frame.frame_index
         num_arm = len(d.info.robot.arm_joints)
         recorded = d.joint_position[step]
         differences = [
@@ -97,56 +99,101 @@ class _Comparison:
 
 
 def replay(
-    demonstration: Demonstration, world: World, options: ReplayOptions, *, sink: FrameSink | None = None
-) -> tuple[ReplayReport, tuple[Check, ...]]:
+    demonstration: Demonstration,
+    world: World,
+    options: ReplayOptions,
+    *,
+    painter: Painter | None = None,
+    sink: FrameSink | None = None,
+) -> tuple[ReplayReport, Outcome]:
     """Send the actions of a demonstration and compare.
 
     Args:
         demonstration: What to do.
         world: Of its robot and rate (`World(info.robot, fps=demonstration.fps)`); is reset.
         options: How.
-        sink: Is given every frame of the replay, without pictures, before its command is sent.
+        painter: For the pictures of the frames, or None.
+        sink: Is given every frame of the replay before its command is sent.
 
     Returns:
-        The report, and the task's conditions at the end (empty with `states`).
+        The report, and how the replay ended; with `states`, which judge nothing, how the recording did.
     """
     d = demonstration
     task = None if options.states else TASKS.load(d.info.task, options.allowed)()
-    world.reset(d.info.scene)
+    session = Session(world, d.info.scene, task, painter=painter)
+    agent = DemonstrationAgent(d, options)
     comparison = _Comparison(demonstration=d)
-    if task is None:
-        for step in range(d.num_steps):
-            place_state(world, d, step)
-            comparison.take(step, world)
-            if sink is not None:
-                command = d.recorded[step].command if step < len(d.recorded) else _hold(world)
-                sink(_frame(world, step, d.fps, command))
-        return _report(comparison, checks=(), digest=None), ()
     num_steps = 0
-    for step, command in enumerate(_sent(d, world, options, comparison)):
-        if step < d.num_steps:
-            comparison.take(step, world)
+    for frame in _placed(session, d) if options.states else session.run(agent):
+        if frame.frame_index < d.num_steps:
+            comparison.take(frame)
         if sink is not None:
-            sink(_frame(world, step, d.fps, command))
-        world.apply(command)
-        num_steps = step + 1
-    checks = task.evaluate(world)
-    digest = world.state_digest() if d.final_state_digest else None
-    report = _report(comparison, checks=checks, digest=digest)
-    return replace(report, num_steps=num_steps), checks
+            sink(frame)
+        num_steps += 1
+    outcome = _recorded_outcome(d, world) if options.states else session.outcome
+    return _report(comparison, agent, outcome, num_steps=num_steps, is_judged=not options.states), outcome
 
 
-def _sent(d: Demonstration, world: World, options: ReplayOptions, comparison: _Comparison) -> Iterator[Action]:
-    rng = generator(root_seed=options.seed, episode_index=d.info.episode_index, attempt=d.info.attempt, purpose="noise")
-    for _ in range(options.delay):
-        yield _hold(world)
-    for command in d.commands(world):
-        if not np.isfinite(command.joint_target).all():  # IK's way to say that it found nothing
-            comparison.unreachable += 1
-            command = replace(_hold(world), gripper_target=command.gripper_target)
-        if options.noise > 0.0:
-            command = _noisy(command, world, rng.normal(0.0, options.noise, len(command.joint_target)))
-        yield command
+class DemonstrationAgent:
+    """Says what was recorded, as the options want it sent: late, with noise, or as it is."""
+
+    num_retries = 0
+
+    def __init__(self, demonstration: Demonstration, options: ReplayOptions) -> None:
+        self._demonstration, self._options = demonstration, options
+        self._decoder: ActionDecoder | None = None
+        self._num_held = 0
+
+    @property
+    def num_unreachable(self) -> int:
+        """Steps whose pose inverse kinematics did not reach, or whose target is not a number."""
+        return self._num_held + (0 if self._decoder is None else self._decoder.num_unreachable)
+
+    def decide(self, world: World) -> Iterator[Decision]:
+        """See `demorec.loop.Agent`; label, phase and events are those of the recorded frame, if there is one."""
+        recorded = self._demonstration.recorded
+        for step, command in enumerate(self._sent(world)):
+            yield _labelled(command, recorded[step]) if step < len(recorded) else _unlabelled(command)
+
+    def _sent(self, world: World) -> Iterator[Action]:
+        d, options = self._demonstration, self._options
+        rng = generator(
+            root_seed=options.seed, episode_index=d.info.episode_index, attempt=d.info.attempt, purpose="noise"
+        )
+        for _ in range(options.delay):
+            yield world.hold()
+        for command in self._commands(world):
+            if not np.isfinite(command.joint_target).all():  # of a damaged dataset: the arm stays where it is
+                self._num_held += 1
+                command = replace(world.hold(), gripper_target=command.gripper_target)
+            if options.noise > 0.0:
+                command = _noisy(command, world, rng.normal(0.0, options.noise, len(command.joint_target)))
+            yield command
+
+    def _commands(self, world: World) -> Iterable[Action]:
+        d = self._demonstration
+        if d.actions is None or d.action_kind is None:
+            return d.commands
+        self._decoder = ActionDecoder(world, d.action_kind, is_limited=False)
+        return map(self._decoder.command, d.actions)
+
+    def failure(self, failed: Sequence[str]) -> tuple[str, str]:
+        """See `demorec.loop.Agent`."""
+        return ("replay", failed[0]) if failed else ("", "")
+
+
+def _labelled(command: Action, recorded: Frame) -> Decision:
+    return Decision(
+        action=recorded.action,
+        command=command,
+        phase=recorded.phase,
+        events=recorded.events,
+        is_deliberate_miss=recorded.is_deliberate_miss,
+    )
+
+
+def _unlabelled(command: Action) -> Decision:
+    return Decision(action=command, command=command)
 
 
 def _noisy(command: Action, world: World, noise: Array) -> Action:
@@ -159,44 +206,44 @@ def _noisy(command: Action, world: World, noise: Array) -> Action:
     )
 
 
-def _hold(world: World) -> Action:
-    target = world.arm.target.copy()
-    return Action(
-        joint_target=target,
-        gripper_target=world.arm.gripper_target,
-        base_from_tcp_target=world.arm.kinematics.forward(target),
+def _placed(session: Session, d: Demonstration) -> Iterator[Frame]:
+    """The recorded states one after the other, without physics."""
+    session.reset()
+    for step in range(d.num_steps):
+        session.place(
+            step,
+            joint_position=d.joint_position[step],
+            object_poses={name: pose_of(poses[step]) for name, poses in d.object_poses.items()},
+        )
+        recorded = d.recorded[step] if step < len(d.recorded) else None
+        hold = session.world.hold()
+        yield session.frame(_unlabelled(hold) if recorded is None else _labelled(recorded.command, recorded))
+
+
+def _recorded_outcome(d: Demonstration, world: World) -> Outcome:
+    success = bool(d.recorded_success)
+    return Outcome(
+        success=success,
+        checks=d.recorded_checks,
+        failure_phase="" if success else "replay",
+        failure_reason="" if success else "unknown",
+        num_frames=d.num_steps,
+        final_state_digest=world.state_digest(),
     )
 
 
-def place_state(world: World, demonstration: Demonstration, step: int) -> None:
-    """Put joints and objects where they were recorded at a step, without physics."""
-    world.set_state(
-        joint_position=demonstration.joint_position[step],
-        object_poses={name: pose_of(poses[step]) for name, poses in demonstration.object_poses.items()},
-    )
-
-
-def _frame(world: World, step: int, fps: int, command: Action) -> Frame:
-    return Frame(
-        frame_index=step,
-        time_ns=frame_time_ns(step, fps),
-        observation=world.observe(),
-        action=command,
-        command=command,
-        phase="",
-        joint_samples=world.joint_samples,
-    )
-
-
-def _report(comparison: _Comparison, *, checks: Sequence[Check], digest: str | None) -> ReplayReport:
+def _report(
+    comparison: _Comparison, agent: DemonstrationAgent, outcome: Outcome, *, num_steps: int, is_judged: bool
+) -> ReplayReport:
     d = comparison.demonstration
     first = comparison.first
-    if first is None and digest is not None and digest != d.final_state_digest:
+    if first is None and is_judged and d.final_state_digest not in ("", outcome.final_state_digest):
         first = (d.num_steps, "the final state")
+    checks = outcome.checks if is_judged else ()
     failed = tuple(check.name for check in checks if not check.passed)
     return ReplayReport(
         name=d.name,
-        num_steps=d.num_steps,
+        num_steps=num_steps,
         is_bitwise=bool(d.object_poses) or d.joint_velocity is not None,
         is_identical=first is None,
         first_difference=first,
@@ -210,7 +257,7 @@ def _report(comparison: _Comparison, *, checks: Sequence[Check], digest: str | N
         recorded_success=d.recorded_success,
         success=not failed if checks else None,
         failed_checks=failed,
-        unreachable=comparison.unreachable,
+        unreachable=agent.num_unreachable,
     )
 
 

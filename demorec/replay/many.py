@@ -9,11 +9,9 @@ from pathlib import Path
 
 from demorec.assets import allow_models
 from demorec.config import VideoConfig
-from demorec.episode import Frame, Outcome
 from demorec.errors import ConfigError
 from demorec.plain import from_plain
 from demorec.recording import EpisodeWriter
-from demorec.render.painter import Painter
 from demorec.replay.demonstration import Demonstration, ReplayOptions
 from demorec.replay.drive import ReplayReport, replay
 from demorec.rerender import recorded_view, view_painter
@@ -80,32 +78,12 @@ def record_replay(
     out.mkdir(parents=True, exist_ok=True)
     info = replace(d.info, fps=d.fps, origin=f"replay of {d.digest[:16]}")
     video = from_plain(config.get("video", {}), VideoConfig)
-    num_frames = 0
     with ExitStack() as stack:
-        renderer = None
+        painter = None
         if info.scene.cameras:
             renderer = stack.enter_context(RENDERERS.load(str(config.get("renderer", "raster")))())
-        painter: Painter | None = None
+            painter = view_painter(renderer, view, config)
         writer = stack.enter_context(EpisodeWriter(path, info, video=video, overwrite=overwrite))
-
-        def sink(frame: Frame) -> None:
-            nonlocal num_frames, painter
-            if renderer is not None and painter is None:
-                painter = view_painter(renderer, world, view, config)  # the world is in its scene only now
-            num_frames += 1
-            images = {} if painter is None else painter.images()
-            writer.write(replace(d.labelled(frame), images=images))
-
-        report, checks = replay(d, world, options, sink=sink)
-        success = bool(report.success) if checks else bool(report.recorded_success)
-        writer.finish(
-            Outcome(
-                success=success,
-                checks=checks if checks else d.recorded_checks,
-                failure_phase="" if success else "replay",
-                failure_reason="" if success else (report.failed_checks or ("unknown",))[0],
-                num_frames=num_frames,
-                final_state_digest=world.state_digest(),
-            )
-        )
+        report, outcome = replay(d, world, options, painter=painter, sink=writer.write)
+        writer.finish(outcome)
     return report, path

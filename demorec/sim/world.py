@@ -98,13 +98,14 @@ class World:
         self._inertial = {name: base_from_inertial(self.client, index) for name, index in self._bodies.items()}
         movable = [self._bodies[body.name] for body in scene.movable]
         self._hold = ConstraintHold(self.client, self.arm, movable) if scene.hold == "constraint" else None
-        self.arm.command(self._stay())
+        self.arm.command(self.hold())
         for _ in range(round(SETTLE_SECONDS * scene.physics.hz)):
             self.arm.drive(self.arm.target)
             self.client.stepSimulation()
 
-    def _stay(self) -> Action:
-        q = self.arm.target
+    def hold(self) -> Action:
+        """The command that keeps the present targets."""
+        q = self.arm.target.copy()
         return Action(
             joint_target=q,
             gripper_target=self.arm.gripper_target,

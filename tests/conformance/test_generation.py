@@ -65,7 +65,7 @@ def test_recordings_know_the_run_that_they_belong_to(tmp_path, reference):
 
 
 def test_a_run_knows_the_versions_that_its_recordings_know(reference):
-    from demorec.rollout import prepare
+    from demorec.loop import prepare
 
     assert reference.run.versions == deciding_versions()
     assert prepare(EpisodePlan(config=CONFIG, episode_index=0)).info.versions == deciding_versions()

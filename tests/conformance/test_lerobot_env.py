@@ -19,8 +19,8 @@ from demorec.evaluate.policy import find_checkpoint, trained_action
 from demorec.evaluate.rollouts import evaluate, load_evaluation, settings_for
 from demorec.export.lerobot import export_lerobot
 from demorec.export.options import ExportOptions
+from demorec.loop import ScriptAgent, Session, make_world
 from demorec.recording import EpisodeWriter, Recording
-from demorec.rollout import Rollout, make_world
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]  # each command of LeRobot takes 15 s of CPU to start
 
@@ -51,11 +51,10 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     recordings.mkdir()
     prepared = episode(0)
     with make_world(prepared.info) as world, EpisodeWriter(recordings / "episode_000000.mcap", prepared.info) as writer:
-        rollout = Rollout(world, prepared)
-        for frame in rollout:
+        session = Session.of_episode(world, prepared)
+        for frame in session.run(ScriptAgent(prepared)):
             writer.write(frame)
-        assert rollout.outcome is not None
-        writer.finish(rollout.outcome)
+        writer.finish(session.outcome)
     options = ExportOptions(repo_id="local/cubes", action="joint_increment", privileged=True)
     export_lerobot((recordings,), folder / "dataset", options)
     lerobot(

@@ -16,7 +16,7 @@ from demorec.config import EpisodePlan, GenerateConfig
 from demorec.episode import EpisodeInfo
 from demorec.export.lerobot import export_lerobot
 from demorec.export.options import ExportOptions
-from demorec.rollout import prepare
+from demorec.loop import prepare
 from demorec.tables import TASKS
 
 

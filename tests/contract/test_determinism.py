@@ -8,8 +8,8 @@ import pytest
 from helpers_sim import episode, run
 
 from demorec.episode import EpisodeInfo
+from demorec.loop import make_world
 from demorec.plain import from_json, to_json
-from demorec.rollout import make_world
 from demorec.tables import ROBOTS, TASKS
 from demorec.variation import PRESET_NAMES
 

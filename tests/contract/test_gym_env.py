@@ -16,11 +16,11 @@ from helpers_sim import episode
 
 import demorec.gym_env
 from demorec import features
-from demorec.acting import ACTION_KINDS
 from demorec.errors import ConfigError, SceneError
 from demorec.gym_env import DemorecEnv, env_id
+from demorec.loop import ScriptAgent, Session, make_renderer, make_world
+from demorec.loop.actions import ACTION_KINDS
 from demorec.recording import EpisodeWriter, Recording
-from demorec.rollout import Rollout, make_renderer, make_world
 from demorec.tables import TASKS
 
 FRAMES = 45
@@ -56,11 +56,10 @@ def test_a_recordings_commands_give_its_observations_to_the_bit(task: str, tmp_p
     prepared = episode(3, task=task)
     path = tmp_path / "episode.mcap"
     with make_world(prepared.info) as world, EpisodeWriter(path, prepared.info) as writer:
-        rollout = Rollout(world, prepared)
-        for frame in rollout:
+        session = Session.of_episode(world, prepared)
+        for frame in session.run(ScriptAgent(prepared)):
             writer.write(frame)
-        assert rollout.outcome is not None
-        writer.finish(rollout.outcome)
+        writer.finish(session.outcome)
     with Recording(path) as recording:
         info, columns = recording.info, recording.columns()
     rows = features.ObservationRows.of_columns(columns)
@@ -86,7 +85,7 @@ def test_exported_actions_solve_the_task(kind: features.ActionKind) -> None:
     """float32 actions of each kind, executed one after the other, do what the expert did (without noise)."""
     prepared = episode(2, variation="none")
     with make_world(prepared.info) as world:
-        frames = list(Rollout(world, prepared))
+        frames = list(Session.of_episode(world, prepared).run(ScriptAgent(prepared)))
     columns = columns_of(frames)
     actions = features.action_vectors(columns, prepared.info.scene, kind)
     assert actions.dtype == np.float32
@@ -130,7 +129,7 @@ def test_pictures_are_those_of_the_rollout() -> None:
     assert "environment_state" not in env.observation_space.spaces
     observation, _ = env.reset(seed=5)
     with make_world(prepared.info) as world, make_renderer(prepared.info) as renderer:
-        for frame in Rollout(world, prepared, renderer):
+        for frame in Session.of_episode(world, prepared, renderer).run(ScriptAgent(prepared)):
             for camera, images in frame.images.items():
                 assert np.array_equal(observation["pixels"][camera], images.color)
             observation = env.step(np.append(frame.command.joint_target, frame.command.gripper_target))[0]
@@ -197,8 +196,9 @@ def test_commands_keep_to_the_limits() -> None:
     before = np.array(env.info.scene.robot.joint_position)
     for target in (np.full(7, 100.0), np.full(7, -100.0)):
         env.step(np.append(target, 5.0))
-        command = env.situation.command
-        assert command is not None
+        frame = env.situation.last_frame
+        assert frame is not None
+        command = frame.command
         step = np.abs(command.joint_target - before)
         assert np.all(step <= np.array(robot.velocity_limit) / 30 + 1e-12)
         assert command.gripper_target == robot.gripper_max_width

@@ -10,9 +10,9 @@ import pytest
 from helpers_check import checked, simulate
 
 from demorec.config import EpisodePlan, GenerateConfig
+from demorec.loop import ScriptAgent, Session, make_world, prepare
 from demorec.recording import Recording
 from demorec.replay import ReplayOptions, open_file, replay_all
-from demorec.rollout import Rollout, make_world, prepare
 from demorec.tables import ROBOTS
 
 EXAMPLE = Path(__file__).parents[2] / "docs" / "tasks.md"
@@ -29,10 +29,9 @@ def test_the_documented_task_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     episode = prepare(EpisodePlan(config=config, episode_index=0))
     start = episode.info.scene.movable[0].world_from_body.position
     with make_world(episode.info) as world:
-        run = Rollout(world, episode)
-        frames = list(run)
-    assert run.outcome is not None
-    assert run.outcome.success, run.outcome
+        session = Session.of_episode(world, episode)
+        frames = list(session.run(ScriptAgent(episode)))
+    assert session.outcome.success, session.outcome
     end = frames[-1].observation.object_poses[episode.info.scene.movable[0].name].position
     assert end[1] - start[1] == pytest.approx(0.15, abs=0.02)
     assert end[0] - start[0] == pytest.approx(0.0, abs=0.02)

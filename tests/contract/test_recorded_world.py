@@ -11,8 +11,8 @@ from helpers_sim import episode
 from demorec.episode import Action, RobotSpec
 from demorec.errors import SceneError
 from demorec.geometry import Pose
+from demorec.loop import make_world
 from demorec.render.recorded import RecordedWorld
-from demorec.rollout import make_world
 from demorec.scene import Body, Scene, Shape, Texture
 from demorec.sim.world import World
 from demorec.tables import ROBOTS, TASKS

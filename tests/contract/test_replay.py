@@ -195,3 +195,15 @@ def test_a_robot_without_a_gripper_is_one_sentence(tmp_path: Path, capsys: pytes
     said = capsys.readouterr().err
     assert "has 0 finger joints" in said
     assert len(said.splitlines()) == 1
+
+
+def test_what_is_no_number_is_not_sent(recorded: Path) -> None:
+    """An action of a damaged dataset: the arm stays where it is, and the step is counted."""
+    options = ReplayOptions()
+    whole = open_file(recorded, options)
+    actions = np.array([[*command.joint_target, command.gripper_target] for command in whole.commands[:6]])
+    actions[3, 2] = np.nan
+    damaged = replace(whole, commands=(), actions=actions, action_kind="joint", recorded=())
+    report = next(iter(replay_all([damaged], options)))[0]
+    assert report.unreachable == 1
+    assert np.isfinite(report.joint_error)

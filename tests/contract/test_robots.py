@@ -10,8 +10,8 @@ from helpers_sim import episode, run
 
 from demorec.assets import asset_path
 from demorec.episode import RobotSpec
+from demorec.loop import make_world
 from demorec.plain import from_json, to_json
-from demorec.rollout import make_world
 from demorec.sim.arm import arm_kinematics
 from demorec.sim.world import World
 from demorec.tables import ROBOTS

@@ -10,7 +10,7 @@ import pytest
 
 from demorec.config import EpisodePlan, GenerateConfig
 from demorec.errors import ConfigError
-from demorec.rollout import Episode, Rollout, make_world, prepare
+from demorec.loop import Episode, ScriptAgent, Session, make_world, prepare
 from demorec.tables import TASKS
 
 
@@ -25,12 +25,11 @@ def test_an_episode_succeeds_and_repeats_to_the_bit(task: str) -> None:
     digests = set()
     with make_world(episode.info) as world:
         for _ in range(2):
-            run = Rollout(world, episode)
-            frames = list(run)
-            assert run.outcome is not None
-            assert run.outcome.success, (run.outcome, episode.info.instruction)
-            assert run.outcome.num_frames == len(frames)
-            digests.add(run.outcome.final_state_digest)
+            session = Session.of_episode(world, episode)
+            frames = list(session.run(ScriptAgent(episode)))
+            assert session.outcome.success, (session.outcome, episode.info.instruction)
+            assert session.outcome.num_frames == len(frames)
+            digests.add(session.outcome.final_state_digest)
     assert len(digests) == 1
 
 

@@ -10,7 +10,7 @@ import pytest
 from helpers_sim import episode
 
 from demorec.geometry import Pose
-from demorec.rollout import make_world
+from demorec.loop import make_world
 from demorec.scene import Camera
 from demorec.tables import CAMERAS, ROBOTS
 

@@ -78,8 +78,8 @@ class Balls:
 
 def painted(world: Any, *cameras: Camera, **options: Any) -> tuple[Noted, Painter]:
     renderer = Noted()
-    painter = Painter(renderer)
-    painter.setup(world, cameras, **options)
+    painter = Painter(renderer, cameras, **options)
+    painter.setup(world)
     return renderer, painter
 
 
@@ -127,4 +127,4 @@ def test_each_body_begins_after_the_links_of_the_one_before() -> None:
 
 def test_a_painter_without_a_world_says_so() -> None:
     with pytest.raises(RuntimeError, match="setup"):
-        Painter(Noted()).images()
+        Painter(Noted(), ()).images()

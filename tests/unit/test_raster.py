@@ -100,8 +100,8 @@ def test_the_rehearsal_compiles_all_that_scenes_need(client: Any) -> None:
 @pytest.mark.parametrize("mass", [0.0, 1.0])
 def test_changed_colours_are_noticed(client: Any, mass: float) -> None:
     body = scenes.add(client, "box", (0.3, 0.3, 0.3), rgbaColor=[1, 0, 0, 1], mass=mass)
-    painter = Painter(RasterRenderer())
-    painter.setup(scenes.ClientWorld(client), (scenes.camera(64, 64),), segmentation=True)
+    painter = Painter(RasterRenderer(), (scenes.camera(64, 64),), segmentation=True)
+    painter.setup(scenes.ClientWorld(client))
     red = painter.images()["front"]
     client.changeVisualShape(body, -1, rgbaColor=[0, 0, 1, 1])
     blue = painter.images()["front"]

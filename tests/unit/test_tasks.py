@@ -11,7 +11,7 @@ from helpers_sim import episode, run
 
 from demorec.errors import SceneError
 from demorec.geometry import Pose, wrap_angle
-from demorec.rollout import Episode, make_world
+from demorec.loop import Episode, make_world
 from demorec.scene import Body, Shape
 from demorec.sim.robots.panda import PANDA
 from demorec.tasks import skills

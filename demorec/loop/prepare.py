@@ -1,19 +1,8 @@
-"""An `EpisodePlan` becomes an episode: scene and words first, then frames, then how it ended.
-
-    episode = prepare(EpisodePlan(config=GenerateConfig(), episode_index=0))  # info, task, behaviour; no simulator
-    with make_world(episode.info) as world, make_renderer(episode.info) as renderer:  # both reusable
-        run = Rollout(world, episode, renderer)  # renderer=None for no pictures
-        for frame in run:  # world.reset happens here, then one control step a frame
-            print(frame.frame_index, frame.phase, frame.observation.gripper_width)
-        print(run.outcome)
-
-An episode is a pure function of its plan: whatever ran before in the same world, on any worker, the bits are equal.
-"""
+"""An `EpisodePlan` becomes an episode: scene, words and behaviour, and the world and renderer that it needs."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 
@@ -21,21 +10,18 @@ import numpy as np
 
 from demorec.assets import allow_models, model_name
 from demorec.config import EpisodePlan, GenerateConfig, deciding_versions
-from demorec.episode import Action, EpisodeInfo, Frame, Outcome, frame_time_ns
+from demorec.episode import EpisodeInfo
 from demorec.errors import ConfigError
-from demorec.features import NOISE_LETS_GO
-from demorec.geometry import Array, Pose
+from demorec.geometry import Pose
 from demorec.motion import angle_between
 from demorec.plain import digest, to_plain
 from demorec.render import Renderer
-from demorec.render.painter import Painter
 from demorec.scene import Camera, Scene
 from demorec.seeding import Purpose, generator
 from demorec.sim.world import World
 from demorec.tables import CAMERAS, RENDERERS, TASKS, camera_name, load_robot
-from demorec.tasks.base import Behaviour, Step, Task
+from demorec.tasks.base import Behaviour, Task
 from demorec.tasks.sampling import Sampler, stratified_point
-from demorec.tasks.skills import Expert, GaveUp
 from demorec.tasks.vary import calibration_errors, draw_behaviour, vary_cameras, vary_looks, vary_physics
 from demorec.user_modules import modules_of
 from demorec.variation import Ranges, resolve
@@ -200,130 +186,3 @@ def make_renderer(info: EpisodeInfo) -> AbstractContextManager[Renderer | None]:
     if not info.scene.cameras:
         return nullcontext(None)
     return RENDERERS.load(str(info.config["renderer"]))()
-
-
-class Rollout:
-    """Runs the expert in the world; iterate for the frames, then read `outcome`.
-
-    Args:
-        world: Of the episode's robot and frame rate; is reset when the iteration starts.
-        episode: What to do.
-        renderer: For the pictures, or None.
-
-    Attributes:
-        outcome: How it ended; None until the last frame has been taken.
-    """
-
-    def __init__(self, world: World, episode: Episode, renderer: Renderer | None = None) -> None:
-        self.world = world
-        self.episode = episode
-        self.renderer = renderer
-        self.outcome: Outcome | None = None
-
-    def __iter__(self) -> Iterator[Frame]:
-        """Yield one frame per control step; SceneError or RenderError when the scene cannot be built or drawn."""
-        world, info, config = self.world, self.episode.info, self.episode.plan.config
-        world.reset(info.scene)
-        painter = None if self.renderer is None else Painter(self.renderer)
-        if painter is not None:
-            painter.setup(
-                world,
-                self.episode.cameras,
-                true_from_recorded=self.episode.true_from_recorded,
-                depth=config.depth,
-                segmentation=config.segmentation,
-                antialias=config.antialias,
-            )
-        expert = Expert(world, self.episode.behaviour)
-        noise = ActionNoise(
-            world, sigma=self.episode.behaviour.action_noise, rng=self.episode.rng("noise"), fps=info.fps
-        )
-        max_frames = math.floor(config.max_episode_seconds * info.fps)
-        gave_up: list[GaveUp] = []
-        timed_out = ""
-        num_frames = 0
-        for step in self._steps(expert, gave_up):
-            if num_frames == max_frames:
-                timed_out = step.phase
-                break
-            frame = Frame(
-                frame_index=num_frames,
-                time_ns=frame_time_ns(num_frames, info.fps),
-                observation=world.observe(),
-                action=step.action,
-                command=noise.command(step),
-                phase=step.phase,
-                events=step.events,
-                images={} if painter is None else painter.images(),
-                joint_samples=world.joint_samples,
-                is_deliberate_miss=step.is_deliberate_miss,
-            )
-            yield frame
-            world.apply(frame.command)
-            num_frames += 1
-        stopped = ("", "")
-        if timed_out:
-            stopped = (timed_out, "time_limit")
-        elif gave_up:
-            stopped = (gave_up[0].phase, gave_up[0].reason)
-        self.outcome = self._judge(expert, num_frames, stopped)
-
-    def _steps(self, expert: Expert, gave_up: list[GaveUp]) -> Iterator[Step]:
-        """The script; when the expert gives up, one step more, which carries the events that say why."""
-        try:
-            yield from self.episode.task.script(expert)
-        except GaveUp as error:
-            gave_up.append(error)
-            yield expert.step()
-
-    def _judge(self, expert: Expert, num_frames: int, stopped: tuple[str, str]) -> Outcome:
-        checks = self.episode.task.evaluate(self.world)
-        failed = [check.name for check in checks if not check.passed]
-        phase, reason = stopped
-        if not reason and failed:
-            phase, reason = (expert.trouble[0] or expert.phase, failed[0])
-        return Outcome(
-            success=not reason,
-            checks=checks,
-            failure_phase=phase,
-            failure_reason=reason,
-            num_frames=num_frames,
-            num_retries=expert.num_retries,
-            final_state_digest=self.world.state_digest(),
-        )
-
-
-class ActionNoise:
-    """Ornstein-Uhlenbeck noise on the executed joint targets; nothing is added except in free motion.
-
-    The label stays clean, so that a policy learns how to come back (DART, Laskey et al. 2017,
-    https://arxiv.org/abs/1703.09327). The noise lets go at the same rate whether more is added or not
-    (`demorec.features.NOISE_LETS_GO`), so that there is one way back from it, which increments of the command can
-    hold. Every command stays within the joint limits in position and velocity.
-    """
-
-    def __init__(self, world: World, *, sigma: float, rng: np.random.Generator, fps: int) -> None:
-        self._kinematics = world.arm.kinematics
-        self._sigma, self._rng = sigma, rng
-        self._decay = (1.0 - NOISE_LETS_GO) ** (30 / fps)
-        self._max_step = np.array(world.robot.velocity_limit) / fps
-        self._noise: Array = np.zeros(len(self._max_step))
-        self._last: Array = world.arm.target.copy()
-
-    def command(self, step: Step) -> Action:
-        """What is sent to the motors for a step: its clean action plus the noise."""
-        if self._sigma == 0.0:
-            return step.action
-        drawn = self._rng.normal(0.0, self._sigma, len(self._noise))
-        self._noise = self._decay * self._noise
-        if step.noise_allowed:
-            self._noise = self._noise + math.sqrt(1 - self._decay**2) * drawn
-        target = step.action.joint_target + self._noise
-        target = np.clip(target, self._kinematics.lower, self._kinematics.upper)
-        target = np.clip(target, self._last - self._max_step, self._last + self._max_step)
-        self._last = target
-        return Action(
-            joint_target=target,
-            gripper_target=step.action.gripper_target,
-            base_from_tcp_target=self._kinematics.forward(target),
-        )

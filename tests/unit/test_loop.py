@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -13,11 +14,12 @@ import numpy as np
 import pytest
 from helpers_sim import episode, run
 
+import demorec.loop
 from demorec.config import EpisodePlan, GenerateConfig
 from demorec.episode import EpisodeInfo
 from demorec.features import NOISE_LETS_GO
+from demorec.loop import ScriptAgent, Session, make_world, prepare
 from demorec.plain import from_json, to_json
-from demorec.rollout import Rollout, make_world, prepare
 
 
 @pytest.fixture(scope="module")
@@ -222,9 +224,17 @@ def test_attempts_draw_other_scenes():
 def test_breaking_off_leaves_the_world_usable(ran):
     prepared, _, outcome = ran
     with make_world(prepared.info) as world:
-        rollout = Rollout(world, prepared)
-        for frame in rollout:
+        session = Session.of_episode(world, prepared)
+        for frame in session.run(ScriptAgent(prepared)):
             if frame.frame_index == 20:
                 break
-        assert rollout.outcome is None
+        with pytest.raises(RuntimeError, match="has not ended"):
+            _ = session.outcome
         assert run(prepared, world)[1].final_state_digest == outcome.final_state_digest
+
+
+def test_nothing_else_steps_a_world() -> None:
+    package = Path(demorec.loop.__file__).parents[1]
+    steps = re.compile(r"stepSimulation|\bworld\.apply\(")
+    found = {path.relative_to(package).parts[0] for path in package.rglob("*.py") if steps.search(path.read_text())}
+    assert found == {"sim", "loop"}

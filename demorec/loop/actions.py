@@ -51,11 +51,23 @@ def action_bounds(robot: RobotSpec, kind: ActionKind, *, fps: int) -> tuple[Arra
 class ActionDecoder:
     """Turns the actions of one episode into commands, from the world's present targets on.
 
-    Every command is held within the joint limits in position and velocity (from the last command), the gripper
-    within its opening; for a pose out of reach the last targets stay.
+    For a pose out of reach the last joint targets stay.
+
+    Args:
+        world: At the episode's start.
+        kind: What the actions mean (`demorec.features.action_vectors`).
+        is_limited: True for what a policy says: every command is held within the joint limits in position and velocity
+            (from the last command) and the gripper within its opening, the elbow is pulled towards where the expert
+            has it, and deltas go on from the last pose that was reached. False for recorded actions, which are sent as
+            they are, so that a replay shows what they do.
+
+    Attributes:
+        num_unreachable: Poses that inverse kinematics has not reached so far.
     """
 
-    def __init__(self, world: World, kind: ActionKind) -> None:
+    def __init__(self, world: World, kind: ActionKind, *, is_limited: bool = True) -> None:
+        self.num_unreachable = 0
+        self._is_limited = is_limited
         self._robot, self._kinematics, self._kind = world.robot, world.arm.kinematics, kind
         self._max_step = np.array(world.robot.velocity_limit) / world.fps
         self._joint_target: Array = world.arm.target.copy()
@@ -63,14 +75,14 @@ class ActionDecoder:
 
     def command(self, values: Array) -> Action:
         """The command for an action (D,), float64."""
-        wanted = self._wanted(values)
-        wanted = np.clip(wanted, self._kinematics.lower, self._kinematics.upper)
-        wanted = np.clip(wanted, self._joint_target - self._max_step, self._joint_target + self._max_step)
+        wanted, gripper = self._wanted(values), float(values[-1])
+        if self._is_limited:
+            wanted = np.clip(wanted, self._kinematics.lower, self._kinematics.upper)
+            wanted = np.clip(wanted, self._joint_target - self._max_step, self._joint_target + self._max_step)
+            gripper = float(np.clip(gripper, 0.0, self._robot.gripper_max_width))
         self._joint_target = wanted
         return Action(
-            joint_target=wanted,
-            gripper_target=float(np.clip(values[-1], 0.0, self._robot.gripper_max_width)),
-            base_from_tcp_target=self._kinematics.forward(wanted),
+            joint_target=wanted, gripper_target=gripper, base_from_tcp_target=self._kinematics.forward(wanted)
         )
 
     def _wanted(self, values: Array) -> Array:
@@ -82,12 +94,13 @@ class ActionDecoder:
             self._tcp_target = features.pose_from_delta(self._tcp_target, values)
         else:
             self._tcp_target = _pose(values[:7], otherwise=self._tcp_target)
-        found = self._kinematics.inverse(
-            self._tcp_target, start=self._joint_target, rest=self._rest(), null_gain=NULL_GAIN
-        )
+        rest = self._rest() if self._is_limited else None
+        found = self._kinematics.inverse(self._tcp_target, start=self._joint_target, rest=rest, null_gain=NULL_GAIN)
         if found is None:
+            self.num_unreachable += 1
             found = self._joint_target
-            self._tcp_target = self._kinematics.forward(found)
+            if self._is_limited:
+                self._tcp_target = self._kinematics.forward(found)
         return found
 
     def _rest(self) -> Array:
@@ -101,7 +114,7 @@ class ActionDecoder:
 
 def _pose(values: Array, *, otherwise: Pose) -> Pose:
     """Position and quaternion of any length; the given pose where the quaternion is (nearly) zero."""
-    length = math.sqrt(sum(float(v) ** 2 for v in values[3:7]))
+    length = math.sqrt(float((values[3:7] * values[3:7]).sum()))
     if length < 1e-3:
         return otherwise
     return Pose(position=values[:3], quat_xyzw=values[3:7] / length)

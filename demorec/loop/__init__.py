@@ -1,0 +1,28 @@
+"""The closed loop, the only place that steps a world: an agent says what to do, a session does it and gives frames.
+
+    episode = prepare(EpisodePlan(config=GenerateConfig(), episode_index=0))  # info, task, behaviour; no simulator
+    with make_world(episode.info) as world, make_renderer(episode.info) as renderer:  # both reusable
+        session = Session.of_episode(world, episode, renderer)  # renderer=None for no pictures
+        for frame in session.run(ScriptAgent(episode)):  # the world is reset here, then one control step a frame
+            print(frame.frame_index, frame.phase, frame.observation.gripper_width)
+        print(session.outcome)
+
+Generating, replaying and the gymnasium environment, through which policies are evaluated, are its callers. An episode
+is a pure function of its plan: whatever ran before in the same world, on any worker, the bits are equal.
+"""
+
+from demorec.loop.agents import Agent, Decision, ScriptAgent
+from demorec.loop.prepare import Episode, load_task, make_renderer, make_world, prepare
+from demorec.loop.session import Session
+
+__all__ = [
+    "Agent",
+    "Decision",
+    "Episode",
+    "ScriptAgent",
+    "Session",
+    "load_task",
+    "make_renderer",
+    "make_world",
+    "prepare",
+]

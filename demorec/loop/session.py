@@ -1,0 +1,158 @@
+"""One episode in a simulated world, step by step."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import Self
+
+from demorec.episode import Action, CameraImages, Check, Frame, Observation, Outcome, frame_time_ns
+from demorec.geometry import Array, Pose
+from demorec.loop.agents import Agent, Decision
+from demorec.loop.prepare import Episode
+from demorec.render import Renderer
+from demorec.render.painter import Painter
+from demorec.scene import Scene
+from demorec.sim.world import World
+from demorec.tasks.base import Task
+
+
+class Session:
+    """Resets a world, steps it, and tells what is seen; nothing else does.
+
+    `run` lets an agent act until it is done. A caller that acts from outside, as gymnasium's does, calls `reset`, then
+    `frame` and `step` in turn.
+
+    Args:
+        world: Of the scene's robot; left open.
+        scene: What the world is reset to.
+        task: Whose conditions are judged; None for none.
+        painter: For the pictures, or None.
+        max_frames: Time limit of `run`; None: until the agent is done.
+
+    Attributes:
+        world: As given.
+        frame_index: Control steps since the reset.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        scene: Scene,
+        task: Task | None,
+        *,
+        painter: Painter | None = None,
+        max_frames: int | None = None,
+    ) -> None:
+        self.world = world
+        self.frame_index = 0
+        self._scene, self._task, self._painter, self._max_frames = scene, task, painter, max_frames
+        self._observation: Observation | None = None
+        self._images: Mapping[str, CameraImages] | None = None
+        self._outcome: Outcome | None = None
+
+    @classmethod
+    def of_episode(cls, world: World, episode: Episode, renderer: Renderer | None = None) -> Self:
+        """A session of a prepared episode with its cameras and time limit; without a renderer it has no pictures."""
+        config = episode.plan.config
+        painter = None
+        if renderer is not None:
+            painter = Painter(
+                renderer,
+                episode.cameras,
+                true_from_recorded=episode.true_from_recorded,
+                depth=config.depth,
+                segmentation=config.segmentation,
+                antialias=config.antialias,
+            )
+        max_frames = math.floor(config.max_episode_seconds * episode.info.fps)
+        return cls(world, episode.info.scene, episode.task, painter=painter, max_frames=max_frames)
+
+    @property
+    def observation(self) -> Observation:
+        """What is sensed now."""
+        if self._observation is None:
+            self._observation = self.world.observe()
+        return self._observation
+
+    @property
+    def images(self) -> Mapping[str, CameraImages]:
+        """Camera name -> images now; RenderError when something cannot be drawn."""
+        if self._images is None:
+            self._images = {} if self._painter is None else self._painter.images()
+        return self._images
+
+    @property
+    def outcome(self) -> Outcome:
+        """How the last run ended; RuntimeError before its end."""
+        if self._outcome is None:
+            raise RuntimeError("the episode has not ended: take all frames of the run first")
+        return self._outcome
+
+    def checks(self) -> tuple[Check, ...]:
+        """The task's conditions with the values found now."""
+        return () if self._task is None else self._task.evaluate(self.world)
+
+    def run(self, agent: Agent) -> Iterator[Frame]:
+        """Reset the world and let the agent act; yields each frame before its command is sent.
+
+        Raises:
+            SceneError, RenderError: The scene cannot be built or drawn.
+        """
+        self.reset()
+        stopped = ("", "")
+        for decision in agent.decide(self.world):
+            if self.frame_index == self._max_frames:
+                stopped = (decision.phase, "time_limit")
+                break
+            frame = self.frame(decision)
+            yield frame
+            self.step(frame.command)
+        checks = self.checks()
+        phase, reason = stopped if stopped[1] else agent.failure([check.name for check in checks if not check.passed])
+        self._outcome = Outcome(
+            success=not reason,
+            checks=checks,
+            failure_phase=phase,
+            failure_reason=reason,
+            num_frames=self.frame_index,
+            num_retries=agent.num_retries,
+            final_state_digest=self.world.state_digest(),
+        )
+
+    def reset(self) -> None:
+        """Build the scene anew; errors as `run`."""
+        self.world.reset(self._scene)
+        if self._painter is not None:
+            self._painter.setup(self.world)
+        self._outcome = None
+        self._arrive(0)
+
+    def frame(self, decision: Decision) -> Frame:
+        """The present frame: what is seen now, and what was decided on it."""
+        return Frame(
+            frame_index=self.frame_index,
+            time_ns=frame_time_ns(self.frame_index, self.world.fps),
+            observation=self.observation,
+            action=decision.action,
+            command=decision.command,
+            phase=decision.phase,
+            events=decision.events,
+            images=self.images,
+            joint_samples=self.world.joint_samples,
+            is_deliberate_miss=decision.is_deliberate_miss,
+        )
+
+    def step(self, command: Action) -> None:
+        """Send a command and advance by one control step."""
+        self.world.apply(command)
+        self._arrive(self.frame_index + 1)
+
+    def place(self, frame_index: int, *, joint_position: Array, object_poses: Mapping[str, Pose]) -> None:
+        """Put the world where a recording has it at a frame, without physics; arguments as of `World.set_state`."""
+        self.world.set_state(joint_position=joint_position, object_poses=object_poses)
+        self._arrive(frame_index)
+
+    def _arrive(self, frame_index: int) -> None:
+        self.frame_index = frame_index
+        self._observation = self._images = None
