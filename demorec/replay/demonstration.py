@@ -12,7 +12,8 @@ from demorec.episode import Action, Check, EpisodeInfo, Frame
 from demorec.errors import ConfigError, RecordingError
 from demorec.geometry import Array
 from demorec.recording import Recording
-from demorec.recording.frames import command_at, frames_of
+from demorec.recording.frames import frames_of
+from demorec.recording.streams import command_at
 from demorec.sim.world import World
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from demorec.episode import Action, Check, Frame, frame_time_ns
 from demorec.geometry import Array
-from demorec.recording.frames import pose_of
+from demorec.recording.streams import pose_of
 from demorec.replay.demonstration import Demonstration, ReplayOptions
 from demorec.seeding import generator
 from demorec.sim.world import World
