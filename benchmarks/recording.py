@@ -117,7 +117,7 @@ def raw_bytes(frames: list[Frame]) -> int:
     """Pictures as RGB, numbers as float64."""
     pictures = sum(image.color.nbytes for frame in frames for image in frame.images.values())
     observation = frames[0].observation
-    numbers = 3 * len(observation.joint_position) + 2 + 7 + 7 * len(observation.object_poses)
+    numbers = 3 * len(observation.joint_position) + 2 + 6 + 7 + 7 * len(observation.object_poses)
     numbers += 2 * (len(frames[0].action.joint_target) + 1 + 7) + 7 * len(frames[0].images)
     return pictures + 8 * numbers * len(frames)
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from demorec.geometry import Array, Pose
 from demorec.scene import Scene
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 """Of the recordings. A reader knows every version up to this one; `recordings/sample/` holds a file of each."""
 
 
@@ -33,7 +33,7 @@ class RobotSpec:
         arm_joints: Names of the arm's joints, base to flange.
         gripper_joints: Names of the finger joints; each opens by half the width.
         tcp_link: Link whose frame is the tool centre point: z out of the hand, y along the fingers' motion.
-        hand_link: Link that carries the wrist camera.
+        hand_link: Link that carries the wrist camera and the fingers; the force-torque sensor is where it is mounted.
         finger_links: Links that touch the object.
         home_q: (n_arm,) rest configuration, rad.
         position_lower, position_upper: (n_arm,) rad.
@@ -92,6 +92,9 @@ class Observation:
         base_from_tcp: TCP pose in the base frame.
         object_poses: name -> world_from_object, of every movable body of the scene.
         contact_force: Sum of the normal forces on the fingers, N.
+        wrench: (6,) force (N) and torque (N m) with which the arm holds the hand, as a force-torque sensor at the
+            hand's mount feels them: about the origin of `RobotSpec.hand_link` and along its axes. Nothing is taken off:
+            the weight and the inertia of hand, fingers and what they hold are in it. None when there is no sensor.
     """
 
     joint_position: Array
@@ -101,6 +104,7 @@ class Observation:
     base_from_tcp: Pose
     object_poses: Mapping[str, Pose]
     contact_force: float
+    wrench: Array | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -280,6 +284,7 @@ class EpisodeColumns:
     base_from_tcp: Array  # (T, 7)
     object_poses: Mapping[str, Array]  # name -> (T, 7), world_from_object
     contact_force: Array  # (T,)
+    wrench: Array | None = None  # (T, 6); None in recordings of format version 1
     action_joint_target: Array  # (T, n_arm)
     action_gripper: Array  # (T,)
     action_base_from_tcp: Array  # (T, 7)

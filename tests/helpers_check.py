@@ -139,7 +139,7 @@ class Spoilt:
 
     def _frame(self, frame: Frame, number: int, index: int) -> Frame:
         from demorec.episode import frame_time_ns
-        from demorec.recording.frames import pose_of
+        from demorec.recording.streams import pose_of
 
         images = {
             name: replace(image, world_from_camera=pose_of(self.columns.world_from_camera[name][index]))

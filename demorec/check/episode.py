@@ -26,6 +26,7 @@ from demorec.urdf import Urdf
 _STAMP_FIRST = {
     "sensor_msgs/msg/JointState",
     "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/WrenchStamped",
     "sensor_msgs/msg/CompressedImage",
     "sensor_msgs/msg/Image",
     "foxglove_msgs/msg/CompressedVideo",

@@ -8,6 +8,7 @@ from demorec.check.base import Measurement, check
 from demorec.check.episode import RecordedEpisode
 from demorec.episode import FORMAT_VERSION
 from demorec.recording import channels, messages
+from demorec.recording.streams import frame_streams
 
 
 @check(group="file", measures="recordings that cannot be opened (index, metadata, format version)", warn=0)
@@ -33,7 +34,7 @@ def checksums(episode: RecordedEpisode) -> Measurement:
 def topics(episode: RecordedEpisode) -> Measurement:
     """Every stream that the metadata promises is there, of its type, with one message for each frame."""
     expected: dict[str, tuple[str, int | None]] = {}
-    for stream in channels.state_streams(episode.info):
+    for stream in frame_streams(episode.info):
         expected[stream.topic] = (stream.schema, episode.num_frames)
     for camera in episode.cameras:
         expected |= {topic: (schema, episode.num_frames) for topic, schema in _picture_streams(episode, camera.name)}

@@ -30,6 +30,7 @@ def finite_numbers(episode: RecordedEpisode) -> Measurement:
         "joint_effort": c.joint_effort,
         "gripper_width": c.gripper_width,
         "contact_force": c.contact_force,
+        **({} if c.wrench is None else {"wrench": c.wrench}),
         "base_from_tcp": c.base_from_tcp,
         "action": np.column_stack([c.action_joint_target, c.action_gripper, c.action_base_from_tcp]),
         "command": np.column_stack([c.command_joint_target, c.command_gripper, c.command_base_from_tcp]),
@@ -160,6 +161,28 @@ def gripper_width(episode: RecordedEpisode) -> Measurement | None:
 def _widths(episode: RecordedEpisode) -> tuple[Array, Array, Array]:
     c = episode.columns
     return c.gripper_width, c.action_gripper, c.command_gripper
+
+
+@check(group="physics", measures="force that holds the hand against the vertical", unit="rad", warn=0.1, fail=0.4)
+def wrench_holds_the_hand(episode: RecordedEpisode) -> Measurement | None:
+    """Where the hand hardly accelerates and touches nothing, the arm's force on it is the answer to gravity.
+
+    Catches axes of another frame, a turned sign, torques for forces. The median over those frames, rad; what is
+    heavier or lighter by an unknown load cannot be seen.
+    """
+    c, fps = episode.columns, episode.info.fps
+    gravity = np.array(episode.info.scene.physics.gravity)
+    if c.wrench is None or c.num_frames < 3 or not gravity.any():
+        return None
+    hand = episode.world_from_base @ episode.base_from_link(episode.info.robot.hand_link, c.joint_position)
+    force = (hand[:, :3, :3] @ c.wrench[:, :3, None])[1:-1, :, 0]
+    steady = np.linalg.norm(np.diff(hand[:, :3, 3], 2, axis=0), axis=1) * fps**2 < 0.05 * np.linalg.norm(gravity)
+    steady &= c.contact_force[1:-1] == 0
+    if not steady.any():
+        return None
+    cosine = -(force @ gravity) / np.maximum(np.linalg.norm(force, axis=1) * np.linalg.norm(gravity), 1e-12)
+    angle = float(np.median(np.arccos(np.clip(cosine[steady], -1.0, 1.0))))
+    return Measurement(value=angle, detail=f"{int(steady.sum())} steady frames")
 
 
 @check(group="physics", measures="distance of the joints from the command before", unit="rad", warn=0.15, fail=0.3)

@@ -7,10 +7,11 @@ import numpy as np
 from demorec.check.base import Measurement, check, worst
 from demorec.check.episode import RecordedEpisode
 from demorec.recording import channels
+from demorec.recording.streams import frame_streams
 
 
 def _once_a_frame(episode: RecordedEpisode) -> list[str]:
-    topics = [stream.topic for stream in channels.state_streams(episode.info)]
+    topics = [stream.topic for stream in frame_streams(episode.info)]
     return [topic for topic in topics if topic in episode.scan]
 
 

@@ -71,7 +71,8 @@ class Episode:
         phase: T names.
         events: (time_ns, event).
         curves: Name -> measured values: "position", "velocity", "effort" of the joints, "gripper" (m), "force" (N),
-            "ee" (m); "target" and "gripper target" are what was asked for.
+            "ee" (m), "hand force" (N) and "hand torque" (N m) along the hand's axes; "target" and "gripper target" are
+            what was asked for.
         videos: Camera -> coded pictures.
         depth: Camera -> reads (H, W) metres of every frame.
         segmentation: Camera -> reads (H, W) segment numbers of every frame.

@@ -85,6 +85,12 @@ def _curves(recording: Recording, columns: EpisodeColumns) -> dict[str, Curves]:
         effort = np.array([sample.joint_effort for sample in samples])
     num_arm = len(robot.arm_joints)
     frames = columns.time_ns
+    wrench = {}
+    if columns.wrench is not None:
+        wrench = {
+            "hand force": Curves(time_ns=frames, values=columns.wrench[:, :3], names=("x", "y", "z")),
+            "hand torque": Curves(time_ns=frames, values=columns.wrench[:, 3:], names=("x", "y", "z")),
+        }
     return {
         "position": Curves(time_ns=time_ns, values=position[:, :num_arm], names=robot.arm_joints),
         "velocity": Curves(time_ns=time_ns, values=velocity[:, :num_arm], names=robot.arm_joints),
@@ -94,4 +100,5 @@ def _curves(recording: Recording, columns: EpisodeColumns) -> dict[str, Curves]:
         "gripper target": Curves(time_ns=frames, values=columns.action_gripper[:, None], names=("target",)),
         "force": Curves(time_ns=frames, values=columns.contact_force[:, None], names=("contact force",)),
         "ee": Curves(time_ns=frames, values=columns.base_from_tcp[:, :3], names=("x", "y", "z")),
+        **wrench,
     }

@@ -183,6 +183,8 @@ def _curve_views(roots: list[Paths], episode: Episode) -> rrb.Container:
         view("joint velocity (rad/s)", "velocity"),
         view("joint effort (N m)", "effort"),
         view("gripper position (m)", "ee"),
+        view("force on the hand (N)", "hand force"),
+        view("torque on the hand (N m)", "hand torque"),
     ]
     side = [
         view("gripper opening (m)", "gripper", *(["gripper target"] if len(roots) == 1 else [])),

@@ -14,6 +14,8 @@ from demorec.assets import asset_path
 from demorec.episode import EpisodeInfo, Frame
 from demorec.errors import RecordingError
 from demorec.geometry import Array, Pose
+from demorec.recording.channels import WRENCH
+from demorec.recording.streams import frame_streams
 from demorec.urdf import Urdf
 
 
@@ -39,6 +41,8 @@ class FrameCheck:
         self._joints, self._arm = (len(info.robot.joint_names),), (len(info.robot.arm_joints),)
         self._objects = {body.name for body in info.scene.movable}
         self._cameras = {camera.name for camera in info.scene.cameras}
+        self._version = info.format_version
+        self._has_wrench = any(stream.topic == WRENCH for stream in frame_streams(info))
 
     def __call__(self, frame: Frame) -> None:
         """Raise RecordingError for what is wrong with a frame; missing pictures are found by who codes them."""
@@ -49,6 +53,11 @@ class FrameCheck:
         targets = [action.joint_target, command.joint_target]
         if {vector.shape for vector in joints} != {self._joints} or {vector.shape for vector in targets} != {self._arm}:
             raise _wrong_shape(frame, self._joints, joints, self._arm, targets)
+        wrenches = []
+        if self._has_wrench:
+            if seen.wrench is None or seen.wrench.shape != (6,):
+                raise self._wrong_wrench(frame)
+            wrenches.append(seen.wrench)
         if seen.object_poses.keys() != self._objects:
             raise _other_names(frame, "poses of the objects", seen.object_poses, self._objects)
         if not frame.images.keys() <= self._cameras:
@@ -57,12 +66,20 @@ class FrameCheck:
         poses += seen.object_poses.values()
         poses += [images.world_from_camera for images in frame.images.values()]
         numbers = np.concatenate(
-            joints + targets + [part for pose in poses for part in (pose.position, pose.quat_xyzw)]
+            joints + targets + wrenches + [part for pose in poses for part in (pose.position, pose.quat_xyzw)]
         )
         scalars = (seen.gripper_width, seen.contact_force, action.gripper_target, command.gripper_target)
         # One sum in place of sixty questions; it is finite unless a summand is not, or all are absurdly large.
         if not math.isfinite(numbers.sum() + sum(scalars)):
             _refuse_not_finite(frame)
+
+    def _wrong_wrench(self, frame: Frame) -> RecordingError:
+        wrench = frame.observation.wrench
+        found = "no wrench" if wrench is None else f"a wrench of shape {wrench.shape}"
+        return RecordingError(
+            f"Frame {frame.frame_index} has {found}; recordings of format version {self._version} have one of shape "
+            "(6,) at each frame, zeros where there is no force-torque sensor."
+        )
 
 
 def _wrong_shape(

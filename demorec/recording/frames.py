@@ -9,47 +9,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from demorec.episode import Action, CameraImages, EpisodeColumns, Event, Frame, JointSample, Observation
-from demorec.geometry import Array, Pose
+from demorec.episode import CameraImages, EpisodeColumns, Event, Frame, JointSample
+from demorec.recording.streams import action_at, command_at, observation_at, pose_of
 
 if TYPE_CHECKING:
     from demorec.recording.reader import Recording
-
-
-def pose_of(row: Array) -> Pose:
-    """The pose of a row (7,): position, quaternion xyzw."""
-    return Pose(position=row[:3], quat_xyzw=row[3:])
-
-
-def observation_at(columns: EpisodeColumns, frame: int) -> Observation:
-    """The observation of a frame, to the bit."""
-    return Observation(
-        joint_position=columns.joint_position[frame].copy(),
-        joint_velocity=columns.joint_velocity[frame].copy(),
-        joint_effort=columns.joint_effort[frame].copy(),
-        gripper_width=float(columns.gripper_width[frame]),
-        base_from_tcp=pose_of(columns.base_from_tcp[frame]),
-        object_poses={name: pose_of(rows[frame]) for name, rows in columns.object_poses.items()},
-        contact_force=float(columns.contact_force[frame]),
-    )
-
-
-def action_at(columns: EpisodeColumns, frame: int) -> Action:
-    """What the expert wanted at a frame."""
-    return Action(
-        joint_target=columns.action_joint_target[frame].copy(),
-        gripper_target=float(columns.action_gripper[frame]),
-        base_from_tcp_target=pose_of(columns.action_base_from_tcp[frame]),
-    )
-
-
-def command_at(columns: EpisodeColumns, frame: int) -> Action:
-    """What was sent to the motors at a frame."""
-    return Action(
-        joint_target=columns.command_joint_target[frame].copy(),
-        gripper_target=float(columns.command_gripper[frame]),
-        base_from_tcp_target=pose_of(columns.command_base_from_tcp[frame]),
-    )
 
 
 def frames_of(recording: Recording, columns: EpisodeColumns | None = None) -> Iterator[Frame]:

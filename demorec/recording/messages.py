@@ -17,6 +17,7 @@ from demorec.scene import Camera
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 POSE = "geometry_msgs/msg/PoseStamped"
+WRENCH = "geometry_msgs/msg/WrenchStamped"
 STRING = "std_msgs/msg/String"
 BOOL = "std_msgs/msg/Bool"
 LOG = "rcl_interfaces/msg/Log"

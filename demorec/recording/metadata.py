@@ -74,6 +74,8 @@ def read_episode_metadata(metadata: Mapping[str, str]) -> tuple[EpisodeInfo, dic
         )
     try:
         info = read_episode_info(metadata["info"])
+        if str(info.format_version) != version:
+            raise ValueError(f"its description is of format version {info.format_version}")
         cameras = from_description(metadata["cameras"], dict[str, CameraStreams])
         _check_cameras(info, cameras)
     except (KeyError, ValueError) as error:

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from demorec.recording.reader import Recording
 
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
+_WRENCH = ("fx", "fy", "fz", "tx", "ty", "tz")
 _MOMENTS, _PICTURE_HEIGHT = 5, 120
 
 
@@ -70,7 +71,8 @@ def frame_table(recording: Recording) -> pd.DataFrame:
 
     Columns are named as in `demorec.episode.EpisodeColumns`, vectors with their component:
     `joint_position.panda_joint1` (rad, fingers m), `base_from_tcp.x` (m), `base_from_tcp.qw`,
-    `object_poses.cube.z` (m, world frame), `phase`. `time_ns` is simulated time since the episode's start.
+    `wrench.fz` (N) and `wrench.tx` (N m) where they were recorded, `object_poses.cube.z` (m, world frame), `phase`.
+    `time_ns` is simulated time since the episode's start.
 
     Raises:
         MissingDependencyError: pandas is not installed.
@@ -85,6 +87,8 @@ def frame_table(recording: Recording) -> pd.DataFrame:
     for name in ("joint_position", "joint_velocity", "joint_effort"):
         table |= _components(name, getattr(columns, name), joints)
     table |= {"gripper_width": columns.gripper_width, "contact_force": columns.contact_force}
+    if columns.wrench is not None:
+        table |= _components("wrench", columns.wrench, _WRENCH)
     table |= _components("base_from_tcp", columns.base_from_tcp, _POSE)
     for kind in ("action", "command"):
         table |= _components(f"{kind}_joint_target", getattr(columns, f"{kind}_joint_target"), arm)

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from demorec.episode import EpisodeColumns, Event, Frame, JointSample, frame_time_ns
 from demorec.errors import RecordingError
-from demorec.geometry import Array
 from demorec.plain import to_json, to_plain
 from demorec.recording import channels, messages, metadata
 from demorec.recording.chunks import Block
@@ -27,6 +26,7 @@ from demorec.recording.frames import frames_of, frames_with_images, images_at
 from demorec.recording.labels import decode_labels, from_labels
 from demorec.recording.notebook import described, frame_table, html_page
 from demorec.recording.pixels import PixelCounter, PixelStatistics
+from demorec.recording.streams import Columns, FrameStream, frame_streams, merged_columns
 from demorec.recording.video import Rgb, VideoPacket, VideoSettings, decode, is_keyframe
 from demorec.urdf import check_primitives
 
@@ -169,45 +169,30 @@ class Recording:
 
     def columns(self) -> EpisodeColumns:
         """All numbers, one row a frame, to the bit as they were written."""
-        streams = {stream.topic: stream for stream in channels.state_streams(self.info)}
+        streams = frame_streams(self.info)
         times = self._frame_times()
-        blocks = self._container.blocks((*streams, channels.PHASE, channels.DELIBERATE_MISS))
+        topics = [stream.topic for stream in streams]
+        blocks = self._container.blocks((*topics, channels.PHASE, channels.DELIBERATE_MISS))
         joint_states = blocks[channels.JOINT_STATES]  # there may be more of these between the frames
         blocks[channels.JOINT_STATES] = joint_states.select(np.isin(joint_states.time_ns, times))
-        rows: dict[str, Array] = {}
         with damage_as_recording_error(self.path):
-            for topic, stream in streams.items():
-                block = blocks[topic]
-                if not np.array_equal(block.time_ns, times):
-                    raise RecordingError(
-                        f"The recording has {len(block)} messages on {topic} at other times than its "
-                        f"{len(times)} frames: {self.path}"
-                    )
-                rows[topic] = stream.layout.decode_rows(block.rows(len(stream.layout.constant)))
+            columns = merged_columns(self._columns_of(stream, blocks[stream.topic], times) for stream in streams)
             phases = _held(blocks[channels.PHASE], messages.read_string, times, "")
             misses = _held(blocks[channels.DELIBERATE_MISS], messages.read_boolean, times, False)
-        joints = rows[channels.JOINT_STATES].reshape(self.num_frames, 3, len(self.info.robot.joint_names))
-        gripper, action, command = (rows[topic] for topic in (channels.GRIPPER, channels.ACTION, channels.COMMAND))
-        num_arm = len(self.info.robot.arm_joints)
+        # Before the first frame nobody knows which cameras there are.
+        columns["world_from_camera"] = {name: columns["world_from_camera"][name] for name in self.cameras}
         return EpisodeColumns(
-            time_ns=times,
-            joint_position=joints[:, 0].copy(),
-            joint_velocity=joints[:, 1].copy(),
-            joint_effort=joints[:, 2].copy(),
-            gripper_width=gripper[:, 0].copy(),
-            base_from_tcp=rows[channels.EE_POSE],
-            object_poses={body.name: rows[channels.object_topic(body.name)] for body in self.info.scene.movable},
-            contact_force=gripper[:, 2].copy(),
-            action_joint_target=action[:, :num_arm].copy(),
-            action_gripper=action[:, num_arm].copy(),
-            action_base_from_tcp=rows[channels.ACTION + channels.EE_POSE],
-            command_joint_target=command[:, :num_arm].copy(),
-            command_gripper=command[:, num_arm].copy(),
-            command_base_from_tcp=rows[channels.COMMAND + channels.EE_POSE],
-            phase=tuple(phases),
-            is_deliberate_miss=np.array(misses, dtype=np.bool_),
-            world_from_camera={name: rows[channels.camera_topic(name, "pose")] for name in self.cameras},
+            time_ns=times, phase=tuple(phases), is_deliberate_miss=np.array(misses, dtype=np.bool_), **columns
         )
+
+    def _columns_of(self, stream: FrameStream, block: Block, times: NDArray[np.int64]) -> Columns:
+        """The columns of a stream, which must have one message at each of `times` (T,)."""
+        if not np.array_equal(block.time_ns, times):
+            raise RecordingError(
+                f"The recording has {len(block)} messages on {stream.topic} at other times than its "
+                f"{len(times)} frames: {self.path}"
+            )
+        return stream.columns(stream.layout.decode_rows(block.rows(len(stream.layout.constant))))
 
     def description(self, body: str = "") -> str:
         """URDF of the robot, or of the body of that name: primitives only, complete without any other file."""
@@ -221,7 +206,7 @@ class Recording:
 
     def joint_samples(self) -> Iterator[JointSample]:
         """Every recorded joint state in order of time: the frames' own and those between them."""
-        stream = next(row for row in channels.state_streams(self.info) if row.topic == channels.JOINT_STATES)
+        stream = next(row for row in frame_streams(self.info) if row.topic == channels.JOINT_STATES)
         for message in self._container.messages((channels.JOINT_STATES,)):
             with damage_as_recording_error(self.path):
                 position, velocity, effort = stream.layout.decode([message.data]).reshape(3, -1)
@@ -364,7 +349,8 @@ class Recording:
         """SHA-256 (hex) of the content: metadata, numbers, phases, events, coded pictures.
 
         Not of how a file lays it out, nor of the versions that wrote it: two recordings of one digest hold the same
-        episode to the bit.
+        episode to the bit. A column that the format version does not have is not part of it, so that recordings of
+        older versions keep their digests.
         """
         described = to_plain(self.info)
         del described["versions"], described["format_version"]
@@ -390,9 +376,11 @@ class Recording:
 
 
 def _column_bytes(columns: EpisodeColumns) -> Iterator[tuple[str, bytes]]:
-    """Name and bytes of every column."""
+    """Name and bytes of every column that was recorded."""
     for field in dataclasses.fields(columns):
         value = getattr(columns, field.name)
+        if value is None:
+            continue
         if isinstance(value, Mapping):
             for key in sorted(value):
                 yield f"{field.name}/{key}", value[key].tobytes()

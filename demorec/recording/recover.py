@@ -18,6 +18,7 @@ from demorec.recording.container import SalvagedMessage, SalvagedMetadata, salva
 from demorec.recording.part_file import PartFile
 from demorec.recording.reader import Recording
 from demorec.recording.ros2 import DEFINITIONS
+from demorec.recording.streams import frame_streams
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,7 +144,7 @@ def _survey(source: Path) -> _Survey:
     if episode is None:
         return _Survey(episode=None, outcome=None, num_frames=0, reason=reason or "no episode metadata")
     info, cameras = metadata.read_episode_metadata(episode)
-    topics = [stream.topic for stream in channels.state_streams(info) if stream.topic != channels.JOINT_STATES]
+    topics = [stream.topic for stream in frame_streams(info) if stream.topic != channels.JOINT_STATES]
     for camera, streams in cameras.items():
         topics.append(channels.video_topic(camera, streams.video.codec))
         topics += [channels.camera_topic(camera, name) for name in ("depth", "segmentation") if getattr(streams, name)]

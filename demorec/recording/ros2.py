@@ -11,6 +11,7 @@ _VECTOR3 = "MSG: geometry_msgs/Vector3\nfloat64 x\nfloat64 y\nfloat64 z\n"
 _QUATERNION = "MSG: geometry_msgs/Quaternion\nfloat64 x\nfloat64 y\nfloat64 z\nfloat64 w\n"
 _POINT = "MSG: geometry_msgs/Point\nfloat64 x\nfloat64 y\nfloat64 z\n"
 _POSE = "MSG: geometry_msgs/Pose\ngeometry_msgs/Point position\ngeometry_msgs/Quaternion orientation\n"
+_WRENCH = "MSG: geometry_msgs/Wrench\ngeometry_msgs/Vector3 force\ngeometry_msgs/Vector3 torque\n"
 _TRANSFORM = "MSG: geometry_msgs/Transform\ngeometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation\n"
 _TRANSFORM_STAMPED = (
     "MSG: geometry_msgs/TransformStamped\nstd_msgs/Header header\nstring child_frame_id\n"
@@ -42,6 +43,9 @@ DEFINITIONS: dict[str, str] = {
     ),
     "geometry_msgs/msg/PoseStamped": _definition(
         "std_msgs/Header header\ngeometry_msgs/Pose pose\n", _HEADER, _TIME, _POSE, _POINT, _QUATERNION
+    ),
+    "geometry_msgs/msg/WrenchStamped": _definition(
+        "std_msgs/Header header\ngeometry_msgs/Wrench wrench\n", _HEADER, _TIME, _WRENCH, _VECTOR3
     ),
     "tf2_msgs/msg/TFMessage": _definition(
         "geometry_msgs/TransformStamped[] transforms\n",

@@ -24,6 +24,7 @@ from demorec.recording.frame_check import FrameCheck, check_joint_names
 from demorec.recording.part_file import PartFile
 from demorec.recording.pictures import CameraRecorder
 from demorec.recording.recover import can_be_made_again
+from demorec.recording.streams import FrameValues, frame_streams, tf_stream
 from demorec.recording.transforms import FrameTree
 
 
@@ -49,13 +50,13 @@ class _Pending(NamedTuple):
 
     Attributes:
         time_ns: When.
-        numbers: What the streams that have one message a frame are made of.
+        values: What the streams that have one message a frame are made of.
         joint_samples: Joint states since the frame before.
         changes: (topic, type, message) of events and of what is written only when it changes.
     """
 
     time_ns: int
-    numbers: channels.Numbers
+    values: FrameValues
     joint_samples: tuple[JointSample, ...]
     changes: list[tuple[str, str, bytes]]
 
@@ -86,7 +87,7 @@ class EpisodeWriter:
         self._check = FrameCheck(info)
         self._video = video or VideoConfig()
         self._tree = FrameTree(info)
-        self._streams = [*channels.state_streams(info), channels.tf_stream(self._tree)]
+        self._streams = [*frame_streams(info), tf_stream(self._tree)]
         self._cameras: dict[str, CameraRecorder] = {}
         self._pending: list[_Pending] = []
         self._num_frames = 0
@@ -126,7 +127,7 @@ class EpisodeWriter:
         self._pending.append(
             _Pending(
                 time_ns=frame.time_ns,
-                numbers=channels.Numbers.of(frame),
+                values=FrameValues.of(frame),
                 joint_samples=frame.joint_samples,
                 changes=self._changes(frame),
             )
@@ -147,7 +148,7 @@ class EpisodeWriter:
         streams = {name: camera.streams for name, camera in self._cameras.items()}
         self._file.metadata(metadata.EPISODE, metadata.episode_metadata(self._info, streams))
         has_labels = any(camera.segmentation for camera in streams.values())
-        for topic, schema, data in channels.said_once(self._info, self._tree, has_labels=has_labels):
+        for topic, schema, data in channels.latched_messages(self._info, self._tree, has_labels=has_labels):
             self._file.log(topic, schema, data, 0, latched=True)
         self._file.flush()
 
@@ -158,9 +159,9 @@ class EpisodeWriter:
         if not frames:
             return
         time_ns = [frame.time_ns for frame in frames]
-        numbers = [frame.numbers for frame in frames]
+        values = [frame.values for frame in frames]
         logs = [self._file.logger(stream.topic, stream.schema) for stream in self._streams]
-        encoded = [stream.encode(time_ns, stream.rows(numbers)) for stream in self._streams]
+        encoded = [stream.encode(time_ns, stream.rows(values)) for stream in self._streams]
         samples = iter(self._sample_messages(frames))
         for time, frame, *rows in zip(time_ns, frames, *encoded, strict=True):
             for sample, data in islice(samples, len(frame.joint_samples)):

@@ -13,7 +13,8 @@ from demorec.errors import ConfigError, RecordingError
 from demorec.features import ActionKind
 from demorec.geometry import Array
 from demorec.recording import Recording
-from demorec.recording.frames import command_at, frames_of
+from demorec.recording.frames import frames_of
+from demorec.recording.streams import command_at
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,7 +12,7 @@ from demorec.episode import Action, Frame, Outcome
 from demorec.geometry import Array
 from demorec.loop import Decision, Session
 from demorec.loop.actions import ActionDecoder
-from demorec.recording.frames import pose_of
+from demorec.recording.streams import pose_of
 from demorec.render.painter import Painter
 from demorec.replay.demonstration import Demonstration, ReplayOptions
 from demorec.seeding import generator

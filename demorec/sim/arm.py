@@ -62,6 +62,7 @@ class Arm:
         self._fingers = [by_name[name] for name in spec.gripper_joints]
         self._tcp = self.links[spec.tcp_link]
         self.finger_links = tuple(self.links[name] for name in spec.finger_links)
+        self._hand = self._mounted_hand()
         self.kinematics = arm_kinematics(spec, scale=placement.scale)
         self._forces = list(spec.torque_limit)
         self._gains = [POSITION_GAIN] * len(self._arm)
@@ -89,6 +90,19 @@ class Arm:
             self.body, left, self.body, right, self._client.JOINT_GEAR, [1, 0, 0], [0, 0, 0], [0, 0, 0]
         )
         self._client.changeConstraint(gear, gearRatio=-1, erp=0.1, maxForce=50)
+
+    def _mounted_hand(self) -> int:
+        """The hand's link, with a force-torque sensor on the joint that carries it."""
+        hand: int = self.links.get(self.spec.hand_link, -1)
+        if hand < 0:
+            raise SceneError(
+                f"The robot {self.spec.name!r} has no joint that carries its hand_link {self.spec.hand_link!r}; its "
+                f"links on joints are {', '.join(name for name, link in self.links.items() if link >= 0)}."
+            )
+        self._client.enableJointForceTorqueSensor(self.body, hand, True)
+        # PyBullet tells the wrench along the axes of the link's inertia, not of the link.
+        self._hand_from_inertia = Pose(quat_xyzw=np.array(self._client.getDynamicsInfo(self.body, hand)[4]))
+        return hand
 
     def place(self, joint_position: Array, gripper_width: float) -> None:
         """Set the arm joints (n_arm,) rad and the opening (m) at once, at rest, without physics."""
@@ -131,6 +145,11 @@ class Arm:
         states = self._client.getJointStates(self.body, self._arm + self._fingers)
         position, velocity, effort = (np.array([state[i] for state in states]) for i in (0, 1, 3))
         return position, velocity, effort
+
+    def wrench(self) -> Array:
+        """(6,) force (N) and torque (N m) on the hand in the last physics step, as `Observation.wrench`."""
+        wrench = np.array(self._client.getJointState(self.body, self._hand)[2])
+        return self._hand_from_inertia.apply(wrench.reshape(2, 3)).reshape(6)
 
     def gripper_width(self) -> float:
         """Opening, metres."""

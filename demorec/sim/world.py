@@ -152,6 +152,7 @@ class World:
                 for link in self.arm.finger_links
                 for contact in self.client.getContactPoints(bodyA=self.arm.body, linkIndexA=link)
             ),
+            wrench=self.arm.wrench(),
         )
 
     def body(self, name: str) -> Body:
@@ -278,4 +279,6 @@ def _set_engine(client: Any, physics: Physics) -> None:
         globalCFM=0.0,
         minimumSolverIslandSize=1,
         warmStartingFactor=0.85,
+        # About the joint that has the sensor, along the axes of the link that it carries.
+        jointFeedbackMode=client.JOINT_FEEDBACK_IN_JOINT_FRAME,
     )

@@ -87,6 +87,11 @@ def test_mcap_decodes_what_was_written(path: Path, episode) -> None:
         assert [pose.position.x, pose.position.y, pose.position.z] == expected.position.tolist()
         quat = [pose.orientation.x, pose.orientation.y, pose.orientation.z, pose.orientation.w]
         assert quat == expected.quat_xyzw.tolist()
+    for frame, (time, content) in zip(frames, decoded["/wrench"], strict=True):
+        force, torque = content.wrench.force, content.wrench.torque
+        assert (time, content.header.frame_id) == (frame.time_ns, "panda_hand")
+        found = [force.x, force.y, force.z, torque.x, torque.y, torque.z]
+        assert found == frame.observation.wrench.tolist()
     info = decoded["/camera/front/camera_info"][0][1]
     assert (info.width, info.height) == (64, 48)
     assert np.allclose(np.reshape(info.k, (3, 3)), [[49.68, 0, 32], [0, 49.68, 24], [0, 0, 1]], atol=0.01)
@@ -110,7 +115,7 @@ def test_rosbags_deserialises_every_message(path: Path, episode) -> None:
     store = get_typestore(Stores.EMPTY)
     for name, definition in DEFINITIONS.items():
         store.register(get_types_from_msg(definition, name))
-    count, positions = 0, []
+    count, positions, wrenches = 0, [], []
     with AnyReader([path], default_typestore=store) as reader:
         for connection, _, raw in reader.messages():
             message = reader.deserialize(raw, connection.msgtype)
@@ -119,8 +124,12 @@ def test_rosbags_deserialises_every_message(path: Path, episode) -> None:
             count += 1
             if connection.topic == "/ee_pose":
                 positions.append([message.pose.position.x, message.pose.position.y, message.pose.position.z])
+            if connection.topic == "/wrench":
+                force, torque = message.wrench.force, message.wrench.torque
+                wrenches.append([force.x, force.y, force.z, torque.x, torque.y, torque.z])
     assert count > 1000
     assert np.array_equal(positions, [frame.observation.base_from_tcp.position for frame in frames])
+    assert np.array_equal(wrenches, [frame.observation.wrench for frame in frames])
 
 
 def test_definitions_are_those_of_ros(path: Path) -> None:
@@ -206,6 +215,7 @@ def test_rerun_shows_everything_without_code_of_ours(path: Path, tmp_path: Path)
         "/tf": "Transform3D",
         "/tf_static": "Transform3D",
         "/ee_pose": "InstancePoses3D",
+        "/wrench": "geometry_msgs.msg.WrenchStamped",  # as Rerun shows types that it has no archetype for
         "/object/cube/pose": "InstancePoses3D",
         "/events": "TextLog",
         "/phase": "TextDocument",

@@ -136,6 +136,25 @@ def not_a_number(s: Spoilt) -> None:
     s.set(joint_effort=effort)
 
 
+def wrench_not_a_number(s: Spoilt) -> None:
+    wrench = s.columns.wrench.copy()
+    wrench[40, 5] = np.nan
+    s.set(wrench=wrench)
+
+
+def wrench_of_the_load(s: Spoilt) -> None:
+    # What the hand does to the arm, in place of what the arm does to the hand.
+    s.set(wrench=-s.columns.wrench)
+
+
+def torque_before_force(s: Spoilt) -> None:
+    s.set(wrench=s.columns.wrench[:, [3, 4, 5, 0, 1, 2]])
+
+
+def wrench_along_other_axes(s: Spoilt) -> None:
+    s.set(wrench=s.columns.wrench[:, [2, 0, 1, 5, 3, 4]])
+
+
 def a_jump_while_untouched(s: Spoilt) -> None:
     poses = s.columns.object_poses["red_cube"].copy()
     poses[10:, 1] += 0.02
@@ -246,6 +265,10 @@ NUMBERS: list[tuple[Fault, str]] = [
     (random_actions, "action_matches_command"),
     (commands_of_another_motion, "command_tracking"),
     (not_a_number, "finite_numbers"),
+    (wrench_not_a_number, "finite_numbers"),
+    (wrench_of_the_load, "wrench_holds_the_hand"),
+    (torque_before_force, "wrench_holds_the_hand"),
+    (wrench_along_other_axes, "wrench_holds_the_hand"),
     (a_jump_while_untouched, "object_motion"),
     (a_drift_while_untouched, "object_motion"),
     (a_jump_in_the_hand, "teleports"),

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import math
+import xml.etree.ElementTree as ET
+from contextlib import nullcontext
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from helpers_sim import episode, run
 
-from demorec.assets import asset_path
-from demorec.episode import RobotSpec
+from demorec.assets import asset_path, mesh_path
+from demorec.episode import Action, RobotSpec
+from demorec.errors import SceneError
 from demorec.loop import make_world
 from demorec.plain import from_json, to_json
 from demorec.sim.arm import arm_kinematics
@@ -41,6 +45,68 @@ def test_the_spec_names_what_the_urdf_has(spec):
     for values in (spec.home_q, spec.velocity_limit, spec.acceleration_limit, spec.torque_limit):
         assert len(values) == numbers
     assert from_json(to_json(spec), RobotSpec) == spec
+
+
+def test_the_wrench_holds_the_weight_of_the_hand(spec, monkeypatch, tmp_path):
+    """At rest in a tilted pose, against statics; whichever way the axes of the hand's inertia are turned.
+
+    The fingers' motion stays horizontal: docs/recording.md tells what PyBullet loses otherwise.
+    """
+    scene = episode(0, robot=spec.name, variation="none").info.scene
+    q = np.array(spec.home_q)
+    q[-2] += 0.6
+    command = Action(joint_target=q, gripper_target=0.04, base_from_tcp_target=arm_kinematics(spec).forward(q))
+    urdf = asset_path(spec.urdf)
+    turned = tmp_path / "turned.urdf"
+    root = ET.parse(urdf).getroot()
+    for mesh in root.iter("mesh"):
+        mesh.attrib["filename"] = str(mesh_path(urdf.parent, mesh.attrib["filename"]))
+    root.find(f"link[@name='{spec.hand_link}']/inertial/origin").attrib["rpy"] = "0.4 -0.7 1.9"
+    turned.write_text(ET.tostring(root, encoding="unicode"))
+    found = {}
+    for name, model in (("as it is", None), ("turned", turned)):
+        if model is not None:
+            monkeypatch.setattr("demorec.sim.arm.urdf_file", lambda _, model=model: nullcontext(str(model)))
+        with World(spec) as world:
+            world.reset(scene)
+            world.set_state(joint_position=np.array([*q, 0.02, 0.02]))
+            wrenches = []
+            for _ in range(150):
+                world.apply(command)
+                wrenches.append(world.observe().wrench)
+            found[name] = np.mean(wrenches[-90:], axis=0), _weight(world)
+    for wrench, expected in found.values():
+        assert np.abs(expected[[0, 2]]).min() > 4.0, "the hand is tilted"
+        assert abs(expected[4]) > 0.2
+        assert np.abs(wrench[:3] - expected[:3]).max() < 0.02 * np.linalg.norm(expected[:3])
+        assert np.abs(wrench[3:] - expected[3:]).max() < 0.01
+    assert np.allclose(found["as it is"][1], found["turned"][1], atol=0.01)
+
+
+def _weight(world: World) -> np.ndarray:
+    """(6,) force and torque that balance gravity on hand and fingers, about the hand's origin and along its axes."""
+    client, arm = world.client, world.arm
+    hand = arm.links[arm.spec.hand_link]
+    place = client.getLinkState(arm.body, hand, computeForwardKinematics=1)
+    axes = np.reshape(client.getMatrixFromQuaternion(place[5]), (3, 3))
+    force, torque = np.zeros(3), np.zeros(3)
+    for link in (hand, *arm.finger_links):
+        held = np.array([0.0, 0.0, 9.81 * client.getDynamicsInfo(arm.body, link)[0]])
+        centre = client.getLinkState(arm.body, link, computeForwardKinematics=1)[0]
+        force += held
+        torque += np.cross(np.subtract(centre, place[4]), held)
+    return np.concatenate((axes.T @ force, axes.T @ torque))
+
+
+@pytest.mark.parametrize("hand", ["no_such_link", "base"])
+def test_a_hand_that_no_joint_carries_is_refused(spec, hand):
+    name = spec.base_link if hand == "base" else hand
+    scene = episode(0, robot=spec.name, variation="none").info.scene
+    with (
+        World(replace(spec, hand_link=name)) as world,
+        pytest.raises(SceneError, match=f"hand_link '{name}'; its links"),
+    ):
+        world.reset(scene)
 
 
 def test_home_points_the_hand_down_with_the_fingers_across(spec):

@@ -18,6 +18,11 @@ SAMPLES = {
         219,
         "move the red cube to the green target",
     ),
+    2: (
+        "6e88228b90c112e018d96a227ff9182f3bccbf9a5cd1adb958b0961e46d4020b",
+        219,
+        "move the red cube to the green target",
+    ),
 }
 
 
@@ -42,6 +47,7 @@ def test_a_sample_is_read(version: int) -> None:
         (moved,) = columns.object_poses.values()
         assert np.abs(moved[-1, :2] - moved[0, :2]).max() > 0.05  # the cube was carried away
         assert np.ptp(columns.gripper_width) > 0.02
+        assert (columns.wrench is None) == (version < 2)
         assert {"approach", "lift"} <= set(columns.phase) or len(set(columns.phase)) >= 5
         for camera in ("front", "wrist"):
             pictures = list(recording.images(camera))

@@ -291,5 +291,5 @@ def test_a_newer_format_is_refused_by_its_number(tmp_path: Path) -> None:
         for frame in frames:
             writer.write(frame)
         writer.finish(outcome)
-    with pytest.raises(RecordingError, match=r"format version 99, this demorec reads 1 to 1"):
+    with pytest.raises(RecordingError, match=r"format version 99, this demorec reads 1 to 2"):
         Recording(tmp_path / "a.mcap")

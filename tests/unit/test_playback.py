@@ -74,6 +74,15 @@ def test_every_joint_sample_is_plotted_at_its_time(saved: dict[str, list[Any]], 
     np.testing.assert_array_equal([value for _, value in rows], [s.joint_position[:joints] for s in samples])
 
 
+@pytest.mark.parametrize(("plot", "part"), [("hand_force", slice(0, 3)), ("hand_torque", slice(3, 6))])
+def test_the_wrench_is_plotted(saved: dict[str, list[Any]], recording: Path, plot: str, part: slice) -> None:
+    with Recording(recording) as source:
+        wrench = source.columns().wrench
+    assert wrench is not None
+    rows = _column(saved[f"/plots/{plot}"], "Scalars:scalars")
+    np.testing.assert_array_equal([value for _, value in rows], wrench[:, part])
+
+
 def test_frames_are_on_both_time_lines(saved: dict[str, list[Any]]) -> None:
     (chunk,) = [chunk for chunk in saved["/plots/gripper"] if not chunk.is_static]
     assert sorted(chunk.timeline_names) == ["frame", "time"]

@@ -63,6 +63,15 @@ FAULTS: dict[str, tuple[Callable[[Frame], Frame], str]] = {
         lambda f: replace(f, images={**f.images, "top": f.images["front"]}),
         "pictures of the cameras front, top, the scene has front",
     ),
+    "no wrench": (
+        lambda f: observed(f, wrench=None),
+        r"no wrench; recordings of format version 2 have one of shape \(6,\) at each frame",
+    ),
+    "a force without a torque": (lambda f: observed(f, wrench=np.zeros(3)), r"a wrench of shape \(3,\); recordings"),
+    "a NaN in the wrench": (
+        lambda f: observed(f, wrench=with_nan(f.observation.wrench)),
+        "wrench in its observation that is not finite",
+    ),
     "a NaN in a joint": (
         lambda f: observed(f, joint_velocity=with_nan(f.observation.joint_velocity)),
         "joint_velocity in its observation that is not finite",

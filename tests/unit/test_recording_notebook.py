@@ -124,12 +124,14 @@ def test_the_table_holds_every_number(path, truth):
         assert row["is_deliberate_miss"] == frame.is_deliberate_miss
         assert row["joint_position.panda_joint3"] == seen.joint_position[2]
         assert row["joint_effort.panda_finger_joint2"] == seen.joint_effort[8]
+        assert row["wrench.fz"] == seen.wrench[2]
+        assert row["wrench.tx"] == seen.wrench[3]
         assert row["base_from_tcp.z"] == seen.base_from_tcp.position[2]
         assert row["object_poses.cube.qw"] == seen.object_poses["cube"].quat_xyzw[3]
         assert row["command_joint_target.panda_joint7"] == command.joint_target[6]
         assert row["action_gripper"] == frame.action.gripper_target
         assert row["world_from_camera.wrist.x"] == frame.images["wrist"].world_from_camera.position[0]
-    numbers = 2 + 3 * 9 + 2 + 7 + 2 * (7 + 1 + 7) + 7 + 2 * 7 + 1
+    numbers = 2 + 3 * 9 + 2 + 6 + 7 + 2 * (7 + 1 + 7) + 7 + 2 * 7 + 1
     assert table.shape == (NUM_FRAMES, numbers)
 
 

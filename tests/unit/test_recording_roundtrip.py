@@ -46,6 +46,7 @@ def test_columns_are_the_frames_to_the_bit(tmp_path: Path, num_frames: int, came
         "gripper_width": [o.gripper_width for o in observations],
         "base_from_tcp": [o.base_from_tcp.vector() for o in observations],
         "contact_force": [o.contact_force for o in observations],
+        "wrench": [o.wrench for o in observations],
         "action_joint_target": [frame.action.joint_target for frame in frames],
         "action_gripper": [frame.action.gripper_target for frame in frames],
         "action_base_from_tcp": [frame.action.base_from_tcp_target.vector() for frame in frames],
@@ -266,6 +267,6 @@ def test_the_outcome_is_for_people_too(tmp_path: Path) -> None:
     assert episode is not None
     assert outcome is not None
     assert episode["instruction"] == "pick up the red cube and place it on the green target"
-    assert episode["format_version"] == "1"
+    assert episode["format_version"] == "2"
     assert json.loads(episode["info"])["config"]["task"] == "pick_place"
     assert outcome["success"] == "false"

@@ -84,6 +84,33 @@ def test_one_command_is_one_frame_of_physics(scene):
         assert world.joint_samples[0].time_ns == round(1e9 * 9 / 240)
 
 
+def test_the_force_torque_sensor_does_not_touch_the_physics(world, scene):
+    def digest_after(sensor: bool) -> tuple[str, bool]:
+        world.reset(scene)
+        hand = world.arm.links[PANDA.hand_link]
+        world.client.enableJointForceTorqueSensor(world.arm.body, hand, sensor)
+        q = world.arm.target + 0.05
+        for _ in range(30):
+            world.apply(
+                Action(joint_target=q, gripper_target=0.01, base_from_tcp_target=world.arm.kinematics.forward(q))
+            )
+        return world.state_digest(), bool(world.observe().wrench.any())
+
+    with_sensor, without = digest_after(True), digest_after(False)
+    assert with_sensor[0] == without[0]
+    assert (with_sensor[1], without[1]) == (True, False)
+
+
+def test_the_wrench_grows_by_the_weight_of_what_is_lifted():
+    prepared = episode(0, variation="none")
+    frames, outcome = run(prepared)
+    assert outcome.success
+    lift = next(i for i, f in enumerate(frames) if f.observation.object_poses["red_cube"].position[2] > 0.06)
+    free = np.mean([f.observation.wrench[2] for f in frames[: lift // 2]])
+    held = np.mean([f.observation.wrench[2] for f in frames[lift + 10 : lift + 60]])
+    assert abs((free - held) - 9.81 * prepared.info.scene.body("red_cube").mass) < 0.15
+
+
 def test_set_state_places_everything_exactly(world, scene):
     world.reset(scene)
     q = np.concatenate([np.array(PANDA.home_q) + 0.1, [0.01, 0.01]])

@@ -1,0 +1,296 @@
+"""The streams with one message a frame, one row each: topic, ROS 2 type, layout, encoding and decoding.
+
+`frame_streams` is the table. A row says which values of a frame its message holds (`parts`) and which columns of
+`EpisodeColumns` they become when a recording is read (`columns`); the writer, the reader, recovery and the checks go
+through the rows and know no topic by name. `since` is the format version that brought a stream: in older recordings it
+is neither expected nor written, and what it would tell is None.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from demorec.episode import Action, EpisodeColumns, EpisodeInfo, Frame, Observation
+from demorec.geometry import Array, Pose
+from demorec.recording import messages
+from demorec.recording.cdr import CdrWriter, Layout
+from demorec.recording.channels import (
+    ACTION,
+    COMMAND,
+    EE_POSE,
+    GRIPPER,
+    JOINT_STATES,
+    TF,
+    WRENCH,
+    camera_topic,
+    object_topic,
+)
+from demorec.recording.transforms import WORLD, FrameTree
+
+GRIPPER_JOINT = "gripper"
+"""Name of the gripper's opening beside the joints' names."""
+
+Columns = dict[str, Array | dict[str, Array]]
+"""Field of `EpisodeColumns` -> its rows, or name -> rows where the field is a mapping."""
+
+
+class FrameValues(NamedTuple):
+    """The numbers of a frame; they wait for the rest of their second, and must not be changed meanwhile."""
+
+    observation: Observation
+    action: Action
+    command: Action
+    world_from_camera: dict[str, Pose]
+
+    @classmethod
+    def of(cls, frame: Frame) -> FrameValues:
+        """Those of a frame, without its pictures."""
+        poses = {name: image.world_from_camera for name, image in frame.images.items()}
+        return cls(frame.observation, frame.action, frame.command, poses)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FrameStream:
+    """One stream that has a message at each frame.
+
+    Attributes:
+        topic: Where.
+        schema: ROS 2 type.
+        layout: Of its messages, which hold K values.
+        parts: The values of a frame, in pieces.
+        columns: The K values of T messages, (T, K), as columns.
+        arrange: All pieces of N frames, (N, ...), to the layout's values (N, K); None when they are these already.
+        since: The first format version that has it.
+    """
+
+    topic: str
+    schema: str
+    layout: Layout
+    parts: Callable[[FrameValues], Sequence[Array]]
+    columns: Callable[[Array], Columns]
+    arrange: Callable[[Array], Array] | None = None
+    since: int = 1
+
+    def rows(self, frames: Sequence[FrameValues]) -> Array:
+        """All pieces of N frames, (N, ...)."""
+        pieces = [piece for frame in frames for piece in self.parts(frame)]
+        return np.concatenate(pieces).reshape(len(frames), -1)
+
+    def encode(self, time_ns: Sequence[int], values: Array) -> list[bytes]:
+        """One message for each row of all pieces (N, ...)."""
+        if self.arrange is not None:
+            values = self.arrange(values)
+        return self.layout.encode(np.array(time_ns, dtype=np.int64), values)
+
+
+def frame_streams(info: EpisodeInfo) -> tuple[FrameStream, ...]:
+    """The streams of a recording of the version that `info` names.
+
+    `/joint_states` comes first; it may have more messages between the frames.
+    """
+    return tuple(stream for stream in _every_stream(info) if stream.since <= info.format_version)
+
+
+def _every_stream(info: EpisodeInfo) -> Iterator[FrameStream]:
+    """The table of all versions' streams."""
+    robot, scene = info.robot, info.scene
+    arm_and_gripper = (*robot.arm_joints, GRIPPER_JOINT)
+    base = robot.base_link
+    yield _joints(JOINT_STATES, robot.joint_names, _joint_state_parts, _joint_state_columns)
+    yield _joints(GRIPPER, (GRIPPER_JOINT,), partial(_gripper_parts, len(robot.gripper_joints)), _gripper_columns)
+    yield _joints(
+        ACTION, arm_and_gripper, lambda v: _targets(v.action), partial(_target_columns, "action"), _with_zeros
+    )
+    yield _joints(
+        COMMAND, arm_and_gripper, lambda v: _targets(v.command), partial(_target_columns, "command"), _with_zeros
+    )
+    yield _pose(EE_POSE, base, lambda v: v.observation.base_from_tcp, "base_from_tcp")
+    yield _pose(ACTION + EE_POSE, base, lambda v: v.action.base_from_tcp_target, "action_base_from_tcp")
+    yield _pose(COMMAND + EE_POSE, base, lambda v: v.command.base_from_tcp_target, "command_base_from_tcp")
+    yield FrameStream(
+        topic=WRENCH,
+        schema=messages.WRENCH,
+        layout=_stamped_layout(robot.hand_link, 6),
+        parts=_wrench_parts,
+        columns=lambda values: {"wrench": values},
+        since=2,
+    )
+    for body in scene.movable:
+        yield _pose(object_topic(body.name), WORLD, partial(_object_pose, body.name), "object_poses", body.name)
+    for camera in scene.cameras:
+        topic = camera_topic(camera.name, "pose")
+        yield _pose(topic, WORLD, partial(_camera_pose, camera.name), "world_from_camera", camera.name)
+
+
+def tf_stream(frames: FrameTree) -> FrameStream:
+    """The moving coordinate frames; they follow from other streams, so they become no column."""
+    message = CdrWriter()
+    message.u32(len(frames.moving))
+    for parent, child in frames.moving:
+        message.header(parent)
+        message.text(child)
+        message.value_slot(7)
+    return FrameStream(
+        topic=TF,
+        schema=messages.TRANSFORMS,
+        layout=message.layout(),
+        parts=lambda values: frames.parts(values.observation),
+        columns=lambda values: {},
+        arrange=frames.arrange,
+    )
+
+
+def merged_columns(found: Iterable[Columns]) -> dict[str, Any]:
+    """The columns of several streams as arguments of `EpisodeColumns`; the mappings are there even when empty."""
+    merged: dict[str, Any] = {"object_poses": {}, "world_from_camera": {}}
+    for columns in found:
+        for name, rows in columns.items():
+            if isinstance(rows, Mapping):
+                merged[name].update(rows)
+            else:
+                merged[name] = rows
+    return merged
+
+
+# --------------------------------------------------------------------------- columns back into one frame's values
+
+
+def observation_at(columns: EpisodeColumns, frame: int) -> Observation:
+    """The observation of a frame, to the bit."""
+    return Observation(
+        joint_position=columns.joint_position[frame].copy(),
+        joint_velocity=columns.joint_velocity[frame].copy(),
+        joint_effort=columns.joint_effort[frame].copy(),
+        gripper_width=float(columns.gripper_width[frame]),
+        base_from_tcp=pose_of(columns.base_from_tcp[frame]),
+        object_poses={name: pose_of(rows[frame]) for name, rows in columns.object_poses.items()},
+        contact_force=float(columns.contact_force[frame]),
+        wrench=None if columns.wrench is None else columns.wrench[frame].copy(),
+    )
+
+
+def action_at(columns: EpisodeColumns, frame: int) -> Action:
+    """What the expert wanted at a frame."""
+    return Action(
+        joint_target=columns.action_joint_target[frame].copy(),
+        gripper_target=float(columns.action_gripper[frame]),
+        base_from_tcp_target=pose_of(columns.action_base_from_tcp[frame]),
+    )
+
+
+def command_at(columns: EpisodeColumns, frame: int) -> Action:
+    """What was sent to the motors at a frame."""
+    return Action(
+        joint_target=columns.command_joint_target[frame].copy(),
+        gripper_target=float(columns.command_gripper[frame]),
+        base_from_tcp_target=pose_of(columns.command_base_from_tcp[frame]),
+    )
+
+
+def pose_of(row: Array) -> Pose:
+    """The pose of a row (7,): position, quaternion xyzw."""
+    return Pose(position=row[:3], quat_xyzw=row[3:])
+
+
+# ------------------------------------------------------------------------------------ what the rows are made of
+
+
+def _joint_state_parts(values: FrameValues) -> Sequence[Array]:
+    observation = values.observation
+    return observation.joint_position, observation.joint_velocity, observation.joint_effort
+
+
+def _joint_state_columns(values: Array) -> Columns:
+    names = ("joint_position", "joint_velocity", "joint_effort")
+    return {name: part.copy() for name, part in zip(names, np.split(values, 3, axis=1), strict=True)}
+
+
+def _gripper_parts(num_fingers: int, values: FrameValues) -> Sequence[Array]:
+    # The opening's velocity is the sum of the fingers' velocities; the force on them stands in for the effort.
+    observation = values.observation
+    velocity = sum(observation.joint_velocity[-num_fingers:].tolist())
+    return (np.array((observation.gripper_width, velocity, observation.contact_force)),)
+
+
+def _gripper_columns(values: Array) -> Columns:
+    return {"gripper_width": values[:, 0].copy(), "contact_force": values[:, 2].copy()}
+
+
+def _targets(action: Action) -> Sequence[Array]:
+    return action.joint_target, np.array((action.gripper_target,))
+
+
+def _with_zeros(targets: Array) -> Array:
+    # No velocity or effort is commanded; zeros, since a viewer makes an empty plot of an empty array.
+    return np.concatenate((targets, np.zeros((len(targets), 2 * targets.shape[1]))), axis=1)
+
+
+def _target_columns(kind: str, values: Array) -> Columns:
+    num_arm = values.shape[1] // 3 - 1
+    return {f"{kind}_joint_target": values[:, :num_arm].copy(), f"{kind}_gripper": values[:, num_arm].copy()}
+
+
+def _wrench_parts(values: FrameValues) -> Sequence[Array]:
+    wrench = values.observation.wrench
+    assert wrench is not None, "FrameCheck lets no frame without it into a recording that has the stream"
+    return (wrench,)
+
+
+def _object_pose(name: str, values: FrameValues) -> Pose:
+    return values.observation.object_poses[name]
+
+
+def _camera_pose(name: str, values: FrameValues) -> Pose:
+    return values.world_from_camera[name]
+
+
+def _joints(
+    topic: str,
+    names: Sequence[str],
+    parts: Callable[[FrameValues], Sequence[Array]],
+    columns: Callable[[Array], Columns],
+    arrange: Callable[[Array], Array] | None = None,
+) -> FrameStream:
+    layout = _joints_layout(tuple(names))
+    return FrameStream(
+        topic=topic, schema=messages.JOINT_STATE, layout=layout, parts=parts, columns=columns, arrange=arrange
+    )
+
+
+def _pose(topic: str, frame_id: str, pose: Callable[[FrameValues], Pose], column: str, key: str = "") -> FrameStream:
+    """A pose that becomes the rows of `column`, or of `key` in it."""
+    return FrameStream(
+        topic=topic,
+        schema=messages.POSE,
+        layout=_stamped_layout(frame_id, 7),
+        parts=lambda values: ((found := pose(values)).position, found.quat_xyzw),
+        columns=lambda values: {column: {key: values}} if key else {column: values},
+    )
+
+
+# The recordings of a run have the same few layouts, and an export opens many.
+@lru_cache(maxsize=64)
+def _joints_layout(names: tuple[str, ...]) -> Layout:
+    message = CdrWriter()
+    message.header("")
+    message.u32(len(names))
+    for name in names:
+        message.text(name)
+    for _ in range(3):  # position, velocity, effort
+        message.u32(len(names))
+        message.value_slot(len(names))
+    return message.layout()
+
+
+@lru_cache(maxsize=64)
+def _stamped_layout(frame_id: str, num_values: int) -> Layout:
+    """A header and float64 after float64: PoseStamped, WrenchStamped."""
+    message = CdrWriter()
+    message.header(frame_id)
+    message.value_slot(num_values)
+    return message.layout()
