@@ -22,8 +22,6 @@ from demorec.export.mp4 import CodedVideo
 from demorec.export.stats import PixelHistogram
 from demorec.geometry import Array
 
-DEPTH_SUFFIX = "_depth"
-
 _NEAREST, _FARTHEST, _SHIFT = 0.01, 10.0, 3.5
 _LARGEST_CODE = 4095
 _GOP, _CRF = 2, 30

@@ -32,8 +32,6 @@ SIDECAR_EPISODES_PATH = f"{SIDECAR_DIR}/episodes/{_CHUNK}.parquet"
 SIDECAR_ATTEMPTS_PATH = f"{SIDECAR_DIR}/attempts/{_CHUNK}.parquet"
 SIDECAR_CAMERAS_PATH = f"{SIDECAR_DIR}/camera_poses/{_CHUNK}.parquet"
 
-IMAGE_PREFIX = "observation.images."
-
 FeatureType = Literal["float32", "float64", "int64", "bool", "string", "video", "image", "language"]
 
 _ARROW_TYPES = {

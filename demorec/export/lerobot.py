@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from demorec.errors import ConfigError, ExportError
+from demorec.errors import ConfigError
 from demorec.export.card import CardFacts, write_card
 from demorec.export.digest import combined_digest
 from demorec.export.existing import Existing, features_to_append, link_files, open_existing
@@ -22,7 +22,7 @@ from demorec.export.layout import DatasetInfo
 from demorec.export.options import ExportOptions, ExportReport, Progress
 from demorec.export.readings import Reading, readings
 from demorec.export.sidecar import AttemptRecord, SidecarStart, SidecarWriter
-from demorec.export.sources import Source, find_recordings, places_of, refuse_differences
+from demorec.export.sources import Source, find_recordings, nothing_to_export, places_of, refuse_differences
 from demorec.export.staging import CODED, staged_folder
 from demorec.export.verify import LEROBOT, MAX_EPISODES, Sample, Verifier, lerobot_is_installed
 from demorec.export.writer import DatasetWriter, WriterStart
@@ -95,10 +95,7 @@ class _Export:
                 break
             waiting.append(first.attempt)
         if first is None or first.prepared is None:
-            raise ExportError(
-                f"Nothing to export: of {len(self._found)} recordings, {len(waiting)} are failed attempts and the "
-                "others are not among the wanted episodes (--include-failures, --episodes)."
-            )
+            raise nothing_to_export(len(self._found), len(waiting))
         info = self._dataset_info(first)
         start = self._existing.writer if self._existing else WriterStart()
         sidecar_start = self._existing.sidecar if self._existing else SidecarStart()

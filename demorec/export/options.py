@@ -1,15 +1,16 @@
-"""What a user chooses about an export, and what the export tells at the end."""
+"""What a user chooses about an export, to any format and to LeRobot's, and what an export tells at the end."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from demorec.config import VideoConfig
 from demorec.errors import ConfigError
+from demorec.export.exporter import Exporter
 from demorec.features import ACTION, STATE, ActionKind
 
 Progress = Callable[[int, int], None]
@@ -17,33 +18,49 @@ Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExportOptions:
-    """How recordings become a dataset."""
+class CommonOptions:
+    """How recordings become a dataset, whatever its format."""
 
-    repo_id: str = "local/demorec"
-    """Name of the dataset on the Hub, OWNER/NAME; also written into its card."""
     episodes: str = ""
     """Which episodes of each run, by their number: 0:100, ::2, 3,5,8:10; all by default."""
     include_failures: bool = False
-    """Export failed episodes too; next.success tells them apart."""
+    """Export failed episodes too; the dataset says of each whether it succeeded."""
     action: ActionKind = "joint"
     """Form of the action: joint (absolute joint targets), joint_increment (their change since the frame before),
     ee (absolute TCP pose), ee_delta (its change). The gripper's opening is always absolute."""
     privileged: bool = False
     """Add observation.environment_state: poses and sizes that no sensor of a real robot gives."""
     features: tuple[str, ...] = ()
-    """Names of the features to have, the others are left out; all by default. observation.state, action, timestamp and
-    the indices stay whatever is named. LeRobot reads every column for every item: fewer make training faster."""
+    """Names of the features to have, the others are left out; all by default. observation.state, action and what the
+    format itself needs (times, indices) stay whatever is named. Fewer features make training faster."""
     depth: bool = False
-    """Add depth videos (12 bit, as LeRobot 0.6 has them) of recordings that have depth."""
+    """Add depth pictures of recordings that have depth: LeRobot's 12-bit videos, or float32 metres in HDF5."""
     fps: int | None = None
     """Frames per second of the dataset; divides that of the recordings, the frames between are left out."""
+    overwrite: bool = False
+    """Replace the dataset that is there already; anything else than a dataset, or with anything else in it, is not."""
+
+    def takes(self, feature: str) -> bool:
+        """Whether the dataset shall have a feature, if the recordings give it."""
+        return not self.features or feature in self.features or feature in (STATE, ACTION)
+
+    def validate(self) -> None:
+        """Raise ConfigError for impossible values and combinations."""
+        parse_episodes(self.episodes)
+        if self.fps is not None and self.fps < 1:
+            raise ConfigError(f"fps is {self.fps}, it must be at least 1.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportOptions(CommonOptions):
+    """How recordings become a LeRobot dataset."""
+
+    repo_id: str = "local/demorec"
+    """Name of the dataset on the Hub, OWNER/NAME; also written into its card."""
     append: bool = False
     """Add the episodes to the dataset that is there already."""
     allow_duplicates: bool = False
     """With --append: add episodes whose content the dataset has already a second time, instead of refusing them."""
-    overwrite: bool = False
-    """Replace the dataset that is there already; anything else than a dataset, or with anything else in it, is not."""
     verify: bool = True
     """Open the finished dataset with LeRobot, where that is installed, and compare samples with the recordings."""
     workers: int = 0
@@ -70,19 +87,13 @@ class ExportOptions:
         """How pictures are coded that cannot be taken as they are."""
         return VideoConfig(codec=self.transcode_codec, crf=self.transcode_crf)
 
-    def takes(self, feature: str) -> bool:
-        """Whether the dataset shall have a feature, if the recordings give it."""
-        return not self.features or feature in self.features or feature in (STATE, ACTION)
-
     def validate(self) -> None:
         """Raise ConfigError for impossible values and combinations."""
-        parse_episodes(self.episodes)
+        super().validate()
         if self.append and self.overwrite:
             raise ConfigError("--append and --overwrite exclude each other: choose one.")
         if self.allow_duplicates and not self.append:
             raise ConfigError("--allow-duplicates belongs to --append.")
-        if self.fps is not None and self.fps < 1:
-            raise ConfigError(f"fps is {self.fps}, it must be at least 1.")
         if self.workers < 0:
             raise ConfigError(f"workers is {self.workers}, it must be 0 (as many as pay) or more.")
         check_repo_id(self.repo_id)
@@ -153,3 +164,16 @@ def parse_episodes(text: str) -> Callable[[int], bool]:
     if not parts:
         return lambda index: True
     return lambda index: any(index in part for part in parts)
+
+
+def _export(sources: Sequence[Path], out: Path, options: ExportOptions, progress: Progress | None) -> ExportReport:
+    from demorec.export.lerobot import export_lerobot
+
+    return export_lerobot(sources, out, options, progress)
+
+
+LEROBOT = Exporter(
+    summary="LeRobot v3.0, a folder: recorded video as it is, numbers bit for bit, statistics, card",
+    options=ExportOptions,
+    export=_export,
+)
