@@ -17,7 +17,7 @@ from helpers_recording import write_episode
 
 from demorec.config import VideoConfig
 from demorec.errors import ExportError
-from demorec.export import ExportReport
+from demorec.lerobot import ExportReport
 from demorec.tables import EXPORTERS
 
 

@@ -15,8 +15,8 @@ from demorec.cli.export import Export
 from demorec.cli.flags import parse
 from demorec.cli.generate import Generate
 from demorec.config import GenerateConfig, VideoConfig
-from demorec.export.commands import flags
-from demorec.export.options import ExportOptions
+from demorec.lerobot.commands import flags
+from demorec.lerobot.options import ExportOptions
 from demorec.variation import Ranges
 
 

@@ -10,13 +10,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from demorec.export.columns import frame_stride
-from demorec.export.layout import Feature
-from demorec.export.options import ExportOptions, Progress
-from demorec.export.prepare import PreparedEpisode, dataset_features, prepare_episode
-from demorec.export.sidecar import AttemptRecord
+from demorec.export.options import Progress
 from demorec.export.sources import Profile, Source, goes_in, is_among_episodes
-from demorec.export.transcode import reason_to_transcode
 from demorec.features import IMAGE_PREFIX
+from demorec.lerobot.layout import Feature
+from demorec.lerobot.options import ExportOptions
+from demorec.lerobot.prepare import PreparedEpisode, dataset_features, prepare_episode
+from demorec.lerobot.sidecar import AttemptRecord
+from demorec.lerobot.transcode import reason_to_transcode
 from demorec.processes import SPAWN
 from demorec.recording import Recording
 

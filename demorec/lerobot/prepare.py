@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from demorec.export.columns import DONE, REWARD, SUCCESS, check_feature_names, feature_columns, frame_stride
-from demorec.export.depth import depth_info, depth_video
-from demorec.export.layout import AUTOMATIC_FEATURES, Feature
-from demorec.export.options import ExportOptions
-from demorec.export.sidecar import EpisodeRecord
-from demorec.export.stats import PixelHistogram, colour_levels
-from demorec.export.transcode import coded_videos, dataset_settings, video_info
-from demorec.export.writer import EpisodeData
 from demorec.features import ACTION, DEPTH_SUFFIX, IMAGE_PREFIX, action_names, observation_names
+from demorec.lerobot.depth import depth_info, depth_video
+from demorec.lerobot.layout import AUTOMATIC_FEATURES, Feature
+from demorec.lerobot.options import ExportOptions
+from demorec.lerobot.sidecar import EpisodeRecord
+from demorec.lerobot.stats import PixelHistogram, colour_levels
+from demorec.lerobot.transcode import coded_videos, dataset_settings, video_info
+from demorec.lerobot.writer import EpisodeData
 from demorec.recording import Recording
 
 _SCALARS = {
