@@ -13,9 +13,7 @@ from demorec.episode import EpisodeInfo
 from demorec.errors import ExportError
 from demorec.features import ACTION, ActionKind, action_names
 from demorec.lerobot.files import read_table
-from demorec.lerobot.layout import (
-    DatasetInfo,
-)
+from demorec.lerobot.layout import DatasetInfo
 from demorec.lerobot.paths import SIDECAR_DIR
 from demorec.lerobot.reader import EpisodePlace, RowReader, episode_places, read_tasks
 from demorec.lerobot.sidecar import EPISODE_SCHEMA

@@ -17,10 +17,7 @@ from numpy.typing import NDArray
 from demorec.features import ACTION, EE_POSE, ENVIRONMENT_STATE, IMAGE_PREFIX, STATE, VELOCITY, ActionKind
 from demorec.lerobot.commands import making_commands
 from demorec.lerobot.files import read_table
-from demorec.lerobot.layout import (
-    DatasetInfo,
-    Feature,
-)
+from demorec.lerobot.layout import DatasetInfo, Feature
 from demorec.lerobot.options import ExportOptions
 from demorec.lerobot.paths import SIDECAR_DIR
 from demorec.lerobot.reader import read_tasks

@@ -14,14 +14,7 @@ from typing import Any
 
 from demorec.errors import ExportError
 from demorec.lerobot.files import open_table, read_json, read_table
-from demorec.lerobot.layout import (
-    AUTOMATIC_FEATURES,
-    STATS_PATH,
-    TASKS_PATH,
-    DatasetInfo,
-    Feature,
-    FilePosition,
-)
+from demorec.lerobot.layout import AUTOMATIC_FEATURES, STATS_PATH, TASKS_PATH, DatasetInfo, Feature, FilePosition
 from demorec.lerobot.paths import INFO_PATH, SIDECAR_DIR
 from demorec.lerobot.reader import read_tasks
 from demorec.lerobot.sidecar import CONFIGS_PATH, SidecarStart

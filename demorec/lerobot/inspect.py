@@ -9,9 +9,7 @@ from pathlib import Path
 from demorec.errors import ExportError
 from demorec.lerobot.digest import combined_digest, episode_digest
 from demorec.lerobot.files import open_table, read_json, read_table
-from demorec.lerobot.layout import (
-    DatasetInfo,
-)
+from demorec.lerobot.layout import DatasetInfo
 from demorec.lerobot.paths import SIDECAR_DIR
 from demorec.lerobot.reader import PacketReader, RowReader, episode_places, read_tasks
 

@@ -24,12 +24,7 @@ from numpy.typing import NDArray
 
 from demorec.episode import EpisodeColumns, Outcome
 from demorec.geometry import Array, Pose
-from demorec.lerobot.layout import (
-    SIDECAR_ATTEMPTS_PATH,
-    SIDECAR_CAMERAS_PATH,
-    SIDECAR_EPISODES_PATH,
-    FilePosition,
-)
+from demorec.lerobot.layout import SIDECAR_ATTEMPTS_PATH, SIDECAR_CAMERAS_PATH, SIDECAR_EPISODES_PATH, FilePosition
 from demorec.lerobot.parquet import RollingParquet, vector_array
 from demorec.lerobot.paths import SIDECAR_DIR
 from demorec.lerobot.writer import WrittenEpisode, write_text
