@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.episode import EpisodeInfo, Frame, Outcome
-from demorec.export import ExportOptions, export_lerobot
+from demorec.lerobot import ExportOptions, export_lerobot
 from demorec.recording import EpisodeWriter
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
@@ -194,7 +194,7 @@ def growth(args: argparse.Namespace, work: Path) -> list[dict[str, float]]:
     program = (
         "import resource, sys, time\n"
         "from pathlib import Path\n"
-        "from demorec.export import ExportOptions, export_lerobot\n"
+        "from demorec.lerobot import ExportOptions, export_lerobot\n"
         "files = sorted(Path(sys.argv[1]).glob('*.mcap'))[: int(sys.argv[2])]\n"
         "export_lerobot(files[:1], Path(sys.argv[3] + '.warm'), ExportOptions(verify=False))\n"
         "cpu = time.process_time()\n"

@@ -29,6 +29,8 @@ VELOCITY = "observation.velocity"
 EE_POSE = "observation.ee_pose"
 ENVIRONMENT_STATE = "observation.environment_state"
 ACTION = "action"
+IMAGE_PREFIX, DEPTH_SUFFIX = "observation.images.", "_depth"
+"""A camera's pictures are called IMAGE_PREFIX + its name, its distances have the suffix, too."""
 
 ActionKind = Literal["joint", "joint_increment", "ee", "ee_delta"]
 """What the action column holds; `action_vectors` defines each."""

@@ -32,7 +32,7 @@ from demorec.render import Renderer
 from demorec.render.painter import Painter
 from demorec.scene import Scene
 from demorec.sim.world import World
-from demorec.tables import CAMERAS, RENDERERS, TASKS
+from demorec.tables import CAMERAS, RENDERERS, TASKS, environment_name
 from demorec.variation import Preset
 
 SUCCESS_FRAMES = 5
@@ -378,13 +378,12 @@ def env_id(task: str) -> str:
         ConfigError: An unknown task.
     """
     TASKS.check_name(task)
-    name = "".join(word.capitalize() for word in task.split("_")) if task in TASKS.rows else task.rpartition(":")[2]
-    full = f"demorec/{name}-v0"
+    full = environment_name(task)
     if full not in gymnasium.registry:
         gymnasium.register(full, entry_point="demorec.gym_env:DemorecEnv", kwargs={"task": task})
     elif gymnasium.registry[full].kwargs["task"] != task:
         raise ConfigError(
-            f"Two tasks are called {name!r}: {gymnasium.registry[full].kwargs['task']} and {task}; rename one class."
+            f"Two tasks are called {full!r}: {gymnasium.registry[full].kwargs['task']} and {task}; rename one class."
         )
     return full
 

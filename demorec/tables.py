@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from demorec.assets import model_name
 from demorec.registry import Registry
@@ -13,6 +13,7 @@ from demorec.user_modules import modules_of, split_name
 if TYPE_CHECKING:
     from demorec.check.base import Check
     from demorec.episode import RobotSpec
+    from demorec.export.exporter import Exporter
     from demorec.render import Renderer
     from demorec.render.cameras import CameraPreset
     from demorec.tasks.base import Task
@@ -53,6 +54,11 @@ RENDERERS: Registry[type[Renderer]] = Registry(
         "tiny": "demorec.sim.renderers.tiny:TinyRenderer",
         "egl": "demorec.sim.renderers.egl:EglRenderer",
     },
+)
+
+EXPORTERS: Registry[Exporter[Any]] = Registry(
+    kind="format",
+    rows={"lerobot": "demorec.lerobot.options:LEROBOT", "hdf5": "demorec.hdf5.options:HDF5"},
 )
 
 CHECKS: Registry[Check] = Registry(
@@ -136,6 +142,12 @@ def load_robot(name: str, allowed: Collection[str] = ()) -> RobotSpec:
     robot = ROBOTS.load(name, allowed)
     module, *_ = modules_of([name]) or ("",)
     return replace(robot, urdf=model_name(robot.urdf, module)) if module else robot
+
+
+def environment_name(task: str) -> str:
+    """Gymnasium's name of a task's environment: "demorec/PickPlace-v0", or "demorec/Mine-v0" for "my_package:Mine"."""
+    name = "".join(word.capitalize() for word in task.split("_")) if task in TASKS.rows else task.rpartition(":")[2]
+    return f"demorec/{name}-v0"
 
 
 def camera_name(name: str) -> str:

@@ -17,7 +17,8 @@ from helpers_recording import write_episode
 
 from demorec.config import VideoConfig
 from demorec.errors import ExportError
-from demorec.export import ExportOptions, ExportReport, export_lerobot
+from demorec.lerobot import ExportReport
+from demorec.tables import EXPORTERS
 
 
 def make_run(
@@ -40,10 +41,12 @@ def make_run(
     return folder
 
 
-def export(sources: Path | Sequence[Path], out: Path, **options: Any) -> ExportReport:
-    """`export_lerobot` without the verification, unless asked for."""
+def export(sources: Path | Sequence[Path], out: Path, exporter: str = "lerobot", **options: Any) -> ExportReport:
+    """An export by a row of the table; to LeRobot without the verification, unless asked for."""
     sources = [sources] if isinstance(sources, Path) else sources
-    return export_lerobot(sources, out, ExportOptions(**{"verify": False, **options}))
+    row = EXPORTERS.load(exporter)
+    defaults = {"verify": False} if exporter == "lerobot" else {}
+    return row.export(sources, out, row.options(**{**defaults, **options}), None)
 
 
 def data_table(dataset: Path) -> pa.Table:

@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 
 from demorec.episode import EpisodeInfo
 from demorec.errors import ExportError
-from demorec.export.files import read_table
-from demorec.export.layout import SIDECAR_DIR, DatasetInfo
-from demorec.export.reader import EpisodePlace, RowReader, episode_places, read_tasks
-from demorec.export.sidecar import EPISODE_SCHEMA
 from demorec.features import ACTION, ActionKind, action_names
+from demorec.lerobot.files import read_table
+from demorec.lerobot.layout import DatasetInfo
+from demorec.lerobot.paths import SIDECAR_DIR
+from demorec.lerobot.reader import EpisodePlace, RowReader, episode_places, read_tasks
+from demorec.lerobot.sidecar import EPISODE_SCHEMA
 from demorec.validity import read_episode_info
 
 Rows = Mapping[str, NDArray[Any]]

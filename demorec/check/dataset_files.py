@@ -15,11 +15,11 @@ import numpy as np
 from demorec.check.base import Measurement, check, worst
 from demorec.check.dataset import Dataset
 from demorec.errors import ExportError, MissingDependencyError
-from demorec.export.files import check_video, read_json
-from demorec.export.inspect import episode_digests
-from demorec.export.reader import PacketReader
-from demorec.export.verify import LEROBOT, lerobot_is_installed
 from demorec.geometry import Array
+from demorec.lerobot.files import check_video, read_json
+from demorec.lerobot.inspect import episode_digests
+from demorec.lerobot.reader import PacketReader
+from demorec.lerobot.verify import LEROBOT, lerobot_is_installed
 
 
 @check(group="dataset", scope="dataset", measures="tables that cannot be read", warn=0)

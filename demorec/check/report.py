@@ -14,6 +14,7 @@ from demorec.check.dataset import Dataset
 from demorec.check.episode import RecordedEpisode
 from demorec.check.run import RUN_NAME, RunFolder
 from demorec.errors import ConfigError, DemorecError, resource_error
+from demorec.lerobot.paths import is_dataset
 from demorec.processes import SPAWN
 from demorec.tables import CHECKS
 
@@ -124,9 +125,9 @@ def find_subjects(paths: Sequence[Path]) -> list[Subject]:
                 Subject(path=file, kind="recording", is_failed_attempt=file.parent.name == "failed")
                 for file in RunFolder(path).recordings
             ]
-            if (path / "dataset" / "meta" / "info.json").is_file():
+            if is_dataset(path / "dataset"):
                 found.append(Subject(path=path / "dataset", kind="dataset"))
-        elif (path / "meta" / "info.json").is_file():
+        elif is_dataset(path):
             found.append(Subject(path=path, kind="dataset"))
         elif path.is_dir():
             files = [*sorted(path.glob("*.mcap")), *sorted((path / "episodes").glob("*.mcap"))]

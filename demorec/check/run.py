@@ -14,8 +14,9 @@ from demorec.check.base import Measurement, check, worst
 from demorec.check.coverage import infos_by_task, largest_gap, start_vector, twins
 from demorec.episode import EpisodeInfo
 from demorec.errors import ConfigError, RecordingError, resource_error
-from demorec.export.files import read_json
 from demorec.files import open_regular, read_json_limited
+from demorec.lerobot.files import read_json
+from demorec.lerobot.paths import INFO_PATH
 from demorec.recording import Recording
 
 RUN_NAME = "run.json"
@@ -168,7 +169,7 @@ def worst_gap(infos: Sequence[EpisodeInfo]) -> Measurement | None:
 @check(group="run", scope="run", measures="episodes that the run's dataset lacks or has too many", warn=0)
 def run_dataset(run: RunFolder) -> Measurement | None:
     """The dataset that was made from the run has an episode for each success of those asked for last."""
-    path = run.path / "dataset" / "meta" / "info.json"
+    path = run.path / "dataset" / INFO_PATH
     if not path.is_file():
         return None
     try:

@@ -2,49 +2,65 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
+from tyro.constructors import MISSING_NONPROP
 
 from demorec.cli.output import say
 from demorec.cli.progress import ProgressBar
 from demorec.errors import ConfigError
-from demorec.export.options import ExportOptions, ExportReport
+from demorec.export.options import CommonOptions, ExportReport
+from demorec.tables import EXPORTERS
 
 
 @dataclass(frozen=True, kw_only=True)
 class Export:
-    """Turn recordings into a LeRobot v3.0 dataset, without coding a picture anew.
+    """Turn recordings into a dataset: lerobot (LeRobot v3.0) or hdf5 (robomimic).
 
-    Each recorded video packet goes into the dataset as it is, each number bit for bit. The dataset appears whole or
-    not at all; the recordings are never touched.
+    LeRobot gets each recorded video packet as it is, HDF5 the decoded pictures; the numbers are the same. The dataset
+    appears whole or not at all; the recordings are never touched. The flags below are those of every format; a format
+    named in front of --help shows its own, too.
 
     Examples:
       demorec export lerobot recordings/cubes --out cubes --repo-id me/cubes
       demorec export lerobot run_a run_b --out both --action joint_increment
       demorec export lerobot recordings/cubes --out cubes --append --episodes 100:
       demorec export lerobot recordings/cubes --out slow --fps 10
+      demorec export hdf5 recordings/cubes --out cubes.hdf5 --action ee_delta
     """
 
-    format: Positional[Literal["lerobot"]]
-    """Of the dataset."""
+    format: Annotated[Positional[str], arg(metavar="FORMAT")]
+    """Of the dataset: lerobot or hdf5."""
     sources: Positional[tuple[Path, ...]]
     """Runs, recordings, or folders of recordings."""
     out: Path
-    """Folder of the dataset."""
-    options: Annotated[ExportOptions, arg(name="")] = field(default_factory=ExportOptions)
+    """Folder (LeRobot) or file (HDF5) to make."""
+    options: Annotated[CommonOptions, arg(name="")] = field(default_factory=CommonOptions)
     """How."""
+
+    @classmethod
+    def defaults(cls, args: Sequence[str]) -> Export:
+        """Nothing but the options of the format that the command line names."""
+        required: Any = MISSING_NONPROP
+        name = next((arg for arg in args if arg in EXPORTERS.rows), None)
+        options = CommonOptions() if name is None else EXPORTERS.load(name).options()
+        return cls(format=required, sources=required, out=required, options=options)
 
     def run(self) -> int:
         """Export and say what came out."""
+        exporter = EXPORTERS.load(self.format)
+        if type(self.options) is not exporter.options:
+            raise ConfigError(f"Name the format before everything else: demorec export {self.format} ...")
         if not self.sources:
-            raise ConfigError("No recordings are given: name a run, e.g. demorec export lerobot recordings/cubes.")
-        from demorec.export.lerobot import export_lerobot
-
+            raise ConfigError(
+                f"No recordings are given: name a run, e.g. demorec export {self.format} recordings/cubes."
+            )
         with ProgressBar("exporting") as bar:
-            report = export_lerobot(self.sources, self.out, self.options, bar.set)
+            report = exporter.export(self.sources, self.out, self.options, bar.set)
         say(*_told(report))
         return 0
 
@@ -61,7 +77,8 @@ def _told(report: ExportReport) -> list[str]:
         lines.append(f"Verified: {report.verified_frames} frames read through LeRobot equal the recordings.")
     if report.not_verified:
         lines.append(f"Not verified: {report.not_verified}")
-    lines.append(f"Content digest: {report.digest}")
+    if report.digest:
+        lines.append(f"Content digest: {report.digest}")
     if report.url:
         lines.append(f"Uploaded to {report.url}")
     return lines

@@ -124,9 +124,12 @@ def _options(info: StructTypeInfo) -> StructConstructorSpec | None:
 
 @functools.cache
 def _field_texts(kind: type) -> dict[str, str]:
-    """Field -> the docstring below it, in one line."""
-    parsed = docstring_parser.parse_from_object(kind)
-    return {text.arg_name: " ".join((text.description or "").split()) for text in parsed.params}
+    """Field -> the docstring below it, in one line; also of the fields that come from a base class."""
+    texts = {}
+    for base in reversed([base for base in kind.__mro__ if dataclasses.is_dataclass(base)]):
+        for text in docstring_parser.parse_from_object(base).params:
+            texts[text.arg_name] = " ".join((text.description or "").split())
+    return texts
 
 
 def _default(field: dataclasses.Field[Any], instance: Any) -> Any:

@@ -12,6 +12,8 @@ from tyro.conf import Positional
 
 from demorec.cli.output import say, say_json
 from demorec.errors import ConfigError, ExportError, RecordingError
+from demorec.features import IMAGE_PREFIX
+from demorec.lerobot.paths import INFO_PATH, is_dataset
 
 if TYPE_CHECKING:
     from demorec.generate.run_file import RunFile
@@ -55,16 +57,14 @@ def _describe(path: Path) -> tuple[dict[str, Any], list[str]]:
         return _recording(path)
     if (path / "run.json").is_file():
         return _run(path)
-    if (path / "meta" / "info.json").is_file():
+    if is_dataset(path):
         return _dataset(path)
     recordings = sorted(path.glob("*.mcap"))
     if recordings:
         return _folder(path, recordings)
     parts = sorted(path.glob("*.mcap.part"))
     hint = f" It has unfinished recordings; demorec recover {parts[0].name} reads one." if parts else ""
-    raise ConfigError(
-        f"The folder holds no run (run.json), dataset (meta/info.json) or recording (*.mcap).{hint} {path}"
-    )
+    raise ConfigError(f"The folder holds no run (run.json), dataset ({INFO_PATH}) or recording (*.mcap).{hint} {path}")
 
 
 def _recording(path: Path) -> tuple[dict[str, Any], list[str]]:
@@ -164,9 +164,9 @@ def _run_lines(path: Path, run: RunFile) -> list[str]:
 
 
 def _dataset(path: Path) -> tuple[dict[str, Any], list[str]]:
-    from demorec.export.files import read_json
+    from demorec.lerobot.files import read_json
 
-    file = path / "meta" / "info.json"
+    file = path / INFO_PATH
     try:
         info: dict[str, Any] = read_json(file)
         facts = [
@@ -189,7 +189,7 @@ def _dataset(path: Path) -> tuple[dict[str, Any], list[str]]:
 
 def _dataset_content(path: Path) -> list[tuple[str, str]]:
     """What the tables say beyond info.json, where demorec understands them."""
-    from demorec.export import dataset_digest, dataset_info
+    from demorec.lerobot import dataset_digest, dataset_info
 
     facts: list[tuple[str, str]] = []
     # Incomplete datasets and kinds of features that demorec does not write: demorec check says what is wrong.
@@ -198,7 +198,7 @@ def _dataset_content(path: Path) -> list[tuple[str, str]]:
         if summary.num_attempts is not None:
             facts.append(("successes", f"{summary.num_successes}, of {summary.num_attempts} attempts"))
         for name, width, height, codec in summary.cameras:
-            facts.append(("camera", f"{name.removeprefix('observation.images.')} {width}x{height} {codec}"))
+            facts.append(("camera", f"{name.removeprefix(IMAGE_PREFIX)} {width}x{height} {codec}"))
         facts.append(("digest", dataset_digest(path)))
     return facts
 

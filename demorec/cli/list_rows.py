@@ -17,14 +17,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class ListRows:
-    """List the tasks, cameras, robots, renderers or checks that there are.
+    """List the tasks, cameras, robots, renderers, formats of exports or checks that there are.
 
     Examples:
       demorec list tasks
       demorec list cameras --json
     """
 
-    what: Positional[Literal["tasks", "cameras", "robots", "renderers", "checks"]]
+    what: Positional[Literal["tasks", "cameras", "robots", "renderers", "exporters", "checks"]]
     """Which table."""
     json: bool = False
     """Print JSON: a list of names and what they are."""
@@ -44,13 +44,14 @@ class ListRows:
 
 def _tables() -> Mapping[str, tuple[Registry[Any], Callable[[Registry[Any], str], str]]]:
     """What to list -> its table, and how a row is told in one line."""
-    from demorec.tables import CAMERAS, CHECKS, RENDERERS, ROBOTS, TASKS
+    from demorec.tables import CAMERAS, CHECKS, EXPORTERS, RENDERERS, ROBOTS, TASKS
 
     return {
         "tasks": (TASKS, _own_summary),
         "cameras": (CAMERAS, _own_summary),
         "robots": (ROBOTS, _robot),
         "renderers": (RENDERERS, _first_line_of_module),
+        "exporters": (EXPORTERS, _own_summary),
         "checks": (CHECKS, _own_summary),
     }
 

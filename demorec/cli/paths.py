@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from demorec.errors import ConfigError
+from demorec.lerobot.paths import is_dataset
 
 
 def places_read(paths: Sequence[Path]) -> list[Path]:
@@ -13,7 +14,7 @@ def places_read(paths: Sequence[Path]) -> list[Path]:
 
     A run's own folder is none: an .rrd file or a picture beside its recordings may be replaced.
     """
-    return [path if path.is_file() or (path / "meta" / "info.json").is_file() else path / "dataset" for path in paths]
+    return [path if path.is_file() or is_dataset(path) else path / "dataset" for path in paths]
 
 
 def refuse_sources(sources: Sequence[Path], targets: Sequence[Path]) -> None:

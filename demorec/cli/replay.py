@@ -16,6 +16,7 @@ from demorec.cli.output import say, say_json, tell
 from demorec.cli.paths import refuse_sources
 from demorec.cli.progress import ProgressBar
 from demorec.errors import ConfigError
+from demorec.lerobot.paths import is_dataset
 
 if TYPE_CHECKING:
     from demorec.replay import Demonstration, ReplayOptions, ReplayReport
@@ -116,15 +117,11 @@ class Replay:
 
 def _check_out(paths: Sequence[Path], out: Path) -> None:
     """Refuse to write replays over recordings that are replayed, or over each other."""
-    files = [file for path in paths if not _is_dataset(path) for file in _recordings(path)]
+    files = [file for path in paths if not is_dataset(path) for file in _recordings(path)]
     names = [file.name for file in files]
     if len(set(names)) != len(names):
         raise ConfigError("Two recordings have the same name and would get into each other's way: replay them apart.")
     refuse_sources(files, [out / name for name in names])
-
-
-def _is_dataset(path: Path) -> bool:
-    return (path / "meta" / "info.json").is_file()
 
 
 def demonstrations(
@@ -155,7 +152,7 @@ def _found(
 
     wanted = parse_episodes(episodes)
     for path in paths:
-        if _is_dataset(path):
+        if is_dataset(path):
             yield from dataset_demonstrations(path, wanted, options, limit=limit)
             continue
         files = _recordings(path)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from demorec.errors import ConfigError, MissingDependencyError, NotAllowedError
 from demorec.features import ActionKind
+from demorec.lerobot.paths import INFO_PATH
 from demorec.user_modules import is_allowed
 
 CONFIG_NAME, TRAIN_CONFIG_NAME = "config.json", "train_config.json"
@@ -78,7 +79,7 @@ def trained_action(checkpoint: Path) -> ActionKind | None:
     """What the policy's actions mean, from the names in the dataset that it was trained on; None if that is gone."""
     try:
         root = json.loads((checkpoint / TRAIN_CONFIG_NAME).read_text())["dataset"]["root"]
-        info = json.loads((Path(root) / "meta" / "info.json").read_text())
+        info = json.loads((Path(root) / INFO_PATH).read_text())
         names = info["features"]["action"]["names"]
         first = str(names[0] if isinstance(names, list) else next(iter(names.values()))[0])
     except (OSError, ValueError, KeyError, TypeError, IndexError, AttributeError, StopIteration):

@@ -24,7 +24,7 @@ from demorec.errors import ConfigError, DemorecError
 from demorec.evaluate.policy import Policy, check_steps, find_checkpoint, policy_summary, trained_action
 from demorec.evaluate.progress import Progress, factors_of
 from demorec.evaluate.statistics import Rate
-from demorec.features import ENVIRONMENT_STATE, ActionKind
+from demorec.features import ENVIRONMENT_STATE, IMAGE_PREFIX, ActionKind
 from demorec.generate.contents import foreign_recordings
 from demorec.generate.executor import Lost, Raised
 from demorec.generate.local import LocalExecutor
@@ -116,8 +116,8 @@ def settings_for(
     check_steps(checkpoint, allowed)
     plain, digest = policy_summary(checkpoint)
     inputs: Mapping[str, Any] = plain.get("input_features") or {}
-    pictures = {name.removeprefix("observation.images."): value["shape"] for name, value in inputs.items()
-                if name.startswith("observation.images.")}  # fmt: skip
+    pictures = {name.removeprefix(IMAGE_PREFIX): value["shape"] for name, value in inputs.items()
+                if name.startswith(IMAGE_PREFIX)}  # fmt: skip
     if pictures:
         (_, height, width), *_ = pictures.values()
         own = {camera_name(name): name for name in config.cameras}

@@ -1,4 +1,4 @@
-"""What a user chooses about an export, and what the export tells at the end."""
+"""What a user chooses about an export, whatever its format, and what the export tells at the end."""
 
 from __future__ import annotations
 
@@ -6,9 +6,7 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
-from demorec.config import VideoConfig
 from demorec.errors import ConfigError
 from demorec.features import ACTION, STATE, ActionKind
 
@@ -17,58 +15,27 @@ Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExportOptions:
-    """How recordings become a dataset."""
+class CommonOptions:
+    """How recordings become a dataset, whatever its format."""
 
-    repo_id: str = "local/demorec"
-    """Name of the dataset on the Hub, OWNER/NAME; also written into its card."""
     episodes: str = ""
     """Which episodes of each run, by their number: 0:100, ::2, 3,5,8:10; all by default."""
     include_failures: bool = False
-    """Export failed episodes too; next.success tells them apart."""
+    """Export failed episodes too; the dataset says of each whether it succeeded."""
     action: ActionKind = "joint"
     """Form of the action: joint (absolute joint targets), joint_increment (their change since the frame before),
     ee (absolute TCP pose), ee_delta (its change). The gripper's opening is always absolute."""
     privileged: bool = False
     """Add observation.environment_state: poses and sizes that no sensor of a real robot gives."""
     features: tuple[str, ...] = ()
-    """Names of the features to have, the others are left out; all by default. observation.state, action, timestamp and
-    the indices stay whatever is named. LeRobot reads every column for every item: fewer make training faster."""
+    """Names of the features to have, the others are left out; all by default. observation.state, action and what the
+    format itself needs (times, indices) stay whatever is named. Fewer features make training faster."""
     depth: bool = False
-    """Add depth videos (12 bit, as LeRobot 0.6 has them) of recordings that have depth."""
+    """Add depth pictures of recordings that have depth: LeRobot's 12-bit videos, or float32 metres in HDF5."""
     fps: int | None = None
     """Frames per second of the dataset; divides that of the recordings, the frames between are left out."""
-    append: bool = False
-    """Add the episodes to the dataset that is there already."""
-    allow_duplicates: bool = False
-    """With --append: add episodes whose content the dataset has already a second time, instead of refusing them."""
     overwrite: bool = False
     """Replace the dataset that is there already; anything else than a dataset, or with anything else in it, is not."""
-    verify: bool = True
-    """Open the finished dataset with LeRobot, where that is installed, and compare samples with the recordings."""
-    workers: int = 0
-    """Processes that read recordings; 0: as many as pay."""
-    push_to_hub: bool = False
-    """Upload the dataset to the Hugging Face Hub as --repo-id."""
-    public: bool = False
-    """Make an uploaded dataset public."""
-    license: str = "apache-2.0"
-    """Licence that the dataset card names."""
-    data_files_mb: float = 100
-    """Size in MiB above which a new parquet file is begun."""
-    video_files_mb: float = 200
-    """Size in MiB above which a new mp4 file is begun."""
-    files_per_chunk: int = 1000
-    """How many files a chunk folder holds."""
-    transcode_codec: Literal["h264", "av1"] = "h264"
-    """Codec of pictures that cannot be taken as they are (jpeg, or --fps between keyframes)."""
-    transcode_crf: int | None = 18
-    """Constant rate factor of such pictures, smaller is better; auto is that of a recording."""
-
-    @property
-    def transcode(self) -> VideoConfig:
-        """How pictures are coded that cannot be taken as they are."""
-        return VideoConfig(codec=self.transcode_codec, crf=self.transcode_crf)
 
     def takes(self, feature: str) -> bool:
         """Whether the dataset shall have a feature, if the recordings give it."""
@@ -77,28 +44,8 @@ class ExportOptions:
     def validate(self) -> None:
         """Raise ConfigError for impossible values and combinations."""
         parse_episodes(self.episodes)
-        if self.append and self.overwrite:
-            raise ConfigError("--append and --overwrite exclude each other: choose one.")
-        if self.allow_duplicates and not self.append:
-            raise ConfigError("--allow-duplicates belongs to --append.")
         if self.fps is not None and self.fps < 1:
             raise ConfigError(f"fps is {self.fps}, it must be at least 1.")
-        if self.workers < 0:
-            raise ConfigError(f"workers is {self.workers}, it must be 0 (as many as pay) or more.")
-        check_repo_id(self.repo_id)
-        if self.data_files_mb <= 0 or self.video_files_mb <= 0 or self.files_per_chunk < 1:
-            raise ConfigError("data-files-mb, video-files-mb and files-per-chunk must be above 0.")
-        self.transcode.validate()
-
-
-def check_repo_id(repo_id: str) -> None:
-    """Raise ConfigError for what cannot be OWNER/NAME on the Hub; LeRobot takes a dataset's name apart at the slash."""
-    word = r"(?!.*(?:--|\.\.))[A-Za-z0-9_](?:[A-Za-z0-9_.-]*[A-Za-z0-9_])?"
-    if len(repo_id) > 96 or repo_id.endswith(".git") or not re.fullmatch(f"{word}/{word}", repo_id):
-        raise ConfigError(
-            f"repo-id is {repo_id!r}, but must be OWNER/NAME, for example me/cubes, of letters, digits and underscores "
-            "with single dots and dashes between them."
-        )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,9 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from demorec.errors import ConfigError, ExportError
-from demorec.export.layout import IMAGE_PREFIX
-from demorec.export.options import ExportOptions
-from demorec.features import ENVIRONMENT_STATE, observation_names
+from demorec.export.options import CommonOptions, parse_episodes
+from demorec.features import ENVIRONMENT_STATE, IMAGE_PREFIX, observation_names
 from demorec.plain import digest
 from demorec.recording import Recording
 
@@ -56,6 +55,25 @@ def find_recordings(paths: Sequence[Path], *, include_failures: bool) -> list[So
     return found
 
 
+def is_among_episodes(recording: Recording, options: CommonOptions) -> bool:
+    """Whether the number of its episode is wanted (`--episodes`)."""
+    return parse_episodes(options.episodes)(recording.info.episode_index)
+
+
+def goes_in(source: Source, recording: Recording, options: CommonOptions) -> bool:
+    """Whether a recording of a wanted episode goes into the dataset, and is no failed attempt to be left out."""
+    success = recording.outcome is not None and recording.outcome.success
+    return source.is_chosen and (success or options.include_failures)
+
+
+def nothing_to_export(num_recordings: int, num_failures: int) -> ExportError:
+    """What to raise when not one recording goes in."""
+    return ExportError(
+        f"Nothing to export: of {num_recordings} recordings, {num_failures} are failed attempts and the "
+        "others are not among the wanted episodes (--include-failures, --episodes)."
+    )
+
+
 def places_of(sources: Iterable[Source]) -> list[Path]:
     """What an export must not write over: the recordings, and a run's folders of them with all that is in there.
 
@@ -79,7 +97,7 @@ class Profile:
     traits: tuple[tuple[str, str], ...]
 
     @classmethod
-    def of(cls, recording: Recording, options: ExportOptions) -> Profile:
+    def of(cls, recording: Recording, options: CommonOptions) -> Profile:
         """That of a recording, as far as it matters for these options."""
         info = recording.info
         # A scaled arm (the tutorial's) has the same joints and limits; its lengths stay with each episode's sidecar.
@@ -107,7 +125,7 @@ class Profile:
         )
 
 
-def refuse_differences(profile: Profile, reference: Path, paths: Iterable[Path], options: ExportOptions) -> None:
+def refuse_differences(profile: Profile, reference: Path, paths: Iterable[Path], options: CommonOptions) -> None:
     """Raise ExportError with every difference between the reference and any of the recordings.
 
     Called only when one is known to differ: then all headers are read, so that the user hears of everything at once.

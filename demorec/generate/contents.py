@@ -7,11 +7,11 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-from demorec.export.kind import DATASET, is_dataset_file
-from demorec.export.sidecar import CONFIGS_PATH
 from demorec.generate.run_file import DATASET as DATASET_FOLDER
 from demorec.generate.run_file import EPISODES, FAILED, RUN_NAME, UNFINISHED
 from demorec.generate.survey import recordings_of
+from demorec.lerobot.kind import DATASET, is_dataset_file
+from demorec.lerobot.sidecar import CONFIGS_PATH
 from demorec.replacing import RECORDING, Kind, files_below, json_object
 
 PARTS = (RUN_NAME, EPISODES, FAILED, UNFINISHED, DATASET_FOLDER)

@@ -9,8 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 
 from demorec.errors import DemorecError, ExportError, resource_error
-from demorec.export import ExportOptions, ExportReport, dataset_digest, export_lerobot
-from demorec.export.inspect import check_tables
 from demorec.generate.contents import is_dataset_of_run
 from demorec.generate.lock import run_lock
 from demorec.generate.run_file import (
@@ -23,6 +21,8 @@ from demorec.generate.run_file import (
     save_run_file,
     sync_folder,
 )
+from demorec.lerobot import ExportOptions, ExportReport, dataset_digest, export_lerobot
+from demorec.lerobot.inspect import check_tables
 
 
 def export_run(

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from demorec.errors import ConfigError
-from demorec.export.options import check_repo_id
+from demorec.lerobot.options import check_repo_id
 
 MAX_EPISODES = 10_000_000
 

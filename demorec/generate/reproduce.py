@@ -13,13 +13,13 @@ from typing import Any
 
 from demorec.config import GenerateConfig, parse_config
 from demorec.errors import ConfigError
-from demorec.export import ExportOptions, export_lerobot
-from demorec.export.files import read_json, read_table
-from demorec.export.layout import SIDECAR_DIR
-from demorec.export.sidecar import CONFIGS_PATH, EXPORT_PATH
 from demorec.generate.options import RunOptions
 from demorec.generate.run import Progress, RunResult, generate
 from demorec.generate.run_file import DATASET, RUN_NAME, load_run_file
+from demorec.lerobot import ExportOptions, export_lerobot
+from demorec.lerobot.files import read_json, read_table
+from demorec.lerobot.paths import SIDECAR_DIR
+from demorec.lerobot.sidecar import CONFIGS_PATH, EXPORT_PATH
 from demorec.own_versions import version_differences
 from demorec.validity import read_episode_info
 

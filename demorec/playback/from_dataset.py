@@ -15,17 +15,16 @@ from rerun.experimental import LeRobotReader
 from demorec.assets import asset_path
 from demorec.episode import Check, EpisodeInfo, Outcome, frame_time_ns
 from demorec.errors import RecordingError
-from demorec.export.files import check_video, read_json, read_table
-from demorec.export.layout import DatasetInfo, Feature
-from demorec.features import ENVIRONMENT_STATE
+from demorec.features import ENVIRONMENT_STATE, IMAGE_PREFIX
 from demorec.geometry import Array, Pose
 from demorec.kinematics import ArmKinematics
+from demorec.lerobot.files import check_video, read_json, read_table
+from demorec.lerobot.layout import DatasetInfo, Feature
+from demorec.lerobot.paths import SIDECAR_DIR
 from demorec.playback.episode import Curves, Episode, Video, VideoBatch
 from demorec.playback.held_objects import held_object_poses
 from demorec.validity import read_episode_info
 
-_SIDECAR = "demorec"
-_IMAGES = "observation.images."
 _PICTURES_AT_ONCE = 256
 _CODECS = {"h264": "h264", "av1": "av1"}
 
@@ -36,7 +35,7 @@ def dataset_episodes(root: Path) -> list[int]:
     Raises:
         RecordingError: It was not exported by demorec, or is damaged.
     """
-    return [int(row["episode_index"]) for row in _rows(root, f"{_SIDECAR}/episodes", ["episode_index"])]
+    return [int(row["episode_index"]) for row in _rows(root, f"{SIDECAR_DIR}/episodes", ["episode_index"])]
 
 
 @contextmanager
@@ -49,7 +48,7 @@ def open_dataset_episode(root: Path, episode_index: int) -> Iterator[Episode]:
     row = _episode_row(root, episode_index)
     try:
         described = DatasetInfo.load(root)
-        export = dict(read_json(root / _SIDECAR / "export.json"))
+        export = dict(read_json(root / SIDECAR_DIR / "export.json"))
         info = read_episode_info(row["episode_info"])
     except (OSError, ValueError, TypeError) as error:
         raise RecordingError(f"The dataset cannot be read ({error}): {root}") from error
@@ -98,7 +97,7 @@ def _rows(root: Path, table: str, columns: list[str] | None, episode_index: int 
 
 
 def _episode_row(root: Path, episode_index: int) -> dict[str, Any]:
-    for row in _rows(root, f"{_SIDECAR}/episodes", None, episode_index):
+    for row in _rows(root, f"{SIDECAR_DIR}/episodes", None, episode_index):
         return row
     raise RecordingError(f"The dataset has no episode {episode_index}: {root}")
 
@@ -168,9 +167,9 @@ def _phases(row: dict[str, Any], num_frames: int) -> tuple[str, ...]:
 
 def _camera_poses(root: Path, episode_index: int) -> dict[str, Array]:
     """Camera -> (T, 7) of the cameras that move."""
-    if not (root / _SIDECAR / "camera_poses").is_dir():
+    if not (root / SIDECAR_DIR / "camera_poses").is_dir():
         return {}
-    rows = _rows(root, f"{_SIDECAR}/camera_poses", None, episode_index)
+    rows = _rows(root, f"{SIDECAR_DIR}/camera_poses", None, episode_index)
     names = [name for name in (rows[0] if rows else {}) if name not in ("episode_index", "frame_index")]
     return {name: np.array([row[name] for row in rows]) for name in names}
 
@@ -211,7 +210,7 @@ def _videos(
         codec = _CODECS.get(str((feature.info or {}).get("video.codec")))
         if feature.is_video and codec is not None and not feature.is_depth:
             batches = partial(_video_batches, root, episode_index, key, time_ns)
-            result[key.removeprefix(_IMAGES)] = Video(codec=codec, batches=batches)
+            result[key.removeprefix(IMAGE_PREFIX)] = Video(codec=codec, batches=batches)
     return result
 
 

@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 
 from demorec.errors import ConfigError
+from demorec.lerobot.paths import INFO_PATH, is_dataset
 from demorec.playback.episode import Episode
 from demorec.playback.from_dataset import dataset_episodes, open_dataset_episode
 from demorec.playback.from_recording import open_recording
@@ -55,7 +56,7 @@ def _sources(path: Path, include_failures: bool) -> list[Source]:
         return [_recording(path)]
     if not path.is_dir():
         raise ConfigError(f"This is neither a file nor a folder: {path}")
-    if (path / "meta" / "info.json").is_file():
+    if is_dataset(path):
         return [
             Source(name=f"{path}: episode {index}", open=partial(open_dataset_episode, path, index))
             for index in dataset_episodes(path)
@@ -70,9 +71,7 @@ def _sources(path: Path, include_failures: bool) -> list[Source]:
         hint = " Its failures are shown with --include-failures."
     elif below := sorted(folder.parent.name for folder in path.glob("*/episodes")):
         hint = f" It holds runs, name one: {', '.join(below[:5])}{', ...' if below[5:] else ''}."
-    raise ConfigError(
-        f"The folder holds no recording (*.mcap), run (episodes/) or dataset (meta/info.json).{hint} {path}"
-    )
+    raise ConfigError(f"The folder holds no recording (*.mcap), run (episodes/) or dataset ({INFO_PATH}).{hint} {path}")
 
 
 def _is_mcap(path: Path) -> bool:

@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 from helpers_export import episode_rows, files_of, make_run
 
-import demorec.export.hub
-import demorec.export.prepare
+import demorec.lerobot.hub
+import demorec.lerobot.prepare
 from demorec.cli import main
-from demorec.export import ExportOptions, dataset_digest, export_lerobot
+from demorec.lerobot import ExportOptions, dataset_digest, export_lerobot
 
 
 @pytest.fixture(scope="module")

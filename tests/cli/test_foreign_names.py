@@ -16,9 +16,9 @@ from helpers_check import Spoilt
 from demorec.cli import main
 from demorec.config import GenerateConfig
 from demorec.errors import ConfigError, NotAllowedError
-from demorec.export import ExportOptions, export_lerobot
 from demorec.generate.recordings import inspect_recording
 from demorec.generate.run_file import RUN_NAME, RunFile, save_run_file
+from demorec.lerobot import ExportOptions, export_lerobot
 from demorec.plain import to_plain
 
 SAMPLE = next((Path(__file__).parents[2] / "recordings" / "sample").glob("*.mcap"))

@@ -167,7 +167,14 @@ def test_help_has_examples_and_every_option(capsys):
 
 @pytest.mark.parametrize(
     ("what", "names"),
-    [("tasks", "pick_place"), ("cameras", "front"), ("robots", "panda"), ("renderers", "raster"), ("checks", "opens")],
+    [
+        ("tasks", "pick_place"),
+        ("cameras", "front"),
+        ("robots", "panda"),
+        ("renderers", "raster"),
+        ("exporters", "lerobot"),
+        ("checks", "opens"),
+    ],
 )
 def test_list_tells_every_row_in_one_line(capsys, what, names):
     from demorec import tables

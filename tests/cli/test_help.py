@@ -8,8 +8,14 @@ import unicodedata
 import pytest
 
 from demorec.cli import COMMANDS, generate_dataset_main, main
+from demorec.tables import EXPORTERS
 
-PROGRAMS = ("demorec", "generate-dataset", *(f"demorec {name}" for name in COMMANDS.names() if name != "generate"))
+PROGRAMS = (
+    "demorec",
+    "generate-dataset",
+    *(f"demorec {name}" for name in COMMANDS.names() if name != "generate"),
+    *(f"demorec export {name}" for name in EXPORTERS.names()),
+)
 
 
 def help_of(program: str, width: int, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> list[str]:

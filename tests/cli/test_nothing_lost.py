@@ -136,7 +136,7 @@ def test_a_workshop_of_somebody_else_is_left_alone(place: Path, capsys: pytest.C
 
 
 def test_files_put_into_the_target_meanwhile_are_kept(place: Path) -> None:
-    from demorec.export import ExportOptions, export_lerobot
+    from demorec.lerobot import ExportOptions, export_lerobot
 
     def note(done: int, total: int) -> None:
         (place / "dataset" / "notes.txt").write_text("years of work")

@@ -10,11 +10,11 @@ import pytest
 
 from demorec.cli import generate_dataset_main, main
 from demorec.config import EpisodePlan, GenerateConfig, deciding_versions
-from demorec.export import ExportOptions, dataset_digest, export_lerobot
 from demorec.generate.export_step import export_run
 from demorec.generate.options import RunOptions
 from demorec.generate.run import NoProgress, RunResult, generate
 from demorec.generate.run_file import load_run_file
+from demorec.lerobot import ExportOptions, dataset_digest, export_lerobot
 from demorec.recording import Recording
 
 CONFIG = GenerateConfig(seed=11, width=48, height=32)

@@ -17,9 +17,9 @@ from helpers_docs import run_examples
 from helpers_export import data_table, episode_rows, export, make_run
 from helpers_recording import make_episode
 
-import demorec.export.writer
-from demorec.export import dataset_digest
-from demorec.export.depth import code_values, quantised
+import demorec.lerobot.writer
+from demorec.lerobot import dataset_digest
+from demorec.lerobot.depth import code_values, quantised
 from demorec.recording import Recording
 
 LENGTHS = (20, 15, 17, 9, 31, 12)
@@ -46,7 +46,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def dataset(run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("dataset") / "d"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(demorec.export.writer, "_EPISODES_PER_TABLE", 2)
+        patch.setattr(demorec.lerobot.writer, "_EPISODES_PER_TABLE", 2)
         export(run, out, privileged=True, video_files_mb=0.006, data_files_mb=0.03, files_per_chunk=2)
     for folder in ("data", "meta/episodes", "videos/observation.images.front", "videos/observation.images.wrist"):
         assert len(list((out / folder).rglob("file-*"))) > 1, folder

@@ -17,8 +17,8 @@ from demorec.config import GenerateConfig
 from demorec.errors import ConfigError
 from demorec.evaluate.policy import find_checkpoint, trained_action
 from demorec.evaluate.rollouts import evaluate, load_evaluation, settings_for
-from demorec.export.lerobot import export_lerobot
-from demorec.export.options import ExportOptions
+from demorec.lerobot.export import export_lerobot
+from demorec.lerobot.options import ExportOptions
 from demorec.loop import ScriptAgent, Session, make_world
 from demorec.recording import EpisodeWriter, Recording
 

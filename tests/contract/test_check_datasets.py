@@ -14,8 +14,8 @@ from helpers_check import checked, copy, edit_column, edit_json, level_of, simul
 from demorec.check.coverage import draw_coverage, largest_gap
 from demorec.config import EpisodePlan, GenerateConfig
 from demorec.episode import EpisodeInfo
-from demorec.export.lerobot import export_lerobot
-from demorec.export.options import ExportOptions
+from demorec.lerobot.export import export_lerobot
+from demorec.lerobot.options import ExportOptions
 from demorec.loop import prepare
 from demorec.tables import TASKS
 

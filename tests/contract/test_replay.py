@@ -14,8 +14,8 @@ from helpers_recording import make_episode
 
 from demorec.cli import main
 from demorec.errors import ConfigError
-from demorec.export.lerobot import export_lerobot
-from demorec.export.options import ExportOptions
+from demorec.lerobot.export import export_lerobot
+from demorec.lerobot.options import ExportOptions
 from demorec.recording import EpisodeWriter, Recording
 from demorec.replay import ReplayOptions, ReplayReport, open_file, replay_all
 from demorec.tables import TASKS

@@ -21,7 +21,7 @@ from helpers_mcap import chunk_record, message_record, record, rewritten
 from helpers_recording import write_episode
 
 from demorec.errors import ConfigError, ExportError, RecordingError
-from demorec.export.files import check_video
+from demorec.lerobot.files import check_video
 from demorec.recording import Recording, recover
 from demorec.urdf import check_primitives
 

@@ -95,3 +95,35 @@ def test_a_full_disk_where_processes_leave_pictures(context: Any, run: Path, tmp
     assert exit_code(context, run, tmp_path / "d", {"workers": 2}, size_limit=500) == 3
     assert files_of(tmp_path) == before
     assert list(tmp_path.iterdir()) == []
+
+
+def test_hdf5_killed_at_any_moment(context: Any, run: Path, tmp_path: Path) -> None:
+    place = tmp_path / "place"
+    out = place / "d.hdf5"
+    export(run, out, "hdf5", episodes=":2")
+    before = out.read_bytes()
+    options: dict[str, Any] = {"exporter": "hdf5", "overwrite": True}
+    export(run, tmp_path / "other.hdf5", "hdf5")
+    after = (tmp_path / "other.hdf5").read_bytes()
+    calls = count_calls(run, tmp_path / "other.hdf5", options)
+    leftovers = 0
+    rng = np.random.default_rng(3)
+    for moment in ((np.arange(KILLS) + rng.random(KILLS)) / KILLS * calls).astype(int).tolist():
+        out.write_bytes(before)  # beside what the kills before have left
+        assert exit_code(context, run, out, options, kill_at=max(1, moment)) == -signal.SIGKILL
+        assert out.read_bytes() in (before, after), moment
+        leftovers += len(list(place.iterdir())) > 1
+    assert leftovers  # some were killed in the middle of their work
+    export(run, out, **options)
+    assert out.read_bytes() == after
+    assert list(place.iterdir()) == [out]
+
+
+@pytest.mark.parametrize("limit", [1, 50, 4_000, 60_000])
+def test_hdf5_on_a_full_disk(context: Any, run: Path, tmp_path: Path, limit: int) -> None:
+    out = tmp_path / "place" / "d.hdf5"
+    export(run, out, "hdf5", episodes=":2")
+    before = files_of(out.parent)
+    options = {"exporter": "hdf5", "overwrite": True}
+    assert exit_code(context, run, out, options, size_limit=limit) == 3
+    assert files_of(out.parent) == before

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from demorec.errors import ConfigError
-from demorec.export.options import check_repo_id
+from demorec.lerobot.options import check_repo_id
 
 words = st.text(st.sampled_from("aZ09_-.é "), min_size=0, max_size=6)
 

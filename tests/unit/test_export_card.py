@@ -15,8 +15,8 @@ from demorec.cli.export import Export
 from demorec.cli.flags import parse
 from demorec.cli.generate import Generate
 from demorec.config import GenerateConfig, VideoConfig
-from demorec.export.commands import flags
-from demorec.export.options import ExportOptions
+from demorec.lerobot.commands import flags
+from demorec.lerobot.options import ExportOptions
 from demorec.variation import Ranges
 
 
@@ -54,7 +54,7 @@ def test_the_commands_of_a_card_make_the_dataset(tmp_path):
     assert made.episodes == GenerateConfig(task="pick_place", seed=0, video=VideoConfig(codec="h264"))
     assert (made.options.num_episodes, made.options.export) == (2, False)
     assert exporting[:2] == ["demorec", "export"]
-    parsed = parse(Export, exporting[2:], prog="", defaults=None)
+    parsed = parse(Export, exporting[2:], prog="", defaults=Export.defaults(exporting[2:]))
     assert parsed.options == ExportOptions(**options)
     assert parsed.sources == (made.options.out,)
     assert "demorec reproduce path/of/this/folder --out copy" in (tmp_path / "d" / "README.md").read_text()

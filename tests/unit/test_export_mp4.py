@@ -12,9 +12,9 @@ import pytest
 
 from demorec.config import VideoConfig
 from demorec.errors import ExportError
-from demorec.export.bitstream import parameter_sets
-from demorec.export.depth import code_values, depth_video, quantised
-from demorec.export.mp4 import CodedVideo, Mp4Writer
+from demorec.lerobot.bitstream import parameter_sets
+from demorec.lerobot.depth import code_values, depth_video, quantised
+from demorec.lerobot.mp4 import CodedVideo, Mp4Writer
 from demorec.recording import VideoPacket, VideoSettings
 from demorec.recording.video import decode, is_keyframe, make_encoder
 

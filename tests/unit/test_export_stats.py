@@ -11,10 +11,10 @@ import pytest
 from numpy.typing import NDArray
 
 from demorec.errors import ExportError
-from demorec.export.data_stats import data_statistics
-from demorec.export.layout import Feature, data_schema
-from demorec.export.stats import QUANTILES, PixelHistogram, Statistics, colour_levels, vector_statistics
-from demorec.export.writer import merge_statistics
+from demorec.lerobot.data_stats import data_statistics
+from demorec.lerobot.layout import Feature, data_schema
+from demorec.lerobot.stats import QUANTILES, PixelHistogram, Statistics, colour_levels, vector_statistics
+from demorec.lerobot.writer import merge_statistics
 
 
 def check(found: Statistics, column: NDArray[np.generic]) -> None:

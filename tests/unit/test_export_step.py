@@ -11,10 +11,10 @@ from helpers_export import export, files_of, make_run
 
 from demorec.config import GenerateConfig, deciding_versions
 from demorec.errors import ExportError
-from demorec.export import ExportOptions, dataset_digest
 from demorec.generate import export_step
 from demorec.generate.export_step import export_run
 from demorec.generate.run_file import RunFile, load_run_file, save_run_file
+from demorec.lerobot import ExportOptions, dataset_digest
 
 
 @pytest.fixture(scope="module")

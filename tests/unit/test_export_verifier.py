@@ -10,8 +10,8 @@ import pytest
 from helpers_verifier import die, lack_memory, never_end, never_listen
 
 from demorec.errors import ExportError, ResourceError
-from demorec.export import ExportOptions, verify
-from demorec.export.verify import Verifier
+from demorec.lerobot import ExportOptions, verify
+from demorec.lerobot.verify import Verifier
 
 
 def test_an_export_that_fails_does_not_wait_for_it(monkeypatch):

@@ -10,10 +10,10 @@ from helpers_export import export, info, make_run
 
 from demorec.check.report import CheckOptions, check_subjects, find_subjects
 from demorec.config import GenerateConfig
-from demorec.export import ExportOptions
 from demorec.generate import export_step
 from demorec.generate.recordings import inspect_recording
 from demorec.generate.run_file import RunFile, save_run_file
+from demorec.lerobot import ExportOptions
 
 
 def test_the_dataset_has_what_was_asked_for_last(tmp_path, monkeypatch):

@@ -14,9 +14,9 @@ from demorec.check.dataset import Dataset
 from demorec.cli import COMMANDS, main
 from demorec.errors import ExportError, MissingDependencyError
 from demorec.evaluate.policy import Policy
-from demorec.export import ExportOptions, export_lerobot
-from demorec.export.hub import push_to_hub
-from demorec.export.verify import LEROBOT
+from demorec.lerobot import ExportOptions, export_lerobot
+from demorec.lerobot.hub import push_to_hub
+from demorec.lerobot.verify import LEROBOT
 from demorec.tables import CHECKS
 
 ROOT = Path(__file__).parents[2]

@@ -25,8 +25,8 @@ from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
 from demorec.errors import ExportError
-from demorec.export.bitstream import mp4_samples, parameter_sets
 from demorec.export.staging import sync_file
+from demorec.lerobot.bitstream import mp4_samples, parameter_sets
 
 _DEMUXERS = {"h264": "h264", "hevc": "hevc", "av1": "obu"}
 

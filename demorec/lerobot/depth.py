@@ -18,11 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.errors import ExportError
-from demorec.export.mp4 import CodedVideo
-from demorec.export.stats import PixelHistogram
 from demorec.geometry import Array
-
-DEPTH_SUFFIX = "_depth"
+from demorec.lerobot.mp4 import CodedVideo
+from demorec.lerobot.stats import PixelHistogram
 
 _NEAREST, _FARTHEST, _SHIFT = 0.01, 10.0, 3.5
 _LARGEST_CODE = 4095

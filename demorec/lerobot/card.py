@@ -14,15 +14,16 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from demorec.export.commands import making_commands
-from demorec.export.files import read_table
-from demorec.export.layout import IMAGE_PREFIX, SIDECAR_DIR, DatasetInfo, Feature
-from demorec.export.options import ExportOptions
-from demorec.export.reader import read_tasks
-from demorec.export.sidecar import ATTEMPT_SCHEMA
-from demorec.export.thumbnails import THUMBNAILS_PATH, write_thumbnails
-from demorec.export.writer import write_text
-from demorec.features import ACTION, EE_POSE, ENVIRONMENT_STATE, STATE, VELOCITY, ActionKind
+from demorec.features import ACTION, EE_POSE, ENVIRONMENT_STATE, IMAGE_PREFIX, STATE, VELOCITY, ActionKind
+from demorec.lerobot.commands import making_commands
+from demorec.lerobot.files import read_table
+from demorec.lerobot.layout import DatasetInfo, Feature
+from demorec.lerobot.options import ExportOptions
+from demorec.lerobot.paths import SIDECAR_DIR
+from demorec.lerobot.reader import read_tasks
+from demorec.lerobot.sidecar import ATTEMPT_SCHEMA
+from demorec.lerobot.thumbnails import THUMBNAILS_PATH, write_thumbnails
+from demorec.lerobot.writer import write_text
 
 CARD_PATH = "README.md"
 SECOND_CARD_PATH = f"{SIDECAR_DIR}/README.md"

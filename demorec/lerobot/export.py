@@ -11,21 +11,22 @@ from typing import Any
 
 import numpy as np
 
-from demorec.errors import ConfigError, ExportError
-from demorec.export.card import CardFacts, write_card
-from demorec.export.digest import combined_digest
-from demorec.export.existing import Existing, features_to_append, link_files, open_existing
-from demorec.export.hub import push_to_hub
-from demorec.export.inspect import episode_digests
-from demorec.export.kind import DATASET, GROWING_DATASET
-from demorec.export.layout import DatasetInfo
-from demorec.export.options import ExportOptions, ExportReport, Progress
-from demorec.export.readings import Reading, readings
-from demorec.export.sidecar import AttemptRecord, SidecarStart, SidecarWriter
-from demorec.export.sources import Source, find_recordings, places_of, refuse_differences
+from demorec.errors import ConfigError
+from demorec.export.options import ExportReport, Progress
+from demorec.export.sources import Source, find_recordings, nothing_to_export, places_of, refuse_differences
 from demorec.export.staging import CODED, staged_folder
-from demorec.export.verify import LEROBOT, MAX_EPISODES, Sample, Verifier, lerobot_is_installed
-from demorec.export.writer import DatasetWriter, WriterStart
+from demorec.lerobot.card import CardFacts, write_card
+from demorec.lerobot.digest import combined_digest
+from demorec.lerobot.existing import Existing, features_to_append, link_files, open_existing
+from demorec.lerobot.hub import push_to_hub
+from demorec.lerobot.inspect import episode_digests
+from demorec.lerobot.kind import DATASET, GROWING_DATASET
+from demorec.lerobot.layout import DatasetInfo
+from demorec.lerobot.options import ExportOptions
+from demorec.lerobot.readings import Reading, readings
+from demorec.lerobot.sidecar import AttemptRecord, SidecarStart, SidecarWriter
+from demorec.lerobot.verify import LEROBOT, MAX_EPISODES, Sample, Verifier, lerobot_is_installed
+from demorec.lerobot.writer import DatasetWriter, WriterStart
 from demorec.replacing import shown
 
 
@@ -95,10 +96,7 @@ class _Export:
                 break
             waiting.append(first.attempt)
         if first is None or first.prepared is None:
-            raise ExportError(
-                f"Nothing to export: of {len(self._found)} recordings, {len(waiting)} are failed attempts and the "
-                "others are not among the wanted episodes (--include-failures, --episodes)."
-            )
+            raise nothing_to_export(len(self._found), len(waiting))
         info = self._dataset_info(first)
         start = self._existing.writer if self._existing else WriterStart()
         sidecar_start = self._existing.sidecar if self._existing else SidecarStart()

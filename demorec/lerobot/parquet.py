@@ -11,8 +11,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from demorec.export.layout import MEBIBYTE, FilePosition
 from demorec.export.staging import sync_file
+from demorec.lerobot.layout import MEBIBYTE, FilePosition
 
 _ROWS_PER_GROUP = 4096
 _BYTES_PER_GROUP = 2 * MEBIBYTE

@@ -23,11 +23,12 @@ from typing import Any
 import numpy as np
 
 from demorec.errors import DemorecError, ExportError, resource_error
-from demorec.export.depth import DEPTH_SUFFIX, code_values, quantised
-from demorec.export.layout import IMAGE_PREFIX
-from demorec.export.options import ExportOptions
-from demorec.export.prepare import frame_stride, prepare_episode
-from demorec.export.transcode import reason_to_transcode
+from demorec.export.columns import frame_stride
+from demorec.features import DEPTH_SUFFIX, IMAGE_PREFIX
+from demorec.lerobot.depth import code_values, quantised
+from demorec.lerobot.options import ExportOptions
+from demorec.lerobot.prepare import prepare_episode
+from demorec.lerobot.transcode import reason_to_transcode
 from demorec.processes import SPAWN
 from demorec.recording import Recording
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from demorec.export.layout import INFO_PATH, SIDECAR_DIR
+from demorec.lerobot.paths import INFO_PATH, SIDECAR_DIR
 from demorec.replacing import Kind, files_below, json_object
 
 _NUMBERED = r"(file-\d+|episode_\d+)"

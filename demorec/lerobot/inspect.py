@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from demorec.errors import ExportError
-from demorec.export.digest import combined_digest, episode_digest
-from demorec.export.files import open_table, read_json, read_table
-from demorec.export.layout import INFO_PATH, SIDECAR_DIR, DatasetInfo
-from demorec.export.reader import PacketReader, RowReader, episode_places, read_tasks
+from demorec.lerobot.digest import combined_digest, episode_digest
+from demorec.lerobot.files import open_table, read_json, read_table
+from demorec.lerobot.layout import DatasetInfo
+from demorec.lerobot.paths import SIDECAR_DIR
+from demorec.lerobot.reader import PacketReader, RowReader, episode_places, read_tasks
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,11 +41,6 @@ class DatasetSummary:
     num_bytes: int
     num_successes: int | None
     num_attempts: int | None
-
-
-def is_dataset(path: Path) -> bool:
-    """Whether a folder looks like a LeRobot dataset."""
-    return (path / INFO_PATH).is_file()
 
 
 def dataset_info(path: Path) -> DatasetSummary:

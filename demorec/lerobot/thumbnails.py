@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from demorec.errors import ExportError
-from demorec.export.layout import IMAGE_PREFIX, SIDECAR_DIR, DatasetInfo
-from demorec.export.reader import EpisodePlace, episode_places
 from demorec.export.staging import sync_file
+from demorec.features import IMAGE_PREFIX
+from demorec.lerobot.layout import DatasetInfo
+from demorec.lerobot.paths import SIDECAR_DIR
+from demorec.lerobot.reader import EpisodePlace, episode_places
 from demorec.text import printable
 
 THUMBNAILS_PATH = f"{SIDECAR_DIR}/thumbnails.jpg"

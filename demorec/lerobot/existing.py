@@ -13,21 +13,13 @@ from pathlib import Path
 from typing import Any
 
 from demorec.errors import ExportError
-from demorec.export.files import open_table, read_json, read_table
-from demorec.export.layout import (
-    AUTOMATIC_FEATURES,
-    INFO_PATH,
-    SIDECAR_DIR,
-    STATS_PATH,
-    TASKS_PATH,
-    DatasetInfo,
-    Feature,
-    FilePosition,
-)
-from demorec.export.reader import read_tasks
-from demorec.export.sidecar import CONFIGS_PATH, SidecarStart
-from demorec.export.stats import Statistics
-from demorec.export.writer import WriterStart
+from demorec.lerobot.files import open_table, read_json, read_table
+from demorec.lerobot.layout import AUTOMATIC_FEATURES, STATS_PATH, TASKS_PATH, DatasetInfo, Feature, FilePosition
+from demorec.lerobot.paths import INFO_PATH, SIDECAR_DIR
+from demorec.lerobot.reader import read_tasks
+from demorec.lerobot.sidecar import CONFIGS_PATH, SidecarStart
+from demorec.lerobot.stats import Statistics
+from demorec.lerobot.writer import WriterStart
 
 _CODING = (
     "video.codec",

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.export.layout import DatasetInfo
+from demorec.lerobot.layout import DatasetInfo
 
 _POSITIONS = frozenset(("index", "episode_index", "task_index"))
 

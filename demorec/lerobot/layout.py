@@ -13,7 +13,8 @@ from typing import Any, Literal
 import pyarrow as pa
 
 from demorec.errors import ExportError
-from demorec.export.files import read_json
+from demorec.lerobot.files import read_json
+from demorec.lerobot.paths import INFO_PATH, SIDECAR_DIR
 
 CODEBASE_VERSION = "v3.0"
 MEBIBYTE = 2**20
@@ -24,15 +25,10 @@ EPISODES_PATH = f"meta/episodes/{_CHUNK}.parquet"
 VIDEO_PATH = "videos/{video_key}/" + f"{_CHUNK}.mp4"
 TASKS_PATH = "meta/tasks.parquet"
 STATS_PATH = "meta/stats.json"
-INFO_PATH = "meta/info.json"
 
-SIDECAR_DIR = "demorec"
-"""Folder inside the dataset for what LeRobot has no place for."""
 SIDECAR_EPISODES_PATH = f"{SIDECAR_DIR}/episodes/{_CHUNK}.parquet"
 SIDECAR_ATTEMPTS_PATH = f"{SIDECAR_DIR}/attempts/{_CHUNK}.parquet"
 SIDECAR_CAMERAS_PATH = f"{SIDECAR_DIR}/camera_poses/{_CHUNK}.parquet"
-
-IMAGE_PREFIX = "observation.images."
 
 FeatureType = Literal["float32", "float64", "int64", "bool", "string", "video", "image", "language"]
 

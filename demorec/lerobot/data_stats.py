@@ -17,10 +17,10 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from demorec.errors import ExportError
-from demorec.export.files import open_table
-from demorec.export.layout import Feature
-from demorec.export.stats import QUANTILES, Statistics, quantile_ranks
 from demorec.geometry import Array
+from demorec.lerobot.files import open_table
+from demorec.lerobot.layout import Feature
+from demorec.lerobot.stats import QUANTILES, Statistics, quantile_ranks
 
 _BATCH_ROWS = 2048
 _LEVELS = ((21, 11), (10, 11), (0, 10))

@@ -15,9 +15,9 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from demorec.errors import ExportError
-from demorec.export.data_stats import column_numbers
-from demorec.export.files import check_video, open_table, read_table
-from demorec.export.layout import TASKS_PATH, VIDEO_PATH, DatasetInfo, FilePosition
+from demorec.lerobot.data_stats import column_numbers
+from demorec.lerobot.files import check_video, open_table, read_table
+from demorec.lerobot.layout import TASKS_PATH, VIDEO_PATH, DatasetInfo, FilePosition
 
 _MOST = 1 << 40
 """Above all rows, frames and seconds of any dataset."""

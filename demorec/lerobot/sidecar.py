@@ -23,16 +23,11 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from demorec.episode import EpisodeColumns, Outcome
-from demorec.export.layout import (
-    SIDECAR_ATTEMPTS_PATH,
-    SIDECAR_CAMERAS_PATH,
-    SIDECAR_DIR,
-    SIDECAR_EPISODES_PATH,
-    FilePosition,
-)
-from demorec.export.parquet import RollingParquet, vector_array
-from demorec.export.writer import WrittenEpisode, write_text
 from demorec.geometry import Array, Pose
+from demorec.lerobot.layout import SIDECAR_ATTEMPTS_PATH, SIDECAR_CAMERAS_PATH, SIDECAR_EPISODES_PATH, FilePosition
+from demorec.lerobot.parquet import RollingParquet, vector_array
+from demorec.lerobot.paths import SIDECAR_DIR
+from demorec.lerobot.writer import WrittenEpisode, write_text
 from demorec.plain import to_json, to_plain
 from demorec.recording import Recording
 from demorec.scene import Goal, Scene

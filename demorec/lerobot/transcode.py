@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from demorec.config import VideoConfig
 from demorec.errors import ExportError
-from demorec.export.mp4 import CodedVideo
+from demorec.lerobot.mp4 import CodedVideo
 from demorec.recording import Recording, VideoSettings
 from demorec.recording.video import make_encoder
 

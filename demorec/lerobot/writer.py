@@ -18,13 +18,13 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from demorec.errors import ExportError
-from demorec.export.data_stats import data_statistics
-from demorec.export.digest import episode_digest
-from demorec.export.layout import (
+from demorec.export.staging import sync_file
+from demorec.lerobot.data_stats import data_statistics
+from demorec.lerobot.digest import episode_digest
+from demorec.lerobot.layout import (
     AUTOMATIC_FEATURES,
     DATA_PATH,
     EPISODES_PATH,
-    INFO_PATH,
     MEBIBYTE,
     STATS_PATH,
     TASKS_PATH,
@@ -34,10 +34,10 @@ from demorec.export.layout import (
     data_schema,
     merged_video_info,
 )
-from demorec.export.mp4 import CodedVideo, Mp4Writer
-from demorec.export.parquet import RollingParquet, nested_array, vector_array
-from demorec.export.staging import sync_file
-from demorec.export.stats import NAMES, PixelHistogram, Statistics, vector_statistics
+from demorec.lerobot.mp4 import CodedVideo, Mp4Writer
+from demorec.lerobot.parquet import RollingParquet, nested_array, vector_array
+from demorec.lerobot.paths import INFO_PATH
+from demorec.lerobot.stats import NAMES, PixelHistogram, Statistics, vector_statistics
 
 _EPISODES_PER_TABLE = 100
 _MAX_SECONDS_PER_VIDEO = 900.0
@@ -92,7 +92,7 @@ class WriterStart:
 
 @dataclass(frozen=True, kw_only=True)
 class WrittenEpisode:
-    """Where an episode went, and its digest (`demorec.export.digest`)."""
+    """Where an episode went, and its digest (`demorec.lerobot.digest`)."""
 
     episode_index: int
     digest: str

@@ -9,12 +9,15 @@ from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from demorec.export.layout import IMAGE_PREFIX, Feature
-from demorec.export.options import ExportOptions, Progress, parse_episodes
-from demorec.export.prepare import PreparedEpisode, dataset_features, frame_stride, prepare_episode
-from demorec.export.sidecar import AttemptRecord
-from demorec.export.sources import Profile, Source
-from demorec.export.transcode import reason_to_transcode
+from demorec.export.columns import frame_stride
+from demorec.export.options import Progress
+from demorec.export.sources import Profile, Source, goes_in, is_among_episodes
+from demorec.features import IMAGE_PREFIX
+from demorec.lerobot.layout import Feature
+from demorec.lerobot.options import ExportOptions
+from demorec.lerobot.prepare import PreparedEpisode, dataset_features, prepare_episode
+from demorec.lerobot.sidecar import AttemptRecord
+from demorec.lerobot.transcode import reason_to_transcode
 from demorec.processes import SPAWN
 from demorec.recording import Recording
 
@@ -56,11 +59,10 @@ def read(source: Source, options: ExportOptions) -> Reading | None:
     """
     with Recording(source.path) as recording:
         info = recording.info
-        if not parse_episodes(options.episodes)(info.episode_index):
+        if not is_among_episodes(recording, options):
             return None
         attempt = AttemptRecord.of(recording)
         stride = frame_stride(info.fps, options.fps)
-        is_wanted = source.is_chosen and (attempt.success or options.include_failures)
         features = dataset_features(recording, options)
         cameras = [name for name in recording.cameras if IMAGE_PREFIX + name in features]
         reasons = {name: reason_to_transcode(recording.video_settings(name), stride) for name in cameras}
@@ -72,7 +74,7 @@ def read(source: Source, options: ExportOptions) -> Reading | None:
             fps=info.fps // stride,
             robot=info.robot.name,
             transcoded=tuple(f"{camera}, {reason}" for camera, reason in reasons.items() if reason),
-            prepared=prepare_episode(recording, options) if is_wanted else None,
+            prepared=prepare_episode(recording, options) if goes_in(source, recording, options) else None,
         )
 
 

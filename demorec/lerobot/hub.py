@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from demorec.errors import ExportError, MissingDependencyError
-from demorec.export.layout import CODEBASE_VERSION
+from demorec.lerobot.layout import CODEBASE_VERSION
 
 
 def push_to_hub(folder: Path, repo_id: str, *, private: bool) -> str:

@@ -12,8 +12,8 @@ import pyarrow.parquet as pq
 
 from demorec.config import GenerateConfig, parse_config
 from demorec.errors import ConfigError
-from demorec.export.layout import SIDECAR_DIR
-from demorec.export.options import ExportOptions
+from demorec.lerobot.options import ExportOptions
+from demorec.lerobot.paths import SIDECAR_DIR
 
 _NOT_TOLD = ("append", "overwrite", "verify", "workers", "push_to_hub", "public")
 """Options of an export that leave the dataset's content alone."""

@@ -4,30 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
-from demorec.errors import ConfigError, ExportError
-from demorec.export.depth import DEPTH_SUFFIX, depth_info, depth_video
-from demorec.export.layout import AUTOMATIC_FEATURES, IMAGE_PREFIX, Feature
-from demorec.export.options import ExportOptions
-from demorec.export.sidecar import EpisodeRecord
-from demorec.export.stats import PixelHistogram, colour_levels
-from demorec.export.transcode import coded_videos, dataset_settings, video_info
-from demorec.export.writer import EpisodeData
-from demorec.features import (
-    ACTION,
-    ENVIRONMENT_STATE,
-    ObservationRows,
-    action_names,
-    action_vectors,
-    observation_names,
-    observation_vectors,
-)
+from demorec.export.columns import DONE, REWARD, SUCCESS, check_feature_names, feature_columns, frame_stride
+from demorec.features import ACTION, DEPTH_SUFFIX, IMAGE_PREFIX, action_names, observation_names
+from demorec.lerobot.depth import depth_info, depth_video
+from demorec.lerobot.layout import AUTOMATIC_FEATURES, Feature
+from demorec.lerobot.options import ExportOptions
+from demorec.lerobot.sidecar import EpisodeRecord
+from demorec.lerobot.stats import PixelHistogram, colour_levels
+from demorec.lerobot.transcode import coded_videos, dataset_settings, video_info
+from demorec.lerobot.writer import EpisodeData
 from demorec.recording import Recording
-from demorec.registry import nearest_match
-
-REWARD, DONE, SUCCESS = "next.reward", "next.done", "next.success"
 
 _SCALARS = {
     REWARD: Feature(dtype="float32", shape=(1,)),
@@ -42,22 +28,6 @@ class PreparedEpisode:
 
     data: EpisodeData
     record: EpisodeRecord
-
-
-def frame_stride(recording_fps: int, fps: int | None) -> int:
-    """How many frames of the recording make one of the dataset.
-
-    Raises:
-        ConfigError: The wanted fps does not divide that of the recording.
-    """
-    if fps is None:
-        return 1
-    if recording_fps % fps:
-        divisors = [str(n) for n in range(1, recording_fps + 1) if recording_fps % n == 0]
-        raise ConfigError(
-            f"fps is {fps}, which does not divide the recordings' {recording_fps}: allowed are {', '.join(divisors)}."
-        )
-    return recording_fps // fps
 
 
 def dataset_features(recording: Recording, options: ExportOptions) -> dict[str, Feature]:
@@ -87,14 +57,7 @@ def dataset_features(recording: Recording, options: ExportOptions) -> dict[str, 
 
 def _chosen(offered: dict[str, Feature], options: ExportOptions) -> dict[str, Feature]:
     """Those of the offered features that the dataset shall have."""
-    for name in options.features:
-        if name == ENVIRONMENT_STATE and name not in offered:
-            raise ConfigError(f"The feature {name} is named in --features, but only --privileged adds it.")
-        if name not in offered:
-            raise ConfigError(
-                f"Unknown feature {name!r}.{nearest_match(name, offered)} The recordings and these options give: "
-                f"{', '.join(offered)}."
-            )
+    check_feature_names(options, offered)
     return {name: feature for name, feature in offered.items() if name in AUTOMATIC_FEATURES or options.takes(name)}
 
 
@@ -105,35 +68,16 @@ def _camera_feature(shape: tuple[int, int, int], info: dict[str, object]) -> Fea
 def prepare_episode(recording: Recording, options: ExportOptions, *, code_depth: bool = True) -> PreparedEpisode:
     """Read a recording into memory, as the dataset wants it; depth videos, which must be coded, only with `code_depth`.
 
-    With frames left out, an observation is that of the first frame of its group and an action the last one of it:
-    where the robot shall be when the next observation is taken.
-
     Raises:
         ExportError: It has no frames, or a kind of picture is missing that was asked for.
         RecordingError: It is damaged.
     """
-    info = recording.info
-    if recording.num_frames == 0:
-        raise ExportError(f"The recording has no frames: {recording.path}")
-    stride = frame_stride(info.fps, options.fps)
-    columns = recording.columns()
-    rows = np.arange(0, recording.num_frames, stride)
-    action_rows = np.minimum(rows + stride - 1, recording.num_frames - 1)
+    stride = frame_stride(recording.info.fps, options.fps)
     wanted = dataset_features(recording, options)
-    features: dict[str, NDArray[np.generic]] = dict(
-        observation_vectors(
-            ObservationRows.of_columns(columns, rows), info.robot, info.scene, privileged=options.privileged
-        )
-    )
-    features[ACTION] = action_vectors(columns, info.scene, options.action, action_rows)
-    success = recording.outcome is not None and recording.outcome.success
-    is_last = rows == rows[-1]
-    features[REWARD] = (is_last & success).astype(np.float32)
-    features[DONE] = is_last
-    features[SUCCESS] = is_last & success
+    columns = feature_columns(recording, options)
     videos, pixels = {}, {}
     cameras = [camera for camera in recording.cameras if IMAGE_PREFIX + camera in wanted]
-    for camera, video in coded_videos(recording, cameras, options.transcode, rows).items():
+    for camera, video in coded_videos(recording, cameras, options.transcode, columns.rows).items():
         key = IMAGE_PREFIX + camera
         videos[key] = video
         statistics = recording.pixel_statistics(camera)
@@ -144,12 +88,12 @@ def prepare_episode(recording: Recording, options: ExportOptions, *, code_depth:
         key = IMAGE_PREFIX + camera + DEPTH_SUFFIX
         if key in wanted:
             pictures = (picture for index, picture in enumerate(recording.depth(camera)) if index % stride == 0)
-            videos[key], pixels[key] = depth_video(pictures, fps=info.fps // stride)
+            videos[key], pixels[key] = depth_video(pictures, fps=recording.info.fps // stride)
     data = EpisodeData(
-        task=info.instruction,
-        columns={name: values for name, values in features.items() if name in wanted},
+        task=recording.info.instruction,
+        columns={name: values for name, values in columns.features.items() if name in wanted},
         videos=videos,
         video_info={key: wanted[key].info or {} for key in videos},
         pixels=pixels,
     )
-    return PreparedEpisode(data=data, record=EpisodeRecord.of(recording, columns, rows))
+    return PreparedEpisode(data=data, record=EpisodeRecord.of(recording, columns.recorded, columns.rows))

@@ -1,0 +1,92 @@
+"""The numbers of a recording as every exporter writes them: which frames, which features, in float32."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.episode import EpisodeColumns
+from demorec.errors import ConfigError, ExportError
+from demorec.export.options import CommonOptions
+from demorec.features import ACTION, ENVIRONMENT_STATE, ObservationRows, action_vectors, observation_vectors
+from demorec.recording import Recording
+from demorec.registry import nearest_match
+
+REWARD, DONE, SUCCESS = "next.reward", "next.done", "next.success"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FeatureColumns:
+    """The numbers of one recording, ready to be written.
+
+    Attributes:
+        recorded: All of its numbers, every frame.
+        rows: (T,) which of these frames the dataset has.
+        features: Feature -> (T, D) float32; (T,) float32 for REWARD, (T,) bool for DONE and SUCCESS.
+    """
+
+    recorded: EpisodeColumns
+    rows: NDArray[np.intp]
+    features: Mapping[str, NDArray[np.generic]]
+
+
+def frame_stride(recording_fps: int, fps: int | None) -> int:
+    """How many frames of the recording make one of the dataset.
+
+    Raises:
+        ConfigError: The wanted fps does not divide that of the recording.
+    """
+    if fps is None:
+        return 1
+    if recording_fps % fps:
+        divisors = [str(n) for n in range(1, recording_fps + 1) if recording_fps % n == 0]
+        raise ConfigError(
+            f"fps is {fps}, which does not divide the recordings' {recording_fps}: allowed are {', '.join(divisors)}."
+        )
+    return recording_fps // fps
+
+
+def check_feature_names(options: CommonOptions, offered: Collection[str]) -> None:
+    """Raise ConfigError when `options.features` names one that is not among the offered ones."""
+    for name in options.features:
+        if name == ENVIRONMENT_STATE and name not in offered:
+            raise ConfigError(f"The feature {name} is named in --features, but only --privileged adds it.")
+        if name not in offered:
+            raise ConfigError(
+                f"Unknown feature {name!r}.{nearest_match(name, offered)} The recordings and these options give: "
+                f"{', '.join(offered)}."
+            )
+
+
+def feature_columns(recording: Recording, options: CommonOptions) -> FeatureColumns:
+    """All numbers that recordings and options give, whichever of them `options.features` names.
+
+    With frames left out, an observation is that of the first frame of its group and an action the last one of it:
+    where the robot shall be when the next observation is taken.
+
+    Raises:
+        ExportError: The recording has no frames.
+        RecordingError: It is damaged.
+    """
+    info = recording.info
+    if recording.num_frames == 0:
+        raise ExportError(f"The recording has no frames: {recording.path}")
+    stride = frame_stride(info.fps, options.fps)
+    columns = recording.columns()
+    rows = np.arange(0, recording.num_frames, stride)
+    action_rows = np.minimum(rows + stride - 1, recording.num_frames - 1)
+    features: dict[str, NDArray[np.generic]] = dict(
+        observation_vectors(
+            ObservationRows.of_columns(columns, rows), info.robot, info.scene, privileged=options.privileged
+        )
+    )
+    features[ACTION] = action_vectors(columns, info.scene, options.action, action_rows)
+    success = recording.outcome is not None and recording.outcome.success
+    is_last = rows == rows[-1]
+    features[REWARD] = (is_last & success).astype(np.float32)
+    features[DONE] = is_last
+    features[SUCCESS] = is_last & success
+    return FeatureColumns(recorded=columns, rows=rows, features=features)

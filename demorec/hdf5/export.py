@@ -1,0 +1,90 @@
+"""Recordings to an HDF5 file: `export_hdf5`, from the first recording to the finished file."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from demorec.errors import ExportError
+from demorec.export.options import ExportReport, Progress
+from demorec.export.sources import (
+    Profile,
+    Source,
+    find_recordings,
+    goes_in,
+    is_among_episodes,
+    nothing_to_export,
+    places_of,
+    refuse_differences,
+)
+from demorec.hdf5.file import DATASET, UNFINISHED, NewFile
+from demorec.hdf5.options import Hdf5Options
+from demorec.hdf5.writer import RobomimicWriter
+from demorec.recording import Recording
+from demorec.replacing import check_replaceable, written_whole
+
+
+def export_hdf5(
+    sources: Sequence[Path], out: Path, options: Hdf5Options, progress: Progress | None = None
+) -> ExportReport:
+    """Write the recordings into the file `out`: whole, or not at all. One picture is in memory at a time.
+
+    Args:
+        sources: Recordings, runs, or folders of recordings.
+        out: The file.
+        options: How.
+        progress: Called after every recording.
+
+    Raises:
+        ConfigError: Impossible options, or something at `out` that is never replaced.
+        ExportError: Nothing to export, recordings that differ, a file in the way, a full disk. What was at `out` is
+            still there then.
+        RecordingError: A recording is damaged, or lacks pictures that were asked for.
+    """
+    options.validate()
+    found = find_recordings(sources, include_failures=options.include_failures)
+
+    def check() -> None:
+        check_replaceable(out, DATASET, overwrite=options.overwrite, sources=places_of(found), already=ExportError)
+
+    check()
+    target = out.resolve()
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with written_whole(target, UNFINISHED) as part:
+            with NewFile(part) as file:
+                report = _write(RobomimicWriter(file, options), found, out, progress)
+            check()  # something may have been put there meanwhile
+    except OSError as error:
+        raise ExportError(f"The file cannot be written ({error.strerror or error}): {out}") from error
+    return report
+
+
+def _write(writer: RobomimicWriter, found: Sequence[Source], out: Path, progress: Progress | None) -> ExportReport:
+    options = writer.options
+    first: tuple[Profile, Path] | None = None
+    skipped_failures = 0
+    for done, source in enumerate(found, start=1):
+        with Recording(source.path) as recording:
+            if is_among_episodes(recording, options):
+                if goes_in(source, recording, options):
+                    profile = Profile.of(recording, options)
+                    first = first or (profile, source.path)
+                    if profile != first[0]:
+                        refuse_differences(*first, (other.path for other in found), options)
+                    writer.add(recording)
+                else:
+                    skipped_failures += 1
+        if progress is not None:
+            progress(done, len(found))
+    if first is None:
+        raise nothing_to_export(len(found), skipped_failures)
+    writer.finish()
+    return ExportReport(
+        path=out,
+        num_episodes=writer.num_episodes,
+        num_frames=writer.num_frames,
+        new_episodes=writer.num_episodes,
+        new_frames=writer.num_frames,
+        skipped_failures=skipped_failures,
+    )

@@ -1,0 +1,123 @@
+"""HDF5 files: made anew so that no failure harms, and known by their content, so that nothing else is ever replaced."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import h5py
+
+from demorec.files import open_regular
+from demorec.replacing import Kind
+
+_MAGIC = b"\x89HDF\r\n\x1a\n"
+
+
+def _begins_as_hdf5(path: Path) -> bool:
+    with open_regular(path) as file:
+        return file.read(len(_MAGIC)) == _MAGIC
+
+
+def _is_robomimic_dataset(path: Path) -> bool:
+    if not _begins_as_hdf5(path):
+        return False
+    try:
+        with h5py.File(path, "r", locking=False) as file:
+            return isinstance(file.get("data"), h5py.Group) and {"total", "env_args"} <= set(file["data"].attrs)
+    except (OSError, RuntimeError, KeyError, ValueError):
+        return False
+
+
+DATASET = Kind(name="a robomimic dataset (HDF5)", recognises=_is_robomimic_dataset)
+UNFINISHED = Kind(name="an HDF5 file", recognises=_begins_as_hdf5)
+"""What a killed export leaves (`NewFile` sees to its first bytes)."""
+
+
+class _Storage(io.RawIOBase):
+    """A file whose writes never fail: the first error is kept, and what is written after it goes nowhere.
+
+    The HDF5 library ends the process with a segmentation fault when it cannot write what it still holds on closing.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("r+b", buffering=0)
+        self.error: BaseException | None = None
+
+    def readable(self) -> bool:
+        return True
+
+    def writable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        return self._file.seek(offset, whence)
+
+    def tell(self) -> int:
+        return self._file.tell()
+
+    def readinto(self, buffer: memoryview) -> int | None:  # type: ignore[override]
+        return self._file.readinto(buffer)
+
+    def write(self, data: memoryview) -> int:  # type: ignore[override]
+        left = memoryview(data)
+        try:
+            while self.error is None and left:
+                left = left[self._file.write(left) :]
+        except BaseException as error:  # an interrupt, too, must not reach HDF5
+            self.error = error
+        return len(data)
+
+    def truncate(self, size: int | None = None) -> int:
+        try:
+            if self.error is None:
+                return self._file.truncate(size)
+        except BaseException as error:
+            self.error = error
+        return 0 if size is None else size
+
+    def close(self) -> None:
+        self._file.close()
+        super().close()
+
+
+class NewFile:
+    """Context manager: an HDF5 file written over what is at a path, which must exist and be locked by the caller.
+
+    Attributes:
+        root: Its root group.
+
+    Raises:
+        OSError: It cannot be written; so do `flush` and the end of the block.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._storage = _Storage(path)
+        self.root = h5py.File(self._storage, "w")
+        # HDF5 writes its first bytes late; without them nobody would know whose file a killed export has left.
+        self._storage.seek(0)
+        self._storage.write(memoryview(_MAGIC))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.root.close()
+        self._storage.close()
+        if exc is None:
+            self._raise_error()
+
+    def flush(self) -> None:
+        """Write what is still in memory; raise the error of any write since the last time."""
+        self.root.flush()
+        self._raise_error()
+
+    def _raise_error(self) -> None:
+        if self._storage.error is not None:
+            raise self._storage.error

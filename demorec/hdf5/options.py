@@ -1,0 +1,42 @@
+"""What a user chooses about an export to HDF5; its row in the table of exporters."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from demorec.errors import ConfigError
+from demorec.export.exporter import Exporter
+from demorec.export.options import CommonOptions, ExportReport, Progress
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hdf5Options(CommonOptions):
+    """How recordings become an HDF5 file."""
+
+    valid_share: float = 0.1
+    """Share of the episodes that mask/valid names, spread evenly; mask/train names the others."""
+    compression: int = 4
+    """Level of gzip for pictures, 0 (none) to 9 (smallest)."""
+
+    def validate(self) -> None:
+        """Raise ConfigError for impossible values."""
+        super().validate()
+        if not 0 <= self.valid_share < 1:
+            raise ConfigError(f"valid-share is {self.valid_share}, it must be at least 0 and below 1.")
+        if not 0 <= self.compression <= 9:
+            raise ConfigError(f"compression is {self.compression}, it must be from 0 to 9.")
+
+
+def _export(sources: Sequence[Path], out: Path, options: Hdf5Options, progress: Progress | None) -> ExportReport:
+    from demorec.hdf5.export import export_hdf5
+
+    return export_hdf5(sources, out, options, progress)
+
+
+HDF5 = Exporter(
+    summary="robomimic's layout, one HDF5 file: decoded pictures, the same numbers, masks for training and validation",
+    options=Hdf5Options,
+    export=_export,
+)

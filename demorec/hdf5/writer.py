@@ -1,0 +1,183 @@
+"""Writes robomimic's layout: one group an episode, one HDF5 dataset a stream.
+
+The rules come from robomimic's own reader (`SequenceDataset`, `get_env_metadata_from_dataset`). The names of the
+observations are those of robosuite's environments, which robomimic's example configurations ask for.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from itertools import islice
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.episode import EpisodeColumns, EpisodeInfo
+from demorec.export.columns import DONE, REWARD, SUCCESS, check_feature_names, feature_columns, frame_stride
+from demorec.features import (
+    ACTION,
+    DEPTH_SUFFIX,
+    EE_POSE,
+    ENVIRONMENT_STATE,
+    IMAGE_PREFIX,
+    STATE,
+    VELOCITY,
+    action_names,
+    observation_names,
+)
+from demorec.hdf5.file import NewFile
+from demorec.hdf5.options import Hdf5Options
+from demorec.recording import Recording, channels
+from demorec.tables import environment_name
+
+_GYM = 2
+"""`EnvType.GYM_TYPE` of robomimic."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Observation:
+    """One of robomimic's observations: which components of which feature."""
+
+    name: str
+    feature: str
+    components: slice = slice(None)
+
+
+_OBSERVATIONS = (
+    _Observation(name="robot0_joint_pos", feature=STATE, components=slice(None, -1)),
+    _Observation(name="robot0_gripper_qpos", feature=STATE, components=slice(-1, None)),
+    _Observation(name="robot0_joint_vel", feature=VELOCITY, components=slice(None, -1)),
+    _Observation(name="robot0_gripper_qvel", feature=VELOCITY, components=slice(-1, None)),
+    _Observation(name="robot0_eef_pos", feature=EE_POSE, components=slice(0, 3)),
+    _Observation(name="robot0_eef_quat", feature=EE_POSE, components=slice(3, 7)),
+    _Observation(name="object", feature=ENVIRONMENT_STATE),
+)
+
+
+class RobomimicWriter:
+    """Adds episodes to an empty file; `finish` completes it.
+
+    Attributes:
+        options: Of the export.
+        num_episodes, num_frames: Written so far.
+    """
+
+    def __init__(self, file: NewFile, options: Hdf5Options) -> None:
+        self.options = options
+        self.num_episodes = 0
+        self.num_frames = 0
+        self._file = file
+        self._data = file.root.create_group("data")
+
+    def add(self, recording: Recording) -> None:
+        """Append an episode: numbers at once, pictures one by one."""
+        info, options = recording.info, self.options
+        names = observation_names(info.robot, info.scene, privileged=options.privileged)
+        self._check_feature_names(recording, names)
+        columns = feature_columns(recording, options)
+        demo = self._data.create_group(f"demo_{self.num_episodes}")
+        demo.attrs["num_samples"] = len(columns.rows)
+        demo.attrs["instruction"] = info.instruction
+        demo.attrs["episode_index"], demo.attrs["attempt"] = info.episode_index, info.attempt
+        demo.attrs["success"] = recording.outcome is not None and recording.outcome.success
+        if channels.description_topic() in recording.topics:
+            demo.attrs["model_file"] = recording.description()
+        _add_vectors(demo, "actions", columns.features[ACTION], action_names(info.robot, options.action))
+        _add_vectors(demo, "states", *_states(columns.recorded, columns.rows, info))
+        demo["rewards"] = columns.features[REWARD]
+        demo["dones"] = columns.features[DONE].astype(np.int64)
+        observations = demo.create_group("obs")
+        for row in _OBSERVATIONS:
+            if row.feature in names and options.takes(row.feature):
+                values = columns.features[row.feature][:, row.components]
+                _add_vectors(observations, row.name, values, names[row.feature][row.components])
+        self._add_pictures(observations, recording, len(columns.rows))
+        if self.num_episodes == 0:
+            self._describe(recording)
+        self.num_episodes += 1
+        self.num_frames += len(columns.rows)
+        self._file.flush()
+
+    def finish(self) -> None:
+        """Write what is known of all episodes together: their number of samples, and who is for validation."""
+        self._data.attrs["total"] = self.num_frames
+        share = Fraction(self.options.valid_share).limit_denominator(1_000_000)
+        numbers = range(self.num_episodes)
+        valid = [number for number in numbers if int((number + 1) * share) > int(number * share)]
+        train = [number for number in numbers if number not in set(valid)]
+        for name, chosen in (("train", train), ("valid", valid)):
+            self._file.root[f"mask/{name}"] = np.array([f"demo_{number}" for number in chosen], dtype="S")
+
+    def _check_feature_names(self, recording: Recording, names: Iterable[str]) -> None:
+        pictures = [IMAGE_PREFIX + camera for camera in recording.cameras]
+        depth = [name + DEPTH_SUFFIX for name in pictures] if self.options.depth else []
+        check_feature_names(self.options, [*names, *pictures, *depth, ACTION, REWARD, DONE, SUCCESS])
+
+    def _add_pictures(self, observations: h5py.Group, recording: Recording, count: int) -> None:
+        options = self.options
+        stride = frame_stride(recording.info.fps, options.fps)
+        for camera in recording.cameras:
+            settings = recording.video_settings(camera)
+            size = settings.height, settings.width
+            if options.takes(IMAGE_PREFIX + camera):
+                stored = self._pictures(observations, f"{camera}_image", (count, *size, 3), np.uint8)
+                for index, picture in enumerate(islice(recording.images(camera), 0, None, stride)):
+                    stored[index] = picture
+            if options.depth and options.takes(IMAGE_PREFIX + camera + DEPTH_SUFFIX):
+                stored = self._pictures(observations, f"{camera}_depth", (count, *size, 1), np.float32)
+                for index, metres in enumerate(islice(recording.depth(camera), 0, None, stride)):
+                    stored[index] = metres[..., np.newaxis]
+
+    def _pictures(
+        self, observations: h5py.Group, name: str, shape: tuple[int, ...], kind: type[np.generic]
+    ) -> h5py.Dataset:
+        """An empty stream of pictures, each a compressed chunk of its own, so that one is read by itself."""
+        level = self.options.compression
+        return observations.create_dataset(
+            name,
+            shape,
+            kind,
+            chunks=(1, *shape[1:]),
+            compression="gzip" if level else None,
+            compression_opts=level or None,
+        )
+
+    def _describe(self, recording: Recording) -> None:
+        """The attributes of `data` that robomimic makes an environment from, and what else holds for all episodes."""
+        info, options = recording.info, self.options
+        fps = info.fps // frame_stride(info.fps, options.fps)
+        arguments = {
+            "robot": info.scene.robot.name,
+            "fps": fps,
+            "physics_hz": info.physics_hz,
+            "cameras": [name for name in recording.cameras if options.takes(IMAGE_PREFIX + name)],
+            "action": options.action,
+            "privileged": options.privileged,
+        }
+        described = {"env_name": environment_name(info.task), "type": _GYM, "env_kwargs": arguments}
+        self._data.attrs["env_args"] = json.dumps(described)
+        self._data.attrs["task"], self._data.attrs["fps"] = info.task, fps
+
+
+def _states(
+    columns: EpisodeColumns, rows: NDArray[np.intp], info: EpisodeInfo
+) -> tuple[NDArray[np.float64], tuple[str, ...]]:
+    """(T, D) float64 state of the simulated world as recorded, and the names of its components.
+
+    Positions (rad, fingers m) and velocities (rad/s, m/s) of all joints, then world_from_object of every movable body:
+    xyz (m) and quaternion xyzw.
+    """
+    parts = [columns.joint_position, columns.joint_velocity, *columns.object_poses.values()]
+    joints = info.robot.joint_names
+    names = [f"{joint}.{what}" for what in ("pos", "vel") for joint in joints]
+    names += [f"{body}.{axis}" for body in columns.object_poses for axis in ("x", "y", "z", "qx", "qy", "qz", "qw")]
+    return np.concatenate(parts, axis=1)[rows], tuple(names)
+
+
+def _add_vectors(group: h5py.Group, name: str, values: NDArray[np.generic], components: Sequence[str]) -> None:
+    stored = group.create_dataset(name, data=values)
+    stored.attrs["names"] = json.dumps(components)

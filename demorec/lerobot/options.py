@@ -1,0 +1,88 @@
+"""What a user chooses about an export to LeRobot; its row in the table of exporters."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from demorec.config import VideoConfig
+from demorec.errors import ConfigError
+from demorec.export.exporter import Exporter
+from demorec.export.options import CommonOptions, ExportReport, Progress
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportOptions(CommonOptions):
+    """How recordings become a LeRobot dataset."""
+
+    repo_id: str = "local/demorec"
+    """Name of the dataset on the Hub, OWNER/NAME; also written into its card."""
+    append: bool = False
+    """Add the episodes to the dataset that is there already."""
+    allow_duplicates: bool = False
+    """With --append: add episodes whose content the dataset has already a second time, instead of refusing them."""
+    verify: bool = True
+    """Open the finished dataset with LeRobot, where that is installed, and compare samples with the recordings."""
+    workers: int = 0
+    """Processes that read recordings; 0: as many as pay."""
+    push_to_hub: bool = False
+    """Upload the dataset to the Hugging Face Hub as --repo-id."""
+    public: bool = False
+    """Make an uploaded dataset public."""
+    license: str = "apache-2.0"
+    """Licence that the dataset card names."""
+    data_files_mb: float = 100
+    """Size in MiB above which a new parquet file is begun."""
+    video_files_mb: float = 200
+    """Size in MiB above which a new mp4 file is begun."""
+    files_per_chunk: int = 1000
+    """How many files a chunk folder holds."""
+    transcode_codec: Literal["h264", "av1"] = "h264"
+    """Codec of pictures that cannot be taken as they are (jpeg, or --fps between keyframes)."""
+    transcode_crf: int | None = 18
+    """Constant rate factor of such pictures, smaller is better; auto is that of a recording."""
+
+    @property
+    def transcode(self) -> VideoConfig:
+        """How pictures are coded that cannot be taken as they are."""
+        return VideoConfig(codec=self.transcode_codec, crf=self.transcode_crf)
+
+    def validate(self) -> None:
+        """Raise ConfigError for impossible values and combinations."""
+        super().validate()
+        if self.append and self.overwrite:
+            raise ConfigError("--append and --overwrite exclude each other: choose one.")
+        if self.allow_duplicates and not self.append:
+            raise ConfigError("--allow-duplicates belongs to --append.")
+        if self.workers < 0:
+            raise ConfigError(f"workers is {self.workers}, it must be 0 (as many as pay) or more.")
+        check_repo_id(self.repo_id)
+        if self.data_files_mb <= 0 or self.video_files_mb <= 0 or self.files_per_chunk < 1:
+            raise ConfigError("data-files-mb, video-files-mb and files-per-chunk must be above 0.")
+        self.transcode.validate()
+
+
+def check_repo_id(repo_id: str) -> None:
+    """Raise ConfigError for what cannot be OWNER/NAME on the Hub; LeRobot takes a dataset's name apart at the slash."""
+    word = r"(?!.*(?:--|\.\.))[A-Za-z0-9_](?:[A-Za-z0-9_.-]*[A-Za-z0-9_])?"
+    if len(repo_id) > 96 or repo_id.endswith(".git") or not re.fullmatch(f"{word}/{word}", repo_id):
+        raise ConfigError(
+            f"repo-id is {repo_id!r}, but must be OWNER/NAME, for example me/cubes, of letters, digits and underscores "
+            "with single dots and dashes between them."
+        )
+
+
+def _export(sources: Sequence[Path], out: Path, options: ExportOptions, progress: Progress | None) -> ExportReport:
+    from demorec.lerobot.export import export_lerobot
+
+    return export_lerobot(sources, out, options, progress)
+
+
+LEROBOT = Exporter(
+    summary="LeRobot v3.0, a folder: recorded video as it is, numbers bit for bit, statistics, card",
+    options=ExportOptions,
+    export=_export,
+)

@@ -1,0 +1,128 @@
+"""What every row of the table of exporters promises."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+from pathlib import Path
+
+import pytest
+from helpers_export import export, files_of, make_run
+
+from demorec.cli.flags import _field_texts
+from demorec.config import VideoConfig
+from demorec.errors import ConfigError, DemorecError, ExportError, RecordingError
+from demorec.export.options import CommonOptions
+from demorec.tables import EXPORTERS
+
+pytestmark = pytest.mark.parametrize("exporter", EXPORTERS.names())
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_run(tmp_path_factory.mktemp("run") / "run", (6, 5, 4), failures=(1,))
+
+
+def content(place: Path) -> dict[str, bytes]:
+    """All files at a path, be it a folder or a file."""
+    return {"": place.read_bytes()} if place.is_file() else files_of(place)
+
+
+def test_options_are_the_common_ones_and_more(exporter: str) -> None:
+    options = EXPORTERS.load(exporter).options
+    assert issubclass(options, CommonOptions)
+    assert all(_field_texts(options)[field.name] for field in dataclasses.fields(options))
+
+
+def test_the_wanted_episodes_go_in_and_nothing_else_changes(exporter: str, run: Path, tmp_path: Path) -> None:
+    before = files_of(run)
+    row = EXPORTERS.load(exporter)
+    calls: list[tuple[int, int]] = []
+    options = row.options(episodes="1:", **({"verify": False} if exporter == "lerobot" else {}))
+    report = row.export([run], tmp_path / "a" / "d", options, lambda done, total: calls.append((done, total)))
+    assert (report.num_episodes, report.num_frames, report.skipped_failures) == (2, 9, 1)
+    assert report.path == tmp_path / "a" / "d"
+    assert calls == [(1, 4), (2, 4), (3, 4), (4, 4)]
+    assert [path.name for path in (tmp_path / "a").iterdir()] == ["d"]
+    assert files_of(run) == before
+
+
+def test_failed_attempts_go_in_when_asked_for(exporter: str, run: Path, tmp_path: Path) -> None:
+    report = export(run, tmp_path / "d", exporter, include_failures=True)
+    assert (report.num_episodes, report.num_frames, report.skipped_failures) == (4, 27, 0)
+
+
+def test_the_same_recordings_give_the_same_bytes(exporter: str, run: Path, tmp_path: Path) -> None:
+    export(run, tmp_path / "a", exporter, privileged=True, action="ee_delta")
+    export(run, tmp_path / "b", exporter, privileged=True, action="ee_delta")
+    assert content(tmp_path / "a") == content(tmp_path / "b")
+
+
+def test_a_dataset_is_replaced_only_when_asked_for(exporter: str, run: Path, tmp_path: Path) -> None:
+    export(run, tmp_path / "d", exporter, episodes="0")
+    before = content(tmp_path / "d")
+    with pytest.raises(ExportError, match="is there already"):
+        export(run, tmp_path / "d", exporter)
+    assert content(tmp_path / "d") == before
+    assert export(run, tmp_path / "d", exporter, overwrite=True).num_episodes == 3
+    assert content(tmp_path / "d") != before
+    assert [path.name for path in tmp_path.iterdir()] == ["d"]
+
+
+@pytest.mark.parametrize("kind", ["file", "folder", "recording"])
+def test_what_is_no_dataset_is_never_replaced(exporter: str, run: Path, tmp_path: Path, kind: str) -> None:
+    out = tmp_path / "d"
+    if kind == "file":
+        out.write_text("years of work")
+    elif kind == "folder":
+        out.mkdir()
+        (out / "thesis.txt").write_text("years of work")
+    else:
+        shutil.copy(run / "episodes" / "episode_000000.mcap", out)
+    before = content(out)
+    with pytest.raises(ConfigError, match="never replaced"):
+        export(run, out, exporter, overwrite=True)
+    assert content(out) == before
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"episodes": "7"}, ExportError, "Nothing to export"),
+        ({"episodes": "x"}, ConfigError, "0:100"),
+        ({"fps": 7}, ConfigError, "does not divide"),
+        ({"fps": 0}, ConfigError, "at least 1"),
+        ({"features": ("observation.stat",)}, ConfigError, "Did you mean 'observation.state'"),
+        ({"features": ("observation.environment_state",)}, ConfigError, "only --privileged adds it"),
+        ({"depth": True}, RecordingError, "no depth pictures"),
+    ],
+)
+def test_a_refused_export_leaves_nothing(
+    exporter: str,
+    run: Path,
+    tmp_path: Path,
+    options: dict[str, object],
+    error: type[DemorecError],
+    message: str,
+) -> None:
+    with pytest.raises(error, match=message):
+        export(run, tmp_path / "d", exporter, **options)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_recordings_that_differ_are_refused(exporter: str, run: Path, tmp_path: Path) -> None:
+    other = make_run(tmp_path / "other", (4,), video=VideoConfig(), width=48)
+    with pytest.raises(ExportError, match=r"do not go into one dataset.*48x48 instead of 64x48"):
+        export([run, other], tmp_path / "d", exporter)
+    assert [path.name for path in tmp_path.iterdir()] == ["other"]
+
+
+def test_a_damaged_recording_leaves_nothing(exporter: str, run: Path, tmp_path: Path) -> None:
+    spoilt = tmp_path / "run"
+    shutil.copytree(run, spoilt)
+    path = spoilt / "episodes" / "episode_000002.mcap"
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2])
+    with pytest.raises(RecordingError):
+        export(spoilt, tmp_path / "d", exporter)
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]

@@ -1,0 +1,220 @@
+"""The HDF5 export: what h5py reads in it is what the recordings say."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from helpers_export import export, make_run
+
+from demorec.cli import main
+from demorec.errors import ConfigError
+from demorec.recording import Recording
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_run(tmp_path_factory.mktemp("run") / "run", (8, 7, 5), failures=(1,), depth=True)
+
+
+def recording(run: Path, index: int) -> Recording:
+    return Recording(run / "episodes" / f"episode_{index:06d}.mcap")
+
+
+def test_numbers_are_those_of_the_recording(run: Path, tmp_path: Path) -> None:
+    export(run, tmp_path / "d.hdf5", "hdf5", privileged=True)
+    with h5py.File(tmp_path / "d.hdf5") as file:
+        assert set(file["data"]) == {"demo_0", "demo_1", "demo_2"}
+        assert file["data"].attrs["total"] == 20
+        for index in range(3):
+            demo = file[f"data/demo_{index}"]
+            with recording(run, index) as source:
+                columns = source.columns()
+                assert demo.attrs["model_file"] == source.description()
+                assert demo.attrs["instruction"] == source.info.instruction
+            assert demo.attrs["num_samples"] == columns.num_frames
+            assert (demo.attrs["episode_index"], demo.attrs["success"]) == (index, True)
+            observed = {name: data[()] for name, data in demo["obs"].items()}
+            single = {
+                "robot0_joint_pos": columns.joint_position[:, :7],
+                "robot0_gripper_qpos": columns.gripper_width[:, np.newaxis],
+                "robot0_joint_vel": columns.joint_velocity[:, :7],
+                "robot0_gripper_qvel": columns.joint_velocity[:, 7:].sum(axis=1, keepdims=True),
+                "robot0_eef_pos": columns.base_from_tcp[:, :3],
+            }
+            for name, expected in single.items():
+                assert observed[name].dtype == np.float32
+                np.testing.assert_array_equal(observed[name], expected.astype(np.float32), err_msg=name)
+            same = (observed["robot0_eef_quat"] * columns.base_from_tcp[:, 3:]).sum(axis=1)
+            np.testing.assert_allclose(np.abs(same), 1, atol=1e-6)  # either sign is the same rotation
+            target = np.column_stack([columns.action_joint_target, columns.action_gripper])
+            np.testing.assert_array_equal(demo["actions"][()], target.astype(np.float32))
+            state = [columns.joint_position, columns.joint_velocity, *columns.object_poses.values()]
+            np.testing.assert_array_equal(demo["states"][()], np.concatenate(state, axis=1))
+            last = [0] * (columns.num_frames - 1) + [1]
+            assert demo["rewards"][()].tolist() == demo["dones"][()].tolist() == last
+            assert observed["object"].shape[1] == len(json.loads(demo["obs/object"].attrs["names"]))
+
+
+def test_names_tell_every_component(run: Path, tmp_path: Path) -> None:
+    export(run, tmp_path / "d.hdf5", "hdf5", action="ee_delta", episodes="0")
+    with h5py.File(tmp_path / "d.hdf5") as file, recording(run, 0) as source:
+        demo = file["data/demo_0"]
+        names = {name: json.loads(demo[name].attrs["names"]) for name in ("actions", "states", "obs/robot0_joint_pos")}
+        assert names["actions"] == ["tcp.dx", "tcp.dy", "tcp.dz", "tcp.rx", "tcp.ry", "tcp.rz", "gripper.width"]
+        assert names["obs/robot0_joint_pos"] == [f"panda_joint{n}.pos" for n in range(1, 8)]
+        columns = source.columns()
+        for body, poses in columns.object_poses.items():
+            number = names["states"].index(f"{body}.x")
+            np.testing.assert_array_equal(demo["states"][:, number : number + 7], poses)
+        assert len(names["states"]) == demo["states"].shape[1]
+
+
+def test_pictures_are_the_decoded_ones(run: Path, tmp_path: Path) -> None:
+    export(run, tmp_path / "d.hdf5", "hdf5", depth=True)
+    with h5py.File(tmp_path / "d.hdf5") as file:
+        for index in range(3):
+            demo = file[f"data/demo_{index}/obs"]
+            with recording(run, index) as source:
+                for camera in ("front", "wrist"):
+                    pictures, distances = demo[f"{camera}_image"], demo[f"{camera}_depth"]
+                    np.testing.assert_array_equal(pictures[()], np.stack(list(source.images(camera))))
+                    np.testing.assert_array_equal(distances[..., 0], np.stack(list(source.depth(camera))))
+                    assert (pictures.chunks, pictures.compression) == ((1, 48, 64, 3), "gzip")
+                    assert (distances.chunks, distances.dtype) == ((1, 48, 64, 1), np.float32)
+
+
+def test_fewer_frames(run: Path, tmp_path: Path) -> None:
+    """Observations of frames 0 and 3, actions of frames 2 and 4: the last of each group, and of the episode."""
+    export(run, tmp_path / "d.hdf5", "hdf5", fps=10, episodes="2")
+    with h5py.File(tmp_path / "d.hdf5") as file, recording(run, 2) as source:
+        demo, columns = file["data/demo_0"], source.columns()
+        assert demo.attrs["num_samples"] == 2
+        np.testing.assert_array_equal(demo["states"][:, :9], columns.joint_position[[0, 3]])
+        np.testing.assert_array_equal(demo["actions"][:, :7], columns.action_joint_target[[2, 4]].astype(np.float32))
+        np.testing.assert_array_equal(demo["obs/front_image"][1], source.image("front", 3))
+        assert file["data"].attrs["fps"] == 10
+
+
+def test_features_leave_observations_out(run: Path, tmp_path: Path) -> None:
+    export(run, tmp_path / "d.hdf5", "hdf5", features=("observation.images.wrist",))
+    with h5py.File(tmp_path / "d.hdf5") as file:
+        assert set(file["data/demo_0/obs"]) == {"robot0_joint_pos", "robot0_gripper_qpos", "wrist_image"}
+        assert {"actions", "states", "rewards", "dones"} <= set(file["data/demo_0"])
+
+
+def test_failed_attempts_have_no_reward(run: Path, tmp_path: Path) -> None:
+    export(run, tmp_path / "d.hdf5", "hdf5", include_failures=True)
+    with h5py.File(tmp_path / "d.hdf5") as file:
+        demos = [file[f"data/demo_{number}"] for number in range(4)]
+        assert [bool(demo.attrs["success"]) for demo in demos] == [True, False, True, True]
+        assert [demo["rewards"][-1] for demo in demos] == [1, 0, 1, 1]
+        assert [demo["dones"][-1] for demo in demos] == [1, 1, 1, 1]
+
+
+@pytest.mark.parametrize(
+    ("share", "valid"), [(0.0, []), (0.1, []), (1 / 3, ["demo_2"]), (0.5, ["demo_1"]), (0.7, ["demo_1", "demo_2"])]
+)
+def test_masks_divide_the_episodes(run: Path, tmp_path: Path, share: float, valid: list[str]) -> None:
+    export(run, tmp_path / "d.hdf5", "hdf5", valid_share=share)
+    with h5py.File(tmp_path / "d.hdf5") as file:
+        found = [[name.decode() for name in file[f"mask/{mask}"]] for mask in ("train", "valid")]
+    assert found[1] == valid
+    assert sorted(found[0] + found[1]) == ["demo_0", "demo_1", "demo_2"]
+
+
+def test_env_args_name_an_environment(run: Path, tmp_path: Path) -> None:
+    import gymnasium
+
+    import demorec.gym_env  # noqa: F401  (registers the environments)
+
+    export(run, tmp_path / "d.hdf5", "hdf5", features=("observation.velocity",), action="ee")
+    with h5py.File(tmp_path / "d.hdf5") as file:
+        described = json.loads(file["data"].attrs["env_args"])
+    assert described["type"] == 2  # robomimic's EnvType.GYM_TYPE
+    env = gymnasium.make(described["env_name"], **described["env_kwargs"])
+    assert env.action_space.shape == (8,)
+    env.close()
+
+
+def test_another_hdf5_file_is_not_replaced(run: Path, tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "d.hdf5", "w") as file:
+        file["thesis"] = np.arange(5)
+    before = (tmp_path / "d.hdf5").read_bytes()
+    with pytest.raises(ConfigError, match="it is not a robomimic dataset"):
+        export(run, tmp_path / "d.hdf5", "hdf5", overwrite=True)
+    assert (tmp_path / "d.hdf5").read_bytes() == before
+
+
+def test_no_times_are_kept(run: Path, tmp_path: Path) -> None:
+    """HDF5 knows whole seconds; where it keeps times, as in the last two files, a second later is another file."""
+
+    def make(name: str) -> None:
+        export(run, tmp_path / f"{name}.hdf5", "hdf5", episodes="0")
+        with h5py.File(tmp_path / f"{name}-timed.hdf5", "w") as file:
+            file.create_dataset("x", data=np.arange(3), track_times=True)
+
+    make("now")
+    time.sleep(1.1)
+    make("later")
+    assert (tmp_path / "now.hdf5").read_bytes() == (tmp_path / "later.hdf5").read_bytes()
+    assert (tmp_path / "now-timed.hdf5").read_bytes() != (tmp_path / "later-timed.hdf5").read_bytes()
+
+
+@pytest.mark.parametrize(("option", "value"), [("valid_share", 1.0), ("valid_share", -0.1), ("compression", 10)])
+def test_impossible_options(run: Path, tmp_path: Path, option: str, value: float) -> None:
+    with pytest.raises(ConfigError, match=option.replace("_", "-")):
+        export(run, tmp_path / "d.hdf5", "hdf5", **{option: value})
+
+
+def test_the_command(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "d.hdf5"
+    for arguments, code in (
+        (["hdf5", run, "--out", out, "--compression", "0", "--valid-share", "0.5"], 0),
+        (["hdf5", run, "--out", out], 1),
+        (["hdf6", run, "--out", out], 2),
+        (["--out", "lerobot", "hdf5", run], 2),
+    ):
+        with pytest.raises(SystemExit) as ended:
+            main(["export", *map(str, arguments)])
+        assert ended.value.code == code
+    printed = capsys.readouterr()
+    assert printed.out.splitlines()[:2] == [
+        f"3 episodes, 20 frames: {out}",
+        "1 failed attempts left out (--include-failures takes them).",
+    ]
+    assert "choose another name, or --overwrite" in printed.err
+    assert "Did you mean 'hdf5'?" in printed.err
+    assert "Name the format before everything else: demorec export hdf5" in printed.err
+    assert "Traceback" not in printed.err
+
+
+def test_robomimic_reads_it(run: Path, tmp_path: Path) -> None:
+    """robomimic's own reader, where it is installed: its dependencies need a compiler, so it is none of ours."""
+    dataset = pytest.importorskip("robomimic.utils.dataset", reason="robomimic is not installed")
+    from robomimic.utils import file_utils, obs_utils
+
+    export(run, tmp_path / "d.hdf5", "hdf5", valid_share=0.5)
+    low = ["robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos"]
+    obs_utils.initialize_obs_utils_with_obs_specs({"obs": {"low_dim": low, "rgb": ["front_image"]}})
+    assert file_utils.get_env_metadata_from_dataset(tmp_path / "d.hdf5")["env_name"] == "demorec/PickPlace-v0"
+    shapes = file_utils.get_shape_metadata_from_dataset(tmp_path / "d.hdf5", [*low, "front_image"])
+    assert (shapes["ac_dim"], shapes["all_shapes"]["front_image"]) == (8, [3, 48, 64])
+    for mask, index in (("train", 0), ("valid", 1)):
+        read = dataset.SequenceDataset(
+            hdf5_path=str(tmp_path / "d.hdf5"),
+            obs_keys=[*low, "front_image"],
+            dataset_keys=["actions", "rewards", "dones"],
+            seq_length=3,
+            filter_by_attribute=mask,
+            load_next_obs=False,
+        )
+        with recording(run, index) as source:
+            item, columns = read[1], source.columns()
+            np.testing.assert_array_equal(item["obs"]["front_image"][0], source.image("front", 1))
+        np.testing.assert_array_equal(item["obs"]["robot0_eef_pos"], columns.base_from_tcp[1:4, :3].astype(np.float32))
+        np.testing.assert_array_equal(item["actions"][:, :7], columns.action_joint_target[1:4].astype(np.float32))
