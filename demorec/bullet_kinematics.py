@@ -243,7 +243,7 @@ def _quaternion(rotation: Floats) -> Floats:
     result = np.empty((len(flat), 4), dtype=flat.dtype)
     for i in range(4):
         m = flat[largest == i]
-        found = np.empty((len(m), 4), dtype=flat.dtype)
+        found = np.zeros((len(m), 4), dtype=flat.dtype)
         if i == 3:
             root = np.sqrt(m[:, 0, 0] + m[:, 1, 1] + m[:, 2, 2] + 1.0)
             found[:, :3] = np.stack([m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]], -1)

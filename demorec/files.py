@@ -14,6 +14,8 @@ from io import BufferedReader
 from pathlib import Path
 from typing import Any
 
+from demorec.errors import ConfigError
+
 _KINDS = {
     stat.S_IFIFO: "a FIFO",
     stat.S_IFSOCK: "a socket",
@@ -65,6 +67,20 @@ def read_json_limited(path: Path, limit: int) -> Any:
         return json.loads(read_text_limited(path, limit))
     except RecursionError:
         raise ValueError("its values are nested too deeply") from None
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder for results, and those above it; one that is there is fine.
+
+    Raises:
+        ConfigError: It cannot be made.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(
+            f"The output folder cannot be made ({error.strerror}): choose another --out: {path}"
+        ) from error
 
 
 def _refuse_irregular(path: Path, mode: int) -> None:

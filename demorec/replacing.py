@@ -103,7 +103,7 @@ def _obstacle(target: Path, kind: Kind, sources: Iterable[Path]) -> str:
     """Why `target`, which is there, must not be replaced; "" when it may be."""
     if not target.exists():
         return "it is a link to something that is not there"
-    reason = _use_as_source(target.resolve(), sources)
+    reason = use_as_source(target.resolve(), sources)
     if reason:
         return reason
     if not kind.is_folder:
@@ -121,7 +121,8 @@ def _obstacle(target: Path, kind: Kind, sources: Iterable[Path]) -> str:
     return f"it holds what is not part of {kind.name} ({shown(foreign)})" if foreign else ""
 
 
-def _use_as_source(target: Path, sources: Iterable[Path]) -> str:
+def use_as_source(target: Path, sources: Iterable[Path]) -> str:
+    """How a command that reads these sources uses `target`, a resolved path; "" when it does not."""
     for source in sources:
         resolved = source.resolve()
         if resolved == target:

@@ -18,6 +18,7 @@ from demorec.assets import allow_models
 from demorec.config import EpisodePlan, GenerateConfig, VideoConfig, read_toml
 from demorec.episode import EpisodeInfo, Outcome
 from demorec.errors import ConfigError, DemorecError, NotAllowedError, RecordingError
+from demorec.files import make_folder
 from demorec.geometry import Pose, look_at
 from demorec.loop import prepare
 from demorec.plain import digest, from_plain
@@ -318,7 +319,7 @@ def rerender(source: Path, out: Path, options: RerenderOptions, *, overwrite: bo
             config_digest=digest(config),
             origin=f"render of {recording.digest()[:16]}",
         )
-        out.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(out.parent)
         world = RecordedWorld(
             info.robot, view.scene, joint_position=columns.joint_position, object_poses=columns.object_poses
         )

@@ -56,18 +56,27 @@ def main(argv: Sequence[str] | None = None) -> None:
     if name and not name.startswith("-"):
         if name not in COMMANDS.rows:
             _fail(f"Unknown command {name!r}.{nearest_match(name, COMMANDS.rows)} See demorec --help.", 2)
-        sys.exit(run_command(COMMANDS.load(name), args[1:], prog=f"demorec {name}"))
-    if name == "--version":
-        say(f"demorec {version('demorec')}")
-        return
-    say(*_overview())
-    sys.exit(0 if name in ("-h", "--help") else 2)
+        sys.exit(_run(name, args[1:], prog=f"demorec {name}"))
+    try:
+        say(*([f"demorec {version('demorec')}"] if name == "--version" else _overview()))
+    except DemorecError as error:
+        _fail(str(error), error.exit_code)
+    sys.exit(0 if name in ("-h", "--help", "--version") else 2)
 
 
 def generate_dataset_main(argv: Sequence[str] | None = None) -> None:
     """Entry point of `generate-dataset`: the same as `demorec generate`."""
     args = list(sys.argv[1:] if argv is None else argv)
-    sys.exit(run_command(COMMANDS.load("generate"), args, prog="generate-dataset"))
+    sys.exit(_run("generate", args, prog="generate-dataset"))
+
+
+def _run(name: str, args: Sequence[str], *, prog: str) -> int:
+    try:
+        command = COMMANDS.load(name)  # which may take a while
+    except KeyboardInterrupt:
+        tell(f"{prog}: interrupted.")
+        return 130
+    return run_command(command, args, prog=prog)
 
 
 def run_command(command: type[Command], args: Sequence[str], *, prog: str) -> int:

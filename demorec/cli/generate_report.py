@@ -91,7 +91,10 @@ def print_result(result: RunResult, export: ExportRecord | None, checked: CheckS
     leftovers = sum(1 for path in (folder / UNFINISHED).rglob("*") if path.is_file())
     if leftovers:
         rows.append(
-            ("set aside", f"{leftovers} files in {folder / UNFINISHED} (demorec recover reads what a crash left)")
+            (
+                "set aside",
+                f"{leftovers} files in {folder / UNFINISHED} (demorec recover reads recordings that a crash cut off)",
+            )
         )
     rows.append(("run digest", run.digest))
     if export is not None:

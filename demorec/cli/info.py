@@ -16,6 +16,7 @@ from demorec.features import IMAGE_PREFIX
 from demorec.lerobot.paths import INFO_PATH, is_dataset
 
 if TYPE_CHECKING:
+    from demorec.config import GenerateConfig
     from demorec.generate.run_file import RunFile
     from demorec.recording.summary import RecordingSummary
 
@@ -132,6 +133,12 @@ def _run(path: Path) -> tuple[dict[str, Any], list[str]]:
     return plain, _run_lines(path, run)
 
 
+def _run_cameras(config: GenerateConfig) -> str:
+    if not config.cameras:
+        return "none"
+    return f"{', '.join(config.cameras)} at {config.width}x{config.height}, {config.video.codec}"
+
+
 def _run_lines(path: Path, run: RunFile) -> list[str]:
     config = run.config
     frames = sum(attempt.num_frames for attempt in run.attempts)
@@ -141,7 +148,7 @@ def _run_lines(path: Path, run: RunFile) -> list[str]:
         ("episodes", f"{len(run.successes)} of {run.num_episodes}, {len(run.failures)} failed attempts"),
         ("frames", f"{frames} ({frames / config.fps:.1f} s at {config.fps} Hz)"),
         ("size", _size(sum(attempt.num_bytes for attempt in run.attempts))),
-        ("cameras", f"{', '.join(config.cameras) or 'none'} at {config.width}x{config.height}, {config.video.codec}"),
+        ("cameras", _run_cameras(config)),
         ("digest", run.digest),
     ]
     if run.beyond:

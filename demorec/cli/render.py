@@ -102,7 +102,7 @@ class Render:
                 differing += len(report.differing)
                 for camera, frame in report.differing.items():
                     say(f"{report.source.name}: camera {camera} differs from the recording at frame {frame}")
-        say(f"{len(jobs)} recordings, {pictures} pictures: {self.out}")
+        say(f"{len(jobs)} {'recording' if len(jobs) == 1 else 'recordings'}, {pictures} pictures: {self.out}")
         if compared:
             say(f"{compared - differing} of {compared} unchanged cameras give the recorded pictures to the bit.")
         return 1 if differing else 0

@@ -56,6 +56,11 @@ class Reproduce:
             tell(f"Note: {difference}.")
         total = len(found.same) + len(found.different)
         say(f"{len(found.same)} of {total} episodes are the same to the bit: {self.source} and {found.result.folder}")
+        before = total - len(found.result.made)
+        if before > 0:
+            tell(
+                f"Note: {before} of them were in {self.out} before and were not made now: a new --out proves them, too."
+            )
         if found.different:
             shown = ", ".join(f"{episode} (attempt {attempt})" for episode, attempt in found.different[:10])
             tell(f"Different: {shown}{', ...' if len(found.different) > 10 else ''}")

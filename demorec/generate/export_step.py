@@ -57,9 +57,12 @@ def export_run(
         if os.path.lexists(target):
             if not target.exists():
                 raise ExportError(f"The dataset is a link to something that is not there, mend or remove it: {target}")
-            if present is None:
-                raise ExportError(f"A dataset that this run did not make is in the way: move it elsewhere: {target}")
-            if not _is_as_made(target, present, run):
+            if present is None:  # run.json was lost, or the dataset is somebody's
+                if not is_dataset_of_run(target, run.config_digest):
+                    raise ExportError(
+                        f"A dataset that this run did not make is in the way: move it elsewhere: {target}"
+                    )
+            elif not _is_as_made(target, present, run):
                 aside = _set_aside(target, folder)
                 says(f"{DATASET}/ is not as the run made it (damaged, or changed since); it was moved to {aside}.")
             elif (present.run_digest, present.repo_id) == (run.digest, repo_id) and present.dataset_digest:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 from demorec.config import GenerateConfig, deciding_versions
 from demorec.errors import ConfigError, DemorecError, GenerationError, resource_error
+from demorec.files import make_folder
 from demorec.generate.contents import PARTS, RUN
 from demorec.generate.executor import peak_memory
 from demorec.generate.lock import LOCK_NAME, run_lock
@@ -156,7 +157,7 @@ def open_run(
     with _told_as_unusable(path):
         if not has_unsettled_parts(path):
             _check_request(path, asked, options, inspect=inspect)
-    _make_folder(path)
+    make_folder(path)
     with run_lock(path):  # from here on nobody else changes it, so what was found is looked at once more
         settle_parts(path, PARTS)
         replaces = _check_request(path, asked, options, inspect=inspect)
@@ -276,15 +277,6 @@ def _told_as_unusable(path: Path) -> Iterator[None]:
     except OSError as error:
         unusable = ConfigError(f"The output folder cannot be used ({error.strerror}): choose another --out: {path}")
         raise resource_error(error) or unusable from error
-
-
-def _make_folder(path: Path) -> None:
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(
-            f"The output folder cannot be made ({error.strerror}): choose another --out: {path}"
-        ) from error
 
 
 def _refuse_strangers(path: Path) -> None:

@@ -6,13 +6,15 @@ compared episode by episode, since all that is left of its recordings is in it.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from demorec.config import GenerateConfig, parse_config
-from demorec.errors import ConfigError
+from demorec.errors import ConfigError, DemorecError, resource_error
+from demorec.generate.contents import is_dataset_of_run
 from demorec.generate.options import RunOptions
 from demorec.generate.run import Progress, RunResult, generate
 from demorec.generate.run_file import DATASET, RUN_NAME, load_run_file
@@ -21,6 +23,7 @@ from demorec.lerobot.files import read_json, read_table
 from demorec.lerobot.paths import SIDECAR_DIR
 from demorec.lerobot.sidecar import CONFIGS_PATH, EXPORT_PATH
 from demorec.own_versions import version_differences
+from demorec.replacing import use_as_source
 from demorec.validity import read_episode_info
 
 Key = tuple[int, int]
@@ -75,9 +78,14 @@ def reproduce(
         allowed: The user's own modules that may be imported for what the source names.
 
     Raises:
-        ConfigError: The source is no run and no dataset, or was made from several runs.
+        ConfigError: The source is no run and no dataset, or was made from several runs; or `options.out` is, holds or
+            lies in the source, or holds another dataset.
         NotAllowedError: It names something of a module that is not allowed.
     """
+    assert options.out is not None
+    overlap = use_as_source(options.out.resolve(), [source])
+    if overlap:
+        raise ConfigError(f"The copy needs a place of its own, but {overlap}: choose another --out: {options.out}")
     original = read_original(source)
     original.config.check_names(allowed)
     result = generate(original.config, replace(options, num_episodes=original.num_episodes), progress=progress)
@@ -87,7 +95,12 @@ def reproduce(
         made = {(a.episode_index, a.attempt): a.digest for a in result.run.attempts}
     else:
         target = result.folder / DATASET
-        export_lerobot([result.folder], target, replace(original.export, overwrite=target.exists()))
+        there = os.path.lexists(target)
+        if there and not _is_such_a_copy(target, original, result.run.config_digest):
+            raise ConfigError(
+                f"Something else is where the copy of the dataset would be, choose another --out: {target}"
+            )
+        export_lerobot([result.folder], target, replace(original.export, overwrite=there))
         made = _dataset_digests(target)
     same = tuple(key for key, value in original.digests.items() if made.get(key) == value)
     return Comparison(
@@ -96,6 +109,16 @@ def reproduce(
         different=tuple(key for key in original.digests if key not in same),
         versions=version_differences(original.versions, result.run.versions) if original.versions else (),
     )
+
+
+def _is_such_a_copy(target: Path, original: Original, config_digest: str) -> bool:
+    """Whether a dataset holds episodes of this run alone, none beyond those that are exported anew."""
+    try:
+        return is_dataset_of_run(target, config_digest) and _dataset_digests(target).keys() <= original.digests.keys()
+    except (DemorecError, OSError, ValueError, KeyError, TypeError) as error:
+        if (lack := resource_error(error)) is not None:
+            raise lack from error
+        return False
 
 
 def read_original(source: Path) -> Original:

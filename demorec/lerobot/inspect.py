@@ -119,10 +119,10 @@ def episode_digests(path: Path, info: DatasetInfo) -> list[str]:
                 for sample in packets.read(place):
                     pictures.update(sample)
                 videos[key] = pictures.hexdigest()
-            task_index = int(columns["task_index"][0, 0]) if len(columns["task_index"]) else -1
-            if not 0 <= task_index < len(tasks):
+            task_index = columns["task_index"][0, 0] if len(columns["task_index"]) else -1
+            if not 0 <= task_index < len(tasks):  # which NaN, what a null was read as, is neither
                 raise ExportError(f"Episode {place.episode_index} has no task: {path}")
-            task = tasks[task_index]
+            task = tasks[int(task_index)]
             result.append(episode_digest(task, columns, videos))
     finally:
         for packets in cameras.values():

@@ -14,7 +14,7 @@ from rerun.experimental import LeRobotReader
 
 from demorec.assets import asset_path
 from demorec.episode import Check, EpisodeInfo, Outcome, frame_time_ns
-from demorec.errors import RecordingError
+from demorec.errors import RecordingError, resource_error
 from demorec.features import ENVIRONMENT_STATE, IMAGE_PREFIX
 from demorec.geometry import Array, Pose
 from demorec.kinematics import ArmKinematics
@@ -45,13 +45,18 @@ def open_dataset_episode(root: Path, episode_index: int) -> Iterator[Episode]:
     Raises:
         RecordingError: It cannot be read.
     """
-    row = _episode_row(root, episode_index)
     try:
-        described = DatasetInfo.load(root)
-        export = dict(read_json(root / SIDECAR_DIR / "export.json"))
-        info = read_episode_info(row["episode_info"])
-    except (OSError, ValueError, TypeError) as error:
-        raise RecordingError(f"The dataset cannot be read ({error}): {root}") from error
+        episode = _read_episode(root, episode_index)
+    except (OSError, ValueError, TypeError, KeyError, IndexError) as error:  # nulls and odd values in its tables
+        raise resource_error(error) or RecordingError(f"The dataset cannot be read ({error}): {root}") from error
+    yield episode
+
+
+def _read_episode(root: Path, episode_index: int) -> Episode:
+    row = _episode_row(root, episode_index)
+    described = DatasetInfo.load(root)
+    export = dict(read_json(root / SIDECAR_DIR / "export.json"))
+    info = read_episode_info(row["episode_info"])
     missing = {"observation.state", "action"} - described.features.keys()
     if missing:
         raise RecordingError(f"The dataset has no {' and no '.join(sorted(missing))}, so it cannot be shown: {root}")
@@ -66,7 +71,8 @@ def open_dataset_episode(root: Path, episode_index: int) -> Iterator[Episode]:
     state = data["observation.state"]
     base_from_tcp = data["observation.ee_pose"] if "observation.ee_pose" in data else _tcp_poses(info, state)
     fingers = np.repeat(state[:, num_arm:] / num_fingers, num_fingers, axis=1)
-    yield Episode(
+    ends = {item["name"]: _pose_row(item["world_from_object_end"]) for item in row["objects"]}
+    return Episode(
         name=f"episode_{episode_index:06d}",
         group=root.resolve().name,
         identity=f"dataset-{root.resolve().name}-{episode_index}",
@@ -77,8 +83,8 @@ def open_dataset_episode(root: Path, episode_index: int) -> Iterator[Episode]:
         time_ns=time_ns,
         joint_position=np.concatenate([state[:, :num_arm], fingers], axis=1),
         base_from_tcp=base_from_tcp,
-        object_poses=_object_poses(info, row, data, described, base_from_tcp),
-        end_poses={item["name"]: np.array(item["world_from_object_end"]) for item in row["objects"]},
+        object_poses=_object_poses(info, ends, data, described, base_from_tcp),
+        end_poses=ends,
         world_from_camera=_camera_poses(root, episode_index),
         phase=_phases(row, num_frames),
         curves=_curves(info, data, base_from_tcp, time_ns, with_targets=export.get("action") == "joint"),
@@ -129,11 +135,10 @@ def _tcp_poses(info: EpisodeInfo, state: Array) -> Array:
 
 
 def _object_poses(
-    info: EpisodeInfo, row: dict[str, Any], data: dict[str, Array], described: DatasetInfo, base_from_tcp: Array
+    info: EpisodeInfo, ends: dict[str, Array], data: dict[str, Array], described: DatasetInfo, base_from_tcp: Array
 ) -> dict[str, Array]:
     """Name -> (T, 7): recorded where the dataset has `observation.environment_state`, else as the hand carries them."""
     if ENVIRONMENT_STATE not in data:
-        ends = {item["name"]: np.array(item["world_from_object_end"]) for item in row["objects"]}
         opening, target = data["observation.state"][:, -1], data["action"][:, -1]
         return held_object_poses(info.scene, ends, base_from_tcp, opening, target, int(described.fps))
     first = {name: column for column, name in enumerate(described.features[ENVIRONMENT_STATE].names or ())}
@@ -144,6 +149,14 @@ def _object_poses(
         rows = values[:, column : column + 7]
         result[body.name] = np.array([(base @ Pose(position=p[:3], quat_xyzw=p[3:])).vector() for p in rows])
     return result
+
+
+def _pose_row(values: Any) -> Array:
+    """(7,) position and quaternion of a table; ValueError for others."""
+    pose = np.array(values, dtype=np.float64)
+    if pose.shape != (7,) or not np.isfinite(pose).all():
+        raise ValueError(f"{str(values)[:40]} is no pose")
+    return pose
 
 
 def _outcome(row: dict[str, Any], num_frames: int) -> Outcome:

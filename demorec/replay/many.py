@@ -10,6 +10,7 @@ from pathlib import Path
 from demorec.assets import allow_models
 from demorec.config import VideoConfig
 from demorec.errors import ConfigError
+from demorec.files import make_folder
 from demorec.plain import from_plain
 from demorec.recording import EpisodeWriter
 from demorec.replay.demonstration import Demonstration, ReplayOptions
@@ -75,7 +76,7 @@ def record_replay(
         raise ConfigError(f"The replay would replace the recording itself, choose another --out: {out}")
     config = d.info.config
     view = recorded_view(d.info, options.allowed)
-    out.mkdir(parents=True, exist_ok=True)
+    make_folder(out)
     info = replace(d.info, fps=d.fps, origin=f"replay of {d.digest[:16]}")
     video = from_plain(config.get("video", {}), VideoConfig)
     with ExitStack() as stack:

@@ -58,6 +58,13 @@ class Arm:
         info = [client.getJointInfo(self.body, i) for i in range(client.getNumJoints(self.body))]
         self.links = {spec.base_link: -1} | {row[12].decode(): row[0] for row in info}
         by_name = {row[1].decode(): row[0] for row in info}
+        wanted = {*spec.arm_joints, *spec.gripper_joints} - by_name.keys()
+        wanted |= {spec.tcp_link, *spec.finger_links} - self.links.keys()
+        if wanted:
+            raise SceneError(
+                f"The robot {spec.name!r} has joints or links that its URDF {spec.urdf!r} lacks: "
+                f"{', '.join(sorted(wanted))}."
+            )
         self._arm = [by_name[name] for name in spec.arm_joints]
         self._fingers = [by_name[name] for name in spec.gripper_joints]
         self._tcp = self.links[spec.tcp_link]
