@@ -97,6 +97,8 @@ def dataset_videos(dataset: Dataset) -> Measurement | None:
 def dataset_statistics(dataset: Dataset) -> Measurement | None:
     """meta/stats.json, by which training normalises, is that of the data."""
     stats, found = _stats(dataset), []
+    if not dataset.rows:
+        return None
     for name, feature in dataset.info.features.items():
         if feature.is_video or feature.dtype == "string":
             continue

@@ -35,7 +35,7 @@ def data_statistics(files: Iterable[Path], features: Mapping[str, Feature]) -> d
         features: All features; cameras and strings are left out.
 
     Raises:
-        ExportError: A column holds integers below 0 or above 2^32 - 1, or no rows at all.
+        ExportError: A column holds integers below 0 or above 2^32 - 1, what is no number, or no rows at all.
     """
     paths = list(files)
     names = [name for name, feature in features.items() if not feature.is_video and feature.dtype != "string"]
@@ -44,6 +44,8 @@ def data_statistics(files: Iterable[Path], features: Mapping[str, Feature]) -> d
     selection: _Selection | None = None
     for level in range(len(_LEVELS)):
         for arrays in _batches(paths, names):
+            if any(array.dtype.kind not in "fiub" for array in arrays):  # nulls, or lists of several lengths
+                raise ExportError("A column of the dataset holds values that are no numbers, so it has no statistics.")
             if level == 0:
                 moments.add(np.concatenate(arrays, axis=1, dtype=np.float64))
             keys = np.concatenate([_ordered_keys(array) for array in arrays], axis=1)

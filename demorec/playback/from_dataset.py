@@ -174,6 +174,8 @@ def _outcome(row: dict[str, Any], num_frames: int) -> Outcome:
 def _phases(row: dict[str, Any], num_frames: int) -> tuple[str, ...]:
     names = [""] * num_frames
     for phase in row["phases"]:
+        if not 0 <= phase["from"] <= phase["to"] <= num_frames:
+            raise ValueError(f"a phase from frame {phase['from']} to {phase['to']} of {num_frames}")
         names[phase["from"] : phase["to"]] = [phase["name"]] * (phase["to"] - phase["from"])
     return tuple(names)
 
