@@ -7,6 +7,7 @@ import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,6 +20,10 @@ from demorec.cli import main
 from demorec.config import GenerateConfig
 from demorec.errors import ConfigError, DemorecError
 from demorec.evaluate.rollouts import EVALUATION_NAME, Settings, _open
+from demorec.generate import reproduce as reproducing
+from demorec.generate.options import RunOptions
+from demorec.generate.run import NoProgress
+from demorec.lerobot import ExportOptions
 from demorec.replacing import PICTURE, RECORDING, RERUN_FILE, check_replaceable, settle_parts, written_whole
 
 
@@ -440,3 +445,37 @@ def test_two_processes_do_not_write_one_file(tmp_path: Path) -> None:
         with pytest.raises(ConfigError, match="Another process"), written_whole(target, PICTURE):
             pass
     assert target.read_bytes().endswith(b"1")
+
+
+@pytest.mark.parametrize("out", ["runs/run", "runs/run/copy", "runs"])
+def test_reproduce_needs_a_place_beside_its_source(place: Path, out: str, capsys: pytest.CaptureFixture[str]) -> None:
+    before = files_of(place / "runs")
+    assert demorec("reproduce", place / "runs" / "run", "--out", place / out) == 2
+    assert "needs a place of its own" in capsys.readouterr().err
+    assert files_of(place / "runs") == before
+
+
+def test_reproduce_leaves_another_dataset_alone(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    original = SimpleNamespace(
+        config=GenerateConfig(), num_episodes=1, versions={}, digests={(0, 0): "x"}, export=ExportOptions(verify=False)
+    )
+    copy = place / "copy"
+    shutil.copytree(place / "dataset", copy / "dataset")
+    before = files_of(copy)
+    result = SimpleNamespace(folder=copy, interrupted=False, run=SimpleNamespace(config_digest="another run's"))
+    monkeypatch.setattr(reproducing, "read_original", lambda source: original)
+    monkeypatch.setattr(reproducing, "generate", lambda *arguments, **options: result)
+    options = RunOptions(out=copy)
+    with pytest.raises(ConfigError, match="choose another --out"):
+        reproducing.reproduce(place / "dataset", options, progress=NoProgress())
+    assert files_of(copy) == before
+
+
+@pytest.mark.parametrize("command", ["render", "replay"])
+def test_a_file_where_the_folder_of_results_would_be_is_told(
+    place: Path, command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = files_of(place)
+    assert demorec(command, place / "alone.mcap", "--out", place / "thesis.tex") == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
+    assert files_of(place) == before

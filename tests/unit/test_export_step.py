@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -115,5 +116,26 @@ def test_a_dataset_of_somebody_else_is_left_alone(run: Path) -> None:
     (run / "run.json").write_text(json.dumps(plain))
     before = files_of(run / "dataset")
     with pytest.raises(ExportError, match="did not make"):
+        export_run(run, repo_id="me/cubes")
+    assert files_of(run / "dataset") == before
+
+
+def test_the_dataset_of_a_run_whose_run_file_was_lost_is_known_again(run: Path) -> None:
+    lost = replace(load_run_file(run), export=None)
+    (run / "dataset" / "demorec" / "configs.json").write_text(json.dumps({lost.config_digest: {}}))
+    before = files_of(run / "dataset")
+    save_run_file(lost, run)
+    record, report = export_run(run, repo_id="me/cubes")
+    assert report is not None
+    assert record.dataset_digest == report.digest
+    assert files_of(run / "dataset").keys() == before.keys()
+
+
+def test_a_dataset_of_other_episodes_is_left_alone_when_the_run_file_was_lost(run: Path) -> None:
+    configs = run / "dataset" / "demorec" / "configs.json"
+    configs.write_text(json.dumps({**json.loads(configs.read_text()), "0" * 16: {}}))
+    before = files_of(run / "dataset")
+    save_run_file(replace(load_run_file(run), export=None), run)
+    with pytest.raises(ExportError, match="in the way"):
         export_run(run, repo_id="me/cubes")
     assert files_of(run / "dataset") == before
