@@ -25,7 +25,7 @@ def record(opcode: int, content: bytes) -> bytes:
 
 def string(text: str) -> bytes:
     """A string with its length."""
-    data = text.encode()
+    data = text.encode(errors="surrogatepass")
     return struct.pack("<I", len(data)) + data
 
 

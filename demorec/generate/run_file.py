@@ -31,6 +31,10 @@ MAX_RUN_FILE_BYTES = 2 << 30
 """Above this run.json is not read: some million episodes, which take ten times as much memory."""
 
 
+_MAX_REASON = 1000
+"""Characters of a reason: it may name many keys, and quotes what the file holds."""
+
+
 class DamagedRunFileError(ConfigError):
     """run.json is there but cannot be read; the recordings tell what it held."""
 
@@ -202,7 +206,9 @@ def load_run_file(folder: Path) -> RunFile:
         if not isinstance(plain, dict):
             raise ValueError("no JSON object")
         if plain.get("format", 0) > RUN_FORMAT:
-            raise ConfigError(f"run.json has format {plain['format']}, this demorec knows up to {RUN_FORMAT}: {path}")
+            raise ConfigError(
+                f"run.json has format {str(plain['format'])[:40]}, this demorec knows up to {RUN_FORMAT}: {path}"
+            )
         attempts = [_attempt_line(line) for line in plain.pop("episodes") if line["state"] != "planned"]
         for derived in ("format", "config_digest", "digest", "complete"):
             plain.pop(derived)
@@ -215,7 +221,7 @@ def load_run_file(folder: Path) -> RunFile:
         damaged = DamagedRunFileError(f"run.json is damaged ({error.strerror}): {path}")
         raise resource_error(error, path) or damaged from error
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise DamagedRunFileError(f"run.json is damaged ({error}): {path}") from error
+        raise DamagedRunFileError(f"run.json is damaged ({str(error)[:_MAX_REASON]}): {path}") from error
 
 
 def recording_name(episode_index: int, attempt: int, *, success: bool) -> str:
