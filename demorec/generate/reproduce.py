@@ -83,10 +83,10 @@ def reproduce(
         NotAllowedError: It names something of a module that is not allowed.
     """
     assert options.out is not None
+    original = read_original(source)
     overlap = use_as_source(options.out.resolve(), [source])
     if overlap:
         raise ConfigError(f"The copy needs a place of its own, but {overlap}: choose another --out: {options.out}")
-    original = read_original(source)
     original.config.check_names(allowed)
     result = generate(original.config, replace(options, num_episodes=original.num_episodes), progress=progress)
     if result.interrupted:

@@ -448,7 +448,11 @@ def test_two_processes_do_not_write_one_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("out", ["runs/run", "runs/run/copy", "runs"])
-def test_reproduce_needs_a_place_beside_its_source(place: Path, out: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_reproduce_needs_a_place_beside_its_source(
+    place: Path, out: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    original = SimpleNamespace(config=GenerateConfig(), num_episodes=1, versions={}, digests={(0, 0): "x"}, export=None)
+    monkeypatch.setattr(reproducing, "read_original", lambda source: original)
     before = files_of(place / "runs")
     assert demorec("reproduce", place / "runs" / "run", "--out", place / out) == 2
     assert "needs a place of its own" in capsys.readouterr().err
