@@ -29,9 +29,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.episode import EpisodeInfo, Frame, Outcome
 from demorec.lerobot import ExportOptions, export_lerobot
 from demorec.recording import EpisodeWriter
+from demorec.scene.episode import EpisodeInfo, Frame, Outcome
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 
@@ -86,7 +86,7 @@ def scene_pictures(frames: int, width: int, height: int, seed: int) -> list[NDAr
 
 def made_up(pictures: Pictures, episode: int) -> tuple[EpisodeInfo, list[Frame], Outcome]:
     """An episode of made-up numbers and the given pictures."""
-    from helpers_recording import make_episode  # type: ignore[import-not-found]
+    from support.recording import make_episode  # type: ignore[import-not-found]
 
     length = len(next(iter(pictures.values())))
     info, frames, outcome = make_episode(
@@ -184,7 +184,7 @@ def compare(args: argparse.Namespace, work: Path) -> dict[str, Any]:
 
 def growth(args: argparse.Namespace, work: Path) -> list[dict[str, float]]:
     """Cost an episode and peak memory of exports of more and more episodes, each in a process of its own."""
-    from helpers_recording import write_episode
+    from support.recording import write_episode
 
     run = work / "growth" / "episodes"
     run.mkdir(parents=True)

@@ -32,7 +32,7 @@ from typing import Any
 import psutil
 
 from demorec.config import EpisodePlan
-from demorec.generate.run_file import Attempt
+from demorec.runs.run_file import Attempt
 
 OURS = ("demorec 1 worker", "demorec 2 workers", "demorec ray 2")
 TODAY = ("today default", "today streaming", "today default x2", "today streaming x2")
@@ -330,7 +330,7 @@ def driver(args: argparse.Namespace) -> dict[str, Any]:
     from demorec.config import GenerateConfig
     from demorec.generate.options import RunOptions
     from demorec.generate.run import generate
-    from demorec.generate.run_file import load_run_file, save_run_file
+    from demorec.runs.run_file import load_run_file, save_run_file
 
     config = GenerateConfig(cameras=())
     rows: dict[str, Any] = {}

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 import rerun as rr
 
-from demorec.playback.episode import Episode
+from demorec.playback.episode import PlayedEpisode
 from demorec.playback.layout import episode_layout
 from demorec.playback.motion import log_curves, log_ee_path, log_events, log_phases
 from demorec.playback.paths import Paths
@@ -32,7 +32,7 @@ from demorec.playback.scene import new_recording
 from demorec.playback.sources import find_episodes
 
 
-def as_columns(episode: Episode, target: Path) -> None:
+def as_columns(episode: PlayedEpisode, target: Path) -> None:
     """The numbers as demorec sends them."""
     stream = new_recording(episode)
     stream.save(target)
@@ -45,7 +45,7 @@ def as_columns(episode: Episode, target: Path) -> None:
     stream.disconnect()
 
 
-def row_by_row(episode: Episode, target: Path) -> None:
+def row_by_row(episode: PlayedEpisode, target: Path) -> None:
     """The same numbers, each at its time."""
     stream = new_recording(episode)
     stream.save(target)

@@ -19,11 +19,11 @@ from pathlib import Path
 import numpy as np
 
 from demorec.config import EpisodePlan, GenerateConfig, VideoConfig
-from demorec.episode import CameraImages, EpisodeInfo, Frame, Outcome
 from demorec.geometry import Array
 from demorec.loop import ScriptAgent, Session, make_renderer, make_world, prepare
 from demorec.recording import EpisodeWriter, video
 from demorec.render import Renderer, RenderSetup
+from demorec.scene.episode import CameraImages, EpisodeInfo, Frame, Outcome
 
 WAYS = [VideoConfig(codec=codec, gop=gop) for codec in ("h264", "av1") for gop in (2, 10, 30)]
 

@@ -27,7 +27,7 @@ from demorec.geometry import Array, Pose
 from demorec.loop import Episode, ScriptAgent, Session, make_world, prepare
 from demorec.render import Renderer
 from demorec.render.painter import Painter
-from demorec.scene import Camera
+from demorec.scene.scene import Camera
 from demorec.sim.world import World
 from demorec.tables import RENDERERS
 

@@ -19,7 +19,7 @@ from demorec.config import EpisodePlan, GenerateConfig
 from demorec.loop import ScriptAgent, Session, make_renderer, make_world, prepare
 from demorec.recording import EpisodeWriter, Recording
 from demorec.replay import ReplayOptions, open_file, replay_all
-from demorec.rerender import RerenderOptions, rerender
+from demorec.replay.rerender import RerenderOptions, rerender
 
 
 def generate(path: Path, config: GenerateConfig, index: int) -> None:

@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any
 
 from demorec.config import EpisodePlan, GenerateConfig
-from demorec.episode import Outcome
 from demorec.errors import SceneError
 from demorec.loop import ScriptAgent, Session, make_world, prepare
+from demorec.scene.episode import Outcome
 from demorec.tables import ROBOTS, TASKS
 
 

@@ -16,8 +16,8 @@ from typing import Any, Literal
 
 from demorec.errors import ConfigError
 from demorec.plain import from_plain
-from demorec.user_modules import modules_of
-from demorec.variation import PRESET_NAMES, Preset, Ranges
+from demorec.safety.user_modules import modules_of
+from demorec.scene.variation import PRESET_NAMES, Preset, Ranges
 
 MAX_PIXELS = 16_000_000
 MAX_PHYSICS_HZ = 10_000
@@ -184,7 +184,7 @@ def deciding_versions(config: GenerateConfig | None = None) -> dict[str, str]:
     """package -> version, of everything that decides the bits of an episode (numba draws, av codes the pictures).
 
     With a config, which is taken for the user's own words, also of the modules of the user's own that it names
-    (`demorec.own_versions`).
+    (`demorec.safety.own_versions`).
 
     Raises:
         ConfigError: One of these cannot be found.
@@ -192,7 +192,7 @@ def deciding_versions(config: GenerateConfig | None = None) -> dict[str, str]:
     """
     versions = dict(_deciding_versions())
     if config is not None and config.modules:
-        from demorec.own_versions import own_versions
+        from demorec.safety.own_versions import own_versions
 
         versions |= own_versions(config.modules, robot=config.robot)
     return versions

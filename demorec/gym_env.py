@@ -20,20 +20,20 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from demorec import features
 from demorec.config import EpisodePlan, GenerateConfig
-from demorec.episode import CameraImages, Check, EpisodeInfo, Frame, Observation
 from demorec.errors import ConfigError, SceneError
-from demorec.features import ActionKind, ObservationRows
 from demorec.geometry import Array
 from demorec.loop import Decision, Episode, Session, make_world, prepare
 from demorec.loop.actions import ActionDecoder, action_bounds, check_action_kind
 from demorec.render import Renderer
 from demorec.render.painter import Painter
-from demorec.scene import Scene
+from demorec.scene import features
+from demorec.scene.episode import CameraImages, EpisodeInfo, Frame, Observation, SuccessCheck
+from demorec.scene.features import ActionKind, ObservationRows
+from demorec.scene.scene import Scene
+from demorec.scene.variation import Preset
 from demorec.sim.world import World
 from demorec.tables import CAMERAS, RENDERERS, TASKS, environment_name
-from demorec.variation import Preset
 
 SUCCESS_FRAMES = 5
 """For how many frames in a row every check of the task must hold."""
@@ -72,7 +72,7 @@ class Situation:
     observation: Observation
     images: Mapping[str, CameraImages]
     last_frame: Frame | None
-    checks: tuple[Check, ...]
+    checks: tuple[SuccessCheck, ...]
     is_success: bool
 
 
@@ -80,9 +80,9 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
     """One task: the robot acts until the task's strict conditions have held for 5 frames, or time is up.
 
     Observation (a dict): `agent_pos` (observation.state), `velocity`, `ee_pose`, with `privileged`
-    `environment_state`, with cameras `pixels` (camera name -> (H, W, 3) uint8): see `demorec.features`.
-    Action: float32 of one of the kinds of `demorec.features.action_vectors`; float64 is taken as it is. Targets are
-    held within the joint limits in position and velocity; a pose out of reach keeps the last target.
+    `environment_state`, with cameras `pixels` (camera name -> (H, W, 3) uint8): see `demorec.scene.features`.
+    Action: float32 of one of the kinds of `demorec.scene.features.action_vectors`; float64 is taken as it is. Targets
+    are held within the joint limits in position and velocity; a pose out of reach keeps the last target.
     Reward: 1 at the step that completes a success, else 0, as `next.reward` of the datasets.
     `info["is_success"]` is `next.success`; `info["episode_index"]` names the scene.
 

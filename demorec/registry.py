@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Any, cast
 
 from demorec.errors import ConfigError, NotAllowedError
-from demorec.user_modules import import_object, is_allowed, split_name
+from demorec.safety.user_modules import import_object, is_allowed, split_name
 
 
 def nearest_match(name: str, allowed: Iterable[str]) -> str:
@@ -28,7 +28,7 @@ class Registry[T]:
     """Names of one kind and where their objects are.
 
     A registry with a `subclass_of` or `instance_of` is open: it also takes "my_package.my_module:MyThing", if the
-    caller allows that module (`demorec.user_modules`) and the thing is of the right kind.
+    caller allows that module (`demorec.safety.user_modules`) and the thing is of the right kind.
 
     Attributes:
         kind: What a row is, in the singular, for messages ("task").

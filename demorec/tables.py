@@ -6,16 +6,16 @@ from collections.abc import Collection
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from demorec.assets import model_name
 from demorec.registry import Registry
-from demorec.user_modules import modules_of, split_name
+from demorec.safety.user_modules import modules_of, split_name
+from demorec.scene.assets import model_name
 
 if TYPE_CHECKING:
     from demorec.check.base import Check
-    from demorec.episode import RobotSpec
     from demorec.export.exporter import Exporter
     from demorec.render import Renderer
     from demorec.render.cameras import CameraPreset
+    from demorec.scene.robot import RobotSpec
     from demorec.tasks.base import Task
 
 TASKS: Registry[type[Task]] = Registry(
@@ -38,7 +38,7 @@ TASKS: Registry[type[Task]] = Registry(
 ROBOTS: Registry[RobotSpec] = Registry(
     kind="robot",
     rows={"panda": "demorec.sim.robots.panda:PANDA", "iiwa": "demorec.sim.robots.iiwa:IIWA"},
-    instance_of="demorec.episode:RobotSpec",
+    instance_of="demorec.scene.robot:RobotSpec",
 )
 
 CAMERAS: Registry[CameraPreset] = Registry(

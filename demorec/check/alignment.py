@@ -9,7 +9,7 @@ import numpy as np
 from demorec.check.base import Measurement, check
 from demorec.check.episode import RecordedEpisode
 from demorec.geometry import Array
-from demorec.scene import POSITION_GAIN
+from demorec.scene.scene import POSITION_GAIN
 
 MAX_LAG = 5
 

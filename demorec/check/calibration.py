@@ -14,7 +14,7 @@ from demorec.check.rows import displacement, matrices
 from demorec.errors import RecordingError
 from demorec.geometry import Array
 from demorec.recording import channels
-from demorec.scene import Camera
+from demorec.scene.scene import Camera
 
 MIN_AREA = 30.0
 """Pixels that a body must cover, at 160 pixels a side, to be located."""

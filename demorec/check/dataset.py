@@ -9,15 +9,15 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from demorec.episode import EpisodeInfo
 from demorec.errors import ExportError
-from demorec.features import ACTION, ActionKind, action_names
 from demorec.lerobot.files import read_table
 from demorec.lerobot.layout import DatasetInfo
 from demorec.lerobot.paths import SIDECAR_DIR
 from demorec.lerobot.reader import EpisodePlace, RowReader, episode_places, read_tasks
 from demorec.lerobot.sidecar import EPISODE_SCHEMA
-from demorec.validity import read_episode_info
+from demorec.scene.episode import EpisodeInfo
+from demorec.scene.features import ACTION, ActionKind, action_names
+from demorec.scene.validity import read_episode_info
 
 Rows = Mapping[str, NDArray[Any]]
 

@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 
-from demorec.assets import asset_path
 from demorec.check.alignment import servo_response
 from demorec.check.base import Measurement, check, worst
 from demorec.check.coverage import infos_by_task, largest_gap, twins
@@ -14,9 +13,10 @@ from demorec.check.dataset import Dataset
 from demorec.check.rows import displacement, link_matrices, matrices
 from demorec.check.run import motion_vector
 from demorec.errors import NotAllowedError
-from demorec.features import ACTION, EE_POSE, STATE, VELOCITY
 from demorec.geometry import Array
-from demorec.urdf import Urdf
+from demorec.scene.assets import asset_path
+from demorec.scene.features import ACTION, EE_POSE, STATE, VELOCITY
+from demorec.scene.urdf import Urdf
 
 
 @check(group="dataset", scope="dataset", measures="episodes that move like another", warn=0)

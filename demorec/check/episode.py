@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 
 from demorec.check.pictures_summary import PictureSummary, summarise
 from demorec.check.rows import inverse, link_matrices, matrices
-from demorec.episode import EpisodeColumns, EpisodeInfo, frame_time_ns
 from demorec.errors import RecordingError
 from demorec.geometry import Array
 from demorec.recording import Recording
 from demorec.recording.container import Container
-from demorec.scene import Camera
-from demorec.urdf import Urdf
+from demorec.scene.episode import EpisodeColumns, EpisodeInfo, frame_time_ns
+from demorec.scene.scene import Camera
+from demorec.scene.urdf import Urdf
 
 _STAMP_FIRST = {
     "sensor_msgs/msg/JointState",

@@ -6,9 +6,9 @@ from collections.abc import Iterator
 
 from demorec.check.base import Measurement, check
 from demorec.check.episode import RecordedEpisode
-from demorec.episode import FORMAT_VERSION
 from demorec.recording import channels, messages
 from demorec.recording.streams import frame_streams
+from demorec.scene.episode import FORMAT_VERSION
 
 
 @check(group="file", measures="recordings that cannot be opened (index, metadata, format version)", warn=0)

@@ -11,7 +11,7 @@ from demorec.check.base import Measurement, check, worst
 from demorec.check.episode import RecordedEpisode
 from demorec.check.rows import displacement, inverse, matrices
 from demorec.geometry import Array
-from demorec.scene import Body, Shape
+from demorec.scene.scene import Body, Shape
 
 COAST_SECONDS = 0.7
 """How long a thing may go on moving by itself after it was last touched."""

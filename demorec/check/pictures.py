@@ -9,7 +9,7 @@ from demorec.check.base import Measurement, check, worst
 from demorec.check.episode import RecordedEpisode
 from demorec.check.rows import longest_run
 from demorec.geometry import Array
-from demorec.scene import Camera
+from demorec.scene.scene import Camera
 
 STILL_CHANGE = 1.5
 """Change of a block of pixels, of 255, below which two pictures are the same to the eye. A still picture coded as

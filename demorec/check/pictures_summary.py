@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from demorec.check.rows import matrices
 from demorec.geometry import Array
-from demorec.scene import Body, Camera, Rgba, Scene
+from demorec.scene.scene import Body, Camera, Rgba, Scene
 
 if TYPE_CHECKING:
     from demorec.check.episode import RecordedEpisode

@@ -8,14 +8,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from demorec.assets import allow_models
 from demorec.check.base import Check, Group, Level, Result, Scope
 from demorec.check.dataset import Dataset
 from demorec.check.episode import RecordedEpisode
-from demorec.check.run import RUN_NAME, RunFolder
+from demorec.check.run import RUN_NAME, CheckedRun
 from demorec.errors import ConfigError, DemorecError, resource_error
 from demorec.lerobot.paths import is_dataset
 from demorec.processes import SPAWN
+from demorec.scene.assets import allow_models
 from demorec.tables import CHECKS
 
 _OF_THE_FILE: tuple[Group, ...] = ("file", "time")
@@ -123,7 +123,7 @@ def find_subjects(paths: Sequence[Path]) -> list[Subject]:
             found.append(Subject(path=path, kind="run"))
             found += [
                 Subject(path=file, kind="recording", is_failed_attempt=file.parent.name == "failed")
-                for file in RunFolder(path).recordings
+                for file in CheckedRun(path).recordings
             ]
             if is_dataset(path / "dataset"):
                 found.append(Subject(path=path / "dataset", kind="dataset"))
@@ -158,7 +158,7 @@ def check_subject(subject: Subject, options: CheckOptions) -> SubjectReport:
         with RecordedEpisode(subject.path) as episode:
             results = _run(checks, episode, ("opens", "readable"), lambda: episode.columns)
     elif subject.kind == "run":
-        results = _run(checks, RunFolder(subject.path), (), None)
+        results = _run(checks, CheckedRun(subject.path), (), None)
     else:
         dataset = Dataset(subject.path)
         results = _run(checks, dataset, ("dataset_readable",), lambda: dataset.rows)

@@ -1,6 +1,6 @@
 """Rigid transforms over all frames at once: forward kinematics, distances and angles of (T, ...) arrays.
 
-Written apart from `demorec.kinematics` on purpose: that code made the recorded poses, this one judges them.
+Written apart from `demorec.scene.kinematics` on purpose: that code made the recorded poses, this one judges them.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.geometry import Array
-from demorec.urdf import Urdf
+from demorec.scene.urdf import Urdf
 
 
 def matrices(poses: Array) -> Array:

@@ -12,12 +12,12 @@ import numpy as np
 
 from demorec.check.base import Measurement, check, worst
 from demorec.check.coverage import infos_by_task, largest_gap, start_vector, twins
-from demorec.episode import EpisodeInfo
 from demorec.errors import ConfigError, RecordingError, resource_error
-from demorec.files import open_regular, read_json_limited
 from demorec.lerobot.files import read_json
 from demorec.lerobot.paths import INFO_PATH
 from demorec.recording import Recording
+from demorec.safety.files import open_regular, read_json_limited
+from demorec.scene.episode import EpisodeInfo
 
 RUN_NAME = "run.json"
 _MAX_JSON_BYTES = 2 << 30
@@ -25,7 +25,7 @@ _LINE = {"episode_index": int, "attempt": int, "seed": int, "success": bool, "fi
 """What the line of an attempt says, as far as it is checked."""
 
 
-class RunFolder:
+class CheckedRun:
     """A run on disk, read from its own files.
 
     Args:
@@ -86,7 +86,7 @@ class RunFolder:
 
 
 @check(group="run", scope="run", measures="files missing, changed since they were made, or not in run.json", warn=0)
-def run_files(run: RunFolder) -> Measurement:
+def run_files(run: CheckedRun) -> Measurement:
     """The recordings are exactly those that run.json lists, with the same SHA-256."""
     wrong = []
     listed = {line["file"]: line for line in run.lines}
@@ -106,7 +106,7 @@ def run_files(run: RunFolder) -> Measurement:
 
 
 @check(group="run", scope="run", measures="recordings whose own account differs from run.json or the run", warn=0)
-def run_agrees(run: RunFolder) -> Measurement:
+def run_agrees(run: CheckedRun) -> Measurement:
     """Number, attempt, seed and config of each recording are those of its line and of the run."""
     wrong = []
     for line in run.lines:
@@ -124,7 +124,7 @@ def run_agrees(run: RunFolder) -> Measurement:
 
 
 @check(group="run", scope="run", measures="episodes that have the start or the motion of another", warn=0)
-def run_duplicates(run: RunFolder) -> Measurement | None:
+def run_duplicates(run: CheckedRun) -> Measurement | None:
     """Every episode is there once: no two start alike (within a tenth of a millimetre) or move alike."""
     files = [file for file in run.infos if file.startswith("episodes/")]
     if len(files) < 2:
@@ -156,7 +156,7 @@ def motion_vector(joint_position: np.ndarray[Any, np.dtype[Any]]) -> np.ndarray[
 @check(
     group="run", scope="run", measures="largest gap in the range of a randomised quantity, share", warn=0.35, fail=0.6
 )
-def run_coverage(run: RunFolder) -> Measurement | None:
+def run_coverage(run: CheckedRun) -> Measurement | None:
     """Start places, yaws, sizes and goals are spread over their ranges (judged from 50 episodes on)."""
     return worst_gap(run.successes)
 
@@ -167,7 +167,7 @@ def worst_gap(infos: Sequence[EpisodeInfo]) -> Measurement | None:
 
 
 @check(group="run", scope="run", measures="episodes that the run's dataset lacks or has too many", warn=0)
-def run_dataset(run: RunFolder) -> Measurement | None:
+def run_dataset(run: CheckedRun) -> Measurement | None:
     """The dataset that was made from the run has an episode for each success of those asked for last."""
     path = run.path / "dataset" / INFO_PATH
     if not path.is_file():

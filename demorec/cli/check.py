@@ -14,13 +14,13 @@ from demorec.cli.output import say, say_json
 from demorec.cli.paths import places_read
 from demorec.cli.progress import ProgressBar
 from demorec.errors import ConfigError
-from demorec.replacing import PICTURE, check_replaceable
+from demorec.safety.replacing import PICTURE, check_replaceable
 
 if TYPE_CHECKING:
     from demorec.check.base import Level, Result
     from demorec.check.report import SubjectReport
-    from demorec.episode import EpisodeInfo
     from demorec.replay import ReplayReport
+    from demorec.scene.episode import EpisodeInfo
 
 
 @dataclass(frozen=True, kw_only=True)

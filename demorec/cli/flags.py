@@ -33,7 +33,7 @@ from tyro.constructors import (
 )
 
 from demorec.cli.output import say, tell
-from demorec.text import printable
+from demorec.safety.text import printable
 
 FLAG_TYPES = tyro.constructors.ConstructorRegistry()
 

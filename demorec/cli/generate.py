@@ -17,7 +17,7 @@ from demorec.generate.options import RunOptions, default_out, default_repo_id
 
 if TYPE_CHECKING:
     from demorec.generate.run import RunResult
-    from demorec.generate.run_file import Attempt
+    from demorec.runs.run_file import Attempt
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,7 +16,7 @@ from demorec.cli.progress import duration
 from demorec.generate.estimate import Estimate
 from demorec.generate.options import RunOptions, available_cores
 from demorec.generate.run import RunResult
-from demorec.generate.run_file import DATASET, EPISODES, STARTING, UNFINISHED, Attempt, ExportRecord, RunFile
+from demorec.runs.run_file import DATASET, EPISODES, STARTING, UNFINISHED, Attempt, ExportRecord, RunFile
 
 _WORTH_PROCESSES = 50
 """Recordings from which on several processes check faster than one."""

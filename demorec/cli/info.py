@@ -12,13 +12,13 @@ from tyro.conf import Positional
 
 from demorec.cli.output import say, say_json
 from demorec.errors import ConfigError, ExportError, RecordingError
-from demorec.features import IMAGE_PREFIX
 from demorec.lerobot.paths import INFO_PATH, is_dataset
+from demorec.scene.features import IMAGE_PREFIX
 
 if TYPE_CHECKING:
     from demorec.config import GenerateConfig
-    from demorec.generate.run_file import RunFile
     from demorec.recording.summary import RecordingSummary
+    from demorec.runs.run_file import RunFile
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,8 +118,8 @@ def _outcome(summary: RecordingSummary) -> str:
 
 
 def _run(path: Path) -> tuple[dict[str, Any], list[str]]:
-    from demorec.generate.run_file import load_run_file
     from demorec.plain import to_plain
+    from demorec.runs.run_file import load_run_file
 
     run = load_run_file(path)
     plain = {

@@ -16,7 +16,7 @@ from typing import TextIO
 from tqdm import tqdm
 
 from demorec.errors import DemorecError
-from demorec.text import printable
+from demorec.safety.text import printable
 
 
 class OutputError(DemorecError):

@@ -12,7 +12,7 @@ from tqdm import tqdm
 from demorec.cli.output import tell
 
 if TYPE_CHECKING:
-    from demorec.generate.run_file import Attempt, RunFile
+    from demorec.runs.run_file import Attempt, RunFile
 
 _QUIET_S = 10.0
 """Shortest time between two lines, and before the first: what is over by then needs none."""

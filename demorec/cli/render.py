@@ -17,10 +17,10 @@ from demorec.cli.progress import ProgressBar
 from demorec.config import VideoConfig
 from demorec.errors import ConfigError
 from demorec.processes import SPAWN
-from demorec.user_modules import modules_of
+from demorec.safety.user_modules import modules_of
 
 if TYPE_CHECKING:
-    from demorec.rerender import RerenderOptions, RerenderReport
+    from demorec.replay.rerender import RerenderOptions, RerenderReport
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,7 +108,7 @@ class Render:
         return 1 if differing else 0
 
     def _options(self) -> RerenderOptions:
-        from demorec.rerender import RerenderOptions, read_cameras
+        from demorec.replay.rerender import RerenderOptions, read_cameras
         from demorec.tables import RENDERERS
 
         if self.renderer is not None:
@@ -160,7 +160,7 @@ def _jobs(paths: Sequence[Path], out: Path) -> list[tuple[Path, Path]]:
 def _rendered(
     jobs: Sequence[tuple[Path, Path]], options: RerenderOptions, overwrite: bool, workers: int
 ) -> Iterator[RerenderReport]:
-    from demorec.rerender import rerender
+    from demorec.replay.rerender import rerender
 
     if workers <= 1:
         for source, target in jobs:

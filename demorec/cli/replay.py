@@ -131,8 +131,8 @@ def demonstrations(
 
     Tells where modules of the user's own are not what they were when the episodes were recorded.
     """
-    from demorec.assets import allow_models
-    from demorec.own_versions import changed_sources
+    from demorec.safety.own_versions import changed_sources
+    from demorec.scene.assets import allow_models
 
     allow_models(options.allowed)
     noted: set[str] = set()

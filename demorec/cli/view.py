@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
-from demorec.assets import allow_models
 from demorec.cli.allow import Allow, allowed_modules
 from demorec.cli.output import say, tell
 from demorec.cli.paths import places_read
 from demorec.errors import ConfigError
-from demorec.replacing import PICTURE, RERUN_FILE, check_replaceable
+from demorec.safety.replacing import PICTURE, RERUN_FILE, check_replaceable
+from demorec.scene.assets import allow_models
 
 if TYPE_CHECKING:
-    from demorec.playback.sources import Source
+    from demorec.playback.sources import PlaybackSource
 
 _MOST = 50
 """How many episodes are shown unless --episodes asks for more."""
@@ -148,7 +148,7 @@ class View:
         self._check_targets(())
         return self._show(self.paths, ())
 
-    def _show(self, files: Sequence[Path], sources: Sequence[Source]) -> int:
+    def _show(self, files: Sequence[Path], sources: Sequence[PlaybackSource]) -> int:
         if self.screenshot is not None:
             from demorec.playback.viewer import screenshot
 
@@ -167,7 +167,7 @@ class View:
         show(files)
         return 0
 
-    def _second(self, sources: Sequence[Source]) -> float | None:
+    def _second(self, sources: Sequence[PlaybackSource]) -> float | None:
         """When the screenshot is taken; None leaves it to the viewer, which knows how long an .rrd file is."""
         from demorec.playback.viewer import moment
 

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.errors import ConfigError, MissingDependencyError, NotAllowedError
-from demorec.features import ActionKind
 from demorec.lerobot.paths import INFO_PATH
-from demorec.user_modules import is_allowed
+from demorec.safety.user_modules import is_allowed
+from demorec.scene.features import ActionKind
 
 CONFIG_NAME, TRAIN_CONFIG_NAME = "config.json", "train_config.json"
 

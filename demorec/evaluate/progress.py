@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 
-from demorec.episode import Check
 from demorec.gym_env import Situation
-from demorec.scene import Goal, Scene
+from demorec.scene.episode import SuccessCheck
+from demorec.scene.scene import Goal, Scene
 from demorec.sim.world import World
 from demorec.tasks.checks import goal_pose
 
@@ -19,7 +19,7 @@ LIFTED = 0.03
 NEAR_GOAL = 0.05
 
 
-class Progress:
+class EvaluationObserver:
     """Watches the rollout of one episode; with several goals, the least advanced object counts."""
 
     def __init__(self, scene: Scene) -> None:
@@ -48,7 +48,7 @@ class Progress:
         return PHASES[min(self._stage, default=0)], _first_failed(situation.checks)
 
 
-def _first_failed(checks: tuple[Check, ...]) -> str:
+def _first_failed(checks: tuple[SuccessCheck, ...]) -> str:
     return next((check.name for check in checks if not check.passed), "time_limit")
 
 

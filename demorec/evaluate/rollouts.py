@@ -19,22 +19,22 @@ from pathlib import Path
 from typing import Any
 
 from demorec.config import EpisodePlan, GenerateConfig
-from demorec.episode import Outcome
 from demorec.errors import ConfigError, DemorecError
 from demorec.evaluate.policy import Policy, check_steps, find_checkpoint, policy_summary, trained_action
-from demorec.evaluate.progress import Progress, factors_of
+from demorec.evaluate.progress import EvaluationObserver, factors_of
 from demorec.evaluate.statistics import Rate
-from demorec.features import ENVIRONMENT_STATE, IMAGE_PREFIX, ActionKind
 from demorec.generate.contents import foreign_recordings
 from demorec.generate.executor import Lost, Raised
 from demorec.generate.local import LocalExecutor
 from demorec.generate.plan import plain_differences
-from demorec.generate.run_file import EPISODES, FAILED, Attempt
 from demorec.gym_env import DemorecEnv
 from demorec.loop import prepare
 from demorec.plain import from_plain, to_plain
 from demorec.recording import EpisodeWriter
-from demorec.replacing import Kind, check_replaceable, json_object, replaced_parts, settle_parts
+from demorec.runs.run_file import EPISODES, FAILED, Attempt
+from demorec.safety.replacing import Kind, check_replaceable, json_object, replaced_parts, settle_parts
+from demorec.scene.episode import Outcome
+from demorec.scene.features import ENVIRONMENT_STATE, IMAGE_PREFIX, ActionKind
 from demorec.tables import camera_name
 
 EVALUATION_NAME = "evaluation.json"
@@ -201,7 +201,7 @@ def make_rollout(plan: EpisodePlan, folder: Path) -> Attempt:
     observation, _ = env.reset(seed=plan.episode_index)
     policy.reset(plan.episode_index)
     info = replace(env.info, origin=f"rollout of {settings.policy_type} {settings.policy_digest}")
-    progress = Progress(info.scene)
+    progress = EvaluationObserver(info.scene)
     name = f"episode_{plan.episode_index:06d}.mcap"
     path = folder / name
     with EpisodeWriter(path, info, video=plan.config.video, overwrite=True) as recording:

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.episode import EpisodeColumns
 from demorec.errors import ConfigError, ExportError
 from demorec.export.options import CommonOptions
-from demorec.features import ACTION, ENVIRONMENT_STATE, ObservationRows, action_vectors, observation_vectors
 from demorec.recording import Recording
 from demorec.registry import nearest_match
+from demorec.scene.episode import EpisodeColumns
+from demorec.scene.features import ACTION, ENVIRONMENT_STATE, ObservationRows, action_vectors, observation_vectors
 
 REWARD, DONE, SUCCESS = "next.reward", "next.done", "next.success"
 

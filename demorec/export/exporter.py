@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from demorec.export.options import CommonOptions, ExportReport, Progress
+    from demorec.export.options import CommonOptions, ExportReport, ProgressCallback
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,4 +27,4 @@ class Exporter[O: CommonOptions]:
 
     summary: str
     options: type[O]
-    export: Callable[[Sequence[Path], Path, O, Progress | None], ExportReport]
+    export: Callable[[Sequence[Path], Path, O, ProgressCallback | None], ExportReport]

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from demorec.errors import ConfigError
-from demorec.features import ACTION, STATE, ActionKind
+from demorec.scene.features import ACTION, STATE, ActionKind
 
-Progress = Callable[[int, int], None]
+ProgressCallback = Callable[[int, int], None]
 """Called after every recording with (how many are done, how many there are)."""
 
 

@@ -8,13 +8,13 @@ from pathlib import Path
 
 from demorec.errors import ConfigError, ExportError
 from demorec.export.options import CommonOptions, parse_episodes
-from demorec.features import ENVIRONMENT_STATE, IMAGE_PREFIX, observation_names
 from demorec.plain import digest
 from demorec.recording import Recording
+from demorec.scene.features import ENVIRONMENT_STATE, IMAGE_PREFIX, observation_names
 
 
 @dataclass(frozen=True, kw_only=True)
-class Source:
+class ExportSource:
     """One recording.
 
     Attributes:
@@ -26,23 +26,23 @@ class Source:
     is_chosen: bool = True
 
 
-def find_recordings(paths: Sequence[Path], *, include_failures: bool) -> list[Source]:
+def find_recordings(paths: Sequence[Path], *, include_failures: bool) -> list[ExportSource]:
     """The recordings in the given files, runs (folders with episodes/) and folders of recordings, in order.
 
     Raises:
         ConfigError: A path is missing, holds no recording, or the same recording is given twice.
     """
-    found: list[Source] = []
+    found: list[ExportSource] = []
     for path in paths:
         if path.is_file():
-            found.append(Source(path=path))
+            found.append(ExportSource(path=path))
             continue
         if not path.is_dir():
             raise ConfigError(f"No such recording or run: {path}")
         episodes = path / "episodes" if (path / "episodes").is_dir() else path
         failed = sorted((path / "failed").glob("*.mcap")) if (path / "failed").is_dir() else []
-        of_path = [Source(path=file) for file in sorted(episodes.glob("*.mcap"))]
-        of_path += [Source(path=file, is_chosen=include_failures) for file in failed]
+        of_path = [ExportSource(path=file) for file in sorted(episodes.glob("*.mcap"))]
+        of_path += [ExportSource(path=file, is_chosen=include_failures) for file in failed]
         if not of_path:
             raise ConfigError(f"No finished recordings (*.mcap) in episodes/ of the folder: {path}")
         found += sorted(of_path, key=_attempt_order)
@@ -60,7 +60,7 @@ def is_among_episodes(recording: Recording, options: CommonOptions) -> bool:
     return parse_episodes(options.episodes)(recording.info.episode_index)
 
 
-def goes_in(source: Source, recording: Recording, options: CommonOptions) -> bool:
+def goes_in(source: ExportSource, recording: Recording, options: CommonOptions) -> bool:
     """Whether a recording of a wanted episode goes into the dataset, and is no failed attempt to be left out."""
     success = recording.outcome is not None and recording.outcome.success
     return source.is_chosen and (success or options.include_failures)
@@ -74,7 +74,7 @@ def nothing_to_export(num_recordings: int, num_failures: int) -> ExportError:
     )
 
 
-def places_of(sources: Iterable[Source]) -> list[Path]:
+def places_of(sources: Iterable[ExportSource]) -> list[Path]:
     """What an export must not write over: the recordings, and a run's folders of them with all that is in there.
 
     A dataset that lies beside them, as a run's own does, may be replaced.
@@ -84,7 +84,7 @@ def places_of(sources: Iterable[Source]) -> list[Path]:
     return [*(folder for folder in folders if folder.name in ("episodes", "failed")), *files]
 
 
-def _attempt_order(source: Source) -> tuple[str, bool, str]:
+def _attempt_order(source: ExportSource) -> tuple[str, bool, str]:
     """Failed attempts at an episode before the one that succeeded."""
     episode, _, attempt = source.path.stem.partition(".")
     return episode, not attempt, attempt

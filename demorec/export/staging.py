@@ -19,7 +19,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from demorec.errors import ExportError
-from demorec.replacing import Kind, check_replaceable
+from demorec.safety.replacing import Kind, check_replaceable
 
 _RENAME_EXCHANGE = 2
 _AT_FDCWD = -100

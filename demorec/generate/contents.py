@@ -7,12 +7,12 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-from demorec.generate.run_file import DATASET as DATASET_FOLDER
-from demorec.generate.run_file import EPISODES, FAILED, RUN_NAME, UNFINISHED
 from demorec.generate.survey import recordings_of
 from demorec.lerobot.kind import DATASET, is_dataset_file
 from demorec.lerobot.sidecar import CONFIGS_PATH
-from demorec.replacing import RECORDING, Kind, files_below, json_object
+from demorec.runs.run_file import DATASET as DATASET_FOLDER
+from demorec.runs.run_file import EPISODES, FAILED, RUN_NAME, UNFINISHED
+from demorec.safety.replacing import RECORDING, Kind, files_below, json_object
 
 PARTS = (RUN_NAME, EPISODES, FAILED, UNFINISHED, DATASET_FOLDER)
 """All that a run writes; what else is in its folder is never touched."""

@@ -13,7 +13,7 @@ from demorec.errors import ConfigError, GenerationError
 from demorec.generate.executor import MAKE_EPISODE, Made, Raised
 from demorec.generate.local import LocalExecutor
 from demorec.generate.options import RunOptions, available_cores
-from demorec.generate.run_file import EPISODES, FAILED, STARTING, UNFINISHED
+from demorec.runs.run_file import EPISODES, FAILED, STARTING, UNFINISHED
 
 _MEASURED = 2
 """Attempts with pictures: the first of a worker compiles, loads and fills caches, the second is what counts."""

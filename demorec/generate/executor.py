@@ -14,7 +14,7 @@ import psutil
 
 from demorec.config import EpisodePlan
 from demorec.errors import DemorecError, error_chain
-from demorec.generate.run_file import Attempt
+from demorec.runs.run_file import Attempt
 
 Maker = Callable[[EpisodePlan, Path], Attempt]
 """Makes one attempt in the run's folder: writes the recording to its place, then returns its line."""

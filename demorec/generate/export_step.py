@@ -10,8 +10,10 @@ from pathlib import Path
 
 from demorec.errors import DemorecError, ExportError, resource_error
 from demorec.generate.contents import is_dataset_of_run
-from demorec.generate.lock import run_lock
-from demorec.generate.run_file import (
+from demorec.lerobot import ExportOptions, ExportReport, dataset_digest, export_lerobot
+from demorec.lerobot.inspect import check_tables
+from demorec.runs.lock import run_lock
+from demorec.runs.run_file import (
     DATASET,
     UNFINISHED,
     ExportRecord,
@@ -21,8 +23,6 @@ from demorec.generate.run_file import (
     save_run_file,
     sync_folder,
 )
-from demorec.lerobot import ExportOptions, ExportReport, dataset_digest, export_lerobot
-from demorec.lerobot.inspect import check_tables
 
 
 def export_run(

@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING
 
 from demorec.config import GenerateConfig, deciding_versions
 from demorec.errors import ConfigError, DemorecError, GenerationError, resource_error
-from demorec.files import make_folder
 from demorec.generate.contents import PARTS, RUN
 from demorec.generate.executor import peak_memory
-from demorec.generate.lock import LOCK_NAME, run_lock
 from demorec.generate.options import RunOptions, available_cores
 from demorec.generate.plan import differences
-from demorec.generate.run_file import (
+from demorec.generate.survey import Inspector, recordings_of, survey
+from demorec.runs.lock import LOCK_NAME, run_lock
+from demorec.runs.run_file import (
     EPISODES,
     FAILED,
     RUN_NAME,
@@ -34,11 +34,18 @@ from demorec.generate.run_file import (
     load_run_file,
     save_run_file,
 )
-from demorec.generate.survey import Inspector, recordings_of, survey
-from demorec.replacing import check_replaceable, files_below, has_unsettled_parts, replaced_parts, settle_parts, shown
+from demorec.safety.files import make_folder
+from demorec.safety.replacing import (
+    check_replaceable,
+    files_below,
+    has_unsettled_parts,
+    replaced_parts,
+    settle_parts,
+    shown,
+)
 
 if TYPE_CHECKING:
-    from demorec.generate.run import Progress, RunResult
+    from demorec.generate.run import RunObserver, RunResult
 
 
 class RunFolder:
@@ -141,7 +148,7 @@ class RunFolder:
 
 @contextmanager
 def open_run(
-    config: GenerateConfig, options: RunOptions, *, progress: Progress, inspect: Inspector
+    config: GenerateConfig, options: RunOptions, *, progress: RunObserver, inspect: Inspector
 ) -> Iterator[RunFolder]:
     """Open, continue or begin a run in `options.out`, locked until the context ends.
 
@@ -187,7 +194,7 @@ def _holds_a_run(path: Path) -> bool:
     return (path / RUN_NAME).exists() or bool(recordings_of(path))
 
 
-def _begin_or_continue(path: Path, asked: RunFile, *, progress: Progress, inspect: Inspector) -> RunFolder:
+def _begin_or_continue(path: Path, asked: RunFile, *, progress: RunObserver, inspect: Inspector) -> RunFolder:
     """Bring the folder and its run.json to what is known now."""
     run, damage = _known_run(path, asked, inspect=inspect)
     if damage:

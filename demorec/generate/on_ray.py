@@ -17,7 +17,7 @@ from demorec.config import EpisodePlan
 from demorec.errors import ConfigError, GenerationError, MissingDependencyError
 from demorec.generate.executor import SINGLE_THREADED, Lost, Report, attempt_episode
 from demorec.generate.options import available_cores
-from demorec.generate.run_file import RUN_NAME
+from demorec.runs.run_file import RUN_NAME
 
 try:
     import ray

@@ -9,8 +9,7 @@ from typing import Literal
 
 from demorec.errors import ConfigError
 from demorec.lerobot.options import check_repo_id
-
-MAX_EPISODES = 10_000_000
+from demorec.runs.run_file import MAX_EPISODES
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,9 +7,9 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from demorec.config import EpisodePlan, GenerateConfig
-from demorec.generate.run_file import Attempt, RunFile
-from demorec.own_versions import version_differences
 from demorec.plain import to_plain
+from demorec.runs.run_file import Attempt, RunFile
+from demorec.safety.own_versions import version_differences
 
 
 class Schedule:

@@ -16,15 +16,15 @@ from demorec.config import GenerateConfig, parse_config
 from demorec.errors import ConfigError, DemorecError, resource_error
 from demorec.generate.contents import is_dataset_of_run
 from demorec.generate.options import RunOptions
-from demorec.generate.run import Progress, RunResult, generate
-from demorec.generate.run_file import DATASET, RUN_NAME, load_run_file
+from demorec.generate.run import RunObserver, RunResult, generate
 from demorec.lerobot import ExportOptions, export_lerobot
 from demorec.lerobot.files import read_json, read_table
 from demorec.lerobot.paths import SIDECAR_DIR
 from demorec.lerobot.sidecar import CONFIGS_PATH, EXPORT_PATH
-from demorec.own_versions import version_differences
-from demorec.replacing import use_as_source
-from demorec.validity import read_episode_info
+from demorec.runs.run_file import DATASET, RUN_NAME, load_run_file
+from demorec.safety.own_versions import version_differences
+from demorec.safety.replacing import use_as_source
+from demorec.scene.validity import read_episode_info
 
 Key = tuple[int, int]
 """(episode of the run, attempt)."""
@@ -67,7 +67,7 @@ class Comparison:
 
 
 def reproduce(
-    source: Path, options: RunOptions, *, progress: Progress, allowed: Sequence[str] = ()
+    source: Path, options: RunOptions, *, progress: RunObserver, allowed: Sequence[str] = ()
 ) -> Comparison | RunResult:
     """Make the source's run again in `options.out` and compare; the run's result alone when it was interrupted.
 

@@ -22,10 +22,10 @@ from demorec.generate.interrupts import catch_interrupts
 from demorec.generate.local import LocalExecutor
 from demorec.generate.options import RunOptions, available_cores
 from demorec.generate.plan import Schedule
-from demorec.generate.recordings import inspect_recording
-from demorec.generate.run_file import UNFINISHED, Attempt, RunFile, Session
 from demorec.generate.survey import Inspector
-from demorec.render import prepare
+from demorec.render import warm_up_renderer
+from demorec.runs.recordings import inspect_recording
+from demorec.runs.run_file import UNFINISHED, Attempt, RunFile, Session
 
 MAX_LOSSES = 5
 """How often one attempt may lose its worker before the run stops: chance takes few, too little memory takes all."""
@@ -43,7 +43,7 @@ _REFUSED = {
 }
 
 
-class Progress(Protocol):
+class RunObserver(Protocol):
     """Told how a run goes; every method does nothing by default in `NoProgress`."""
 
     def verifying(self, done: int, total: int) -> None:
@@ -98,7 +98,7 @@ def generate(
     config: GenerateConfig,
     options: RunOptions,
     *,
-    progress: Progress | None = None,
+    progress: RunObserver | None = None,
     maker: str = MAKE_EPISODE,
     inspect: Inspector = inspect_recording,
     episodes: Iterable[int] | None = None,
@@ -128,7 +128,7 @@ def generate(
             return folder.result(interrupted=False)
         schedule.give_back(first)
         if config.cameras and options.executor != "ray":
-            prepare(config.renderer)
+            warm_up_renderer(config.renderer)
         executor = stack.enter_context(make_executor(options, folder.path, folder.run, maker))
         folder.begin_session(executor=options.executor, workers=executor.workers)
         progress.started(folder.run, executor.workers)
@@ -183,7 +183,7 @@ def _advice(number: int) -> str:
 class _Driver:
     """The loop between schedule, executor and run.json."""
 
-    def __init__(self, folder: RunFolder, schedule: Schedule, executor: Executor, progress: Progress) -> None:
+    def __init__(self, folder: RunFolder, schedule: Schedule, executor: Executor, progress: RunObserver) -> None:
         self._folder = folder
         self._schedule = schedule
         self._executor = executor

@@ -8,8 +8,9 @@ from pathlib import Path
 
 from demorec.errors import DemorecError, resource_error
 from demorec.generate.plan import plain_differences
-from demorec.generate.recordings import Inspected, inspect_recording
-from demorec.generate.run_file import (
+from demorec.plain import to_plain
+from demorec.runs.recordings import Inspected, inspect_recording
+from demorec.runs.run_file import (
     EPISODES,
     FAILED,
     UNFINISHED,
@@ -20,8 +21,7 @@ from demorec.generate.run_file import (
     sha256_of,
     sync_folder,
 )
-from demorec.own_versions import version_differences
-from demorec.plain import to_plain
+from demorec.safety.own_versions import version_differences
 
 Inspector = Callable[[Path], Inspected]
 """Reads all of a recording; DemorecError or OSError when it is none."""

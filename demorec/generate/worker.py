@@ -16,15 +16,15 @@ from dataclasses import replace
 from pathlib import Path
 
 from demorec.config import EpisodePlan
-from demorec.episode import CameraImages, EpisodeInfo, Frame, Outcome
 from demorec.errors import ConfigError, SceneError
-from demorec.generate.recordings import inspect_recording
-from demorec.generate.run_file import EPISODES, FAILED, STARTING, UNFINISHED, Attempt, recording_name, sync_folder
 from demorec.geometry import Array
 from demorec.loop import ScriptAgent, Session, make_renderer, make_world, prepare
-from demorec.own_versions import version_differences
 from demorec.recording import EpisodeWriter
 from demorec.render import Renderer, RenderSetup
+from demorec.runs.recordings import inspect_recording
+from demorec.runs.run_file import EPISODES, FAILED, STARTING, UNFINISHED, Attempt, recording_name, sync_folder
+from demorec.safety.own_versions import version_differences
+from demorec.scene.episode import CameraImages, EpisodeInfo, Frame, Outcome
 from demorec.sim.world import World
 
 SIMULATION, RENDERING, RECORDING = "simulation", "rendering", "recording"

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from demorec.errors import ExportError
-from demorec.export.options import ExportReport, Progress
+from demorec.export.options import ExportReport, ProgressCallback
 from demorec.export.sources import (
+    ExportSource,
     Profile,
-    Source,
     find_recordings,
     goes_in,
     is_among_episodes,
@@ -21,11 +21,11 @@ from demorec.hdf5.file import DATASET, UNFINISHED, NewFile
 from demorec.hdf5.options import Hdf5Options
 from demorec.hdf5.writer import RobomimicWriter
 from demorec.recording import Recording
-from demorec.replacing import check_replaceable, written_whole
+from demorec.safety.replacing import check_replaceable, written_whole
 
 
 def export_hdf5(
-    sources: Sequence[Path], out: Path, options: Hdf5Options, progress: Progress | None = None
+    sources: Sequence[Path], out: Path, options: Hdf5Options, progress: ProgressCallback | None = None
 ) -> ExportReport:
     """Write the recordings into the file `out`: whole, or not at all. One picture is in memory at a time.
 
@@ -60,7 +60,9 @@ def export_hdf5(
     return report
 
 
-def _write(writer: RobomimicWriter, found: Sequence[Source], out: Path, progress: Progress | None) -> ExportReport:
+def _write(
+    writer: RobomimicWriter, found: Sequence[ExportSource], out: Path, progress: ProgressCallback | None
+) -> ExportReport:
     options = writer.options
     first: tuple[Profile, Path] | None = None
     skipped_failures = 0

@@ -9,8 +9,8 @@ from typing import Self
 
 import h5py
 
-from demorec.files import open_regular
-from demorec.replacing import Kind
+from demorec.safety.files import open_regular
+from demorec.safety.replacing import Kind
 
 _MAGIC = b"\x89HDF\r\n\x1a\n"
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from demorec.errors import ConfigError
 from demorec.export.exporter import Exporter
-from demorec.export.options import CommonOptions, ExportReport, Progress
+from demorec.export.options import CommonOptions, ExportReport, ProgressCallback
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,7 +29,9 @@ class Hdf5Options(CommonOptions):
             raise ConfigError(f"compression is {self.compression}, it must be from 0 to 9.")
 
 
-def _export(sources: Sequence[Path], out: Path, options: Hdf5Options, progress: Progress | None) -> ExportReport:
+def _export(
+    sources: Sequence[Path], out: Path, options: Hdf5Options, progress: ProgressCallback | None
+) -> ExportReport:
     from demorec.hdf5.export import export_hdf5
 
     return export_hdf5(sources, out, options, progress)

@@ -16,9 +16,12 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.episode import EpisodeColumns, EpisodeInfo
 from demorec.export.columns import DONE, REWARD, SUCCESS, check_feature_names, feature_columns, frame_stride
-from demorec.features import (
+from demorec.hdf5.file import NewFile
+from demorec.hdf5.options import Hdf5Options
+from demorec.recording import Recording, channels
+from demorec.scene.episode import EpisodeColumns, EpisodeInfo
+from demorec.scene.features import (
     ACTION,
     DEPTH_SUFFIX,
     EE_POSE,
@@ -29,9 +32,6 @@ from demorec.features import (
     action_names,
     observation_names,
 )
-from demorec.hdf5.file import NewFile
-from demorec.hdf5.options import Hdf5Options
-from demorec.recording import Recording, channels
 from demorec.tables import environment_name
 
 _GYM = 2

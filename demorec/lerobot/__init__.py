@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from demorec.export.options import ExportReport, Progress
+    from demorec.export.options import ExportReport, ProgressCallback
     from demorec.lerobot.export import export_lerobot
     from demorec.lerobot.inspect import DatasetSummary, dataset_digest, dataset_info
     from demorec.lerobot.options import ExportOptions
@@ -19,7 +19,7 @@ __all__ = [
     "DatasetSummary",
     "ExportOptions",
     "ExportReport",
-    "Progress",
+    "ProgressCallback",
     "dataset_digest",
     "dataset_info",
     "export_lerobot",
@@ -30,7 +30,7 @@ _HOMES = {
     "export_lerobot": "demorec.lerobot.export",
     "ExportOptions": "demorec.lerobot.options",
     "ExportReport": "demorec.export.options",
-    "Progress": "demorec.export.options",
+    "ProgressCallback": "demorec.export.options",
     "is_dataset": "demorec.lerobot.paths",
 }
 

@@ -14,7 +14,6 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from demorec.features import ACTION, EE_POSE, ENVIRONMENT_STATE, IMAGE_PREFIX, STATE, VELOCITY, ActionKind
 from demorec.lerobot.commands import making_commands
 from demorec.lerobot.files import read_table
 from demorec.lerobot.layout import DatasetInfo, Feature
@@ -24,6 +23,7 @@ from demorec.lerobot.reader import read_tasks
 from demorec.lerobot.sidecar import ATTEMPT_SCHEMA
 from demorec.lerobot.thumbnails import THUMBNAILS_PATH, write_thumbnails
 from demorec.lerobot.writer import write_text
+from demorec.scene.features import ACTION, EE_POSE, ENVIRONMENT_STATE, IMAGE_PREFIX, STATE, VELOCITY, ActionKind
 
 CARD_PATH = "README.md"
 SECOND_CARD_PATH = f"{SIDECAR_DIR}/README.md"
@@ -62,7 +62,7 @@ _MEANING = {
 _ACTION_MEANING: Mapping[ActionKind, str] = {
     "joint": "absolute joint targets (rad), gripper opening (m)",
     "joint_increment": "joint target minus that of the frame before (rad), the first minus the initial positions, plus "
-    "the way back from exploration noise (demorec.features); gripper opening (m), absolute",
+    "the way back from exploration noise (demorec.scene.features); gripper opening (m), absolute",
     "ee": "absolute pose of the tool centre point in the base frame: position (m), quaternion xyzw with x >= 0; "
     "gripper opening (m)",
     "ee_delta": "change of the tool centre point's pose since the frame before, the first since the observed one: "

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from demorec.errors import ConfigError
-from demorec.export.options import ExportReport, Progress
-from demorec.export.sources import Source, find_recordings, nothing_to_export, places_of, refuse_differences
+from demorec.export.options import ExportReport, ProgressCallback
+from demorec.export.sources import ExportSource, find_recordings, nothing_to_export, places_of, refuse_differences
 from demorec.export.staging import CODED, staged_folder
 from demorec.lerobot.card import CardFacts, write_card
 from demorec.lerobot.digest import combined_digest
@@ -27,11 +27,11 @@ from demorec.lerobot.readings import Reading, readings
 from demorec.lerobot.sidecar import AttemptRecord, SidecarStart, SidecarWriter
 from demorec.lerobot.verify import LEROBOT, MAX_EPISODES, Sample, Verifier, lerobot_is_installed
 from demorec.lerobot.writer import DatasetWriter, WriterStart
-from demorec.replacing import shown
+from demorec.safety.replacing import shown
 
 
 def export_lerobot(
-    sources: Sequence[Path], out: Path, options: ExportOptions, progress: Progress | None = None
+    sources: Sequence[Path], out: Path, options: ExportOptions, progress: ProgressCallback | None = None
 ) -> ExportReport:
     """Write the recordings into the dataset folder `out`: whole, or not at all.
 
@@ -73,7 +73,9 @@ def export_lerobot(
 class _Export:
     """One export into an empty (or linked) folder."""
 
-    def __init__(self, folder: Path, found: list[Source], options: ExportOptions, existing: Existing | None) -> None:
+    def __init__(
+        self, folder: Path, found: list[ExportSource], options: ExportOptions, existing: Existing | None
+    ) -> None:
         self._folder = folder
         self._found = found
         self._options = options
@@ -85,7 +87,7 @@ class _Export:
         self._recordings: list[Path] = []
         self._skipped_failures = 0
 
-    def run(self, progress: Progress | None) -> ExportReport:
+    def run(self, progress: ProgressCallback | None) -> ExportReport:
         aside = self._folder.with_name(CODED)  # is removed with everything beside the new folder
         aside.mkdir(exist_ok=True)
         found = readings(self._found, self._options, progress, aside=aside)

@@ -16,8 +16,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from demorec.errors import ExportError
-from demorec.files import open_regular, read_text_limited
 from demorec.plain import parse_json
+from demorec.safety.files import open_regular, read_text_limited
 
 MAX_JSON_BYTES = 32 << 20
 """Of info.json, stats.json and the like; ours have some ten kB."""

@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 from demorec.lerobot.paths import INFO_PATH, SIDECAR_DIR
-from demorec.replacing import Kind, files_below, json_object
+from demorec.safety.replacing import Kind, files_below, json_object
 
 _NUMBERED = r"(file-\d+|episode_\d+)"
 _PARTS = re.compile(

@@ -11,7 +11,7 @@ from typing import Literal
 from demorec.config import VideoConfig
 from demorec.errors import ConfigError
 from demorec.export.exporter import Exporter
-from demorec.export.options import CommonOptions, ExportReport, Progress
+from demorec.export.options import CommonOptions, ExportReport, ProgressCallback
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,7 +75,9 @@ def check_repo_id(repo_id: str) -> None:
         )
 
 
-def _export(sources: Sequence[Path], out: Path, options: ExportOptions, progress: Progress | None) -> ExportReport:
+def _export(
+    sources: Sequence[Path], out: Path, options: ExportOptions, progress: ProgressCallback | None
+) -> ExportReport:
     from demorec.lerobot.export import export_lerobot
 
     return export_lerobot(sources, out, options, progress)

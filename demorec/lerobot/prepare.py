@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from demorec.export.columns import DONE, REWARD, SUCCESS, check_feature_names, feature_columns, frame_stride
-from demorec.features import ACTION, DEPTH_SUFFIX, IMAGE_PREFIX, action_names, observation_names
 from demorec.lerobot.depth import depth_info, depth_video
 from demorec.lerobot.layout import AUTOMATIC_FEATURES, Feature
 from demorec.lerobot.options import ExportOptions
@@ -14,6 +13,7 @@ from demorec.lerobot.stats import PixelHistogram, colour_levels
 from demorec.lerobot.transcode import coded_videos, dataset_settings, video_info
 from demorec.lerobot.writer import EpisodeData
 from demorec.recording import Recording
+from demorec.scene.features import ACTION, DEPTH_SUFFIX, IMAGE_PREFIX, action_names, observation_names
 
 _SCALARS = {
     REWARD: Feature(dtype="float32", shape=(1,)),

@@ -10,9 +10,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from demorec.export.columns import frame_stride
-from demorec.export.options import Progress
-from demorec.export.sources import Profile, Source, goes_in, is_among_episodes
-from demorec.features import IMAGE_PREFIX
+from demorec.export.options import ProgressCallback
+from demorec.export.sources import ExportSource, Profile, goes_in, is_among_episodes
 from demorec.lerobot.layout import Feature
 from demorec.lerobot.options import ExportOptions
 from demorec.lerobot.prepare import PreparedEpisode, dataset_features, prepare_episode
@@ -20,6 +19,7 @@ from demorec.lerobot.sidecar import AttemptRecord
 from demorec.lerobot.transcode import reason_to_transcode
 from demorec.processes import SPAWN
 from demorec.recording import Recording
+from demorec.scene.features import IMAGE_PREFIX
 
 _BYTES_THAT_PAY = 1 << 30
 """Reading is so quick that starting processes pays from about a gigabyte of recordings on (benchmarks/export.py)."""
@@ -50,7 +50,7 @@ class Reading:
     prepared: PreparedEpisode | None
 
 
-def read(source: Source, options: ExportOptions) -> Reading | None:
+def read(source: ExportSource, options: ExportOptions) -> Reading | None:
     """Read one recording; None if its episode is not wanted (`--episodes`).
 
     Raises:
@@ -79,7 +79,7 @@ def read(source: Source, options: ExportOptions) -> Reading | None:
 
 
 def readings(
-    sources: Sequence[Source], options: ExportOptions, progress: Progress | None, *, aside: Path
+    sources: Sequence[ExportSource], options: ExportOptions, progress: ProgressCallback | None, *, aside: Path
 ) -> Iterator[Reading]:
     """Every wanted recording in order; several processes read ahead where that pays, and leave pictures in `aside`."""
     workers = options.workers or _workers_that_pay(sources, options)
@@ -93,14 +93,14 @@ def readings(
             progress(done, len(sources))
 
 
-def _workers_that_pay(sources: Sequence[Source], options: ExportOptions) -> int:
+def _workers_that_pay(sources: Sequence[ExportSource], options: ExportOptions) -> int:
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     transcodes = options.depth or options.fps is not None
     size = sum(source.path.stat().st_size for source in sources) * (20 if transcodes else 1)
     return min(cores, 8) if size >= _BYTES_THAT_PAY else 1
 
 
-def _read_aside(source: Source, options: ExportOptions, folder: Path) -> Reading | None:
+def _read_aside(source: ExportSource, options: ExportOptions, folder: Path) -> Reading | None:
     """`read`, with the pictures in files: through a pipe they cost as much as all the rest."""
     reading = read(source, options)
     if reading is None or reading.prepared is None:
@@ -111,7 +111,7 @@ def _read_aside(source: Source, options: ExportOptions, folder: Path) -> Reading
 
 
 def _in_processes(
-    sources: Sequence[Source], options: ExportOptions, workers: int, aside: Path
+    sources: Sequence[ExportSource], options: ExportOptions, workers: int, aside: Path
 ) -> Iterator[Reading | None]:
     waiting: deque[Future[Reading | None]] = deque()
     with ProcessPoolExecutor(max_workers=workers, mp_context=SPAWN) as pool:

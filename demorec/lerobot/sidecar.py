@@ -22,7 +22,6 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from demorec.episode import EpisodeColumns, Outcome
 from demorec.geometry import Array, Pose
 from demorec.lerobot.layout import SIDECAR_ATTEMPTS_PATH, SIDECAR_CAMERAS_PATH, SIDECAR_EPISODES_PATH, FilePosition
 from demorec.lerobot.parquet import RollingParquet, vector_array
@@ -30,7 +29,8 @@ from demorec.lerobot.paths import SIDECAR_DIR
 from demorec.lerobot.writer import WrittenEpisode, write_text
 from demorec.plain import to_json, to_plain
 from demorec.recording import Recording
-from demorec.scene import Goal, Scene
+from demorec.scene.episode import EpisodeColumns, Outcome
+from demorec.scene.scene import Goal, Scene
 
 CONFIGS_PATH = f"{SIDECAR_DIR}/configs.json"
 EXPORT_PATH = f"{SIDECAR_DIR}/export.json"

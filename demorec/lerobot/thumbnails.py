@@ -12,11 +12,11 @@ from PIL import Image, ImageDraw, ImageFont
 
 from demorec.errors import ExportError
 from demorec.export.staging import sync_file
-from demorec.features import IMAGE_PREFIX
 from demorec.lerobot.layout import DatasetInfo
 from demorec.lerobot.paths import SIDECAR_DIR
 from demorec.lerobot.reader import EpisodePlace, episode_places
-from demorec.text import printable
+from demorec.safety.text import printable
+from demorec.scene.features import IMAGE_PREFIX
 
 THUMBNAILS_PATH = f"{SIDECAR_DIR}/thumbnails.jpg"
 

@@ -24,13 +24,13 @@ import numpy as np
 
 from demorec.errors import DemorecError, ExportError, resource_error
 from demorec.export.columns import frame_stride
-from demorec.features import DEPTH_SUFFIX, IMAGE_PREFIX
 from demorec.lerobot.depth import code_values, quantised
 from demorec.lerobot.options import ExportOptions
 from demorec.lerobot.prepare import prepare_episode
 from demorec.lerobot.transcode import reason_to_transcode
 from demorec.processes import SPAWN
 from demorec.recording import Recording
+from demorec.scene.features import DEPTH_SUFFIX, IMAGE_PREFIX
 
 LEROBOT = "lerobot[dataset]>=0.6.1,<0.7"
 """What pip has to install for a verification; a test compares it with pyproject.toml."""

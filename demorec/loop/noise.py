@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
-from demorec.episode import Action
-from demorec.features import NOISE_LETS_GO
 from demorec.geometry import Array
+from demorec.scene.episode import Action
+from demorec.scene.features import NOISE_DECAY
 from demorec.sim.world import World
 from demorec.tasks.base import Step
 
@@ -18,14 +18,14 @@ class ActionNoise:
 
     The label stays clean, so that a policy learns how to come back (DART, Laskey et al. 2017,
     https://arxiv.org/abs/1703.09327). The noise lets go at the same rate whether more is added or not
-    (`demorec.features.NOISE_LETS_GO`), so that there is one way back from it, which increments of the command can
+    (`demorec.scene.features.NOISE_DECAY`), so that there is one way back from it, which increments of the command can
     hold. Every command stays within the joint limits in position and velocity.
     """
 
     def __init__(self, world: World, *, sigma: float, rng: np.random.Generator, fps: int) -> None:
         self._kinematics = world.arm.kinematics
         self._sigma, self._rng = sigma, rng
-        self._decay = (1.0 - NOISE_LETS_GO) ** (30 / fps)
+        self._decay = (1.0 - NOISE_DECAY) ** (30 / fps)
         self._max_step = np.array(world.robot.velocity_limit) / fps
         self._noise: Array = np.zeros(len(self._max_step))
         self._last: Array = world.arm.target.copy()

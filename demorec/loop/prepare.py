@@ -8,23 +8,23 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from demorec.assets import allow_models, model_name
 from demorec.config import EpisodePlan, GenerateConfig, deciding_versions
-from demorec.episode import EpisodeInfo
 from demorec.errors import ConfigError
 from demorec.geometry import Pose
-from demorec.motion import angle_between
 from demorec.plain import digest, to_plain
 from demorec.render import Renderer
-from demorec.scene import Camera, Scene
+from demorec.safety.user_modules import modules_of
+from demorec.scene.assets import allow_models, model_name
+from demorec.scene.episode import EpisodeInfo
+from demorec.scene.motion import angle_between
+from demorec.scene.scene import Camera, Scene
+from demorec.scene.variation import Ranges, resolve
 from demorec.seeding import Purpose, generator
 from demorec.sim.world import World
 from demorec.tables import CAMERAS, RENDERERS, TASKS, camera_name, load_robot
 from demorec.tasks.base import Behaviour, Task
 from demorec.tasks.sampling import Sampler, stratified_point
 from demorec.tasks.vary import calibration_errors, draw_behaviour, vary_cameras, vary_looks, vary_physics
-from demorec.user_modules import modules_of
-from demorec.variation import Ranges, resolve
 
 EVAL_SEED_OFFSET = 2**63
 

@@ -6,13 +6,13 @@ import math
 from collections.abc import Iterator, Mapping
 from typing import Self
 
-from demorec.episode import Action, CameraImages, Check, Frame, Observation, Outcome, frame_time_ns
 from demorec.geometry import Array, Pose
 from demorec.loop.agents import Agent, Decision
 from demorec.loop.prepare import Episode
 from demorec.render import Renderer
 from demorec.render.painter import Painter
-from demorec.scene import Scene
+from demorec.scene.episode import Action, CameraImages, Frame, Observation, Outcome, SuccessCheck, frame_time_ns
+from demorec.scene.scene import Scene
 from demorec.sim.world import World
 from demorec.tasks.base import Task
 
@@ -89,7 +89,7 @@ class Session:
             raise RuntimeError("the episode has not ended: take all frames of the run first")
         return self._outcome
 
-    def checks(self) -> tuple[Check, ...]:
+    def checks(self) -> tuple[SuccessCheck, ...]:
         """The task's conditions with the values found now."""
         return () if self._task is None else self._task.evaluate(self.world)
 

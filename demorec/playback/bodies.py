@@ -11,19 +11,19 @@ import rerun as rr
 import trimesh
 from numpy.typing import NDArray
 
-from demorec.assets import asset_path
-from demorec.episode import EpisodeInfo
 from demorec.errors import DemorecError
 from demorec.geometry import Array, Pose
-from demorec.playback.episode import Episode
-from demorec.playback.meshes import Mesh, joined, mesh_file, of_trimesh, sphere_mesh, urdf_meshes
+from demorec.playback.episode import PlayedEpisode
+from demorec.playback.meshes import SurfaceMesh, joined, mesh_file, of_trimesh, sphere_mesh, urdf_meshes
 from demorec.playback.paths import Paths
 from demorec.playback.robot import as_mesh3d
 from demorec.playback.style import GOAL
 from demorec.playback.times import indexes
-from demorec.scene import Body, Goal, Rgba, Shape, Texture
-from demorec.textures import texture_pixels
-from demorec.urdf import Urdf
+from demorec.scene.assets import asset_path
+from demorec.scene.episode import EpisodeInfo
+from demorec.scene.scene import Body, Goal, Rgba, Shape, Texture
+from demorec.scene.textures import texture_pixels
+from demorec.scene.urdf import Urdf
 
 log = logging.getLogger(__name__)
 
@@ -32,7 +32,7 @@ _SAME_SIZE = 0.1
 """How far a model's extents may be from those of the recorded scene, as a part of the largest."""
 
 
-def log_bodies(recording: rr.RecordingStream, paths: Paths, episode: Episode, tint: Rgba | None = None) -> None:
+def log_bodies(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisode, tint: Rgba | None = None) -> None:
     """Every body at its place or along its way, and as wire frames the goals and the known ends of objects.
 
     A body whose model is not installed here, or is another one, is drawn as the recording describes it.
@@ -71,7 +71,7 @@ def _transform(pose: Array) -> rr.Transform3D:
     return rr.Transform3D(translation=pose[:3], quaternion=pose[3:])
 
 
-def _visible(body: Body, episode: Episode, tint: Rgba | None) -> rr.Mesh3D:
+def _visible(body: Body, episode: PlayedEpisode, tint: Rgba | None) -> rr.Mesh3D:
     if body.shape.kind == "box" and body.texture is not None:
         return _textured_box(np.array(body.shape.size), body.texture)
     color = body.rgba
@@ -91,7 +91,7 @@ def _visible(body: Body, episode: Episode, tint: Rgba | None) -> rr.Mesh3D:
     return as_mesh3d(_unit_mesh("box").placed(Pose(), np.array(body.shape.extents), color), tint)
 
 
-def _primitive_mesh(shape: Shape) -> Mesh:
+def _primitive_mesh(shape: Shape) -> SurfaceMesh:
     if shape.kind == "capsule":
         capsule = trimesh.creation.capsule(radius=shape.size[0], height=shape.size[1], count=[32, 32])
         capsule.apply_translation((0.0, 0.0, -capsule.bounds.mean(axis=0)[2]))
@@ -100,7 +100,7 @@ def _primitive_mesh(shape: Shape) -> Mesh:
 
 
 @functools.lru_cache(maxsize=64)
-def _installed_mesh(shape: Shape) -> Mesh | None:
+def _installed_mesh(shape: Shape) -> SurfaceMesh | None:
     """The model file of a mesh or urdf in the body's frame; None, and a word about it, when it cannot be used."""
     try:
         mesh = _model_mesh(shape)
@@ -114,7 +114,7 @@ def _installed_mesh(shape: Shape) -> Mesh | None:
     return mesh
 
 
-def _model_mesh(shape: Shape) -> Mesh:
+def _model_mesh(shape: Shape) -> SurfaceMesh:
     path = asset_path(shape.file)
     if shape.kind == "mesh":
         return mesh_file(path).placed(shape.body_from_mesh, np.full(3, shape.scale), _OWN_COLOR)
@@ -125,7 +125,7 @@ def _model_mesh(shape: Shape) -> Mesh:
 
 
 @functools.cache
-def _unit_mesh(kind: str) -> Mesh:
+def _unit_mesh(kind: str) -> SurfaceMesh:
     """A box, ball or cylinder with extents of 1: scaled for each body, since shading a mesh anew takes longer."""
     if kind == "box":
         return of_trimesh(trimesh.creation.box(extents=(1.0, 1.0, 1.0)))

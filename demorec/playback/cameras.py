@@ -9,11 +9,11 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from demorec.playback.episode import Episode, Video
+from demorec.playback.episode import PlayedEpisode, Video
 from demorec.playback.paths import Paths
 from demorec.playback.style import FRUSTUM, segment_colors
 from demorec.playback.times import indexes
-from demorec.scene import Camera
+from demorec.scene.scene import Camera
 
 _CODECS = {"h264": rr.VideoCodec.H264, "av1": rr.VideoCodec.AV1}
 _PICTURES_AT_ONCE = 64
@@ -21,7 +21,7 @@ _FRUSTUM_METRES = {"world": 0.22}
 _FRUSTUM_ON_ROBOT = 0.04
 
 
-def log_cameras(recording: rr.RecordingStream, paths: Paths, episode: Episode) -> None:
+def log_cameras(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisode) -> None:
     """Every camera with what it saw; the coded pictures are passed on as they are."""
     for camera in episode.info.scene.cameras:
         _log_pinhole(recording, paths, episode, camera)
@@ -38,7 +38,7 @@ def log_cameras(recording: rr.RecordingStream, paths: Paths, episode: Episode) -
         recording.log(paths.world, rr.AnnotationContext(labels), static=True)
 
 
-def _log_pinhole(recording: rr.RecordingStream, paths: Paths, episode: Episode, camera: Camera) -> None:
+def _log_pinhole(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisode, camera: Camera) -> None:
     entity = paths.camera(camera.name)
     pinhole = rr.Pinhole(
         image_from_camera=camera.intrinsics,
@@ -58,7 +58,7 @@ def _log_pinhole(recording: rr.RecordingStream, paths: Paths, episode: Episode, 
         recording.send_columns(entity, indexes(episode.time_ns, episode.time_ns), columns)
 
 
-def _send_video(recording: rr.RecordingStream, entity: str, episode: Episode, video: Video) -> None:
+def _send_video(recording: rr.RecordingStream, entity: str, episode: PlayedEpisode, video: Video) -> None:
     if video.codec in _CODECS:
         recording.log(entity, rr.VideoStream(codec=_CODECS[video.codec]), static=True)
     for batch in video.batches():
@@ -70,7 +70,10 @@ def _send_video(recording: rr.RecordingStream, entity: str, episode: Episode, vi
 
 
 def _send_depth(
-    recording: rr.RecordingStream, entity: str, episode: Episode, read: Callable[[], Iterator[NDArray[np.float32]]]
+    recording: rr.RecordingStream,
+    entity: str,
+    episode: PlayedEpisode,
+    read: Callable[[], Iterator[NDArray[np.float32]]],
 ) -> None:
     for frames in batched(enumerate(read()), _PICTURES_AT_ONCE):
         pictures = [np.rint(metres * 1000).astype(np.uint16) for _, metres in frames]
@@ -88,14 +91,14 @@ def _format(width: int, height: int) -> rr.components.ImageFormat:
     return rr.components.ImageFormat(width=width, height=height, channel_datatype=rr.ChannelDatatype.U16)
 
 
-def _compact(episode: Episode) -> dict[int, int]:
+def _compact(episode: PlayedEpisode) -> dict[int, int]:
     """Segment number -> small number, the background 0."""
     values = sorted(episode.segment_names)
     return {value: number for number, value in enumerate(values)}
 
 
 def _send_segmentation(
-    recording: rr.RecordingStream, entity: str, episode: Episode, read: Callable[[], Iterator[NDArray[np.int32]]]
+    recording: rr.RecordingStream, entity: str, episode: PlayedEpisode, read: Callable[[], Iterator[NDArray[np.int32]]]
 ) -> None:
     known = np.array(sorted(episode.segment_names))
     for frames in batched(enumerate(read()), _PICTURES_AT_ONCE):

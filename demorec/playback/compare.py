@@ -7,7 +7,7 @@ import rerun as rr
 
 from demorec.errors import ConfigError
 from demorec.geometry import Array
-from demorec.playback.episode import Curves, Episode
+from demorec.playback.episode import Curves, PlayedEpisode
 from demorec.playback.paths import Paths
 from demorec.playback.scene import log_episode
 from demorec.playback.summary import entry, properties
@@ -18,7 +18,7 @@ _ORANGE = (1.0, 0.62, 0.25, 0.6)
 DIFFERENCES = "/differences"
 
 
-def new_comparison(a: Episode, b: Episode) -> rr.RecordingStream:
+def new_comparison(a: PlayedEpisode, b: PlayedEpisode) -> rr.RecordingStream:
     """An empty Rerun recording named after both."""
     recording = rr.RecordingStream("demorec-compare", recording_id=f"{a.identity}-{b.identity}")
     recording.send_recording_name(f"A {entry(a)}, B {entry(b)}")
@@ -27,7 +27,7 @@ def new_comparison(a: Episode, b: Episode) -> rr.RecordingStream:
     return recording
 
 
-def log_comparison(recording: rr.RecordingStream, a: Episode, b: Episode) -> None:
+def log_comparison(recording: rr.RecordingStream, a: PlayedEpisode, b: PlayedEpisode) -> None:
     """Send both episodes and how far they are apart.
 
     Raises:
@@ -48,7 +48,7 @@ def log_comparison(recording: rr.RecordingStream, a: Episode, b: Episode) -> Non
         recording.send_columns(entity, times, rr.Scalars.columns(scalars=curves.values))
 
 
-def differences(a: Episode, b: Episode) -> dict[str, Curves]:
+def differences(a: PlayedEpisode, b: PlayedEpisode) -> dict[str, Curves]:
     """Frame by frame, as long as both last: the gripper's and the objects' distance (mm), the joints' largest (rad)."""
     count = min(a.num_frames, b.num_frames)
     time_ns = a.time_ns[:count]

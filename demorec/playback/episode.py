@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.episode import EpisodeInfo, Event, Outcome
 from demorec.geometry import Array
+from demorec.scene.episode import EpisodeInfo, Event, Outcome
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -50,7 +50,7 @@ class Video:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Episode:
+class PlayedEpisode:
     """What is shown of one episode. What a source does not have is None or empty.
 
     Attributes:

@@ -12,18 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 from rerun.experimental import LeRobotReader
 
-from demorec.assets import asset_path
-from demorec.episode import Check, EpisodeInfo, Outcome, frame_time_ns
 from demorec.errors import RecordingError, resource_error
-from demorec.features import ENVIRONMENT_STATE, IMAGE_PREFIX
 from demorec.geometry import Array, Pose
-from demorec.kinematics import ArmKinematics
 from demorec.lerobot.files import check_video, read_json, read_table
 from demorec.lerobot.layout import DatasetInfo, Feature
 from demorec.lerobot.paths import SIDECAR_DIR
-from demorec.playback.episode import Curves, Episode, Video, VideoBatch
+from demorec.playback.episode import Curves, PlayedEpisode, Video, VideoBatch
 from demorec.playback.held_objects import held_object_poses
-from demorec.validity import read_episode_info
+from demorec.scene.assets import asset_path
+from demorec.scene.episode import EpisodeInfo, Outcome, SuccessCheck, frame_time_ns
+from demorec.scene.features import ENVIRONMENT_STATE, IMAGE_PREFIX
+from demorec.scene.kinematics import ArmKinematics
+from demorec.scene.validity import read_episode_info
 
 _PICTURES_AT_ONCE = 256
 _CODECS = {"h264": "h264", "av1": "av1"}
@@ -39,7 +39,7 @@ def dataset_episodes(root: Path) -> list[int]:
 
 
 @contextmanager
-def open_dataset_episode(root: Path, episode_index: int) -> Iterator[Episode]:
+def open_dataset_episode(root: Path, episode_index: int) -> Iterator[PlayedEpisode]:
     """One episode of a dataset.
 
     Raises:
@@ -52,7 +52,7 @@ def open_dataset_episode(root: Path, episode_index: int) -> Iterator[Episode]:
     yield episode
 
 
-def _read_episode(root: Path, episode_index: int) -> Episode:
+def _read_episode(root: Path, episode_index: int) -> PlayedEpisode:
     row = _episode_row(root, episode_index)
     described = DatasetInfo.load(root)
     export = dict(read_json(root / SIDECAR_DIR / "export.json"))
@@ -72,7 +72,7 @@ def _read_episode(root: Path, episode_index: int) -> Episode:
     base_from_tcp = data["observation.ee_pose"] if "observation.ee_pose" in data else _tcp_poses(info, state)
     fingers = np.repeat(state[:, num_arm:] / num_fingers, num_fingers, axis=1)
     ends = {item["name"]: _pose_row(item["world_from_object_end"]) for item in row["objects"]}
-    return Episode(
+    return PlayedEpisode(
         name=f"episode_{episode_index:06d}",
         group=root.resolve().name,
         identity=f"dataset-{root.resolve().name}-{episode_index}",
@@ -162,7 +162,7 @@ def _pose_row(values: Any) -> Array:
 def _outcome(row: dict[str, Any], num_frames: int) -> Outcome:
     return Outcome(
         success=row["success"],
-        checks=tuple(Check(**check) for check in row["checks"]),
+        checks=tuple(SuccessCheck(**check) for check in row["checks"]),
         failure_phase=row["failure_phase"],
         failure_reason=row["failure_reason"],
         num_frames=num_frames,

@@ -11,16 +11,16 @@ from pathlib import Path
 
 import numpy as np
 
-from demorec.episode import EpisodeColumns
-from demorec.playback.episode import Curves, Episode, Video, VideoBatch
+from demorec.playback.episode import Curves, PlayedEpisode, Video, VideoBatch
 from demorec.recording import Recording
 from demorec.recording.channels import description_topic
+from demorec.scene.episode import EpisodeColumns
 
 _PICTURES_AT_ONCE = 256
 
 
 @contextmanager
-def open_recording(path: Path, *, group: str) -> Iterator[Episode]:
+def open_recording(path: Path, *, group: str) -> Iterator[PlayedEpisode]:
     """The episode of a recording; its pictures can be read until the context is left.
 
     Raises:
@@ -28,7 +28,7 @@ def open_recording(path: Path, *, group: str) -> Iterator[Episode]:
     """
     with Recording(path) as recording:
         info, columns = recording.info, recording.columns()
-        yield Episode(
+        yield PlayedEpisode(
             name=path.name.removesuffix(".mcap"),
             group=group,
             identity=hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:16],

@@ -11,10 +11,10 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 
-from demorec.episode import Outcome
-from demorec.playback.episode import Episode
-from demorec.playback.sources import Source
-from demorec.scene import Scene
+from demorec.playback.episode import PlayedEpisode
+from demorec.playback.sources import PlaybackSource
+from demorec.scene.episode import Outcome
+from demorec.scene.scene import Scene
 
 BOX = "□"
 DRAWABLE = (
@@ -51,17 +51,17 @@ class DrawableText:
         self.missing.update(_MISSING.findall(text))
         return _MISSING.sub(lambda found: spell(found[0]), text)
 
-    def source(self, source: Source) -> Source:
+    def source(self, source: PlaybackSource) -> PlaybackSource:
         """The same episode, with drawable text wherever a layout shows text."""
 
         @contextmanager
-        def opened() -> Iterator[Episode]:
+        def opened() -> Iterator[PlayedEpisode]:
             with source.open() as episode:
                 yield self.episode(episode)
 
-        return Source(name=source.name, open=opened)
+        return PlaybackSource(name=source.name, open=opened)
 
-    def episode(self, episode: Episode) -> Episode:
+    def episode(self, episode: PlayedEpisode) -> PlayedEpisode:
         """The same with drawable text."""
         info = episode.info
         bodies = {self.name(body.name): body.name for body in info.scene.bodies}

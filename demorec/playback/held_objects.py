@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.geometry import Array, Pose
-from demorec.scene import Scene
+from demorec.scene.scene import Scene
 
 _STOPPED_BEFORE_TARGET = 1e-3
 """How much wider than asked the opening is at least when something is between the fingers, metres."""

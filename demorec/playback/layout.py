@@ -9,7 +9,7 @@ import rerun.blueprint as rrb
 
 from demorec.geometry import Array
 from demorec.playback.compare import DIFFERENCES, comparison_paths
-from demorec.playback.episode import Episode
+from demorec.playback.episode import PlayedEpisode
 from demorec.playback.paths import Paths
 from demorec.playback.times import FRAMES, SECONDS
 
@@ -18,7 +18,7 @@ _FLOOR = 3.0
 """Bodies wider than this (metres) are the floor, which would only hide the grid."""
 
 
-def episode_layout(episode: Episode, *, is_alone: bool = False) -> rrb.Blueprint:
+def episode_layout(episode: PlayedEpisode, *, is_alone: bool = False) -> rrb.Blueprint:
     """The layout of one episode, or of all that have its streams; one that is alone needs no list of episodes."""
     paths = Paths()
     return _blueprint(
@@ -35,7 +35,7 @@ def episode_layout(episode: Episode, *, is_alone: bool = False) -> rrb.Blueprint
     )
 
 
-def comparison_layout(a: Episode, b: Episode) -> rrb.Blueprint:
+def comparison_layout(a: PlayedEpisode, b: PlayedEpisode) -> rrb.Blueprint:
     """The layout of two episodes in one recording: below /a and /b, the same streams over each other."""
     roots = list(comparison_paths())
     pictures: list[rrb.View | rrb.Container] = []
@@ -66,7 +66,7 @@ def comparison_layout(a: Episode, b: Episode) -> rrb.Blueprint:
 
 
 def _blueprint(
-    episode: Episode,
+    episode: PlayedEpisode,
     *,
     is_alone: bool,
     three_d: rrb.View,
@@ -95,7 +95,7 @@ def _blueprint(
     )
 
 
-def _view_3d(episode: Episode, roots: list[Paths], name: str) -> rrb.Spatial3DView:
+def _view_3d(episode: PlayedEpisode, roots: list[Paths], name: str) -> rrb.Spatial3DView:
     contents = []
     for paths in roots:
         contents.append(f"+ {paths.world}/**")
@@ -131,7 +131,7 @@ def _view_3d(episode: Episode, roots: list[Paths], name: str) -> rrb.Spatial3DVi
     )
 
 
-def _eye(episode: Episode) -> tuple[Array, Array]:
+def _eye(episode: PlayedEpisode) -> tuple[Array, Array]:
     """Where the 3D view looks from and to: at the gripper's way from the side, with the arm in the picture."""
     base = episode.info.scene.robot.world_from_base
     points = base.apply(episode.base_from_tcp[:, :3])
@@ -142,7 +142,7 @@ def _eye(episode: Episode) -> tuple[Array, Array]:
     return target + 0.15 * forward - 1.05 * side + (0.0, 0.0, 0.42), target
 
 
-def _camera_views(episode: Episode, paths: Paths) -> list[rrb.View | rrb.Container]:
+def _camera_views(episode: PlayedEpisode, paths: Paths) -> list[rrb.View | rrb.Container]:
     views: list[rrb.View | rrb.Container] = []
     for camera in episode.info.scene.cameras:
         tabs: list[rrb.View] = []
@@ -161,7 +161,7 @@ def _camera_views(episode: Episode, paths: Paths) -> list[rrb.View | rrb.Contain
     return views
 
 
-def _curve_views(roots: list[Paths], episode: Episode) -> rrb.Container:
+def _curve_views(roots: list[Paths], episode: PlayedEpisode) -> rrb.Container:
     def view(title: str, *names: str) -> rrb.TimeSeriesView | None:
         shown = [name for name in names if name in episode.curves]
         if not shown:

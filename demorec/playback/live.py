@@ -17,7 +17,7 @@ from typing import Any, Self
 
 from demorec.errors import ConfigError, DemorecError
 from demorec.playback.programs import free_port, has_display, viewer_environment, viewer_program
-from demorec.text import printable
+from demorec.safety.text import printable
 
 _NICENESS = 15
 _END_SECONDS = 60.0

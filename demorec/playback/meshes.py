@@ -19,11 +19,11 @@ import platformdirs
 import trimesh
 from numpy.typing import NDArray
 
-from demorec.assets import mesh_path
 from demorec.errors import DemorecError, RecordingError
 from demorec.geometry import Pose
-from demorec.scene import Rgba
-from demorec.urdf_shapes import UrdfShape, read_links
+from demorec.scene.assets import mesh_path
+from demorec.scene.scene import Rgba
+from demorec.scene.urdf_shapes import UrdfShape, read_links
 
 MAX_TRIANGLES = 2500
 """Of one mesh file."""
@@ -33,7 +33,7 @@ _CACHE_VERSION = b"2"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Mesh:
+class SurfaceMesh:
     """Triangles in a link's or body's frame, metres.
 
     Attributes:
@@ -47,12 +47,12 @@ class Mesh:
     triangles: NDArray[np.uint32]
     colors: NDArray[np.uint8]
 
-    def placed(self, pose: Pose, scale: NDArray[np.float64], rgba: Rgba) -> Mesh:
+    def placed(self, pose: Pose, scale: NDArray[np.float64], rgba: Rgba) -> SurfaceMesh:
         """Scaled, then moved by `pose`, its colours multiplied by `rgba`."""
         rotation = pose.rotation
         normals = (self.normals / scale) @ rotation.T  # only drawn: rounding may differ between CPUs
         lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-        return Mesh(
+        return SurfaceMesh(
             vertices=pose.apply(self.vertices * scale).astype(np.float32),
             normals=(normals / np.maximum(lengths, 1e-12)).astype(np.float32),
             triangles=self.triangles,
@@ -60,10 +60,10 @@ class Mesh:
         )
 
 
-def joined(meshes: list[Mesh]) -> Mesh:
+def joined(meshes: list[SurfaceMesh]) -> SurfaceMesh:
     """Several meshes as one."""
     offsets = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
-    return Mesh(
+    return SurfaceMesh(
         vertices=np.concatenate([mesh.vertices for mesh in meshes]),
         normals=np.concatenate([mesh.normals for mesh in meshes]),
         triangles=np.concatenate(
@@ -73,7 +73,7 @@ def joined(meshes: list[Mesh]) -> Mesh:
     )
 
 
-def urdf_meshes(text: str, folder: Path | None, scale: float = 1.0) -> dict[str, Mesh]:
+def urdf_meshes(text: str, folder: Path | None, scale: float = 1.0) -> dict[str, SurfaceMesh]:
     """Link -> what it looks like, of all links that can be seen.
 
     Args:
@@ -93,7 +93,7 @@ def urdf_meshes(text: str, folder: Path | None, scale: float = 1.0) -> dict[str,
     return links
 
 
-def _shape_mesh(shape: UrdfShape, folder: Path | None) -> Mesh | None:
+def _shape_mesh(shape: UrdfShape, folder: Path | None) -> SurfaceMesh | None:
     scale: NDArray[np.float64] = np.ones(3)
     match shape.kind:
         case "mesh":
@@ -109,7 +109,7 @@ def _shape_mesh(shape: UrdfShape, folder: Path | None) -> Mesh | None:
     return mesh.placed(shape.link_from_shape, scale, shape.rgba or (1.0, 1.0, 1.0, 1.0))
 
 
-def sphere_mesh(radius: float) -> Mesh:
+def sphere_mesh(radius: float) -> SurfaceMesh:
     """A ball."""
     return of_trimesh(trimesh.creation.icosphere(subdivisions=3, radius=radius))
 
@@ -124,7 +124,7 @@ def _mesh_path(folder: Path | None, name: str) -> Path:
 
 
 @functools.lru_cache(maxsize=64)
-def mesh_file(path: Path) -> Mesh:
+def mesh_file(path: Path) -> SurfaceMesh:
     """A mesh file with the colours of its materials, simplified; from the cache when it was read before.
 
     Raises:
@@ -137,7 +137,7 @@ def mesh_file(path: Path) -> Mesh:
         cached = platformdirs.user_cache_path("demorec") / "playback" / f"{digest.hexdigest()[:32]}.npz"
         if cached.is_file():
             with np.load(cached) as arrays:
-                return Mesh(**{name: arrays[name] for name in ("vertices", "normals", "triangles", "colors")})
+                return SurfaceMesh(**{name: arrays[name] for name in ("vertices", "normals", "triangles", "colors")})
         mesh = _read_mesh_file(path)
     except (OSError, ValueError, KeyError) as error:
         raise RecordingError(f"The mesh cannot be read ({error}): {path}") from error
@@ -145,7 +145,7 @@ def mesh_file(path: Path) -> Mesh:
     return mesh
 
 
-def _keep(cached: Path, mesh: Mesh) -> None:
+def _keep(cached: Path, mesh: SurfaceMesh) -> None:
     """Write the cache file as a whole or not at all; a folder that cannot be written only costs time."""
     try:
         cached.parent.mkdir(parents=True, exist_ok=True)
@@ -156,7 +156,7 @@ def _keep(cached: Path, mesh: Mesh) -> None:
         return
 
 
-def _read_mesh_file(path: Path) -> Mesh:
+def _read_mesh_file(path: Path) -> SurfaceMesh:
     loaded = trimesh.load(path, process=False)
     parts: list[Any] = list(loaded.geometry.values()) if isinstance(loaded, trimesh.Scene) else [loaded]
     total = sum(len(part.faces) for part in parts)
@@ -167,7 +167,7 @@ def _read_mesh_file(path: Path) -> Mesh:
     return joined([_simplified(part, keep, _color(part) if colored else None) for part in parts if len(part.faces)])
 
 
-def _simplified(part: Any, keep: float, rgba: NDArray[np.uint8] | None) -> Mesh:
+def _simplified(part: Any, keep: float, rgba: NDArray[np.uint8] | None) -> SurfaceMesh:
     bare = trimesh.Trimesh(vertices=part.vertices, faces=part.faces, process=False)
     bare.merge_vertices()
     if keep < 1.0 and len(bare.faces) > 100:
@@ -195,11 +195,11 @@ def _color(part: Any) -> NDArray[np.uint8] | None:
     return None if color is None else np.array(color, dtype=np.uint8)
 
 
-def of_trimesh(mesh: Any, rgba: NDArray[np.uint8] | None = None) -> Mesh:
+def of_trimesh(mesh: Any, rgba: NDArray[np.uint8] | None = None) -> SurfaceMesh:
     """A trimesh mesh, smooth but for its creases, in one colour (white when None)."""
     shaded = trimesh.graph.smooth_shade(mesh, angle=_CREASE)
     color = np.full(4, 255, dtype=np.uint8) if rgba is None else rgba
-    return Mesh(
+    return SurfaceMesh(
         vertices=np.asarray(shaded.vertices, dtype=np.float32),
         normals=np.asarray(shaded.vertex_normals, dtype=np.float32),
         triangles=np.asarray(shaded.faces, dtype=np.uint32),

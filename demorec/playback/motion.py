@@ -5,17 +5,17 @@ from __future__ import annotations
 import numpy as np
 import rerun as rr
 
-from demorec.episode import Event
 from demorec.geometry import Array
-from demorec.playback.episode import Curves, Episode
+from demorec.playback.episode import Curves, PlayedEpisode
 from demorec.playback.paths import Paths
 from demorec.playback.style import ASKED, FORCE, MEASURED, SECOND, TARGET, Color, phase_colors, series_colors
 from demorec.playback.times import indexes, seconds_only
+from demorec.scene.episode import Event
 
 _WIDTHS = {"target": 0.7, "gripper target": 1.2}
 
 
-def log_ee_path(recording: rr.RecordingStream, paths: Paths, episode: Episode) -> None:
+def log_ee_path(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisode) -> None:
     """The gripper's path: one piece a frame, so that a view can show what lies behind; coloured by phase."""
     if episode.num_frames < 2:
         return
@@ -30,7 +30,7 @@ def log_ee_path(recording: rr.RecordingStream, paths: Paths, episode: Episode) -
 
 
 def log_curves(
-    recording: rr.RecordingStream, paths: Paths, episode: Episode, label: str = "", *, is_second: bool = False
+    recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisode, label: str = "", *, is_second: bool = False
 ) -> None:
     """All plots; `label` goes before the names of the curves, a second episode's have other colours."""
     for name, curves in episode.curves.items():
@@ -78,7 +78,7 @@ def _curve_colors(name: str, curves: Curves, *, is_second: bool) -> list[Color]:
     return [ASKED] * len(curves.names) if name == "target" else series_colors(len(curves.names))
 
 
-def log_phases(recording: rr.RecordingStream, paths: Paths, episode: Episode) -> None:
+def log_phases(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisode) -> None:
     """The phases of the motion as states over time."""
     colors = phase_colors(episode.phase)
     if not colors or set(colors) == {""}:
@@ -92,7 +92,7 @@ def log_phases(recording: rr.RecordingStream, paths: Paths, episode: Episode) ->
     )
 
 
-def log_events(recording: rr.RecordingStream, paths: Paths, episode: Episode) -> None:
+def log_events(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisode) -> None:
     """Changes of phase and what happened, in order."""
     colors = phase_colors(episode.phase)
     rows: list[tuple[int, str, str, Color]] = [

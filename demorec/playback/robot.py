@@ -9,15 +9,15 @@ from collections.abc import Mapping
 import numpy as np
 import rerun as rr
 
-from demorec.assets import asset_path
 from demorec.errors import DemorecError
 from demorec.geometry import Array, quat_multiply
-from demorec.playback.episode import Episode
-from demorec.playback.meshes import Mesh, urdf_meshes
+from demorec.playback.episode import PlayedEpisode
+from demorec.playback.meshes import SurfaceMesh, urdf_meshes
 from demorec.playback.paths import Paths
 from demorec.playback.times import indexes
-from demorec.scene import Rgba
-from demorec.urdf import Urdf, UrdfJoint
+from demorec.scene.assets import asset_path
+from demorec.scene.scene import Rgba
+from demorec.scene.urdf import Urdf, UrdfJoint
 
 log = logging.getLogger(__name__)
 
@@ -25,7 +25,7 @@ _SAME_PLACE = 1e-3
 """How far joints of the installed model may be from those of the recorded description, metres."""
 
 
-def log_robot(recording: rr.RecordingStream, paths: Paths, episode: Episode, tint: Rgba | None = None) -> None:
+def log_robot(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisode, tint: Rgba | None = None) -> None:
     """Meshes of all links below `paths.robot`, nested as the links are, and how the joints move them.
 
     Raises:
@@ -61,7 +61,7 @@ def _log_pose(recording: rr.RecordingStream, entity: str, position: Array, quat_
     recording.log(entity, rr.Transform3D(translation=position, quaternion=quat_xyzw), static=True)
 
 
-def as_mesh3d(mesh: Mesh, tint: Rgba | None = None) -> rr.Mesh3D:
+def as_mesh3d(mesh: SurfaceMesh, tint: Rgba | None = None) -> rr.Mesh3D:
     """For Rerun; `tint` multiplies the colours and, as the only way to do so, makes the mesh translucent."""
     return rr.Mesh3D(
         vertex_positions=mesh.vertices,
@@ -85,7 +85,7 @@ def joint_columns(joint: UrdfJoint, position: Array) -> tuple[Array, Array]:
 
 
 @functools.lru_cache(maxsize=4)
-def robot_model(urdf: str, scale: float, description: str | None) -> tuple[Urdf, Mapping[str, Mesh]]:
+def robot_model(urdf: str, scale: float, description: str | None) -> tuple[Urdf, Mapping[str, SurfaceMesh]]:
     """The joint tree and the links' meshes: the installed model, or else the recorded description.
 
     The installed model is used when all of it is there and its joints are where the recording has them.

@@ -12,11 +12,11 @@ from demorec.errors import RecordingError
 from demorec.playback.compare import log_comparison, new_comparison
 from demorec.playback.layout import comparison_layout, episode_layout
 from demorec.playback.scene import log_episode, new_recording
-from demorec.playback.sources import Source
-from demorec.replacing import RERUN_FILE, written_whole
+from demorec.playback.sources import PlaybackSource
+from demorec.safety.replacing import RERUN_FILE, written_whole
 
 
-def save(source: Source, target: Path) -> None:
+def save(source: PlaybackSource, target: Path) -> None:
     """An episode into an .rrd file, which appears when it is complete.
 
     Raises:
@@ -36,7 +36,7 @@ def numbered(target: Path, count: int) -> list[Path]:
     return [target.with_name(f"{target.stem}-{index:04d}{target.suffix}") for index in range(count)]
 
 
-def save_each(sources: Sequence[Source], folder: Path) -> list[Path]:
+def save_each(sources: Sequence[PlaybackSource], folder: Path) -> list[Path]:
     """Each episode into an .rrd file of its own.
 
     Raises:
@@ -49,7 +49,7 @@ def save_each(sources: Sequence[Source], folder: Path) -> list[Path]:
     return files
 
 
-def save_comparison(a: Source, b: Source, target: Path) -> None:
+def save_comparison(a: PlaybackSource, b: PlaybackSource, target: Path) -> None:
     """Two episodes over each other into one .rrd file.
 
     Raises:
@@ -61,7 +61,7 @@ def save_comparison(a: Source, b: Source, target: Path) -> None:
             log_comparison(recording, first, second)
 
 
-def _save_episode(source: Source, target: Path, *, is_alone: bool) -> None:
+def _save_episode(source: PlaybackSource, target: Path, *, is_alone: bool) -> None:
     with source.open() as episode:
         recording = new_recording(episode)
         with _saving(recording, target, episode_layout(episode, is_alone=is_alone)):

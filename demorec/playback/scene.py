@@ -8,16 +8,16 @@ import rerun as rr
 
 from demorec.playback.bodies import log_bodies
 from demorec.playback.cameras import log_cameras
-from demorec.playback.episode import Episode
+from demorec.playback.episode import PlayedEpisode
 from demorec.playback.motion import log_curves, log_ee_path, log_events, log_phases
 from demorec.playback.paths import Paths
 from demorec.playback.robot import log_robot
 from demorec.playback.summary import entry, properties, summary
-from demorec.scene import Rgba
+from demorec.scene.scene import Rgba
 
 
 def log_episode(
-    recording: rr.RecordingStream, episode: Episode, *, root: str = "", label: str = "", tint: Rgba | None = None
+    recording: rr.RecordingStream, episode: PlayedEpisode, *, root: str = "", label: str = "", tint: Rgba | None = None
 ) -> None:
     """Send all of an episode below `root`; `label` goes before the names of its curves, `tint` colours its robot.
 
@@ -36,7 +36,7 @@ def log_episode(
     recording.log(paths.summary, rr.TextDocument(summary(episode), media_type="text/markdown"), static=True)
 
 
-def new_recording(episode: Episode) -> rr.RecordingStream:
+def new_recording(episode: PlayedEpisode) -> rr.RecordingStream:
     """An empty Rerun recording with the episode's name and properties."""
     recording = rr.RecordingStream(application_id(episode), recording_id=f"{episode.name}-{episode.identity}")
     recording.send_recording_name(entry(episode))
@@ -44,7 +44,7 @@ def new_recording(episode: Episode) -> rr.RecordingStream:
     return recording
 
 
-def application_id(episode: Episode) -> str:
+def application_id(episode: PlayedEpisode) -> str:
     """The group in the viewer's list: episodes of one group, task and set of cameras share a layout."""
     cameras = "-".join(camera.name for camera in episode.info.scene.cameras)
     words = (episode.group, episode.info.task, cameras)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from demorec.errors import ConfigError
 from demorec.lerobot.paths import INFO_PATH, is_dataset
-from demorec.playback.episode import Episode
+from demorec.playback.episode import PlayedEpisode
 from demorec.playback.from_dataset import dataset_episodes, open_dataset_episode
 from demorec.playback.from_recording import open_recording
 
@@ -18,7 +18,7 @@ _MCAP_MAGIC = b"\x89MCAP0\r\n"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Source:
+class PlaybackSource:
     """An episode that can be opened.
 
     Attributes:
@@ -27,10 +27,10 @@ class Source:
     """
 
     name: str
-    open: Callable[[], AbstractContextManager[Episode]]
+    open: Callable[[], AbstractContextManager[PlayedEpisode]]
 
 
-def find_episodes(paths: Sequence[Path], *, include_failures: bool = False) -> list[Source]:
+def find_episodes(paths: Sequence[Path], *, include_failures: bool = False) -> list[PlaybackSource]:
     """Every episode below the paths, in their order; a run's failures only when asked for.
 
     Raises:
@@ -42,7 +42,7 @@ def find_episodes(paths: Sequence[Path], *, include_failures: bool = False) -> l
     return [source for path in paths for source in _sources(path, include_failures)]
 
 
-def _sources(path: Path, include_failures: bool) -> list[Source]:
+def _sources(path: Path, include_failures: bool) -> list[PlaybackSource]:
     if not path.exists():
         raise ConfigError(f"There is no such file or folder: {path}")
     if path.suffix == ".part":
@@ -58,7 +58,7 @@ def _sources(path: Path, include_failures: bool) -> list[Source]:
         raise ConfigError(f"This is neither a file nor a folder: {path}")
     if is_dataset(path):
         return [
-            Source(name=f"{path}: episode {index}", open=partial(open_dataset_episode, path, index))
+            PlaybackSource(name=f"{path}: episode {index}", open=partial(open_dataset_episode, path, index))
             for index in dataset_episodes(path)
         ]
     files = sorted(path.glob("*.mcap")) + sorted((path / "episodes").glob("*.mcap"))
@@ -79,8 +79,8 @@ def _is_mcap(path: Path) -> bool:
         return file.read(len(_MCAP_MAGIC)) == _MCAP_MAGIC
 
 
-def _recording(path: Path) -> Source:
-    return Source(name=str(path), open=partial(open_recording, path, group=_group(path)))
+def _recording(path: Path) -> PlaybackSource:
+    return PlaybackSource(name=str(path), open=partial(open_recording, path, group=_group(path)))
 
 
 def _group(path: Path) -> str:
@@ -89,7 +89,7 @@ def _group(path: Path) -> str:
     return folder.parent.name if folder.name in ("episodes", "failed") else folder.name
 
 
-def select(sources: Sequence[Source], episodes: str) -> list[Source]:
+def select(sources: Sequence[PlaybackSource], episodes: str) -> list[PlaybackSource]:
     """Those of "7", "0:20" or "3,5,8:10", numbered from 0; all for "".
 
     Raises:
@@ -97,7 +97,7 @@ def select(sources: Sequence[Source], episodes: str) -> list[Source]:
     """
     if not episodes:
         return list(sources)
-    chosen: list[Source] = []
+    chosen: list[PlaybackSource] = []
     for word in episodes.split(","):
         first, colon, last = word.partition(":")
         try:

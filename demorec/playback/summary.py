@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import re
 
-from demorec.playback.episode import Episode
+from demorec.playback.episode import PlayedEpisode
 
 _OF_A_RUN = re.compile(r"episode_0*(?P<number>\d+)(?:\.attempt_(?P<attempt>\d+))?")
 
 
-def entry(episode: Episode) -> str:
+def entry(episode: PlayedEpisode) -> str:
     """A few characters for the viewer's narrow list: "3 ok", "0.1 FAIL place" (the attempt after the dot)."""
     match = _OF_A_RUN.fullmatch(episode.name)
     name = episode.name if match is None else ".".join(part for part in match.groups() if part is not None)
@@ -18,7 +18,7 @@ def entry(episode: Episode) -> str:
     return f"{name} ok" if episode.outcome.success else f"{name} FAIL {episode.outcome.failure_phase}".rstrip()
 
 
-def properties(episode: Episode) -> dict[str, str | int | float | bool]:
+def properties(episode: PlayedEpisode) -> dict[str, str | int | float | bool]:
     """What the viewer lists beside the recording's name."""
     info, outcome = episode.info, episode.outcome
     values: dict[str, str | int | float | bool] = {
@@ -43,7 +43,7 @@ def properties(episode: Episode) -> dict[str, str | int | float | bool]:
     return values
 
 
-def summary(episode: Episode) -> str:
+def summary(episode: PlayedEpisode) -> str:
     """Markdown: task, outcome and its checks, the failed ones first."""
     info = episode.info
     lines = [

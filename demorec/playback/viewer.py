@@ -20,7 +20,7 @@ from rerun.experimental import ViewerClient
 from demorec.errors import ConfigError, DemorecError, RecordingError
 from demorec.playback.programs import free_port, has_display, viewer_environment, viewer_program
 from demorec.playback.times import SECONDS
-from demorec.replacing import PICTURE, written_whole
+from demorec.safety.replacing import PICTURE, written_whole
 
 _START_SECONDS = 60.0
 _SETTLE_SECONDS = 30.0

@@ -9,11 +9,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from demorec.episode import EpisodeInfo
 from demorec.recording import messages
 from demorec.recording.description import body_description, robot_description
 from demorec.recording.labels import segment_names, to_labels
 from demorec.recording.transforms import FrameTree, camera_frame
+from demorec.scene.episode import EpisodeInfo
 
 JOINT_STATES = "/joint_states"
 GRIPPER = "/gripper"

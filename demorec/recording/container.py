@@ -32,9 +32,9 @@ from mcap.records import (
 )
 
 from demorec.errors import DemorecError, RecordingError, ResourceError, resource_error
-from demorec.files import open_regular
 from demorec.recording.chunks import MAX_RECORD_BYTES, RECORD_HEAD, Block, ChunkPlace, blocks_of, chunk_content
 from demorec.recording.limits import LimitError, Limits
+from demorec.safety.files import open_regular
 
 MAX_METADATA_BYTES = 4 << 20
 """Of a metadata record: ours have some 20 kB."""

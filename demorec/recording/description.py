@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.assets import asset_path, mesh_path
 from demorec.errors import SceneError
 from demorec.geometry import Array, Pose
 from demorec.recording.shapes import Primitive, fit_primitives
-from demorec.scene import Body, Rgba
-from demorec.urdf import quat_from_rpy
-from demorec.urdf_shapes import UrdfShape, read_links
+from demorec.scene.assets import asset_path, mesh_path
+from demorec.scene.scene import Body, Rgba
+from demorec.scene.urdf import quat_from_rpy
+from demorec.scene.urdf_shapes import UrdfShape, read_links
 
 _WHITE: Rgba = (1.0, 1.0, 1.0, 1.0)
 

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from demorec.assets import asset_path
-from demorec.episode import EpisodeInfo, Frame
 from demorec.errors import RecordingError
 from demorec.geometry import Array, Pose
 from demorec.recording.channels import WRENCH
 from demorec.recording.streams import frame_streams
-from demorec.urdf import Urdf
+from demorec.scene.assets import asset_path
+from demorec.scene.episode import EpisodeInfo, Frame
+from demorec.scene.urdf import Urdf
 
 
 def check_joint_names(info: EpisodeInfo) -> None:

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from demorec.episode import CameraImages, EpisodeColumns, Event, Frame, JointSample
 from demorec.recording.streams import action_at, command_at, observation_at, pose_of
+from demorec.scene.episode import CameraImages, EpisodeColumns, Event, Frame, JointSample
 
 if TYPE_CHECKING:
     from demorec.recording.reader import Recording

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from demorec.assets import asset_path
-from demorec.episode import EpisodeInfo
 from demorec.errors import RecordingError
-from demorec.urdf import Urdf
+from demorec.scene.assets import asset_path
+from demorec.scene.episode import EpisodeInfo
+from demorec.scene.urdf import Urdf
 
 BACKGROUND = -1
 FORMAT = "mono16; png compressed "

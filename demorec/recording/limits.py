@@ -59,13 +59,13 @@ class Limits:
     def check_total(self, size: int) -> None:
         """Raise LimitError when all chunks together are larger than allowed."""
         if size > self.total:
-            raise LimitError(_told(size, self.total))
+            raise LimitError(_refusal(size, self.total))
 
     def check_chunk(self, size: int, stored: int) -> None:
         """Raise LimitError when a chunk that takes `stored` bytes in the file is larger than allowed."""
         allowed = min(max(self.floor, _CHUNK_RATIO * stored), self.total)
         if size > allowed:
-            raise LimitError(_told(size, allowed))
+            raise LimitError(_refusal(size, allowed))
 
     def check_records(self, count: int) -> None:
         """Raise LimitError for more records than allowed."""
@@ -75,5 +75,5 @@ class Limits:
             )
 
 
-def _told(size: int, allowed: int) -> str:
+def _refusal(size: int, allowed: int) -> str:
     return f"it would unpack to {size / 1e6:,.0f} MB, allowed are {allowed / 1e6:,.0f} MB; {VARIABLE} raises this"

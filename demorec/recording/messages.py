@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from demorec.episode import Event
 from demorec.geometry import Array, Pose
 from demorec.recording.cdr import CdrReader, CdrWriter
 from demorec.recording.chunks import Block
 from demorec.recording.pixels import PixelStatistics
-from demorec.scene import Camera
+from demorec.scene.episode import Event
+from demorec.scene.scene import Camera
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 POSE = "geometry_msgs/msg/PoseStamped"

@@ -10,11 +10,11 @@ import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from demorec.episode import FORMAT_VERSION, EpisodeInfo, Outcome
 from demorec.errors import RecordingError
 from demorec.plain import to_json
 from demorec.recording.video import VideoSettings
-from demorec.validity import from_description, read_episode_info
+from demorec.scene.episode import FORMAT_VERSION, EpisodeInfo, Outcome
+from demorec.scene.validity import from_description, read_episode_info
 
 EPISODE = "demorec.episode"
 OUTCOME = "demorec.outcome"

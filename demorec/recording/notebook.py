@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from demorec.errors import MissingDependencyError
-from demorec.text import printable
+from demorec.safety.text import printable
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -69,7 +69,7 @@ def _picture(pixels: NDArray[np.uint8]) -> str:
 def frame_table(recording: Recording) -> pd.DataFrame:
     """All numbers as a table, one row a frame, float64 to the bit; the index is `frame_index`.
 
-    Columns are named as in `demorec.episode.EpisodeColumns`, vectors with their component:
+    Columns are named as in `demorec.scene.episode.EpisodeColumns`, vectors with their component:
     `joint_position.panda_joint1` (rad, fingers m), `base_from_tcp.x` (m), `base_from_tcp.qw`,
     `wrench.fz` (N) and `wrench.tx` (N m) where they were recorded, `object_poses.cube.z` (m, world frame), `phase`.
     `time_ns` is simulated time since the episode's start.

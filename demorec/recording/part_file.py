@@ -14,7 +14,7 @@ from foxglove.messages import CompressedVideo
 from demorec.errors import RecordingError
 from demorec.recording import messages
 from demorec.recording.ros2 import DEFINITIONS
-from demorec.replacing import RECORDING, check_replaceable, lock_part
+from demorec.safety.replacing import RECORDING, check_replaceable, lock_part
 
 _CHUNK_BYTES = 1 << 20
 _LATCHED_QOS = (

@@ -8,7 +8,6 @@ from typing import Any
 from numpy.typing import NDArray
 
 from demorec.config import VideoConfig
-from demorec.episode import CameraImages, Frame
 from demorec.errors import RecordingError
 from demorec.recording import messages
 from demorec.recording.channels import camera_topic, video_topic
@@ -20,7 +19,8 @@ from demorec.recording.metadata import CameraStreams
 from demorec.recording.pixels import PixelCounter
 from demorec.recording.transforms import camera_frame
 from demorec.recording.video import make_encoder
-from demorec.scene import Camera
+from demorec.scene.episode import CameraImages, Frame
+from demorec.scene.scene import Camera
 
 Message = tuple[str, str, bytes]
 """Topic, type, bytes."""

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Self, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.episode import EpisodeColumns, Event, Frame, JointSample, frame_time_ns
 from demorec.errors import RecordingError
 from demorec.plain import to_json, to_plain
 from demorec.recording import channels, messages, metadata
@@ -28,7 +27,8 @@ from demorec.recording.notebook import described, frame_table, html_page
 from demorec.recording.pixels import PixelCounter, PixelStatistics
 from demorec.recording.streams import Columns, FrameStream, frame_streams, merged_columns
 from demorec.recording.video import Rgb, VideoPacket, VideoSettings, decode, is_keyframe
-from demorec.urdf import check_primitives
+from demorec.scene.episode import EpisodeColumns, Event, Frame, JointSample, frame_time_ns
+from demorec.scene.urdf import check_primitives
 
 if TYPE_CHECKING:
     import pandas as pd

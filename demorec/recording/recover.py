@@ -11,7 +11,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from demorec.episode import frame_time_ns
 from demorec.errors import RecordingError, resource_error
 from demorec.recording import channels, messages, metadata
 from demorec.recording.container import SalvagedMessage, SalvagedMetadata, salvage
@@ -19,6 +18,7 @@ from demorec.recording.part_file import PartFile
 from demorec.recording.reader import Recording
 from demorec.recording.ros2 import DEFINITIONS
 from demorec.recording.streams import frame_streams
+from demorec.scene.episode import frame_time_ns
 
 
 @dataclass(frozen=True, kw_only=True)

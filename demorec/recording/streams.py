@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from demorec.episode import Action, EpisodeColumns, EpisodeInfo, Frame, Observation
 from demorec.geometry import Array, Pose
 from demorec.recording import messages
 from demorec.recording.cdr import CdrWriter, Layout
@@ -31,6 +30,7 @@ from demorec.recording.channels import (
     object_topic,
 )
 from demorec.recording.transforms import WORLD, FrameTree
+from demorec.scene.episode import Action, EpisodeColumns, EpisodeInfo, Frame, Observation
 
 GRIPPER_JOINT = "gripper"
 """Name of the gripper's opening beside the joints' names."""

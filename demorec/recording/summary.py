@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from demorec.episode import Check
 from demorec.recording.reader import Recording
 from demorec.recording.video import VideoSettings
+from demorec.scene.episode import SuccessCheck
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +53,7 @@ class RecordingSummary:
     success: bool | None
     failure_phase: str
     failure_reason: str
-    checks: tuple[Check, ...]
+    checks: tuple[SuccessCheck, ...]
     retries: int
     frames: int
     fps: int

@@ -11,10 +11,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from demorec.assets import asset_path
-from demorec.episode import EpisodeInfo, Observation
 from demorec.geometry import Array, Pose, quat_multiply
-from demorec.urdf import Urdf, UrdfJoint, joint_motion
+from demorec.scene.assets import asset_path
+from demorec.scene.episode import EpisodeInfo, Observation
+from demorec.scene.urdf import Urdf, UrdfJoint, joint_motion
 
 WORLD = "world"
 RERUN_ROOT = "tf#/"

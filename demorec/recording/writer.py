@@ -17,7 +17,6 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from demorec.config import VideoConfig
-from demorec.episode import EpisodeInfo, Event, Frame, JointSample, Outcome, frame_time_ns
 from demorec.errors import RecordingError
 from demorec.recording import channels, messages, metadata
 from demorec.recording.frame_check import FrameCheck, check_joint_names
@@ -26,6 +25,7 @@ from demorec.recording.pictures import CameraRecorder
 from demorec.recording.recover import can_be_made_again
 from demorec.recording.streams import FrameValues, frame_streams, tf_stream
 from demorec.recording.transforms import FrameTree
+from demorec.scene.episode import EpisodeInfo, Event, Frame, JointSample, Outcome, frame_time_ns
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,9 +10,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
-from demorec.episode import CameraImages
 from demorec.geometry import Array, Pose
-from demorec.scene import Camera, Light, Rgba, Texture
+from demorec.scene.episode import CameraImages
+from demorec.scene.scene import Camera, Light, Rgba, Texture
 
 VisualKind = Literal["box", "sphere", "cylinder", "capsule", "mesh", "plane"]
 
@@ -129,7 +129,7 @@ def first_rows(bodies: Sequence[VisualBody]) -> list[int]:
     return rows
 
 
-def prepare(renderer: str) -> None:
+def warm_up_renderer(renderer: str) -> None:
     """Do what a renderer needs once on a machine, before several processes that use it start: compiling, for raster."""
     if renderer == "raster":
         from demorec.render.raster import warm_up

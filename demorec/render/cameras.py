@@ -8,9 +8,9 @@ from typing import Literal
 
 import numpy as np
 
-from demorec.episode import RobotSpec
 from demorec.geometry import Pose, look_at
-from demorec.scene import Camera, Vector3
+from demorec.scene.robot import RobotSpec
+from demorec.scene.scene import Camera, Vector3
 
 
 @dataclass(frozen=True, kw_only=True)

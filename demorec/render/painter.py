@@ -9,10 +9,10 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Protocol
 
-from demorec.episode import CameraImages
 from demorec.geometry import Array, Pose
 from demorec.render import Mount, Renderer, RenderSetup, VisualBody
-from demorec.scene import Camera, Scene
+from demorec.scene.episode import CameraImages
+from demorec.scene.scene import Camera, Scene
 
 
 class Drawable(Protocol):

@@ -11,14 +11,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from demorec.assets import asset_path, mesh_path
-from demorec.bullet_kinematics import BulletBody, as_told, origin_as_told, standing_as_told
-from demorec.episode import RobotSpec
 from demorec.errors import SceneError
 from demorec.geometry import Array, Pose
 from demorec.render import Mount, Visual, VisualBody
-from demorec.scene import Body, Rgba, Scene
-from demorec.urdf_shapes import read_links
+from demorec.scene.assets import asset_path, mesh_path
+from demorec.scene.bullet_kinematics import BulletBody, as_told, origin_as_told, standing_as_told
+from demorec.scene.robot import RobotSpec
+from demorec.scene.scene import Body, Rgba, Scene
+from demorec.scene.urdf_shapes import read_links
 
 _WHITE: Rgba = (1.0, 1.0, 1.0, 1.0)
 

@@ -7,7 +7,7 @@ import math
 from demorec.errors import RenderError
 from demorec.geometry import Array, Pose
 from demorec.render import RenderSetup, first_rows
-from demorec.scene import Camera
+from demorec.scene.scene import Camera
 
 MAX_SAMPLES = 1 << 28
 """Of a picture; beyond, buffers would take several GB. (PyBullet ends the process on sizes that it cannot draw.)"""

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from demorec.errors import ConfigError
-from demorec.features import ACTION, STATE
 from demorec.replay.demonstration import Demonstration, ReplayOptions
+from demorec.scene.features import ACTION, STATE
 
 
 def dataset_demonstrations(

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from demorec.episode import Action, Check, EpisodeInfo, Frame
 from demorec.errors import ConfigError, RecordingError
-from demorec.features import ActionKind
 from demorec.geometry import Array
 from demorec.recording import Recording
 from demorec.recording.frames import frames_of
 from demorec.recording.streams import command_at
+from demorec.scene.episode import Action, EpisodeInfo, Frame, SuccessCheck
+from demorec.scene.features import ActionKind
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,7 +92,7 @@ class Demonstration:
     source: Path | None = None
     digest: str = ""
     recorded: tuple[Frame, ...] = ()
-    recorded_checks: tuple[Check, ...] = ()
+    recorded_checks: tuple[SuccessCheck, ...] = ()
 
     @property
     def num_steps(self) -> int:

@@ -8,13 +8,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from demorec.episode import Action, Frame, Outcome
 from demorec.geometry import Array
 from demorec.loop import Decision, Session
 from demorec.loop.actions import ActionDecoder
 from demorec.recording.streams import pose_of
 from demorec.render.painter import Painter
 from demorec.replay.demonstration import Demonstration, ReplayOptions
+from demorec.scene.episode import Action, Frame, Outcome
 from demorec.seeding import generator
 from demorec.sim.world import World
 from demorec.tables import TASKS

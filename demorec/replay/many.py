@@ -7,15 +7,15 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
-from demorec.assets import allow_models
 from demorec.config import VideoConfig
 from demorec.errors import ConfigError
-from demorec.files import make_folder
 from demorec.plain import from_plain
 from demorec.recording import EpisodeWriter
 from demorec.replay.demonstration import Demonstration, ReplayOptions
 from demorec.replay.drive import ReplayReport, replay
-from demorec.rerender import recorded_view, view_painter
+from demorec.replay.rerender import recorded_view, view_painter
+from demorec.safety.files import make_folder
+from demorec.scene.assets import allow_models
 from demorec.sim.world import World
 from demorec.tables import RENDERERS, TASKS
 

@@ -6,12 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from demorec.assets import asset_path
-from demorec.episode import Action, RobotSpec
 from demorec.errors import DemorecError, SceneError
 from demorec.geometry import Array, Pose
-from demorec.kinematics import ArmKinematics
-from demorec.scene import POSITION_GAIN, RobotPlacement
+from demorec.scene.assets import asset_path
+from demorec.scene.episode import Action
+from demorec.scene.kinematics import ArmKinematics
+from demorec.scene.robot import RobotSpec
+from demorec.scene.scene import POSITION_GAIN, RobotPlacement
 from demorec.sim.urdf_file import urdf_file
 
 FINGER_SPEED = 0.1

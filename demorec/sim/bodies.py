@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from demorec.assets import asset_path
 from demorec.errors import DemorecError, SceneError
-from demorec.scene import Body, Shape
+from demorec.scene.assets import asset_path
+from demorec.scene.scene import Body, Shape
 from demorec.sim.urdf_file import urdf_file
 
 

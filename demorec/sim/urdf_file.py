@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from demorec.assets import asset_path, mesh_path
+from demorec.scene.assets import asset_path, mesh_path
 
 
 @contextmanager
@@ -18,7 +18,7 @@ def urdf_file(name: str) -> Iterator[str]:
     """A file that PyBullet can load while the context lasts.
 
     Args:
-        name: As in `demorec.assets.asset_path`.
+        name: As in `demorec.scene.assets.asset_path`.
 
     Raises:
         SceneError: The URDF or one of its meshes is missing.

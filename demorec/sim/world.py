@@ -12,11 +12,12 @@ from typing import Any, Self
 
 import numpy as np
 
-from demorec.episode import Action, JointSample, Observation, RobotSpec, frame_time_ns
 from demorec.errors import ConfigError, SceneError
 from demorec.geometry import Array, Pose
 from demorec.render import Mount, VisualBody
-from demorec.scene import Body, Physics, Scene
+from demorec.scene.episode import Action, JointSample, Observation, frame_time_ns
+from demorec.scene.robot import RobotSpec
+from demorec.scene.scene import Body, Physics, Scene
 from demorec.sim.arm import Arm
 from demorec.sim.bodies import add_body
 from demorec.sim.client import connect

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from demorec.episode import Action, Check, Event, RobotSpec
 from demorec.render.cameras import CameraPreset
-from demorec.scene import Scene
+from demorec.scene.episode import Action, Event, SuccessCheck
+from demorec.scene.robot import RobotSpec
+from demorec.scene.scene import Scene
 from demorec.sim.world import World
 from demorec.tasks.sampling import Sampler
 
@@ -101,5 +102,5 @@ class Task(ABC):
         """Do it, one control step at a time: the world has advanced when the generator resumes."""
 
     @abstractmethod
-    def evaluate(self, world: World) -> tuple[Check, ...]:
+    def evaluate(self, world: World) -> tuple[SuccessCheck, ...]:
         """The conditions of success, with the values found now."""

@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
-from demorec.episode import Check
 from demorec.geometry import Pose
-from demorec.scene import Body, Goal
+from demorec.scene.episode import SuccessCheck
+from demorec.scene.scene import Body, Goal
 from demorec.sim.world import World
 
 MAX_DISTANCE = 0.02
@@ -38,14 +38,14 @@ def tilt_of(pose: Pose) -> float:
     return math.acos(min(1.0, float(np.abs(pose.rotation[2]).max())))
 
 
-def at_most(name: str, value: float, limit: float, unit: str) -> Check:
+def at_most(name: str, value: float, limit: float, unit: str) -> SuccessCheck:
     """A check that holds when value <= limit."""
-    return Check(name=name, value=float(value), limit=limit, unit=unit, passed=bool(value <= limit))
+    return SuccessCheck(name=name, value=float(value), limit=limit, unit=unit, passed=bool(value <= limit))
 
 
-def at_least(name: str, value: float, limit: float, unit: str) -> Check:
+def at_least(name: str, value: float, limit: float, unit: str) -> SuccessCheck:
     """A check that holds when value >= limit."""
-    return Check(name=name, value=float(value), limit=limit, unit=unit, passed=bool(value >= limit))
+    return SuccessCheck(name=name, value=float(value), limit=limit, unit=unit, passed=bool(value >= limit))
 
 
 def on_support(world: World, name: str, onto: str) -> bool:
@@ -57,7 +57,7 @@ def on_support(world: World, name: str, onto: str) -> bool:
     )
 
 
-def placement_checks(world: World, goal: Goal, *, max_distance: float = MAX_DISTANCE) -> tuple[Check, ...]:
+def placement_checks(world: World, goal: Goal, *, max_distance: float = MAX_DISTANCE) -> tuple[SuccessCheck, ...]:
     """That one object lies at its goal: near, on its support, upright, at rest and let go.
 
     The names end in the object's name when the scene has more than one goal.
@@ -79,6 +79,6 @@ def placement_checks(world: World, goal: Goal, *, max_distance: float = MAX_DIST
     )
 
 
-def gripper_open_check(world: World) -> Check:
+def gripper_open_check(world: World) -> SuccessCheck:
     """That the hand has let go."""
     return at_least("gripper_width", world.arm.gripper_width(), MIN_OPENING * world.robot.gripper_max_width, "m")

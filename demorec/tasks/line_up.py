@@ -6,8 +6,9 @@ import math
 
 import numpy as np
 
-from demorec.episode import Check, RobotSpec
-from demorec.scene import Scene
+from demorec.scene.episode import SuccessCheck
+from demorec.scene.robot import RobotSpec
+from demorec.scene.scene import Scene
 from demorec.sim.world import World
 from demorec.tasks.checks import at_most
 from demorec.tasks.furniture import mark, robot_at_origin, table_and_floor
@@ -75,7 +76,7 @@ class LineUp(PlacingTask):
             third=third,
         )
 
-    def evaluate(self, world: World) -> tuple[Check, ...]:
+    def evaluate(self, world: World) -> tuple[SuccessCheck, ...]:
         """Each cube on its mark, the row straight and even."""
         first, second, third = (world.pose(goal.object).position[:2] for goal in world.scene.goals)
         gaps = math.dist(first, second), math.dist(second, third)

@@ -6,9 +6,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from demorec.episode import Check, RobotSpec
 from demorec.geometry import Pose
-from demorec.scene import Goal, Scene
+from demorec.scene.episode import SuccessCheck
+from demorec.scene.robot import RobotSpec
+from demorec.scene.scene import Goal, Scene
 from demorec.sim.world import World
 from demorec.tasks.base import Step, Task
 from demorec.tasks.checks import gripper_open_check, placement_checks
@@ -72,7 +73,7 @@ class PickPlace(Task):
         for goal in expert.world.scene.goals:
             yield from expert.pick_and_place(goal)
 
-    def evaluate(self, world: World) -> tuple[Check, ...]:
+    def evaluate(self, world: World) -> tuple[SuccessCheck, ...]:
         """The cube lies on the mark and the hand has let go."""
         placed = [check for goal in world.scene.goals for check in placement_checks(world, goal)]
         return (*placed, gripper_open_check(world))

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from demorec.episode import RobotSpec
-from demorec.scene import Scene
+from demorec.scene.robot import RobotSpec
+from demorec.scene.scene import Scene
 from demorec.tasks.furniture import COLORS, mark, robot_at_origin, table_and_floor
 from demorec.tasks.placing import PlacingTask, on_table
 from demorec.tasks.sampling import WORKSPACE, Sampler, wording

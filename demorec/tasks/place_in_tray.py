@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from demorec.episode import RobotSpec
 from demorec.geometry import Pose
-from demorec.scene import Goal, Scene
+from demorec.scene.robot import RobotSpec
+from demorec.scene.scene import Goal, Scene
 from demorec.tasks.furniture import robot_at_origin, table_and_floor
 from demorec.tasks.placing import TRAY_FLOOR, PlacingTask, random_cube, tray
 from demorec.tasks.sampling import Region, Sampler, wording

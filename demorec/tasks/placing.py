@@ -7,9 +7,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from demorec.episode import Check
 from demorec.geometry import Pose
-from demorec.scene import Body, Goal, Rgba, Shape
+from demorec.scene.episode import SuccessCheck
+from demorec.scene.scene import Body, Goal, Rgba, Shape
 from demorec.sim.world import World
 from demorec.tasks.base import Step, Task
 from demorec.tasks.checks import at_most, gripper_open_check, placement_checks
@@ -35,13 +35,13 @@ class PlacingTask(Task):
         for goal in expert.world.scene.goals:
             yield from expert.pick_and_place(goal)
 
-    def evaluate(self, world: World) -> tuple[Check, ...]:
+    def evaluate(self, world: World) -> tuple[SuccessCheck, ...]:
         """Goals, bystanders, gripper."""
         placed = [check for goal in world.scene.goals for check in placement_checks(world, goal)]
         return (*placed, *undisturbed_checks(world), gripper_open_check(world))
 
 
-def undisturbed_checks(world: World) -> tuple[Check, ...]:
+def undisturbed_checks(world: World) -> tuple[SuccessCheck, ...]:
     """That each movable body without a goal of its own still lies where it lay."""
     moved = {goal.object for goal in world.scene.goals}
     return tuple(

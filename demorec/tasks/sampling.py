@@ -12,9 +12,9 @@ import numpy as np
 
 from demorec.errors import SceneError
 from demorec.geometry import Array
-from demorec.scene import Vector3
+from demorec.scene.scene import Vector3
+from demorec.scene.variation import PRESETS, Ranges
 from demorec.seeding import generator
-from demorec.variation import PRESETS, Ranges
 
 MAX_TRIES = 1000
 STRATIFIED_NUMBERS = 12

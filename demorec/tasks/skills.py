@@ -13,10 +13,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from demorec.episode import Action, Event
 from demorec.geometry import Array, Pose, wrap_angle
-from demorec.motion import MotionLimits, plan_straight
-from demorec.scene import Body, Goal, yaw_of
+from demorec.scene.episode import Action, Event
+from demorec.scene.motion import MotionLimits, plan_straight
+from demorec.scene.scene import Body, Goal, yaw_of
 from demorec.sim.world import World
 from demorec.tasks.base import Behaviour, Step
 from demorec.tasks.checks import goal_pose, on_support, placement_checks, resting_half_height

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from demorec.geometry import Pose
-from demorec.scene import Body, Role, Shape
+from demorec.scene.scene import Body, Role, Shape
 from demorec.tasks.furniture import COLORS
 from demorec.tasks.sampling import Sampler
 

@@ -9,10 +9,11 @@ from typing import ClassVar
 
 import numpy as np
 
-from demorec.episode import Check, RobotSpec
 from demorec.geometry import Pose
 from demorec.render.cameras import FRONT, CameraPreset
-from demorec.scene import Body, Goal, RobotPlacement, Scene, Shape
+from demorec.scene.episode import SuccessCheck
+from demorec.scene.robot import RobotSpec
+from demorec.scene.scene import Body, Goal, RobotPlacement, Scene, Shape
 from demorec.sim.world import World
 from demorec.tasks.base import Step, Task
 from demorec.tasks.checks import (
@@ -155,7 +156,7 @@ class Tutorial(Task):
         rests = lasting(lambda: self._rests(world), steps=max(1, round(REST_SECONDS * world.fps)))
         yield from expert.set_gripper(open_width, max_seconds=MAX_FALL_SECONDS, done=rests)
 
-    def evaluate(self, world: World) -> tuple[Check, ...]:
+    def evaluate(self, world: World) -> tuple[SuccessCheck, ...]:
         """The cube lies on the table."""
         name = world.scene.goals[0].object
         linear, angular = world.velocity(name)

@@ -1,4 +1,4 @@
-"""Applies the ranges of `demorec.variation` to a task's scene, whatever the task."""
+"""Applies the ranges of `demorec.scene.variation` to a task's scene, whatever the task."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from dataclasses import replace
 import numpy as np
 
 from demorec.geometry import Pose
-from demorec.scene import Body, Camera, Light, Rgba, Scene, Shape, Texture, Vector3
+from demorec.scene.scene import Body, Camera, Light, Rgba, Scene, Shape, Texture, Vector3
+from demorec.scene.variation import Ranges
 from demorec.tasks.base import Behaviour
 from demorec.tasks.sampling import WORKSPACE, Region, Sampler
-from demorec.variation import Ranges
 
 NEUTRAL_COLORS: tuple[Rgba, ...] = (
     (0.15, 0.15, 0.16, 1.0),
@@ -211,7 +211,7 @@ def vary_cameras(cameras: tuple[Camera, ...], ranges: Ranges, rng: np.random.Gen
 
 
 def calibration_errors(cameras: tuple[Camera, ...], ranges: Ranges, rng: np.random.Generator) -> dict[str, Pose]:
-    """Camera name -> recorded_from_true: what the recorded extrinsics are wrong by."""
+    """Camera name -> true_from_recorded: what the recorded extrinsics are wrong by."""
     position, rotation = ranges.number("calibration_position"), ranges.number("calibration_rotation")
     return {camera.name: small_pose(rng, position=position, rotation=rotation) for camera in cameras}
 

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 
-from demorec.episode import RobotSpec
 from demorec.render.cameras import CameraPreset
+from demorec.scene.robot import RobotSpec
 
 TURN = 2 * math.pi
 

@@ -11,8 +11,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from demorec.episode import Check, RobotSpec
 from demorec.scene import Scene
+from demorec.scene.episode import SuccessCheck
+from demorec.scene.robot import RobotSpec
 from demorec.sim.world import World
 from demorec.tasks.base import Step, Task
 from demorec.tasks.checks import placement_checks
@@ -94,6 +95,6 @@ class PushToMark(Task):
         yield from expert.move(away, speed=0.2)
         yield from expert.move(raised(away, 0.1), speed=0.3)
 
-    def evaluate(self, world: World) -> tuple[Check, ...]:
+    def evaluate(self, world: World) -> tuple[SuccessCheck, ...]:
         """The cube lies on the mark, and the hand is off it; how far that is open does not matter here."""
         return placement_checks(world, world.scene.goals[0])

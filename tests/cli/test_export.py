@@ -6,7 +6,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from helpers_export import episode_rows, files_of, make_run
+from support.export import episode_rows, files_of, make_run
 
 import demorec.lerobot.hub
 import demorec.lerobot.prepare

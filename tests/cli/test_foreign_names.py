@@ -11,15 +11,15 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from helpers_check import Spoilt
+from support.check import Spoilt
 
 from demorec.cli import main
 from demorec.config import GenerateConfig
 from demorec.errors import ConfigError, NotAllowedError
-from demorec.generate.recordings import inspect_recording
-from demorec.generate.run_file import RUN_NAME, RunFile, save_run_file
 from demorec.lerobot import ExportOptions, export_lerobot
 from demorec.plain import to_plain
+from demorec.runs.recordings import inspect_recording
+from demorec.runs.run_file import RUN_NAME, RunFile, save_run_file
 
 SAMPLE = next((Path(__file__).parents[2] / "recordings" / "sample").glob("*.mcap"))
 MODULE = "names_of_a_stranger"
@@ -215,8 +215,8 @@ def test_a_policy_cannot_name_the_code_of_its_steps_nor_its_cameras(tmp_path: Pa
     "file", ["/etc/hostname", "../../secret.urdf", "demorec:../robots/panda.py", "stranger:abort.urdf"]
 )
 def test_models_that_a_file_names_lie_in_known_folders(file: str) -> None:
-    from demorec.assets import asset_path
     from demorec.errors import DemorecError
+    from demorec.scene.assets import asset_path
 
     with pytest.raises(DemorecError, match=r"lies outside of|add --allow stranger\."):
         asset_path(file)

@@ -12,14 +12,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers_export import export
-from helpers_mcap import rewritten
-from helpers_recording import write_episode
+from support.export import export
+from support.mcap import rewritten
+from support.recording import write_episode
 
 from demorec.cli import COMMANDS, main, run_command
-from demorec.generate.recordings import inspect_recording
-from demorec.generate.run_file import RunFile, save_run_file
 from demorec.recording import Recording
+from demorec.runs.recordings import inspect_recording
+from demorec.runs.run_file import RunFile, save_run_file
 
 HOSTILE = "\x1b[2Jx\n\u202ey\x9b31m"
 NAME = "\x1b[31mred\u202e.mcap"

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
-from helpers_recording import make_episode, write_episode
+from support.recording import make_episode, write_episode
 
 from demorec.cli import COMMANDS, main, run_command
 from demorec.recording import EpisodeWriter, Recording

@@ -11,10 +11,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers_export import export, files_of, make_run
-from helpers_generate import run_fake
-from helpers_recording import write_episode
 from PIL import Image
+from support.export import export, files_of, make_run
+from support.generate import run_fake
+from support.recording import write_episode
 
 from demorec.cli import main
 from demorec.config import GenerateConfig
@@ -24,7 +24,7 @@ from demorec.generate import reproduce as reproducing
 from demorec.generate.options import RunOptions
 from demorec.generate.run import NoProgress
 from demorec.lerobot import ExportOptions
-from demorec.replacing import PICTURE, RECORDING, RERUN_FILE, check_replaceable, settle_parts, written_whole
+from demorec.safety.replacing import PICTURE, RECORDING, RERUN_FILE, check_replaceable, settle_parts, written_whole
 
 
 def demorec(*arguments: object) -> int:
@@ -348,7 +348,7 @@ def test_render_and_replay_never_replace_what_they_read(
 
 def test_a_recording_replaces_recordings_only(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """What render, replay and evaluate write with."""
-    from helpers_recording import make_episode
+    from support.recording import make_episode
 
     from demorec.recording import EpisodeWriter
 

@@ -9,8 +9,8 @@ from typing import Literal
 
 import numpy as np
 import pytest
-from helpers_recording import make_episode, write_episode
-from helpers_viewer import chromium, need_chromium, need_vulkan, num_colors, pixels
+from support.recording import make_episode, write_episode
+from support.viewer import chromium, need_chromium, need_vulkan, num_colors, pixels
 
 from demorec.cli import run_command
 from demorec.cli.view import View
@@ -175,7 +175,7 @@ def test_the_viewer_shows_the_colours_that_were_recorded(codec: Literal["av1", "
 @pytest.mark.viewer
 def test_the_viewer_shows_a_dataset(run_folder: Path, tmp_path: Path) -> None:
     need_vulkan()
-    from helpers_export import export
+    from support.export import export
 
     dataset = tmp_path / "dataset"
     export(run_folder, dataset)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers_check import checked, simulate_run
+from support.check import checked, simulate_run
 
 from demorec.cli import main
 from demorec.recording import Recording

@@ -13,9 +13,9 @@ from demorec.config import EpisodePlan, GenerateConfig, deciding_versions
 from demorec.generate.export_step import export_run
 from demorec.generate.options import RunOptions
 from demorec.generate.run import NoProgress, RunResult, generate
-from demorec.generate.run_file import load_run_file
 from demorec.lerobot import ExportOptions, dataset_digest, export_lerobot
 from demorec.recording import Recording
+from demorec.runs.run_file import load_run_file
 
 CONFIG = GenerateConfig(seed=11, width=48, height=32)
 NUM_EPISODES = 3

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers_docs import run_examples
-from helpers_export import data_table, episode_rows, export, make_run
-from helpers_recording import make_episode
+from support.docs import run_examples
+from support.export import data_table, episode_rows, export, make_run
+from support.recording import make_episode
 
 import demorec.lerobot.writer
 from demorec.lerobot import dataset_digest

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers_sim import episode
+from support.sim import episode
 
 from demorec.cli import main
 from demorec.config import GenerateConfig

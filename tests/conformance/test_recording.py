@@ -13,16 +13,16 @@ import av
 import cv2
 import numpy as np
 import pytest
-from helpers_recording import frame_number, make_episode, write_episode
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from support.recording import frame_number, make_episode, write_episode
 
-from demorec.assets import asset_path
 from demorec.config import VideoConfig
 from demorec.recording.ros2 import DEFINITIONS
+from demorec.scene.assets import asset_path
 
 NUM_FRAMES = 40
 

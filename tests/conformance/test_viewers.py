@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers_recording import write_episode
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rerun.chunk import RrdReader
+from support.recording import write_episode
 
 VIEWERS = Path(__file__).parents[2] / "viewers"
 PROGRAMS = {

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
-from helpers_check import checked, simulate
+from support.check import checked, simulate
 
 from demorec.cli import main
 from demorec.tables import CHECKS, ROBOTS, TASKS

@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from helpers_check import checked, copy, edit_column, edit_json, level_of, simulate_run
+from support.check import checked, copy, edit_column, edit_json, level_of, simulate_run
 
 from demorec.check.coverage import draw_coverage, largest_gap
 from demorec.config import EpisodePlan, GenerateConfig
-from demorec.episode import EpisodeInfo
 from demorec.lerobot.export import export_lerobot
 from demorec.lerobot.options import ExportOptions
 from demorec.loop import prepare
+from demorec.scene.episode import EpisodeInfo
 from demorec.tables import TASKS
 
 

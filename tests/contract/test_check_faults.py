@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers_check import Message, Spoilt, checked, flip_bits, level_of, rewrite_messages, simulate
+from support.check import Message, Spoilt, checked, flip_bits, level_of, rewrite_messages, simulate
 
-from demorec.episode import Check
 from demorec.recording import channels, messages
+from demorec.scene.episode import SuccessCheck
 
 Fault = Callable[[Spoilt], None]
 
@@ -221,7 +221,7 @@ def trembling_velocities(s: Spoilt) -> None:
 
 def success_that_was_none(s: Spoilt) -> None:
     assert s.outcome is not None
-    failed = Check(name="tilt", value=1.2, limit=0.087, unit="rad", passed=False)
+    failed = SuccessCheck(name="tilt", value=1.2, limit=0.087, unit="rad", passed=False)
     s.outcome = replace(s.outcome, checks=(*s.outcome.checks, failed))
 
 

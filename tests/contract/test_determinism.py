@@ -5,13 +5,13 @@ from __future__ import annotations
 import itertools
 
 import pytest
-from helpers_sim import episode, run
+from support.sim import episode, run
 
-from demorec.episode import EpisodeInfo
 from demorec.loop import make_world
 from demorec.plain import from_json, to_json
+from demorec.scene.episode import EpisodeInfo
+from demorec.scene.variation import PRESET_NAMES
 from demorec.tables import ROBOTS, TASKS
-from demorec.variation import PRESET_NAMES
 
 CASES = list(itertools.product(TASKS.names(), ROBOTS.names(), PRESET_NAMES))
 FAST = [case for case in CASES if case[0] == "pick_place" and case[2] != "none"]

@@ -7,7 +7,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from helpers_export import export, files_of, make_run
+from support.export import export, files_of, make_run
 
 from demorec.cli.flags import _field_texts
 from demorec.config import VideoConfig

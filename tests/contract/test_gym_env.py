@@ -11,16 +11,16 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
-from helpers_docs import run_examples
-from helpers_sim import episode
+from support.docs import run_examples
+from support.sim import episode
 
 import demorec.gym_env
-from demorec import features
 from demorec.errors import ConfigError, SceneError
 from demorec.gym_env import DemorecEnv, env_id
 from demorec.loop import ScriptAgent, Session, make_renderer, make_world
 from demorec.loop.actions import ACTION_KINDS
 from demorec.recording import EpisodeWriter, Recording
+from demorec.scene import features
 from demorec.tables import TASKS
 
 FRAMES = 45
@@ -109,7 +109,7 @@ def columns_of(frames: list[Any]) -> Any:
     """The columns of frames, through a file."""
     import tempfile
 
-    from demorec.episode import Outcome
+    from demorec.scene.episode import Outcome
 
     prepared = episode(2, variation="none")
     with tempfile.TemporaryDirectory() as folder:

@@ -9,19 +9,19 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from helpers_check import simulate
-from helpers_generate import inspect
+from support.check import simulate
+from support.generate import inspect
 
 from demorec.cli import generate_dataset_main, main
 from demorec.config import EpisodePlan, GenerateConfig, deciding_versions
 from demorec.errors import ConfigError, SceneError
 from demorec.generate.options import RunOptions
 from demorec.generate.run import generate
-from demorec.generate.run_file import load_run_file
 from demorec.generate.worker import make_episode
-from demorec.own_versions import changed_sources, own_versions, source_digest
 from demorec.recording import Recording
 from demorec.replay import ReplayOptions, open_file, replay_all
+from demorec.runs.run_file import load_run_file
+from demorec.safety.own_versions import changed_sources, own_versions, source_digest
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "own_robot"
@@ -48,7 +48,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     monkeypatch.chdir(folder)
     before = list(sys.path)
     sys.path[:] = [entry for entry in sys.path if entry not in ("", str(folder))]
-    monkeypatch.setattr("demorec.assets._modules_with_models", set())
+    monkeypatch.setattr("demorec.scene.assets._modules_with_models", set())
     forget("my_robots")
     yield folder
     sys.path[:] = before
@@ -73,7 +73,7 @@ def test_the_example_makes_checks_and_replays_a_dataset(folder: Path, tmp_path: 
     # Elsewhere, without the module: the recording is enough to look and to check, and says what replaying needs.
     (folder / "xarm6.urdf").rename(tmp_path / "xarm6.urdf")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("demorec.assets._modules_with_models", set())
+    monkeypatch.setattr("demorec.scene.assets._modules_with_models", set())
     assert call(main, "check", recording, "--no-pictures") == 0
     assert call(main, "view", recording, "--save", tmp_path / "view.rrd") == 0
     capsys.readouterr()
@@ -112,7 +112,7 @@ def test_a_run_is_not_gone_on_with_when_its_task_was_edited(folder: Path, tmp_pa
 
     def go(num_episodes: int) -> int:
         options = RunOptions(out=tmp_path / "run", num_episodes=num_episodes, workers=1)
-        return len(generate(config, options, maker="helpers_makers:make", inspect=inspect).run.successes)
+        return len(generate(config, options, maker="support.makers:make", inspect=inspect).run.successes)
 
     assert go(1) == 1
     assert go(2) == 2
@@ -174,7 +174,7 @@ def test_the_source_counts_with_what_it_imports_from_beside_it(folder: Path) -> 
 
 @pytest.mark.parametrize("has_init", [True, False])
 def test_modules_in_packages_name_models_of_their_package(has_init: bool, folder: Path) -> None:
-    from demorec.assets import allow_models, asset_path, model_name
+    from demorec.scene.assets import allow_models, asset_path, model_name
 
     package = folder / "my_lab"
     (package / "arms").mkdir(parents=True)
@@ -198,7 +198,7 @@ def test_modules_in_packages_name_models_of_their_package(has_init: bool, folder
 
 @pytest.mark.parametrize("where", ["absolute", "pybullet_data", "absolute in pybullet_data"])
 def test_models_are_found_wherever_they_may_lie(where: str, folder: Path) -> None:
-    from demorec.assets import data_folder, model_name
+    from demorec.scene.assets import data_folder, model_name
 
     name, wanted = {
         "absolute": (str(folder / "xarm6.urdf"), "my_robots:xarm6.urdf"),
@@ -209,7 +209,7 @@ def test_models_are_found_wherever_they_may_lie(where: str, folder: Path) -> Non
 
 
 def test_a_model_from_elsewhere_cannot_be_recorded(folder: Path, tmp_path: Path) -> None:
-    from demorec.assets import allow_models, asset_path, model_name
+    from demorec.scene.assets import allow_models, asset_path, model_name
 
     shutil.copy(folder / "xarm6.urdf", tmp_path / "xarm6.urdf")
     with pytest.raises(ConfigError, match="put it beside the module, found "):

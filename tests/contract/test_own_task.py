@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 
 import pytest
-from helpers_check import checked, simulate
+from support.check import checked, simulate
 
 from demorec.config import EpisodePlan, GenerateConfig
 from demorec.loop import ScriptAgent, Session, make_world, prepare

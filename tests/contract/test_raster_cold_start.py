@@ -14,7 +14,7 @@ import pytest
 PROCESSES = 3
 PROGRAM = """
 import hashlib, json, sys
-import helpers_render as scenes
+from support import render as scenes
 from demorec.render.raster import RasterRenderer, decimate
 from demorec.render.raster.kernels import antialias, records, shade, still, triangles, vertices
 

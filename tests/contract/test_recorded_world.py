@@ -6,14 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers_sim import episode
+from support.sim import episode
 
-from demorec.episode import Action, RobotSpec
 from demorec.errors import SceneError
 from demorec.geometry import Pose
 from demorec.loop import make_world
 from demorec.render.recorded import RecordedWorld
-from demorec.scene import Body, Scene, Shape, Texture
+from demorec.scene.episode import Action
+from demorec.scene.robot import RobotSpec
+from demorec.scene.scene import Body, Scene, Shape, Texture
 from demorec.sim.world import World
 from demorec.tables import ROBOTS, TASKS
 

@@ -11,14 +11,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-import helpers_render as scenes
 import numpy as np
 import pytest
+from support import render as scenes
 
 from demorec.errors import RenderError
 from demorec.geometry import Pose, quat_from_rotation, rotation_from_quat
 from demorec.render import Renderer
-from demorec.scene import Light
+from demorec.scene.scene import Light
 from demorec.tables import RENDERERS
 
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers_check import Spoilt, simulate, simulate_run
-from helpers_recording import make_episode
+from support.check import Spoilt, simulate, simulate_run
+from support.recording import make_episode
 
 from demorec.cli import main
 from demorec.errors import ConfigError

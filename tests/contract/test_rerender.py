@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers_check import checked, simulate
+from support.check import checked, simulate
 
 from demorec.cli import main
 from demorec.errors import ConfigError
 from demorec.recording import Recording
-from demorec.rerender import RerenderOptions, read_cameras, rerender
+from demorec.replay.rerender import RerenderOptions, read_cameras, rerender
 
 SIDE = """
 [side]
@@ -87,7 +87,7 @@ def test_looks_are_a_function_of_the_seed(filmed: Path, tmp_path: Path) -> None:
 
 
 def test_a_spoilt_picture_is_found(filmed: Path, tmp_path: Path) -> None:
-    from helpers_check import Spoilt
+    from support.check import Spoilt
 
     spoilt = Spoilt(filmed)
     spoilt.picture("front", lambda t, p: p[::-1] if t == 20 else p)

@@ -9,19 +9,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers_sim import episode, run
+from support.sim import episode, run
 
-from demorec.assets import asset_path, mesh_path
-from demorec.episode import Action, RobotSpec
 from demorec.errors import SceneError
 from demorec.loop import make_world
 from demorec.plain import from_json, to_json
+from demorec.scene.assets import asset_path, mesh_path
+from demorec.scene.episode import Action
+from demorec.scene.robot import RobotSpec
+from demorec.scene.urdf import Urdf
 from demorec.sim.arm import arm_kinematics
 from demorec.sim.world import World
 from demorec.tables import ROBOTS
 from demorec.tasks import grasping
 from demorec.tasks.grasping import hand_down
-from demorec.urdf import Urdf
 
 
 @pytest.fixture(params=ROBOTS.names())

@@ -15,15 +15,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zstandard
-from helpers_commands import MOST_BYTES, Commands
-from helpers_export import export
-from helpers_mcap import chunk_record, message_record, record, rewritten
-from helpers_recording import write_episode
+from support.commands import MOST_BYTES, Commands
+from support.export import export
+from support.mcap import chunk_record, message_record, record, rewritten
+from support.recording import write_episode
 
 from demorec.errors import ConfigError, ExportError, RecordingError
 from demorec.lerobot.files import check_video
 from demorec.recording import Recording, recover
-from demorec.urdf import check_primitives
+from demorec.scene.urdf import check_primitives
 
 
 @pytest.fixture(scope="module")
@@ -112,11 +112,11 @@ def test_pictures_that_compress_well_are_no_bomb(tmp_path: Path) -> None:
     """Black JPEG files beside a robot that stands still: the most that our own recordings unpack to."""
     from dataclasses import replace
 
-    from helpers_recording import make_episode
+    from support.recording import make_episode
 
     from demorec.config import VideoConfig
-    from demorec.episode import frame_time_ns
     from demorec.recording import EpisodeWriter
+    from demorec.scene.episode import frame_time_ns
 
     info, frames, outcome = make_episode(num_frames=1, cameras=("front", "wrist"), width=640, height=480)
     black = {

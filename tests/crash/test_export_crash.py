@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers_export import count_calls, export, export_in_child, files_of, make_run
+from support.export import count_calls, export, export_in_child, files_of, make_run
 
 KILLS = 10  # of each of three kinds
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from demorec.generate.run_file import load_run_file
+from demorec.runs.run_file import load_run_file
 
 pytestmark = pytest.mark.slow
 NUM_EPISODES = 60

@@ -1,6 +1,6 @@
 """Well-formed but odd input to every command: one sentence or success, never a traceback, never a hang.
 
-`helpers_odd` makes the cases, each from its number. The commands are run below the command line's own net for
+`support.odd` makes the cases, each from its number. The commands are run below the command line's own net for
 unforeseen errors, so that nothing hides in it.
 """
 
@@ -11,11 +11,11 @@ import io
 from collections import Counter
 
 import pytest
-from helpers_odd import Odd
+from support.odd import Odd
 
 from demorec.cli import COMMANDS, parse_command
 from demorec.errors import DemorecError
-from demorec.text import printable
+from demorec.safety.text import printable
 
 
 @pytest.fixture(scope="module")

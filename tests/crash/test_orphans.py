@@ -10,7 +10,7 @@ from pathlib import Path
 
 import psutil
 import pytest
-from helpers_export import make_run
+from support.export import make_run
 
 
 @pytest.fixture(scope="module")

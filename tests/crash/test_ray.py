@@ -12,7 +12,7 @@ from pathlib import Path
 
 import psutil
 import pytest
-from helpers_generate import Remembers, expected_attempts, inspect, run_fake
+from support.generate import Remembers, expected_attempts, inspect, run_fake
 
 from demorec.config import GenerateConfig
 from demorec.errors import ConfigError, GenerationError
@@ -31,7 +31,7 @@ def run_on_ray(out: Path, *, maker: str, progress: NoProgress | None = None, **o
         GenerateConfig(cameras=()),
         RunOptions(out=out, num_episodes=NUM_EPISODES, executor="ray", **options),
         progress=progress,
-        maker=f"helpers_makers:{maker}",
+        maker=f"support.makers:{maker}",
         inspect=inspect,
     )
 

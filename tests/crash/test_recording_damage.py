@@ -12,9 +12,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from helpers_recording import write_episode
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
+from support.recording import write_episode
 
 from demorec.config import VideoConfig
 from demorec.errors import RecordingError
@@ -282,7 +282,7 @@ def test_a_folder_and_a_missing_file(tmp_path: Path) -> None:
 def test_a_newer_format_is_refused_by_its_number(tmp_path: Path) -> None:
     from dataclasses import replace
 
-    from helpers_recording import make_episode
+    from support.recording import make_episode
 
     from demorec.recording import EpisodeWriter
 

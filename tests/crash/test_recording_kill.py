@@ -17,12 +17,12 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from helpers_recording import frame_number, make_episode, write_episode
+from support.recording import frame_number, make_episode, write_episode
 
 from demorec.config import VideoConfig
-from demorec.episode import EpisodeInfo, Frame
 from demorec.errors import RecordingError
 from demorec.recording import EpisodeWriter, Recording, recover
+from demorec.scene.episode import EpisodeInfo, Frame
 
 FPS = 30
 MOST_FRAMES = 300

@@ -6,11 +6,11 @@ import resource
 
 import pytest
 import zstandard
-from helpers_recording import write_episode
+from support.recording import write_episode
 
 from demorec.errors import RecordingError, ResourceError
-from demorec.generate.recordings import inspect_recording
 from demorec.recording import container
+from demorec.runs.recordings import inspect_recording
 
 
 @pytest.mark.parametrize(

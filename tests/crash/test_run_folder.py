@@ -10,9 +10,9 @@ import sys
 from contextlib import chdir
 from pathlib import Path
 
-import helpers_generate
 import pytest
-from helpers_generate import Remembers, expected_attempts, run_fake
+from support import generate as generating
+from support.generate import Remembers, expected_attempts, run_fake
 
 from demorec.cli import main
 from demorec.config import GenerateConfig
@@ -20,7 +20,7 @@ from demorec.errors import ConfigError, GenerationError, MissingDependencyError,
 from demorec.generate import survey
 from demorec.generate.options import RunOptions
 from demorec.generate.run import generate
-from demorec.generate.run_file import load_run_file
+from demorec.runs.run_file import load_run_file
 
 
 def attempts(result) -> dict[tuple[int, int], bool]:
@@ -182,7 +182,7 @@ def test_nothing_is_set_aside_for_what_the_machine_lacks(tmp_path, monkeypatch, 
         raise error
 
     monkeypatch.setattr(survey, "sha256_of", fail)
-    monkeypatch.setattr(helpers_generate, "read_text_limited", lambda path, limit: fail(path))
+    monkeypatch.setattr(generating, "read_text_limited", lambda path, limit: fail(path))
     with pytest.raises(ResourceError, match=words):
         run_fake(out)
     assert {path: data for path, data in content_of(out).items() if path != ".lock"} == before

@@ -12,16 +12,16 @@ from pathlib import Path
 
 import psutil
 import pytest
-from helpers_generate import Remembers, expected_attempts, run_fake
+from support.generate import Remembers, expected_attempts, run_fake
 
 from demorec.errors import ConfigError, DemorecError, GenerationError
-from demorec.generate.run_file import load_run_file
+from demorec.runs.run_file import load_run_file
 
 
 def driver(out: Path, maker: str, num_episodes: int, workers: int = 2) -> subprocess.Popen[str]:
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[1]), *sys.path])}
     return subprocess.Popen(
-        [sys.executable, "-m", "helpers_generate", str(out), maker, str(num_episodes), str(workers)],
+        [sys.executable, "-m", "support.generate", str(out), maker, str(num_episodes), str(workers)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers_recording import write_episode
 from PIL import Image
+from support.recording import write_episode
 
 from demorec.cli import main
 from demorec.playback.programs import viewer_program

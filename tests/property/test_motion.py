@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from demorec.motion import MotionLimits, plan_straight, quintic, slowdown
+from demorec.scene.motion import MotionLimits, plan_straight, quintic, slowdown
 from demorec.sim.arm import arm_kinematics
 from demorec.sim.robots.panda import PANDA
 from demorec.tasks.grasping import hand_down

@@ -16,7 +16,6 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from mcap_ros2._dynamic import generate_dynamic
 
-from demorec.assets import asset_path
 from demorec.errors import RecordingError
 from demorec.geometry import Pose
 from demorec.recording.cdr import CdrReader, CdrWriter
@@ -26,7 +25,8 @@ from demorec.recording.labels import decode_labels, encode_labels
 from demorec.recording.messages import JOINT_STATE
 from demorec.recording.ros2 import DEFINITIONS
 from demorec.recording.shapes import Primitive, fit_primitives
-from demorec.scene import Body, Shape
+from demorec.scene.assets import asset_path
+from demorec.scene.scene import Body, Shape
 
 pictures = hnp.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=24)
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from demorec.config import EpisodePlan, GenerateConfig
 from demorec.generate.plan import Schedule, plain_differences
-from demorec.generate.run_file import Attempt, RunFile
+from demorec.runs.run_file import Attempt, RunFile
 
 MAX_ATTEMPTS = 3
 

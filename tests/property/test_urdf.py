@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from demorec.urdf import Urdf
+from demorec.scene.urdf import Urdf
 
 links = st.integers(0, 6).map("link{}".format)
 

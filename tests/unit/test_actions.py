@@ -6,11 +6,11 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from helpers_sim import episode
+from support.sim import episode
 
-from demorec.features import ActionKind
 from demorec.loop import make_world
 from demorec.loop.actions import ActionDecoder
+from demorec.scene.features import ActionKind
 from demorec.sim.world import World
 
 

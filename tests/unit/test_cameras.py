@@ -7,11 +7,11 @@ import math
 
 import numpy as np
 import pytest
-from helpers_sim import episode
+from support.sim import episode
 
 from demorec.geometry import Pose
 from demorec.loop import make_world
-from demorec.scene import Camera
+from demorec.scene.scene import Camera
 from demorec.tables import CAMERAS, ROBOTS
 
 

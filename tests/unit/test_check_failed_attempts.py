@@ -7,16 +7,16 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from helpers_check import flip_bits
-from helpers_export import make_run
+from support.check import flip_bits
+from support.export import make_run
 
 from demorec.check.report import CheckOptions, SubjectReport, check_subjects, find_subjects
 from demorec.cli import main
 from demorec.cli.generate_report import check_run
 from demorec.config import GenerateConfig
-from demorec.generate.recordings import inspect_recording
 from demorec.generate.run import RunResult
-from demorec.generate.run_file import RunFile, Session, save_run_file
+from demorec.runs.recordings import inspect_recording
+from demorec.runs.run_file import RunFile, Session, save_run_file
 
 FAILED = "failed/episode_000000.attempt_0.mcap"
 

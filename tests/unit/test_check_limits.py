@@ -7,10 +7,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers_recording import PANDA, make_episode
+from support.recording import PANDA, make_episode
 
 from demorec.check.dataset_motion import dataset_joint_limits
-from demorec.features import STATE
+from demorec.scene.features import STATE
 
 
 @pytest.mark.parametrize(("width", "beyond"), [(0.104, 0.0), (0.120, 0.016)])

@@ -11,7 +11,7 @@ from demorec.cli import generate_report
 from demorec.cli.generate_report import next_commands
 from demorec.config import GenerateConfig
 from demorec.generate.run import RunResult
-from demorec.generate.run_file import ExportRecord, RunFile, Session
+from demorec.runs.run_file import ExportRecord, RunFile, Session
 
 
 def result_of(folder: Path, *, cameras: tuple[str, ...] = ("front",)) -> RunResult:

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from demorec.config import GenerateConfig, VideoConfig, parse_config, read_toml
-from demorec.episode import frame_time_ns
 from demorec.errors import ConfigError
+from demorec.scene.episode import frame_time_ns
 
 
 @pytest.mark.parametrize(

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers_recording import make_episode
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image, ImageDraw
+from support.recording import make_episode
 
 from demorec.check.coverage import _ticks, draw_coverage
 from demorec.geometry import Pose

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers_export import export, make_run
-from helpers_recording import frame_number
 from PIL import Image
+from support.export import export, make_run
+from support.recording import frame_number
 
 from demorec.cli.export import Export
 from demorec.cli.flags import parse
@@ -17,7 +17,7 @@ from demorec.cli.generate import Generate
 from demorec.config import GenerateConfig, VideoConfig
 from demorec.lerobot.commands import flags
 from demorec.lerobot.options import ExportOptions
-from demorec.variation import Ranges
+from demorec.scene.variation import Ranges
 
 
 def commands_of(dataset: Path) -> list[str]:

@@ -11,9 +11,9 @@ import av
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from helpers_export import data_table, episode_rows, export, files_of, info, make_run
-from helpers_recording import make_episode, write_episode
 from mcap.reader import make_reader
+from support.export import data_table, episode_rows, export, files_of, info, make_run
+from support.recording import make_episode, write_episode
 
 import demorec.lerobot.writer
 from demorec.config import VideoConfig

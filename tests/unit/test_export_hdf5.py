@@ -9,7 +9,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from helpers_export import export, make_run
+from support.export import export, make_run
 
 from demorec.cli import main
 from demorec.errors import ConfigError

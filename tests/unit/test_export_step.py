@@ -8,14 +8,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from helpers_export import export, files_of, make_run
+from support.export import export, files_of, make_run
 
 from demorec.config import GenerateConfig, deciding_versions
 from demorec.errors import ExportError
 from demorec.generate import export_step
 from demorec.generate.export_step import export_run
-from demorec.generate.run_file import RunFile, load_run_file, save_run_file
 from demorec.lerobot import ExportOptions, dataset_digest
+from demorec.runs.run_file import RunFile, load_run_file, save_run_file
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from helpers_verifier import die, lack_memory, never_end, never_listen
+from support.verifier import die, lack_memory, never_end, never_listen
 
 from demorec.errors import ExportError, ResourceError
 from demorec.lerobot import ExportOptions, verify

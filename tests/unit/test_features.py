@@ -7,11 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers_recording import HOME, PANDA, make_episode
 from scipy.spatial.transform import Rotation
+from support.recording import HOME, PANDA, make_episode
 
-from demorec.episode import EpisodeColumns, frame_time_ns
-from demorec.features import (
+from demorec.geometry import Pose
+from demorec.scene.episode import EpisodeColumns, frame_time_ns
+from demorec.scene.features import (
     ACTION,
     EE_POSE,
     ENVIRONMENT_STATE,
@@ -25,8 +26,7 @@ from demorec.features import (
     observation_vectors,
     pose_from_delta,
 )
-from demorec.geometry import Pose
-from demorec.scene import Body, Goal, RobotPlacement, Scene, Shape
+from demorec.scene.scene import Body, Goal, RobotPlacement, Scene, Shape
 
 
 def random_pose(rng: np.random.Generator) -> Pose:

@@ -6,14 +6,14 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from helpers_export import export, info, make_run
+from support.export import export, info, make_run
 
 from demorec.check.report import CheckOptions, check_subjects, find_subjects
 from demorec.config import GenerateConfig
 from demorec.generate import export_step
-from demorec.generate.recordings import inspect_recording
-from demorec.generate.run_file import RunFile, save_run_file
 from demorec.lerobot import ExportOptions
+from demorec.runs.recordings import inspect_recording
+from demorec.runs.run_file import RunFile, save_run_file
 
 
 def test_the_dataset_has_what_was_asked_for_last(tmp_path, monkeypatch):

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
-from demorec.assets import asset_path
 from demorec.geometry import Pose
-from demorec.kinematics import ArmKinematics
+from demorec.scene.assets import asset_path
+from demorec.scene.kinematics import ArmKinematics
+from demorec.scene.urdf import Urdf, quat_from_rpy
 from demorec.sim.arm import arm_kinematics
 from demorec.sim.client import connect
 from demorec.sim.urdf_file import urdf_file
 from demorec.tables import ROBOTS
-from demorec.urdf import Urdf, quat_from_rpy
 
 
 @pytest.fixture(params=ROBOTS.names())

@@ -8,7 +8,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from helpers_export import make_run
+from support.export import make_run
 
 from demorec.check.dataset import Dataset
 from demorec.cli import COMMANDS, main

@@ -12,14 +12,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers_sim import episode, run
+from support.sim import episode, run
 
 import demorec.loop
 from demorec.config import EpisodePlan, GenerateConfig
-from demorec.episode import EpisodeInfo
-from demorec.features import NOISE_LETS_GO
 from demorec.loop import ScriptAgent, Session, make_world, prepare
 from demorec.plain import from_json, to_json
+from demorec.scene.episode import EpisodeInfo
+from demorec.scene.features import NOISE_DECAY
 
 
 @pytest.fixture(scope="module")
@@ -133,7 +133,7 @@ def test_noise_lets_go_at_the_rate_that_increments_expect(ran):
     moving = [t for t in fading if np.abs(noise[t]).max() > 1e-3]
     assert len(moving) >= 5
     executed = np.diff(commands, axis=0)
-    expected = np.diff(actions, axis=0) + NOISE_LETS_GO * (actions - commands)[:-1]
+    expected = np.diff(actions, axis=0) + NOISE_DECAY * (actions - commands)[:-1]
     assert np.allclose(executed[np.array(fading) - 1], expected[np.array(fading) - 1], atol=1e-9)
     assert prepared.behaviour.action_noise == 0.02
 
@@ -158,7 +158,7 @@ def test_pictures_do_not_disturb_the_physics():
 
 PRINT_DIGEST = """
 import json, sys
-from helpers_sim import episode, run
+from support.sim import episode, run
 from demorec.plain import to_json
 prepared = episode(4)
 frames, outcome = run(prepared)

@@ -10,7 +10,7 @@ import pytest
 from demorec.config import GenerateConfig
 from demorec.geometry import Pose, look_at
 from demorec.plain import digest, from_json, from_plain, to_json
-from demorec.scene import Body, Camera, RobotPlacement, Scene, Shape, Texture
+from demorec.scene.scene import Body, Camera, RobotPlacement, Scene, Shape, Texture
 
 
 def _scene() -> Scene:

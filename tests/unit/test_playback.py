@@ -9,12 +9,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers_recording import make_episode, write_episode
 from rerun.chunk import RrdReader
 from scipy.spatial.transform import Rotation
+from support.recording import make_episode, write_episode
 
-from demorec import assets
-from demorec.assets import asset_path
 from demorec.config import VideoConfig
 from demorec.errors import ConfigError
 from demorec.geometry import Pose
@@ -28,8 +26,10 @@ from demorec.playback.sources import find_episodes, select
 from demorec.playback.style import segment_colors
 from demorec.playback.summary import entry, summary
 from demorec.recording import EpisodeWriter, Recording
-from demorec.scene import Body, Shape
-from demorec.urdf import Urdf
+from demorec.scene import assets
+from demorec.scene.assets import asset_path
+from demorec.scene.scene import Body, Shape
+from demorec.scene.urdf import Urdf
 
 
 @pytest.fixture(scope="module")

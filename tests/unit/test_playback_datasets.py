@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers_export import export
 from rerun.chunk import RrdReader
+from support.export import export
 
 from demorec.geometry import Array
 from demorec.playback.from_dataset import open_dataset_episode

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 import rerun as rr
-from helpers_recording import make_episode
-from helpers_viewer import need_vulkan
+from support.recording import make_episode
+from support.viewer import need_vulkan
 
 from demorec.cli import run_command
 from demorec.cli.view import View

@@ -5,16 +5,16 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import helpers_render as scenes
 import numpy as np
 import pytest
+from support import render as scenes
 
 from demorec.errors import RenderError
 from demorec.geometry import Pose, look_at
 from demorec.render.painter import Painter
 from demorec.render.raster import RasterRenderer, renderer
 from demorec.render.raster.kernels import antialias, records, shade, still, triangles, vertices
-from demorec.scene import Light, Texture
+from demorec.scene.scene import Light, Texture
 
 
 @pytest.fixture
@@ -122,7 +122,7 @@ def test_what_stood_still_and_was_moved_is_noticed(client: Any) -> None:
 
 
 def test_procedural_textures_are_drawn(client: Any) -> None:
-    from demorec.textures import texture_pixels
+    from demorec.scene.textures import texture_pixels
 
     texture = Texture(pattern="checker", colors=((1.0, 1.0, 1.0), (0.0, 0.0, 0.0)), scale=2.0)
     body = scenes.add(client, "box", (0.4, 0.4, 0.4), rgbaColor=[1, 1, 1, 1])

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import helpers_render as scenes
 import numpy as np
 import pytest
 import trimesh
+from support import render as scenes
 
 from demorec.errors import RenderError
 from demorec.render.raster import RasterRenderer

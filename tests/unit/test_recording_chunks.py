@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers_recording import write_episode
 from mcap.reader import make_reader
 from mcap.records import ChunkIndex
 from mcap.stream_reader import StreamReader
+from support.recording import write_episode
 
 from demorec.config import VideoConfig
 from demorec.recording import Recording

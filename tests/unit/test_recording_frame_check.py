@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers_recording import make_episode
+from support.recording import make_episode
 
-from demorec.episode import EpisodeInfo, Frame
 from demorec.errors import RecordingError
 from demorec.geometry import Pose
 from demorec.recording import EpisodeWriter
+from demorec.scene.episode import EpisodeInfo, Frame
 
 NAN = float("nan")
 

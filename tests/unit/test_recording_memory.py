@@ -9,10 +9,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from helpers_recording import make_episode
+from support.recording import make_episode
 
-from demorec.episode import frame_time_ns
 from demorec.recording import EpisodeWriter, Recording
+from demorec.scene.episode import frame_time_ns
 
 READERS: dict[str, Callable[[Recording], object]] = {
     "packets": lambda recording: recording.packets("front"),

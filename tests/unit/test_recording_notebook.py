@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers_docs import run_examples
-from helpers_recording import frame_number, make_episode, write_episode
 from PIL import Image
+from support.docs import run_examples
+from support.recording import frame_number, make_episode, write_episode
 
 from demorec.config import VideoConfig
 from demorec.errors import MissingDependencyError, RecordingError

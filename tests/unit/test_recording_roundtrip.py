@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers_recording import frame_number, make_episode, write_episode
+from support.recording import frame_number, make_episode, write_episode
 
 from demorec.config import VideoConfig
-from demorec.episode import Event, Frame, Outcome
 from demorec.errors import RecordingError
 from demorec.recording import EpisodeWriter, Recording
 from demorec.recording.container import Container
+from demorec.scene.episode import Event, Frame, Outcome
 
 CODECS = [VideoConfig(), VideoConfig(codec="av1"), VideoConfig(codec="jpeg"), VideoConfig(gop=30, crf=30)]
 

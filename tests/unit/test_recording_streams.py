@@ -9,15 +9,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers_check import checked, level_of, rewrite_messages
-from helpers_recording import make_episode, write_episode
+from support.check import checked, level_of, rewrite_messages
+from support.recording import make_episode, write_episode
 
-from demorec.episode import FORMAT_VERSION, EpisodeColumns, EpisodeInfo, Frame, Outcome
 from demorec.errors import RecordingError
 from demorec.recording import EpisodeWriter, Recording, recover
 from demorec.recording.frames import frames_of
 from demorec.recording.ros2 import DEFINITIONS
 from demorec.recording.streams import FrameValues, frame_streams, merged_columns
+from demorec.scene.episode import FORMAT_VERSION, EpisodeColumns, EpisodeInfo, Frame, Outcome
 
 NEWEST = [stream.topic for stream in frame_streams(make_episode(num_frames=1)[0]) if stream.since == FORMAT_VERSION]
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers_recording import make_episode
+from support.recording import make_episode
 
 from demorec.config import VideoConfig
 from demorec.errors import RecordingError
@@ -19,7 +19,7 @@ from demorec.recording.video import VideoPacket, decode, is_keyframe, make_encod
 
 ENCODE = """
 import hashlib, sys
-from helpers_recording import make_episode
+from support.recording import make_episode
 from demorec.config import VideoConfig
 from demorec.recording.video import make_encoder
 _, frames, _ = make_episode(num_frames=40, width=224, height=224, cameras=("front",))

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers_recording import make_episode, write_episode
+from support.recording import make_episode, write_episode
 
 from demorec.config import VideoConfig
-from demorec.episode import Event, Frame, Outcome
 from demorec.errors import RecordingError
 from demorec.recording import EpisodeWriter, Recording, part_file, recover
+from demorec.scene.episode import Event, Frame, Outcome
 
 
 def names(folder: Path) -> list[str]:

@@ -8,11 +8,11 @@ import os
 from dataclasses import replace
 
 import pytest
-from helpers_generate import expected_attempts
+from support.generate import expected_attempts
 
 from demorec.config import GenerateConfig
 from demorec.errors import ConfigError, ResourceError
-from demorec.generate.run_file import (
+from demorec.runs.run_file import (
     Attempt,
     DamagedRunFileError,
     ExportRecord,

@@ -7,12 +7,12 @@ import math
 
 import numpy as np
 import pytest
-from helpers_sim import episode, run
+from support.sim import episode, run
 
 from demorec.errors import SceneError
 from demorec.geometry import Pose, wrap_angle
 from demorec.loop import Episode, make_world
-from demorec.scene import Body, Shape
+from demorec.scene.scene import Body, Shape
 from demorec.sim.robots.panda import PANDA
 from demorec.tasks import skills
 from demorec.tasks.base import Behaviour

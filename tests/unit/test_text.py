@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from demorec.cli.output import OutputError, say, tell
-from demorec.text import printable
+from demorec.safety.text import printable
 
 
 @given(st.text())

@@ -7,17 +7,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers_sim import episode, run
 from scipy.stats import qmc
+from support.sim import episode, run
 
 from demorec.config import GenerateConfig
 from demorec.errors import ConfigError, SceneError
 from demorec.geometry import Pose
-from demorec.scene import Texture
+from demorec.scene.scene import Texture
+from demorec.scene.textures import texture_pixels
+from demorec.scene.variation import LIMITS, PRESETS, Ranges, resolve
 from demorec.tables import TASKS
 from demorec.tasks.sampling import WORKSPACE, stratified_point
-from demorec.textures import texture_pixels
-from demorec.variation import LIMITS, PRESETS, Ranges, resolve
 
 
 def cube_starts(count, **config):

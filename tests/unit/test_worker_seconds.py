@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from demorec.generate import worker
-from demorec.generate.run_file import STARTING
 from demorec.generate.worker import RECORDING, RENDERING, SIMULATION
+from demorec.runs.run_file import STARTING
 
 
 @pytest.mark.parametrize(

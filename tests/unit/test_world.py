@@ -8,13 +8,13 @@ import sys
 
 import numpy as np
 import pytest
-from helpers_sim import episode, run
+from support.sim import episode, run
 
-from demorec.episode import Action
 from demorec.errors import ConfigError, SceneError
 from demorec.geometry import Pose
 from demorec.plain import from_json, to_json
-from demorec.scene import Body, Scene, Shape, Texture
+from demorec.scene.episode import Action
+from demorec.scene.scene import Body, Scene, Shape, Texture
 from demorec.sim.client import connect
 from demorec.sim.robots.panda import PANDA
 from demorec.sim.world import World

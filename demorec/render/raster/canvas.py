@@ -16,7 +16,7 @@ from demorec.render.raster.kernels.triangles import draw_instances
 from demorec.render.raster.kernels.vertices import aim_camera, project_instances, transform_vertices
 from demorec.render.raster.mesh import Floats
 from demorec.render.raster.stage import Stage
-from demorec.scene import Camera, Light
+from demorec.scene.scene import Camera, Light
 
 SHADOW_OFFSET = 0.006
 """How far a point is at least lifted off its surface before it is looked up in the shadow map, metres: the map holds

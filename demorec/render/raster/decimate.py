@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from demorec.render.raster.mesh import Floats, Mesh, face_normals, make_mesh, unit, weld
+from demorec.render.raster.mesh import Floats, RasterMesh, face_normals, make_mesh, unit, weld
 from demorec.render.raster.mesh_cache import cached_mesh
 
 SMALLEST = 64
@@ -15,7 +15,7 @@ SAMPLES = 60_000
 """Points on the original surface from which colours are taken over."""
 
 
-def decimated(mesh: Mesh, target: int, *, key: str) -> Mesh:
+def decimated(mesh: RasterMesh, target: int, *, key: str) -> RasterMesh:
     """The mesh with about `target` faces, from the cache when it was made before.
 
     Args:
@@ -26,7 +26,7 @@ def decimated(mesh: Mesh, target: int, *, key: str) -> Mesh:
     return cached_mesh(f"{key} {target}", lambda: decimate(mesh, target))
 
 
-def decimate(mesh: Mesh, target: int) -> Mesh:
+def decimate(mesh: RasterMesh, target: int) -> RasterMesh:
     """Collapse edges until about `target` faces are left; normals, colours and texture coordinates are transferred."""
     import fast_simplification
 
@@ -42,7 +42,7 @@ def decimate(mesh: Mesh, target: int) -> Mesh:
     return _take_over_looks(mesh, points, kept)
 
 
-def _take_over_looks(mesh: Mesh, points: Floats, faces: NDArray[np.int32]) -> Mesh:
+def _take_over_looks(mesh: RasterMesh, points: Floats, faces: NDArray[np.int32]) -> RasterMesh:
     """Give the faces the looks of the original's nearest surface that looks the same way."""
     extent = float(np.ptp(mesh.points, axis=0).max())
     turn = 0.05 * extent  # how far away a surface may be, to be preferred to one that looks another way

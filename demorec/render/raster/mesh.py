@@ -17,7 +17,7 @@ CREASE_ANGLE = math.radians(35)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Mesh:
+class RasterMesh:
     """Triangles with a normal and a texture coordinate at each corner.
 
     Attributes:
@@ -50,7 +50,7 @@ def make_mesh(
     uv: Floats | None = None,
     colors: Floats | None = None,
     texture: Path | None = None,
-) -> Mesh:
+) -> RasterMesh:
     """A mesh with what is missing made: normals smooth up to the crease angle, white faces; empty faces left out."""
     faces = np.asarray(faces, dtype=np.int32).reshape(-1, 3)
     keep = np.flatnonzero((face_normals(points, faces) ** 2).sum(1) > 0)
@@ -64,7 +64,7 @@ def make_mesh(
         length = np.sqrt((normals * normals).sum(2, keepdims=True))
         flat = unit(face_normals(points, faces))[:, None, :]
         normals = np.where(length > 1e-6, normals / np.maximum(length, 1e-12), flat)
-    return Mesh(
+    return RasterMesh(
         points=points,
         faces=faces,
         normals=normals,

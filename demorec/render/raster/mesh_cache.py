@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from demorec.render.raster.cache import cache_folder, folder_lock, write_whole
-from demorec.render.raster.mesh import Mesh
+from demorec.render.raster.mesh import RasterMesh
 
 log = logging.getLogger(__name__)
 _SOURCES = ("mesh.py", "mesh_files.py", "decimate.py", "textures.py")
@@ -27,7 +27,7 @@ def _version() -> str:
     return digest.hexdigest()[:16]
 
 
-def cached_mesh(key: str, make: Callable[[], Mesh]) -> Mesh:
+def cached_mesh(key: str, make: Callable[[], RasterMesh]) -> RasterMesh:
     """The mesh that `make` makes, from the cache when it was made before under this key.
 
     A file that cannot be read, whatever the reason, is made anew; a folder that cannot be written to costs time only.
@@ -43,7 +43,7 @@ def cached_mesh(key: str, make: Callable[[], Mesh]) -> Mesh:
         return mesh if mesh is not None else _make(path, make)
 
 
-def _make(path: Path, make: Callable[[], Mesh]) -> Mesh:
+def _make(path: Path, make: Callable[[], RasterMesh]) -> RasterMesh:
     mesh = make()
     arrays = {"points": mesh.points, "faces": mesh.faces, "normals": mesh.normals, "colors": mesh.colors}
     if mesh.uv is not None:
@@ -56,11 +56,11 @@ def _make(path: Path, make: Callable[[], Mesh]) -> Mesh:
     return mesh
 
 
-def _read(path: Path) -> Mesh | None:
+def _read(path: Path) -> RasterMesh | None:
     try:
         with np.load(path) as data:
             texture = str(data["texture"])
-            return Mesh(
+            return RasterMesh(
                 points=data["points"],
                 faces=data["faces"],
                 normals=data["normals"],

@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.errors import RenderError
-from demorec.render.raster.mesh import Floats, Mesh, make_mesh
+from demorec.render.raster.mesh import Floats, RasterMesh, make_mesh
 
 FORMATS = (".obj", ".stl", ".dae")
 
 
-def load_mesh(path: Path) -> Mesh:
+def load_mesh(path: Path) -> RasterMesh:
     """Read a mesh file.
 
     Raises:
@@ -61,7 +61,7 @@ def _materials(path: Path) -> dict[str, tuple[Floats, Path | None]]:
     return found
 
 
-def load_obj(path: Path) -> Mesh:
+def load_obj(path: Path) -> RasterMesh:
     """An OBJ file with its materials; polygons are cut into fans.
 
     As in PyBullet the first texture of the file covers all of it. The materials' colours count where there are
@@ -135,7 +135,7 @@ def load_obj(path: Path) -> Mesh:
     )
 
 
-def load_stl(path: Path) -> Mesh:
+def load_stl(path: Path) -> RasterMesh:
     """A binary or text STL file; normals are made anew, since the file knows only flat ones."""
     data = path.read_bytes()
     count = int.from_bytes(data[80:84], "little") if len(data) >= 84 else -1
@@ -150,7 +150,7 @@ def load_stl(path: Path) -> Mesh:
     return make_mesh(corners.reshape(-1, 3), np.arange(len(corners)).reshape(-1, 3))
 
 
-def load_collada(path: Path) -> Mesh:
+def load_collada(path: Path) -> RasterMesh:
     """The triangles and polygons of a COLLADA file, placed by the nodes of its scene, in metres."""
     root = ElementTree.parse(path).getroot()
     tag = root.tag.removesuffix("COLLADA")

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.render.raster.kernels import layout
-from demorec.render.raster.mesh import Floats, Mesh, unit, weld
+from demorec.render.raster.mesh import Floats, RasterMesh, unit, weld
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -44,7 +44,7 @@ class Piece:
         return faces[:, ::-1] if float(np.prod(scale)) < 0 else faces
 
 
-def make_piece(mesh: Mesh, *, textured: bool) -> Piece:
+def make_piece(mesh: RasterMesh, *, textured: bool) -> Piece:
     """Lay a mesh out."""
     n = mesh.num_faces
     uv = mesh.uv if textured and mesh.uv is not None else np.zeros((n, 3, 2))

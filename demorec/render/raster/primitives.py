@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from demorec.render.raster.mesh import Floats, Mesh, make_mesh
+from demorec.render.raster.mesh import Floats, RasterMesh, make_mesh
 
 SEGMENTS = 64
 """Around a circle: the outline of a cylinder of 10 cm radius is then within 0.1 mm of round."""
@@ -16,7 +16,7 @@ PLANE_EXTENT = 100.0
 """Half the side of the square that stands for an infinite plane, metres."""
 
 
-def box(size: tuple[float, float, float]) -> Mesh:
+def box(size: tuple[float, float, float]) -> RasterMesh:
     """A box of full extents `size` around the origin, the texture once on each side."""
     corners = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
     points: list[Floats] = []
@@ -45,7 +45,7 @@ def roundness(segments: int) -> float:
     return 1 + 2 / 3 * (1 - math.cos(math.pi / segments))
 
 
-def revolve(profile: Floats, profile_normals: Floats, along: Floats, segments: int) -> Mesh:
+def revolve(profile: Floats, profile_normals: Floats, along: Floats, segments: int) -> RasterMesh:
     """A surface of revolution about z.
 
     Args:
@@ -73,7 +73,7 @@ def revolve(profile: Floats, profile_normals: Floats, along: Floats, segments: i
     return make_mesh(points, faces, normals=normals[faces], uv=uv[faces])
 
 
-def sphere(radius: float, segments: int = SEGMENTS) -> Mesh:
+def sphere(radius: float, segments: int = SEGMENTS) -> RasterMesh:
     """A sphere around the origin."""
     angle = np.linspace(-math.pi / 2, math.pi / 2, segments // 2 + 1)
     normals = np.stack([np.cos(angle), np.sin(angle)], 1)
@@ -83,7 +83,7 @@ def sphere(radius: float, segments: int = SEGMENTS) -> Mesh:
     return revolve(profile, normals, np.asarray(angle / math.pi + 0.5, dtype=np.float64), segments)
 
 
-def cylinder(radius: float, length: float, segments: int = SEGMENTS) -> Mesh:
+def cylinder(radius: float, length: float, segments: int = SEGMENTS) -> RasterMesh:
     """A cylinder along z around the origin, closed."""
     h = length / 2
     profile = np.array([[0, -h], [radius, -h], [radius, -h], [radius, h], [radius, h], [0, h]], dtype=np.float64)
@@ -91,7 +91,7 @@ def cylinder(radius: float, length: float, segments: int = SEGMENTS) -> Mesh:
     return revolve(profile, normals, np.array([0, 0.25, 0.25, 0.75, 0.75, 1]), segments)
 
 
-def capsule(radius: float, length: float, segments: int = SEGMENTS) -> Mesh:
+def capsule(radius: float, length: float, segments: int = SEGMENTS) -> RasterMesh:
     """A cylinder along z of `length` between the centres of two half spheres."""
     angle = np.linspace(0, math.pi / 2, segments // 4 + 1)
     top = np.stack([np.cos(angle), np.sin(angle)], 1)
@@ -105,7 +105,7 @@ def capsule(radius: float, length: float, segments: int = SEGMENTS) -> Mesh:
     return revolve(profile, np.concatenate([bottom, top]), along, segments)
 
 
-def plane() -> Mesh:
+def plane() -> RasterMesh:
     """A large square in the xy plane that looks up, in cells of 2 m, the texture once on each metre."""
     edge = np.arange(-PLANE_EXTENT, PLANE_EXTENT + 1, 20.0)
     n = len(edge)

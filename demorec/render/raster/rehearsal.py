@@ -9,15 +9,15 @@ import numpy as np
 from demorec.geometry import look_at
 from demorec.render.raster.batch import make_batch
 from demorec.render.raster.canvas import Canvas
-from demorec.render.raster.mesh import Mesh
+from demorec.render.raster.mesh import RasterMesh
 from demorec.render.raster.primitives import box, sphere
 from demorec.render.raster.shapes import Instance, Model
 from demorec.render.raster.stage import Stage
-from demorec.render.raster.view import View
-from demorec.scene import Camera, Light
+from demorec.render.raster.view import CameraView
+from demorec.scene.scene import Camera, Light
 
 
-def _instance(body: int, mesh: Mesh, *, stands: bool, texture: Any = None) -> Instance:
+def _instance(body: int, mesh: RasterMesh, *, stands: bool, texture: Any = None) -> Instance:
     return Instance(
         body=body,
         link=-1,
@@ -56,6 +56,6 @@ def rehearse() -> None:
     for antialias in (True, False):
         for keep_still in (True, False):
             canvas = Canvas(camera, batch, stage, light, antialias=antialias, depth=True, segmentation=True)
-            view = View(canvas, stage, keep_still=keep_still)
+            view = CameraView(canvas, stage, keep_still=keep_still)
             stage.update(poses)
             view.draw(camera.mount_from_camera)

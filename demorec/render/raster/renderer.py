@@ -7,7 +7,6 @@ import logging
 import math
 from typing import Self
 
-from demorec.episode import CameraImages
 from demorec.geometry import Array
 from demorec.render import RenderSetup
 from demorec.render.raster.batch import Batch, make_batch
@@ -16,9 +15,10 @@ from demorec.render.raster.canvas import Canvas
 from demorec.render.raster.kernels.jit import compiled_folder
 from demorec.render.raster.shapes import Instance, ModelStore, make_instances
 from demorec.render.raster.stage import Stage
-from demorec.render.raster.view import View
+from demorec.render.raster.view import CameraView
 from demorec.render.setup_checks import check_setup, world_from_camera
-from demorec.scene import Camera
+from demorec.scene.episode import CameraImages
+from demorec.scene.scene import Camera
 
 log = logging.getLogger(__name__)
 
@@ -44,7 +44,7 @@ class RasterRenderer:
         self._keep_still = keep_still
         self._store = ModelStore()
         self._setup: RenderSetup | None = None
-        self._views: list[View] = []
+        self._views: list[CameraView] = []
         self._stage: Stage | None = None
         warm_up()
 
@@ -90,7 +90,7 @@ class RasterRenderer:
                 depth=setup.depth,
                 segmentation=setup.segmentation,
             )
-            self._views.append(View(canvas, self._stage, keep_still=self._keep_still and camera.mount == "world"))
+            self._views.append(CameraView(canvas, self._stage, keep_still=self._keep_still and camera.mount == "world"))
 
     def _level(self, instance: Instance, camera: Camera) -> int | None:
         """How many faces an instance keeps for a camera."""

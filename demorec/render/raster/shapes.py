@@ -15,13 +15,13 @@ from demorec.errors import DemorecError, RenderError
 from demorec.render import Visual, VisualBody, first_rows
 from demorec.render.raster import primitives
 from demorec.render.raster.decimate import decimated
-from demorec.render.raster.mesh import Floats, Mesh
+from demorec.render.raster.mesh import Floats, RasterMesh
 from demorec.render.raster.mesh_cache import cached_mesh
 from demorec.render.raster.mesh_files import load_mesh
 from demorec.render.raster.pieces import Piece, make_piece
 from demorec.render.raster.textures import Picture, load_picture, palette_colors
-from demorec.scene import Texture
-from demorec.textures import texture_pixels
+from demorec.scene.scene import Texture
+from demorec.scene.textures import texture_pixels
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -36,9 +36,9 @@ class Model:
     """
 
     key: str
-    mesh: Mesh
+    mesh: RasterMesh
     is_palette: bool = False
-    coarse: Mesh | None = None
+    coarse: RasterMesh | None = None
     _pieces: dict[Any, Piece] = field(default_factory=dict)
     _spheres: dict[bytes, tuple[Floats, float]] = field(default_factory=dict)
 

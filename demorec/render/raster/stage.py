@@ -15,7 +15,7 @@ from demorec.render.raster.kernels.triangles import draw_casters
 from demorec.render.raster.kernels.vertices import place_instances, transform_casters
 from demorec.render.raster.mesh import Floats
 from demorec.render.raster.shapes import Instance
-from demorec.scene import Light
+from demorec.scene.scene import Light
 
 REACH = 0.9
 """How far a robot's shadow is expected around its base, metres."""

@@ -12,7 +12,7 @@ from PIL import Image, UnidentifiedImageError
 
 from demorec.errors import RenderError
 from demorec.render.raster.kernels.layout import MIP_LEVELS
-from demorec.render.raster.mesh import Floats, Mesh, face_normals
+from demorec.render.raster.mesh import Floats, RasterMesh, face_normals
 
 LARGEST_SIDE = 1 << (MIP_LEVELS - 1)
 Picture = NDArray[np.uint8]
@@ -81,7 +81,7 @@ PALETTE_COLORS = 24
 """And so few colours cover nearly all of the surface."""
 
 
-def palette_colors(mesh: Mesh, picture: Picture) -> Floats | None:
+def palette_colors(mesh: RasterMesh, picture: Picture) -> Floats | None:
     """(f, 3) face colours 0..1 of a mesh whose faces each lie on one colour of the texture; None when they do not.
 
     Such a texture is a palette: colours by face are faster, do not bleed into each other in small pictures, and

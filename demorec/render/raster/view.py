@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.episode import CameraImages
 from demorec.geometry import Pose
 from demorec.render.raster.batch import Floats32
 from demorec.render.raster.canvas import Canvas, Images, Int32s
@@ -16,6 +15,7 @@ from demorec.render.raster.kernels.antialias import STILL, halve_extents
 from demorec.render.raster.kernels.still import clear_queued, gather_still, list_tiles, restore_samples, shade_still
 from demorec.render.raster.mesh import Floats
 from demorec.render.raster.stage import Stage
+from demorec.scene.episode import CameraImages
 
 
 @dataclass(eq=False)
@@ -43,7 +43,7 @@ class _Still:
     gathered: Floats32
 
 
-class View:
+class CameraView:
     """The pictures of one camera over one scene.
 
     Args:

@@ -8,12 +8,12 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.episode import CameraImages
 from demorec.errors import RenderError
 from demorec.geometry import Array, Pose
 from demorec.render import RenderSetup
 from demorec.render.setup_checks import check_setup, world_from_camera
-from demorec.scene import Camera
+from demorec.scene.episode import CameraImages
+from demorec.scene.scene import Camera
 from demorec.sim.renderers.mirror import SceneMirror
 
 # OpenCV's camera axes (y down, z forward) to OpenGL's (y up, z backward).

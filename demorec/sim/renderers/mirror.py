@@ -19,8 +19,8 @@ from PIL import Image
 from demorec.errors import RenderError
 from demorec.geometry import Array, Pose
 from demorec.render import RenderSetup, Visual, first_rows
-from demorec.scene import Texture
-from demorec.textures import texture_pixels
+from demorec.scene.scene import Texture
+from demorec.scene.textures import texture_pixels
 
 
 @dataclass(frozen=True, kw_only=True)

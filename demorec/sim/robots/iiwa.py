@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 
-from demorec.episode import RobotSpec
+from demorec.scene.robot import RobotSpec
 
 _LIMITS = tuple(math.radians(degrees) for degrees in (170.0, 120.0, 170.0, 120.0, 170.0, 120.0, 175.0))
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 
-from demorec.episode import RobotSpec
+from demorec.scene.robot import RobotSpec
 
 PANDA = RobotSpec(
     name="panda",

@@ -16,10 +16,10 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from demorec.assets import allow_models, asset_path, mesh_path
 from demorec.errors import DemorecError
+from demorec.safety.user_modules import import_root, is_allowed, split_name
+from demorec.scene.assets import allow_models, asset_path, mesh_path
 from demorec.tables import load_robot
-from demorec.user_modules import import_root, is_allowed, split_name
 
 SOURCE = "source of "
 """Begins the name of a digest among versions: "source of my_tasks"."""

@@ -16,8 +16,8 @@ from pathlib import Path
 
 from demorec.config import EpisodePlan, deciding_versions
 from demorec.errors import RenderError
-from demorec.generate.run_file import Attempt, recording_name, sha256_of
 from demorec.plain import digest, to_plain
+from demorec.runs.run_file import Attempt, recording_name, sha256_of
 
 
 def succeeds(seed: int, episode: int, attempt: int) -> bool:

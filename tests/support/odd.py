@@ -16,14 +16,14 @@ from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
-from helpers_export import export
-from helpers_mcap import rewritten
-from helpers_recording import write_episode
 
 from demorec.config import GenerateConfig
-from demorec.generate.recordings import inspect_recording
-from demorec.generate.run_file import RunFile, save_run_file
 from demorec.recording import Recording
+from demorec.runs.recordings import inspect_recording
+from demorec.runs.run_file import RunFile, save_run_file
+from support.export import export
+from support.mcap import rewritten
+from support.recording import write_episode
 
 VALUES: tuple[Any, ...] = (
     None, True, False, 0, 1, -1, 2, 3, 7, 255, 2**31, 2**53, 2**63, 2**64, -(2**63), 10**30, 10**3999,

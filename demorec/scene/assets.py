@@ -14,7 +14,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from demorec.errors import ConfigError, MissingDependencyError, NotAllowedError, SceneError
-from demorec.user_modules import import_root, is_allowed, module_file
+from demorec.safety.user_modules import import_root, is_allowed, module_file
 
 OWN_PREFIX = "demorec:"
 
@@ -54,7 +54,7 @@ def asset_path(name: str) -> Path:
         file = module_file(module)
         folder, limit = file.parent, _top_folder(module)
     else:
-        folder = limit = Path(__file__).parent / "sim" / "assets" if module else data_folder()
+        folder = limit = Path(__file__).parent.parent / "sim" / "assets" if module else data_folder()
     path = Path(os.path.normpath(folder / relative))
     if not path.is_relative_to(limit):
         raise SceneError(f"The model file {name!r} lies outside of {limit}, where it has to be.")

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from demorec.errors import RecordingError
-from demorec.generate.run_file import Attempt, sha256_of
 from demorec.recording import Recording
+from demorec.runs.run_file import Attempt, sha256_of
 
 
 @dataclass(frozen=True, kw_only=True)

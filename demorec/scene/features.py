@@ -18,9 +18,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.episode import EpisodeColumns, Observation, RobotSpec
 from demorec.geometry import Array, Pose, quat_multiply
-from demorec.scene import Goal, Scene
+from demorec.scene.episode import EpisodeColumns, Observation
+from demorec.scene.robot import RobotSpec
+from demorec.scene.scene import Goal, Scene
 
 Vectors = NDArray[np.float32]
 
@@ -35,7 +36,7 @@ IMAGE_PREFIX, DEPTH_SUFFIX = "observation.images.", "_depth"
 ActionKind = Literal["joint", "joint_increment", "ee", "ee_delta"]
 """What the action column holds; `action_vectors` defines each."""
 
-NOISE_LETS_GO = 0.3
+NOISE_DECAY = 0.3
 """Share of the exploration noise on the executed commands that goes away within 1/30 s, when none is added.
 
 Known to both sides: `demorec.loop.noise.ActionNoise` makes the noise so, and the increments below contain this return.
@@ -51,7 +52,7 @@ _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ObservationRows:
-    """The numbers of T observations; shapes and units as in `demorec.episode.Observation`."""
+    """The numbers of T observations; shapes and units as in `demorec.scene.episode.Observation`."""
 
     joint_position: Array  # (T, n_joints)
     joint_velocity: Array  # (T, n_joints)
@@ -226,7 +227,7 @@ def _near(pose: Array, origin: Array) -> Array:
 
 
 def _yaw(pose: Array, n: int) -> tuple[Array, Array]:
-    """Sine and cosine (T,) of n times the yaw of the body axis that `demorec.scene.yaw_of` takes."""
+    """Sine and cosine (T,) of n times the yaw of the body axis that `demorec.scene.scene.yaw_of` takes."""
     rotation = _rotation(pose[:, 3:])
     vertical = np.argmax(np.abs(rotation[:, 2]), axis=1)
     horizontal = (vertical + 1) % 3
@@ -267,7 +268,7 @@ def action_vectors(
     - `joint`: absolute joint targets, rad.
     - `joint_increment`: joint target minus the one of the frame before; the first minus the scene's initial joint
       positions. Sum them up to execute them (`joint_target_from_increment`). Where the executed command of the frame
-      before had noise on it, the increment also takes back the share that lets go within a frame (`NOISE_LETS_GO`):
+      before had noise on it, the increment also takes back the share that lets go within a frame (`NOISE_DECAY`):
       it is then what the robot is expected to do next from where the noise has brought it. Without this, noise would
       teach a policy to stay off the path: increments of the clean targets alone do not know that it left it.
     - `ee`: absolute base_from_tcp target, xyz (m) and quaternion xyzw with x >= 0.
@@ -301,10 +302,10 @@ def action_vectors(
 
 
 def _noise_share(time_ns: NDArray[np.int64]) -> float:
-    """`NOISE_LETS_GO` for the interval between these frames."""
+    """`NOISE_DECAY` for the interval between these frames."""
     if len(time_ns) < 2:
         return 0.0
-    return float(1.0 - (1.0 - NOISE_LETS_GO) ** (30.0 * 1e-9 * int(time_ns[1] - time_ns[0])))
+    return float(1.0 - (1.0 - NOISE_DECAY) ** (30.0 * 1e-9 * int(time_ns[1] - time_ns[0])))
 
 
 def joint_target_from_increment(previous: Array, action: NDArray[np.floating]) -> Array:

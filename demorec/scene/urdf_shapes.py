@@ -13,8 +13,8 @@ from typing import Literal, cast, get_args
 import numpy as np
 
 from demorec.geometry import Pose
-from demorec.scene import Rgba
-from demorec.urdf import parse_xml, quat_from_rpy
+from demorec.scene.scene import Rgba
+from demorec.scene.urdf import parse_xml, quat_from_rpy
 
 UrdfShapeKind = Literal["box", "sphere", "cylinder", "capsule", "mesh", "plane"]
 
@@ -27,7 +27,7 @@ class UrdfShape:
         kind: Which geometry; decides what `size` means.
         size: box: (x, y, z) full extents, metres; sphere: (radius,); cylinder and capsule: (radius, length) along z;
             mesh: (x, y, z) factors by which the file is scaled; plane: ().
-        file: mesh: as the URDF names it (`demorec.assets.mesh_path` finds it); otherwise "".
+        file: mesh: as the URDF names it (`demorec.scene.assets.mesh_path` finds it); otherwise "".
         link_from_shape: Pose in the link's frame.
         rgba: Colour of its material, 0..1; None without a material that has one.
     """

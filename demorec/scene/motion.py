@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from demorec.geometry import Array, Pose
-from demorec.kinematics import ArmKinematics
+from demorec.scene.kinematics import ArmKinematics
 
 # Peaks of the quintic time law u^3 (10 - 15 u + 6 u^2) over unit time and distance.
 PEAK_VELOCITY = 1.875

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from demorec.config import EpisodePlan, GenerateConfig
-from demorec.episode import Frame, Outcome
 from demorec.loop import Episode, ScriptAgent, Session, make_renderer, make_world, prepare
+from demorec.scene.episode import Frame, Outcome
 from demorec.sim.world import World
 
 

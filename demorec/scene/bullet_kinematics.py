@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.geometry import Array, Pose
-from demorec.urdf import Urdf, UrdfJoint
-from demorec.urdf_shapes import read_links
+from demorec.scene.urdf import Urdf, UrdfJoint
+from demorec.scene.urdf_shapes import read_links
 
 Floats = NDArray[np.floating[Any]]
 """float64 or float32: every function below keeps the precision that it is given."""

@@ -14,11 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from demorec.assets import allow_models
 from demorec.config import EpisodePlan, GenerateConfig, VideoConfig, read_toml
-from demorec.episode import EpisodeInfo, Outcome
 from demorec.errors import ConfigError, DemorecError, NotAllowedError, RecordingError
-from demorec.files import make_folder
 from demorec.geometry import Pose, look_at
 from demorec.loop import prepare
 from demorec.plain import digest, from_plain
@@ -28,12 +25,15 @@ from demorec.registry import nearest_match
 from demorec.render import Renderer
 from demorec.render.painter import Painter
 from demorec.render.recorded import RecordedWorld
-from demorec.scene import Camera, Scene
+from demorec.safety.files import make_folder
+from demorec.safety.user_modules import split_name
+from demorec.scene.assets import allow_models
+from demorec.scene.episode import EpisodeInfo, Outcome
+from demorec.scene.scene import Camera, Scene
+from demorec.scene.variation import Ranges, resolve
 from demorec.seeding import generator
 from demorec.tables import CAMERAS, RENDERERS, camera_name
 from demorec.tasks.vary import vary_looks
-from demorec.user_modules import split_name
-from demorec.variation import Ranges, resolve
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,7 +155,7 @@ class RerenderReport:
 
 
 @dataclass(frozen=True, kw_only=True)
-class View:
+class SceneView:
     """Where the pictures of an episode are taken from.
 
     Attributes:
@@ -169,7 +169,7 @@ class View:
     true_from_recorded: Mapping[str, Pose] = field(default_factory=dict)
 
 
-def recorded_view(info: EpisodeInfo, allowed: Collection[str]) -> View:
+def recorded_view(info: EpisodeInfo, allowed: Collection[str]) -> SceneView:
     """The view of a recording.
 
     Recorded extrinsics may be off on purpose, as those of a real camera are; where the cameras really were follows
@@ -190,13 +190,13 @@ def recorded_view(info: EpisodeInfo, allowed: Collection[str]) -> View:
         except (ValueError, DemorecError):
             episode = None
         if episode is not None and episode.info.scene == info.scene:
-            return View(
+            return SceneView(
                 scene=info.scene, true_cameras=episode.cameras, true_from_recorded=dict(episode.true_from_recorded)
             )
-    return View(scene=info.scene, true_cameras=info.scene.cameras)
+    return SceneView(scene=info.scene, true_cameras=info.scene.cameras)
 
 
-def new_view(info: EpisodeInfo, options: RerenderOptions) -> View:
+def new_view(info: EpisodeInfo, options: RerenderOptions) -> SceneView:
     """The view that the options ask for.
 
     Raises:
@@ -235,7 +235,7 @@ def new_view(info: EpisodeInfo, options: RerenderOptions) -> View:
         scene = vary_looks(scene, resolve("full", Ranges()), rng)
     kept = {name: error for name, error in old.true_from_recorded.items() if name in names and name in recorded}
     kept = {name: error for name, error in kept.items() if name not in options.free_cameras}
-    return View(scene=scene, true_cameras=tuple(true_cameras), true_from_recorded=kept)
+    return SceneView(scene=scene, true_cameras=tuple(true_cameras), true_from_recorded=kept)
 
 
 def _default_size(info: EpisodeInfo, options: RerenderOptions) -> tuple[int, int]:
@@ -251,7 +251,7 @@ def _check_size(camera: Camera) -> None:
             raise ConfigError(f"The {what} of the camera {camera.name!r} is {value}: it must be even, 16 to 8192.")
 
 
-def view_painter(renderer: Renderer, view: View, config: Mapping[str, Any]) -> Painter:
+def view_painter(renderer: Renderer, view: SceneView, config: Mapping[str, Any]) -> Painter:
     """A painter that draws worlds in a view's scene as the view and the config of a recording ask for.
 
     Args:

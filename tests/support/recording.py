@@ -13,22 +13,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.config import VideoConfig
-from demorec.episode import (
+from demorec.geometry import Pose, look_at
+from demorec.recording import EpisodeWriter
+from demorec.scene.episode import (
     Action,
     CameraImages,
-    Check,
     EpisodeInfo,
     Event,
     Frame,
     JointSample,
     Observation,
     Outcome,
-    RobotSpec,
+    SuccessCheck,
     frame_time_ns,
 )
-from demorec.geometry import Pose, look_at
-from demorec.recording import EpisodeWriter
-from demorec.scene import Body, Camera, Goal, RobotPlacement, Scene, Shape
+from demorec.scene.robot import RobotSpec
+from demorec.scene.scene import Body, Camera, Goal, RobotPlacement, Scene, Shape
 
 PHASES = ("approach", "descend", "grasp", "lift", "transport", "place", "retreat")
 HOME = (0.0, -0.4, 0.0, -2.2, 0.0, 1.8, 0.785)
@@ -104,7 +104,9 @@ def make_episode(
         frames.append(
             _frame(index, fps, num_frames, specs, episode_index, depth, segmentation, joint_samples=tuple(samples))
         )
-    checks = (Check(name="distance_to_target", value=0.004 if success else 0.2, limit=0.02, unit="m", passed=success),)
+    checks = (
+        SuccessCheck(name="distance_to_target", value=0.004 if success else 0.2, limit=0.02, unit="m", passed=success),
+    )
     outcome = Outcome(
         success=success,
         checks=checks,
@@ -142,7 +144,7 @@ def _camera(name: str, width: int, height: int) -> Camera:
 
 
 def _scene(cameras: tuple[Camera, ...], physics_hz: int) -> Scene:
-    from demorec.scene import Physics
+    from demorec.scene.scene import Physics
 
     return Scene(
         robot=RobotPlacement(name="panda", world_from_base=Pose(), joint_position=HOME, gripper_width=0.08),

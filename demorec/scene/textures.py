@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.geometry import Array
-from demorec.scene import Texture
+from demorec.scene.scene import Texture
 
 
 def texture_pixels(texture: Texture, size: int = 256) -> NDArray[np.uint8]:

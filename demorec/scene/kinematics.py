@@ -18,7 +18,7 @@ import numba
 import numpy as np
 
 from demorec.geometry import Array, Pose, quat_from_rotation
-from demorec.urdf import Urdf
+from demorec.scene.urdf import Urdf
 
 _njit: Any = numba.njit(cache=True, error_model="numpy")
 

@@ -16,12 +16,12 @@ from typing import Any
 
 from demorec.config import GenerateConfig
 from demorec.errors import ConfigError, resource_error
-from demorec.files import open_regular, read_json_limited
-from demorec.generate.options import MAX_EPISODES
 from demorec.plain import digest, from_plain, to_plain
+from demorec.safety.files import open_regular, read_json_limited
 
 RUN_NAME = "run.json"
 RUN_FORMAT = 1
+MAX_EPISODES = 10_000_000
 EPISODES, FAILED, UNFINISHED, DATASET = "episodes", "failed", "unfinished", "dataset"
 STARTING = "starting"
 """What a worker does before its first frame, once: it compiles, or loads, and fills caches that later episodes find."""

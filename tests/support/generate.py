@@ -1,6 +1,6 @@
-"""Runs of stand-in recordings (helpers_makers), with the real machinery around them.
+"""Runs of stand-in recordings (`support.makers`), with the real machinery around them.
 
-As a program (`python -m helpers_generate OUT MAKER NUM_EPISODES WORKERS`) it is a driver that tests can kill.
+As a program (`python -m support.generate OUT MAKER NUM_EPISODES WORKERS`) it is a driver that tests can kill.
 """
 
 from __future__ import annotations
@@ -9,14 +9,13 @@ import json
 import sys
 from pathlib import Path
 
-from helpers_makers import line_of, succeeds
-
 from demorec.config import GenerateConfig
 from demorec.errors import DemorecError
-from demorec.files import read_text_limited
 from demorec.generate.options import RunOptions
-from demorec.generate.recordings import Inspected
 from demorec.generate.run import NoProgress, RunResult, generate
+from demorec.runs.recordings import Inspected
+from demorec.safety.files import read_text_limited
+from support.makers import line_of, succeeds
 
 
 def inspect(path: Path) -> Inspected:
@@ -59,7 +58,7 @@ def run_fake(
             out=out, num_episodes=num_episodes, workers=workers, recycle_after=recycle_after, overwrite=overwrite
         ),
         progress=progress,
-        maker=f"helpers_makers:{maker}",
+        maker=f"support.makers:{maker}",
         inspect=inspect,
         episodes=episodes,
     )

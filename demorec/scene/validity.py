@@ -12,10 +12,11 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 
 from demorec.config import MAX_PIXELS
-from demorec.episode import EpisodeInfo, RobotSpec
 from demorec.geometry import Pose
 from demorec.plain import from_json
-from demorec.scene import Body, Camera, Scene, Shape
+from demorec.scene.episode import EpisodeInfo
+from demorec.scene.robot import RobotSpec
+from demorec.scene.scene import Body, Camera, Scene, Shape
 
 MAX_DESCRIPTION_BYTES = 1 << 20
 """Of one description as JSON: the longest of 720 that the generator made, with all cameras, has 13 kB, 700 values."""

@@ -13,12 +13,12 @@ from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
-from helpers_recording import write_episode
 
 from demorec.config import VideoConfig
 from demorec.errors import ExportError
 from demorec.lerobot import ExportReport
 from demorec.tables import EXPORTERS
+from support.recording import write_episode
 
 
 def make_run(

@@ -1,0 +1,1 @@
+"""What several tests share: recordings made by hand, runs and datasets, readers, commands."""
