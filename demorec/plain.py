@@ -12,6 +12,7 @@ from typing import Any
 
 import cattrs
 import numpy as np
+from cattrs.gen import make_dict_structure_fn, make_dict_unstructure_fn, override
 from cattrs.preconf.json import make_converter
 from cattrs.v import format_exception
 
@@ -75,6 +76,39 @@ _converter.register_structure_hook(Pose, _pose_from_plain)
 _converter.register_unstructure_hook(
     Pose, lambda pose: {"position": pose.position.tolist(), "quat_xyzw": pose.quat_xyzw.tolist()}
 )
+
+
+def write_flat(owner: type, name: str, part: type, keys: Mapping[str, str]) -> None:
+    """Have a field that is a dataclass itself written as keys of its owner, not as an object within it.
+
+    Args:
+        owner: The dataclass that has the field.
+        name: Of the field.
+        part: The field's dataclass.
+        keys: Field of `part` -> key that it has among those of `owner`.
+    """
+    renamed: Any = {field: override(rename=key) for field, key in keys.items()}
+    structure_part: Any = make_dict_structure_fn(part, _converter, _cattrs_forbid_extra_keys=True, **renamed)
+    _converter.register_structure_hook(part, structure_part)
+    _converter.register_unstructure_hook(part, make_dict_unstructure_fn(part, _converter, **renamed))
+    structure: Any = make_dict_structure_fn(owner, _converter, _cattrs_forbid_extra_keys=True)
+    unstructure: Any = make_dict_unstructure_fn(owner, _converter)
+    of_part = frozenset(keys.values())
+
+    def from_flat(value: Mapping[str, Any], _: type) -> Any:
+        if name in value:
+            raise cattrs.ClassValidationError("", [cattrs.ForbiddenExtraKeysError("", owner, {name})], owner)
+        nested = {key: item for key, item in value.items() if key not in of_part}
+        nested[name] = {key: item for key, item in value.items() if key in of_part}
+        return structure(nested, owner)
+
+    def to_flat(value: Any) -> dict[str, Any]:
+        plain: dict[str, Any] = unstructure(value)
+        nested: dict[str, Any] = plain.pop(name)
+        return plain | nested
+
+    _converter.register_structure_hook(owner, from_flat)
+    _converter.register_unstructure_hook(owner, to_flat)
 
 
 def _in_words(error: BaseException, type_: type | None) -> str:

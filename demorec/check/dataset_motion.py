@@ -55,7 +55,7 @@ def dataset_joint_limits(dataset: Dataset) -> Measurement | None:
     for number, (rows, info) in enumerate(dataset.described()):
         robot, state = info.robot, rows[STATE].astype(np.float64)
         low = np.array([*robot.position_lower, 0.0])
-        high = np.array([*robot.position_upper, robot.gripper_max_width])
+        high = np.array([*robot.position_upper, robot.gripper.max_width])
         beyond = np.maximum(np.maximum(low - state, state - high), 0.0)
         frame = int(np.argmax(beyond.max(axis=1)))
         found.append(Measurement(value=float(beyond.max()), frame=frame, detail=f"episode {number}"))

@@ -142,14 +142,14 @@ def unit_quaternions(episode: RecordedEpisode) -> Measurement | None:
 
 @check(group="physics", measures="gripper opening against its fingers and its range", unit="m", warn=1e-6, fail=2e-3)
 def gripper_width(episode: RecordedEpisode) -> Measurement | None:
-    """The opening is the sum of the finger joints and lies, as its target does, within 0 and the full opening.
+    """The opening is that of the finger joints and lies, as its target does, within 0 and the full opening.
 
     A millimetre of overshoot is allowed: the fingers have mass.
     """
     c, robot = episode.columns, episode.info.robot
     found = []
-    fingers = c.joint_position[:, episode.num_arm :].sum(axis=1)
-    beyond = [np.maximum(np.maximum(-w, w - robot.gripper_max_width) - 1e-3, 0.0) for w in _widths(episode)]
+    fingers = robot.gripper.width(c.joint_position[:, episode.num_arm :])
+    beyond = [np.maximum(np.maximum(-w, w - robot.gripper.max_width) - 1e-3, 0.0) for w in _widths(episode)]
     rows = ("against the fingers", "range", "range of the action", "range of the command")
     for detail, off in zip(rows, (np.abs(c.gripper_width - fingers), *beyond), strict=True):
         if len(off):

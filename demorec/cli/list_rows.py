@@ -62,7 +62,7 @@ def _own_summary(registry: Registry[Any], name: str) -> str:
 
 def _robot(registry: Registry[Any], name: str) -> str:
     robot = registry.load(name)
-    return f"{len(robot.arm_joints)} joints, gripper opening {1000 * robot.gripper_max_width:.0f} mm, from {robot.urdf}"
+    return f"{len(robot.arm_joints)} joints, gripper opening {1000 * robot.gripper.max_width:.0f} mm, from {robot.urdf}"
 
 
 def _first_line_of_module(registry: Registry[Any], name: str) -> str:

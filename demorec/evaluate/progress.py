@@ -33,7 +33,7 @@ class EvaluationObserver:
             self._stage[number] = max(self._stage[number], self._reached(world, goal, self._stage[number]))
 
     def _reached(self, world: World, goal: Goal, stage: int) -> int:
-        held = min(world.finger_forces(goal.object)) > GRASP_FORCE
+        held = world.grip_force(goal.object) > GRASP_FORCE
         position = world.pose(goal.object).position
         if stage == 0:
             return 1 if held else 0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from demorec.errors import ConfigError, ExportError
@@ -101,7 +101,7 @@ class Profile:
         """That of a recording, as far as it matters for these options."""
         info = recording.info
         # A scaled arm (the tutorial's) has the same joints and limits; its lengths stay with each episode's sidecar.
-        robot = replace(info.robot, gripper_max_width=0.0, finger_depth=0.0, palm_clearance=0.0)
+        robot = info.robot.scaled(0.0)
         traits = [("fps", str(info.fps)), ("robot", f"{info.robot.name} ({digest(robot)})")]
         cameras = [name for name in recording.cameras if options.takes(IMAGE_PREFIX + name)]
         traits.append(("cameras", " ".join(cameras) or "none"))

@@ -46,7 +46,7 @@ def action_bounds(robot: RobotSpec, kind: ActionKind, *, fps: int) -> tuple[Arra
         # 2 m/s and pi rad/s are more than the arm can follow.
         high = np.array([2.0] * 3 + [math.pi] * 3) / fps
         low = -high
-    return np.append(low, 0.0), np.append(high, robot.gripper_max_width)
+    return np.append(low, 0.0), np.append(high, robot.gripper.max_width)
 
 
 class ActionDecoder:
@@ -80,7 +80,7 @@ class ActionDecoder:
         if self._is_limited:
             wanted = np.clip(wanted, self._kinematics.lower, self._kinematics.upper)
             wanted = np.clip(wanted, self._joint_target - self._max_step, self._joint_target + self._max_step)
-            gripper = float(np.clip(gripper, 0.0, self._robot.gripper_max_width))
+            gripper = float(np.clip(gripper, 0.0, self._robot.gripper.max_width))
         self._joint_target = wanted
         return Action(
             joint_target=wanted, gripper_target=gripper, base_from_tcp_target=self._kinematics.forward(wanted)

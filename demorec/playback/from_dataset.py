@@ -67,10 +67,10 @@ def _read_episode(root: Path, episode_index: int) -> PlayedEpisode:
         raise RecordingError(f"The dataset has no rows of episode {episode_index}, or of another robot: {root}")
     fps = int(described.fps)
     time_ns = np.array([frame_time_ns(index, fps) for index in range(num_frames)], dtype=np.int64)
-    num_arm, num_fingers = len(info.robot.arm_joints), len(info.robot.gripper_joints)
+    num_arm = len(info.robot.arm_joints)
     state = data["observation.state"]
     base_from_tcp = data["observation.ee_pose"] if "observation.ee_pose" in data else _tcp_poses(info, state)
-    fingers = np.repeat(state[:, num_arm:] / num_fingers, num_fingers, axis=1)
+    fingers = info.robot.gripper.joint_position(state[:, num_arm])
     ends = {item["name"]: _pose_row(item["world_from_object_end"]) for item in row["objects"]}
     return PlayedEpisode(
         name=f"episode_{episode_index:06d}",

@@ -31,6 +31,7 @@ from demorec.recording.channels import (
 )
 from demorec.recording.transforms import WORLD, FrameTree
 from demorec.scene.episode import Action, EpisodeColumns, EpisodeInfo, Frame, Observation
+from demorec.scene.robot import RobotSpec
 
 GRIPPER_JOINT = "gripper"
 """Name of the gripper's opening beside the joints' names."""
@@ -102,7 +103,7 @@ def _every_stream(info: EpisodeInfo) -> Iterator[FrameStream]:
     arm_and_gripper = (*robot.arm_joints, GRIPPER_JOINT)
     base = robot.base_link
     yield _joints(JOINT_STATES, robot.joint_names, _joint_state_parts, _joint_state_columns)
-    yield _joints(GRIPPER, (GRIPPER_JOINT,), partial(_gripper_parts, len(robot.gripper_joints)), _gripper_columns)
+    yield _joints(GRIPPER, (GRIPPER_JOINT,), partial(_gripper_parts, robot), _gripper_columns)
     yield _joints(
         ACTION, arm_and_gripper, lambda v: _targets(v.action), partial(_target_columns, "action"), _with_zeros
     )
@@ -210,10 +211,10 @@ def _joint_state_columns(values: Array) -> Columns:
     return {name: part.copy() for name, part in zip(names, np.split(values, 3, axis=1), strict=True)}
 
 
-def _gripper_parts(num_fingers: int, values: FrameValues) -> Sequence[Array]:
-    # The opening's velocity is the sum of the fingers' velocities; the force on them stands in for the effort.
-    observation = values.observation
-    velocity = sum(observation.joint_velocity[-num_fingers:].tolist())
+def _gripper_parts(robot: RobotSpec, values: FrameValues) -> Sequence[Array]:
+    # The force on the fingers stands in for the effort.
+    observation, n = values.observation, len(robot.arm_joints)
+    velocity = float(robot.gripper.width_velocity(observation.joint_position[n:], observation.joint_velocity[n:]))
     return (np.array((observation.gripper_width, velocity, observation.contact_force)),)
 
 

@@ -108,10 +108,9 @@ def observation_vectors(
     - `observation.environment_state` (only if `privileged`): see `_environment_columns`.
     """
     arm = len(robot.arm_joints)
-    velocity = rows.joint_velocity
     features = {
         STATE: _float32([rows.joint_position[:, :arm], rows.gripper_width]),
-        VELOCITY: _float32([velocity[:, :arm], _gripper_velocity(velocity, arm)]),
+        VELOCITY: _float32([rows.joint_velocity[:, :arm], _gripper_velocity(rows, robot)]),
         EE_POSE: _float32([_continuous(rows.base_from_tcp)]),
     }
     if privileged:
@@ -188,7 +187,7 @@ def _environment_columns(rows: ObservationRows, robot: RobotSpec, scene: Scene) 
             wanted_yaw = _yaw(wanted, goal.yaw_symmetry)
             columns += [*wanted_yaw, *_difference(wanted_yaw, _yaw(object_, goal.yaw_symmetry))]
     arm = len(robot.arm_joints)
-    columns += [rows.joint_velocity[:, :arm], _gripper_velocity(rows.joint_velocity, arm)]
+    columns += [rows.joint_velocity[:, :arm], _gripper_velocity(rows, robot)]
     columns += [poses[body.name] for body in scene.movable]
     return columns
 
@@ -350,11 +349,9 @@ def _repeat(values: tuple[float, ...], count: int) -> Array:
     return np.broadcast_to(np.array(values, dtype=np.float64), (count, len(values)))
 
 
-def _gripper_velocity(joint_velocity: Array, arm: int) -> Array:
-    total: Array = np.zeros(len(joint_velocity))
-    for finger in range(arm, joint_velocity.shape[1]):
-        total = total + joint_velocity[:, finger]
-    return total
+def _gripper_velocity(rows: ObservationRows, robot: RobotSpec) -> Array:
+    arm = len(robot.arm_joints)
+    return robot.gripper.width_velocity(rows.joint_position[:, arm:], rows.joint_velocity[:, arm:])
 
 
 def _continuous(pose: Array) -> Array:

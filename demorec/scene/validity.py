@@ -68,7 +68,7 @@ def _episode(info: EpisodeInfo) -> Iterator[str]:
 
 def _robot(robot: RobotSpec) -> Iterator[str]:
     yield from _count("arm joints", robot.arm_joints, least=1)
-    yield from _count("gripper joints", robot.gripper_joints, least=0)
+    yield from _count("gripper joints", robot.gripper.joints, least=0)
     yield from _unique("joints of the robot", robot.joint_names)
     for name in ("home_q", "position_lower", "position_upper", "velocity_limit", "acceleration_limit", "torque_limit"):
         values: tuple[float, ...] = getattr(robot, name)

@@ -15,8 +15,6 @@ from demorec.scene.robot import RobotSpec
 from demorec.scene.scene import POSITION_GAIN, RobotPlacement
 from demorec.sim.urdf_file import urdf_file
 
-FINGER_SPEED = 0.1
-"""Of each finger, m/s."""
 FINGER_STIFFNESS, FINGER_DAMPING = 30_000.0, 1_000.0
 """Contact of the finger pads, N/m and N s/m (the values of panda.urdf)."""
 
@@ -38,10 +36,11 @@ class Arm:
         self.spec = spec
         self.world_from_base = placement.world_from_base
         self._client = client
-        if len(spec.gripper_joints) != 2:
+        num_fingers = 1 + len(spec.gripper.gear_ratios)
+        if len(spec.gripper.joints) != num_fingers:
             raise SceneError(
-                f"The robot {spec.name!r} has {len(spec.gripper_joints)} finger joints; only a parallel gripper with "
-                "2 can be simulated."
+                f"The robot {spec.name!r} has {len(spec.gripper.joints)} finger joints; a gripper of its kind has "
+                f"{num_fingers}."
             )
         try:
             with urdf_file(spec.urdf) as path:
@@ -59,17 +58,17 @@ class Arm:
         info = [client.getJointInfo(self.body, i) for i in range(client.getNumJoints(self.body))]
         self.links = {spec.base_link: -1} | {row[12].decode(): row[0] for row in info}
         by_name = {row[1].decode(): row[0] for row in info}
-        wanted = {*spec.arm_joints, *spec.gripper_joints} - by_name.keys()
-        wanted |= {spec.tcp_link, *spec.finger_links} - self.links.keys()
+        wanted = {*spec.arm_joints, *spec.gripper.joints} - by_name.keys()
+        wanted |= {spec.tcp_link, *spec.gripper.finger_links} - self.links.keys()
         if wanted:
             raise SceneError(
                 f"The robot {spec.name!r} has joints or links that its URDF {spec.urdf!r} lacks: "
                 f"{', '.join(sorted(wanted))}."
             )
         self._arm = [by_name[name] for name in spec.arm_joints]
-        self._fingers = [by_name[name] for name in spec.gripper_joints]
+        self._fingers = [by_name[name] for name in spec.gripper.joints]
         self._tcp = self.links[spec.tcp_link]
-        self.finger_links = tuple(self.links[name] for name in spec.finger_links)
+        self.finger_links = tuple(self.links[name] for name in spec.gripper.finger_links)
         self._hand = self._mounted_hand()
         self.kinematics = arm_kinematics(spec, scale=placement.scale)
         self._forces = list(spec.torque_limit)
@@ -93,11 +92,12 @@ class Arm:
                 contactDamping=FINGER_DAMPING,
             )
         # PyBullet ignores the URDF's mimic joint; without a gear the fingers do not centre the object.
-        left, right = self._fingers
-        gear = self._client.createConstraint(
-            self.body, left, self.body, right, self._client.JOINT_GEAR, [1, 0, 0], [0, 0, 0], [0, 0, 0]
-        )
-        self._client.changeConstraint(gear, gearRatio=-1, erp=0.1, maxForce=50)
+        leader, *followers = self._fingers
+        for joint, ratio in zip(followers, self.spec.gripper.gear_ratios, strict=True):
+            gear = self._client.createConstraint(
+                self.body, leader, self.body, joint, self._client.JOINT_GEAR, [1, 0, 0], [0, 0, 0], [0, 0, 0]
+            )
+            self._client.changeConstraint(gear, gearRatio=-ratio, erp=0.1, maxForce=50)
 
     def _mounted_hand(self) -> int:
         """The hand's link, with a force-torque sensor on the joint that carries it."""
@@ -114,10 +114,7 @@ class Arm:
 
     def place(self, joint_position: Array, gripper_width: float) -> None:
         """Set the arm joints (n_arm,) rad and the opening (m) at once, at rest, without physics."""
-        for joint, position in zip(self._arm, joint_position.tolist(), strict=True):
-            self._client.resetJointState(self.body, joint, position)
-        for joint in self._fingers:
-            self._client.resetJointState(self.body, joint, gripper_width / 2)
+        self.place_joints(np.append(joint_position, self.spec.gripper.joint_position(gripper_width)))
 
     def place_joints(self, joint_position: Array) -> None:
         """Set all joints (n_joints,), fingers included, at once, at rest, without physics."""
@@ -126,14 +123,15 @@ class Arm:
 
     def command(self, action: Action) -> None:
         """Begin a control step: the gripper's motors are set for all of it."""
-        for joint in self._fingers:
+        gripper = self.spec.gripper
+        for joint, target in zip(self._fingers, gripper.joint_position(action.gripper_target).tolist(), strict=True):
             self._client.setJointMotorControl2(
                 self.body,
                 joint,
                 self._client.POSITION_CONTROL,
-                targetPosition=action.gripper_target / 2,
-                force=self.spec.gripper_force,
-                maxVelocity=FINGER_SPEED,
+                targetPosition=target,
+                force=gripper.force,
+                maxVelocity=gripper.joint_speed,
             )
         self.gripper_target = action.gripper_target
 
@@ -161,7 +159,8 @@ class Arm:
 
     def gripper_width(self) -> float:
         """Opening, metres."""
-        return float(sum(state[0] for state in self._client.getJointStates(self.body, self._fingers)))
+        states = self._client.getJointStates(self.body, self._fingers)
+        return float(self.spec.gripper.width(np.array([state[0] for state in states])))
 
     def arm_position(self) -> Array:
         """(n_arm,) joint positions, rad."""

@@ -145,7 +145,7 @@ class World:
             joint_position=position,
             joint_velocity=velocity,
             joint_effort=effort,
-            gripper_width=float(position[n:].sum()),
+            gripper_width=float(self.robot.gripper.width(position[n:])),
             base_from_tcp=self.arm.kinematics.forward(position[:n]),
             object_poses={body.name: self.pose(body.name) for body in self.scene.movable},
             contact_force=sum(
@@ -212,6 +212,10 @@ class World:
             )
             for link in self.arm.finger_links
         )
+
+    def grip_force(self, name: str) -> float:
+        """With what force (N) the hand grips a body of the scene; 0 when a finger does not touch it."""
+        return self.robot.gripper.grip_force(self.finger_forces(name))
 
     def pressed_from_above(self, name: str, *, force: float = 3.0) -> bool:
         """Whether the hand pushes down on a body with more than `force` N (at a contact steeper than 45 degrees)."""

@@ -81,4 +81,4 @@ def placement_checks(world: World, goal: Goal, *, max_distance: float = MAX_DIST
 
 def gripper_open_check(world: World) -> SuccessCheck:
     """That the hand has let go."""
-    return at_least("gripper_width", world.arm.gripper_width(), MIN_OPENING * world.robot.gripper_max_width, "m")
+    return at_least("gripper_width", world.arm.gripper_width(), MIN_OPENING * world.robot.gripper.max_width, "m")

@@ -93,5 +93,5 @@ def robot_at_origin(robot: RobotSpec, sampler: Sampler) -> RobotPlacement:
         name=robot.name,
         world_from_base=Pose(),
         joint_position=tuple(q + sampler.uniform(-spread, spread) for q in robot.home_q),
-        gripper_width=robot.gripper_max_width,
+        gripper_width=robot.gripper.max_width,
     )

@@ -82,7 +82,7 @@ def grasps_beside(
     hand_x, hand_y = grasp.rotation[:, 0], grasp.rotation[:, 1]
     distance = max(abs(x), _half_extent(body, pose, hand_x) + _FINGERS[0] + _GAP)
     centre = np.array([*pose.position[:2], grasp.position[2]])
-    tips, palm = grasp.position[2] - robot.finger_depth, grasp.position[2] + robot.palm_clearance
+    tips, palm = grasp.position[2] - robot.gripper.finger_depth, grasp.position[2] + robot.gripper.palm_clearance
     found = []
     for side in (1.0, -1.0):
         missed = Pose(

@@ -86,7 +86,7 @@ class Expert:
     @property
     def open_width(self) -> float:
         """The gripper's full opening, metres."""
-        return self.world.robot.gripper_max_width
+        return self.world.robot.gripper.max_width
 
     def note(self, name: str, message: str, *, trouble: bool = False) -> None:
         """Record an event with the next step; `trouble` also keeps it as the reason of a failure."""
@@ -274,7 +274,7 @@ class Expert:
 
     def holds(self, name: str) -> bool:
         """Whether both fingers press on an object that keeps them apart."""
-        return min(self.world.finger_forces(name)) > 0.5 and self.world.arm.gripper_width() > 0.01
+        return self.world.grip_force(name) > 0.5 and self.world.arm.gripper_width() > 0.01
 
     def place(self, goal: Goal) -> Generator[Step, None, bool]:
         """Carry the held object to its goal and let go; the generator returns whether it lies well."""
@@ -341,11 +341,11 @@ class Expert:
 
     def _grasps(self, body: Body, pose: Pose) -> list[Pose]:
         """Grasp poses `world_from_tcp` of a body, the yaw nearest to the hand's present one first."""
-        robot = self.world.robot
+        gripper = self.world.robot.gripper
         half = resting_half_height(body, pose)
         top, bottom = pose.position[2] + half, pose.position[2] - half
         # At the centre, but no deeper than the palm allows, and with the finger tips above the support.
-        z = max(pose.position[2], top - (robot.palm_clearance - 0.007), bottom + robot.finger_depth + 0.005)
+        z = max(pose.position[2], top - (gripper.palm_clearance - 0.007), bottom + gripper.finger_depth + 0.005)
         now = hand_yaw(self.tcp())
         yaws = sorted(grasp_yaws(body, pose, now, self.open_width), key=lambda yaw: abs(wrap_angle(yaw - now)))
         return [hand_down((pose.position[0], pose.position[1], z), yaw) for yaw in yaws]

@@ -119,7 +119,7 @@ class Tutorial(Task):
                 world_from_base=Pose(position=np.array(BASE)),
                 scale=ROBOT_SCALE,
                 joint_position=tuple(q + sampler.uniform(-spread, spread) for q in joints),
-                gripper_width=robot.gripper_max_width * ROBOT_SCALE,
+                gripper_width=robot.gripper.scaled(ROBOT_SCALE).max_width,
             ),
             bodies=(floor, table, cube),
             goals=(goal,),

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 
 from demorec.render.cameras import CameraPreset
-from demorec.scene.robot import RobotSpec
+from demorec.scene.robot import ParallelGripper, RobotSpec
 
 TURN = 2 * math.pi
 
@@ -18,20 +18,22 @@ XARM6 = RobotSpec(
     urdf="xarm6.urdf",  # beside this file
     base_link="stand",
     arm_joints=("joint1", "joint2", "joint3", "joint4", "joint5", "joint6"),
-    gripper_joints=("gripper_left_joint", "gripper_right_joint"),
     tcp_link="tcp",
     hand_link="gripper_hand",
-    finger_links=("gripper_left_finger", "gripper_right_finger"),
     home_q=(0.0, -0.55, -0.75, 0.0, 1.30, 0.0),
     position_lower=(-TURN, -2.059, -3.927, -TURN, -1.692, -TURN),
     position_upper=(TURN, 2.094, 0.191, TURN, math.pi, TURN),
     velocity_limit=(3.14,) * 6,
     acceleration_limit=(15.0,) * 6,
     torque_limit=(50.0, 50.0, 32.0, 32.0, 32.0, 20.0),
-    gripper_max_width=0.10,
-    gripper_force=20.0,
-    finger_depth=0.010,
-    palm_clearance=0.065,
+    gripper=ParallelGripper(
+        joints=("gripper_left_joint", "gripper_right_joint"),
+        finger_links=("gripper_left_finger", "gripper_right_finger"),
+        max_width=0.10,
+        force=20.0,
+        finger_depth=0.010,
+        palm_clearance=0.065,
+    ),
 )
 
 TOP = CameraPreset(

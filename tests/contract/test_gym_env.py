@@ -201,7 +201,7 @@ def test_commands_keep_to_the_limits() -> None:
         command = frame.command
         step = np.abs(command.joint_target - before)
         assert np.all(step <= np.array(robot.velocity_limit) / 30 + 1e-12)
-        assert command.gripper_target == robot.gripper_max_width
+        assert command.gripper_target == robot.gripper.max_width
         before = command.joint_target
     env.close()
 

@@ -93,7 +93,7 @@ def test_every_link_is_where_pybullet_has_it(name: str) -> None:
         )
         robot = spec.scaled(placement.scale)
         positions = rng.uniform(-3.0, 3.0, (30, len(robot.joint_names)))
-        positions[:, -2:] = rng.uniform(0, robot.gripper_max_width / 2, (30, 2))
+        positions[:, -2:] = rng.uniform(0, robot.gripper.max_width / 2, (30, 2))
         scene = Scene(robot=placement, bodies=())
         other = RecordedWorld(robot, scene, joint_position=positions, object_poses={})
         with World(robot) as world:

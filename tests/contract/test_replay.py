@@ -184,7 +184,7 @@ def test_what_a_dataset_differs_in_is_in_its_total(tmp_path: Path, capsys: pytes
 
 def test_a_robot_without_a_gripper_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     info, frames, outcome = make_episode(num_frames=3, cameras=())
-    info = replace(info, robot=replace(info.robot, gripper_joints=(), finger_links=()))
+    info = replace(info, robot=replace(info.robot, gripper=replace(info.robot.gripper, joints=(), finger_links=())))
     with EpisodeWriter(tmp_path / "e.mcap", info) as writer:
         for frame in frames:
             seen = frame.observation

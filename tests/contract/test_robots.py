@@ -35,13 +35,13 @@ def test_the_spec_names_what_the_urdf_has(spec):
     joints = {joint.name: joint for joint in urdf.joints}
     links = {joint.child for joint in urdf.joints} | {urdf.root}
     assert urdf.root == spec.base_link
-    assert {spec.tcp_link, spec.hand_link, *spec.finger_links} <= links
+    assert {spec.tcp_link, spec.hand_link, *spec.gripper.finger_links} <= links
     for name, low, high in zip(spec.arm_joints, spec.position_lower, spec.position_upper, strict=True):
         assert joints[name].kind == "revolute"
         assert joints[name].lower - 1e-4 <= low < high <= joints[name].upper + 1e-4
-    for name in spec.gripper_joints:
+    for name in spec.gripper.joints:
         assert joints[name].kind == "prismatic"
-        assert math.isclose(joints[name].upper, spec.gripper_max_width / 2)
+        assert math.isclose(joints[name].upper, spec.gripper.max_width / 2)
     numbers = len(spec.arm_joints)
     for values in (spec.home_q, spec.velocity_limit, spec.acceleration_limit, spec.torque_limit):
         assert len(values) == numbers
@@ -123,7 +123,7 @@ def test_the_fingers_move_along_y_of_the_tcp_and_reach_as_far_as_the_spec_says(s
         world.reset(scene)
         tcp = world.arm.world_from_tcp()
         opened = np.array(scene.robot.joint_position)
-        width = spec.gripper_max_width
+        width = spec.gripper.max_width
         world.set_state(joint_position=np.array([*opened, width / 2, width / 2]))
         tips = []
         for link in world.arm.finger_links:
@@ -133,7 +133,7 @@ def test_the_fingers_move_along_y_of_the_tcp_and_reach_as_far_as_the_spec_says(s
             assert abs(centre[0]) < 0.01
             assert width / 2 - 0.005 < abs(centre[1]) < width / 2 + 0.025
         # PyBullet's boxes are some millimetres too large.
-        assert abs(tcp.position[2] - min(tips) - spec.finger_depth) < 0.005
+        assert abs(tcp.position[2] - min(tips) - spec.gripper.finger_depth) < 0.005
 
 
 def test_the_whole_workspace_is_within_reach(spec):
@@ -167,7 +167,7 @@ def test_the_open_hand_is_no_larger_than_a_deliberate_miss_thinks(spec):
         world.reset(episode(robot=spec.name).info.scene)
         goal = world.arm.world_from_base.inverse() @ hand_down((0.5, 0.0, 0.4), 0.0)
         found = world.arm.kinematics.inverse(goal, start=np.array(spec.home_q))
-        world.arm.place(found, spec.gripper_max_width)
+        world.arm.place(found, spec.gripper.max_width)
         world.client.performCollisionDetection()
         tcp = world.arm.world_from_tcp().position
         boxes = {
@@ -178,5 +178,5 @@ def test_the_open_hand_is_no_larger_than_a_deliberate_miss_thinks(spec):
     for half_size, parts in ((grasping._FINGERS, list(boxes.values())), (grasping._PALM, [hand])):
         for box in parts:
             assert (np.abs(box[:, :2]).max(axis=0) < np.array(half_size) + grasping._GAP).all()
-    assert hand[0, 2] > spec.palm_clearance - 2e-3
-    assert min(box[0, 2] for box in boxes.values()) > -spec.finger_depth - grasping._GAP
+    assert hand[0, 2] > spec.gripper.palm_clearance - 2e-3
+    assert min(box[0, 2] for box in boxes.values()) > -spec.gripper.finger_depth - grasping._GAP

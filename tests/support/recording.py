@@ -27,7 +27,7 @@ from demorec.scene.episode import (
     SuccessCheck,
     frame_time_ns,
 )
-from demorec.scene.robot import RobotSpec
+from demorec.scene.robot import ParallelGripper, RobotSpec
 from demorec.scene.scene import Body, Camera, Goal, RobotPlacement, Scene, Shape
 
 PHASES = ("approach", "descend", "grasp", "lift", "transport", "place", "retreat")
@@ -38,20 +38,22 @@ PANDA = RobotSpec(
     urdf="franka_panda/panda.urdf",
     base_link="panda_link0",
     arm_joints=tuple(f"panda_joint{n}" for n in range(1, 8)),
-    gripper_joints=("panda_finger_joint1", "panda_finger_joint2"),
     tcp_link="panda_grasptarget",
     hand_link="panda_hand",
-    finger_links=("panda_leftfinger", "panda_rightfinger"),
     home_q=HOME,
     position_lower=(-2.9671, -1.8326, -2.9671, -3.1416, -2.9671, -0.0873, -2.9671),
     position_upper=(2.9671, 1.8326, 2.9671, 0.0, 2.9671, 3.8223, 2.9671),
     velocity_limit=(2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61),
     acceleration_limit=(15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0),
     torque_limit=(87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0),
-    gripper_max_width=0.08,
-    gripper_force=20.0,
-    finger_depth=0.01,
-    palm_clearance=0.09,
+    gripper=ParallelGripper(
+        joints=("panda_finger_joint1", "panda_finger_joint2"),
+        finger_links=("panda_leftfinger", "panda_rightfinger"),
+        max_width=0.08,
+        force=20.0,
+        finger_depth=0.01,
+        palm_clearance=0.09,
+    ),
 )
 
 

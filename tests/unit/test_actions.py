@@ -29,7 +29,7 @@ def test_recorded_targets_are_sent_as_they_are(world: World) -> None:
     assert sent.gripper_target == 5.0
     limited = ActionDecoder(world, "joint").command(far)
     assert np.all(limited.joint_target - world.arm.target <= np.array(world.robot.velocity_limit) / world.fps + 1e-12)
-    assert limited.gripper_target == world.robot.gripper_max_width
+    assert limited.gripper_target == world.robot.gripper.max_width
 
 
 @pytest.mark.parametrize("is_limited", [True, False])

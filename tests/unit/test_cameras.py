@@ -53,7 +53,7 @@ def test_wrist_sees_the_space_between_the_fingers(world):
     state = world.client.getLinkState(mount.body, mount.link, computeForwardKinematics=True)
     pose = Pose(position=np.array(state[4]), quat_xyzw=np.array(state[5])) @ camera.mount_from_camera
     tcp = world.arm.world_from_tcp()
-    half = world.robot.gripper_max_width / 2
+    half = world.robot.gripper.max_width / 2
     for point in ([0, 0, 0], [0, 0.7 * half, 0], [0, -0.7 * half, 0], [0, 0, 0.1]):
         assert inside(camera, pixel(camera, pose, tuple(tcp.apply(np.array(point))))), point
     # The hand's own x axis runs down in the picture: what lies ahead of the fingers comes in from below.

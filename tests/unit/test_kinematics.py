@@ -56,7 +56,7 @@ def test_every_link_of_the_urdf_is_where_the_simulator_has_it(robot):
     spec, client, body, links, joints = robot
     urdf = Urdf.load(asset_path(spec.urdf))
     q = dict(zip(spec.arm_joints, random_positions(spec, 1, seed=3)[0].tolist(), strict=True))
-    q |= dict.fromkeys(spec.gripper_joints, 0.3 * spec.gripper_max_width)
+    q |= dict(zip(spec.gripper.joints, spec.gripper.joint_position(0.6 * spec.gripper.max_width), strict=True))
     for name, value in q.items():
         client.resetJointState(body, joints[name], value)
     poses = urdf.link_poses(q)
