@@ -7,7 +7,9 @@ All arguments go to `super().__init__`, so that errors cross process borders (pi
 from __future__ import annotations
 
 import errno
+import json
 import os
+import struct
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -88,6 +90,47 @@ def resource_error(error: BaseException, path: Path | None = None) -> ResourceEr
             unknown = "." if path is None else f"; whether the file is sound is not known: {path}"
             return ResourceError(_LACKS[number] + unknown)
     return None
+
+
+_MAX_WORDS = 300
+"""Characters: an error may quote what a file holds."""
+_PLAIN_WORDS: tuple[tuple[type[BaseException], str], ...] = (
+    (UnicodeDecodeError, "it is no UTF-8 text"),
+    (RecursionError, "its values are nested too deeply"),
+    (struct.error, "it ends within a value"),
+    (EOFError, "it ends too early"),
+    (IndexError, "it has fewer values than it should"),
+    (TypeError, "a value is of another kind than expected"),
+    (AttributeError, "a value is of another kind than expected"),
+    (ArithmeticError, "a number is out of range"),
+)
+"""What errors of Python mean about a file that is read; their own words are about the program that reads it."""
+
+
+def in_words(error: BaseException) -> str:
+    """What an error of Python or of a library says about what was read, for the inside of a sentence.
+
+    Neither class names nor error numbers, and no path: the sentence around it has that.
+    """
+    if isinstance(error, DemorecError):
+        return str(error)
+    reason = getattr(error, "strerror", None)  # of the system's errors and of FFmpeg's
+    if isinstance(reason, str) and reason:
+        return reason
+    if isinstance(error, json.JSONDecodeError):
+        return f"it is no JSON, line {error.lineno}"
+    if isinstance(error, KeyError) and error.args:
+        return f"it has no {error.args[0]!r}"[:_MAX_WORDS]
+    for kind, words in _PLAIN_WORDS:
+        if isinstance(error, kind):
+            return words
+    lines = str(error).split("\n", 1)
+    return lines[0].rstrip(".")[:_MAX_WORDS] or "no reason is given"
+
+
+def without_path(error: BaseException, path: Path) -> str:
+    """What an error of ours says, without the path at its end, for a sentence that names the path already."""
+    return str(error).removesuffix(f": {path}")
 
 
 def error_chain(error: BaseException) -> Iterator[BaseException]:

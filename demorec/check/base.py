@@ -18,6 +18,8 @@ Level = Literal["pass", "warn", "fail", "skip"]
 Scope = Literal["recording", "run", "dataset"]
 Group = Literal["file", "time", "physics", "alignment", "calibration", "pictures", "outcome", "run", "dataset"]
 
+_BLOCKED = "it needs what is damaged"
+
 
 @dataclass(frozen=True, kw_only=True)
 class Measurement:
@@ -84,6 +86,10 @@ class Check:
             return self._result("skip", Measurement(value=math.nan, detail="nothing to measure"))
         return self._result(self.judge(found.value), found)
 
+    def blocked(self) -> Result:
+        """The result of a check that needs what another one has found to be damaged."""
+        return self.skipped(_BLOCKED)
+
     def skipped(self, why: str) -> Result:
         """The result of a check that could not be run."""
         return self._result("skip", Measurement(value=math.nan, detail=why))
@@ -128,6 +134,11 @@ class Result:
     fail: float
     frame: int | None
     detail: str
+
+    @property
+    def is_blocked(self) -> bool:
+        """Whether nothing was measured since what it needs is damaged, which another check tells."""
+        return self.level == "skip" and self.detail == _BLOCKED
 
 
 def check(

@@ -63,7 +63,9 @@ def _expected(episode: RecordedEpisode, camera: Camera) -> Array:
         return np.broadcast_to(mounted, (episode.num_frames, 4, 4))
     try:
         link = episode.base_from_link(camera.mount, episode.columns.joint_position)
-    except RecordingError:
+    except RecordingError as error:
+        if not isinstance(error.__cause__, KeyError):  # damage is no wrong camera
+            raise
         return np.full((episode.num_frames, 4, 4), np.inf)
     return np.asarray(episode.world_from_base @ link @ mounted)
 

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 from demorec.check.base import Check, Group, Level, Result, Scope
 from demorec.check.dataset import Dataset
 from demorec.check.episode import RecordedEpisode
-from demorec.check.run import RUN_NAME, CheckedRun
+from demorec.check.run import CheckedRun
 from demorec.errors import ConfigError, DemorecError, resource_error
-from demorec.lerobot.paths import is_dataset
 from demorec.processes import SPAWN
+from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings, find
+from demorec.runs.run_file import DATASET
 from demorec.scene.assets import allow_models
 from demorec.tables import CHECKS
 
@@ -116,26 +117,18 @@ def find_subjects(paths: Sequence[Path]) -> list[Subject]:
     """
     found: list[Subject] = []
     for path in paths:
-        before = len(found)
-        if path.is_file():
-            found.append(Subject(path=path, kind="recording"))
-        elif (path / RUN_NAME).is_file():
-            found.append(Subject(path=path, kind="run"))
-            found += [
-                Subject(path=file, kind="recording", is_failed_attempt=file.parent.name == "failed")
-                for file in CheckedRun(path).recordings
-            ]
-            if is_dataset(path / "dataset"):
-                found.append(Subject(path=path / "dataset", kind="dataset"))
-        elif is_dataset(path):
+        there = expect(path, "recording", "dataset", *EPISODE_FOLDERS)
+        if there.kind == "dataset":
             found.append(Subject(path=path, kind="dataset"))
-        elif path.is_dir():
-            files = [*sorted(path.glob("*.mcap")), *sorted((path / "episodes").glob("*.mcap"))]
-            found += [Subject(path=file, kind="recording") for file in files]
+        elif there.kind == "run":
+            found.append(Subject(path=path, kind="run"))
+            found += [Subject(path=file, kind="recording") for file in there.recordings]
+            found += [Subject(path=file, kind="recording", is_failed_attempt=True) for file in there.failed]
+            if find(path / DATASET).kind == "dataset":
+                found.append(Subject(path=path / DATASET, kind="dataset"))
         else:
-            raise ConfigError(f"There is no such file or folder: {path}")
-        if len(found) == before:
-            raise ConfigError(f"The folder holds no recording, run or dataset: {path}")
+            expect_recordings(there, there.recordings)
+            found += [Subject(path=file, kind="recording") for file in there.recordings]
     return list(dict.fromkeys(found))
 
 
@@ -156,28 +149,34 @@ def check_subject(subject: Subject, options: CheckOptions) -> SubjectReport:
     checks = options.checks(subject.kind)
     if subject.kind == "recording":
         with RecordedEpisode(subject.path) as episode:
-            results = _run(checks, episode, ("opens", "readable"), lambda: episode.columns)
+            found = _run(checks, episode, ("opens", "readable"), lambda: episode.columns)
     elif subject.kind == "run":
-        results = _run(checks, CheckedRun(subject.path), (), None)
+        found = _run(checks, CheckedRun(subject.path), (), None)
     else:
         dataset = Dataset(subject.path)
-        results = _run(checks, dataset, ("dataset_readable",), lambda: dataset.rows)
+        found = _run(checks, dataset, ("dataset_readable",), lambda: dataset.rows)
     return SubjectReport(
         path=subject.path,
         kind=subject.kind,
-        results=tuple(results),
+        results=tuple(replace(result, detail=_within(subject.path, result.detail)) for result in found),
         is_failed_attempt=subject.is_failed_attempt,
     )
+
+
+def _within(path: Path, detail: str) -> str:
+    """What a check says, without the path of its subject, which the report has above it."""
+    return detail.removesuffix(f": {path}").replace(f"{path}/", "")
 
 
 def _run(
     checks: Sequence[Check], subject: object, gates: tuple[str, ...], read: Callable[[], object] | None
 ) -> list[Result]:
-    """Run checks in order; when a gate fails, what needs the numbers is skipped rather than failing in the same words.
+    """Run checks in order; what needs something damaged is skipped rather than failing in the words of the first one.
 
     The checks of file and time look at the file itself and are run as far as it can be opened.
     """
     results: list[Result] = []
+    told: set[str] = set()
     unreadable = ""
     if read is not None:
         try:
@@ -188,11 +187,16 @@ def _run(
             unreadable = str(error)
     for check in checks:
         if unreadable and check.group not in _OF_THE_FILE and check.name not in gates:
-            results.append(check.skipped("the numbers cannot be read"))
+            results.append(check.blocked())
             continue
-        results.append(check.run(subject))
-        if check.name == "opens" and results[-1].level == "fail":
-            results += [other.skipped("the recording cannot be opened") for other in checks if other is not check]
+        result = check.run(subject)
+        if result.level == "fail" and result.value is None:  # something could not be read
+            if result.detail in told:
+                result = check.blocked()
+            told.add(result.detail)
+        results.append(result)
+        if check.name == "opens" and result.level == "fail":
+            results += [other.blocked() for other in checks if other is not check]
             break
     if unreadable and all(result.level in ("pass", "skip") for result in results):
         # No chosen check looks at what is broken; it must not pass for that.

@@ -153,11 +153,16 @@ def _lines(report: SubjectReport, *, verbose: bool) -> list[str]:
         ("fail", "failed"),
         ("skip", "not applicable"),
     )
-    counts = ", ".join(f"{report.count(level)} {word}" for level, word in words if report.count(level))
+    blocked = sum(result.is_blocked for result in report.results)
+    numbers = {level: report.count(level) - (blocked if level == "skip" else 0) for level, _ in words}
+    counts = ", ".join(f"{numbers[level]} {word}" for level, word in words if numbers[level])
     kind = "failed attempt" if report.is_failed_attempt else report.kind
     lines = [f"{report.level:<4}  {kind} {report.path}: {counts}"]
-    shown = [result for result in report.results if verbose or result.level in ("warn", "fail")]
-    return lines + [f"      {_result(result)}" for result in shown]
+    shown = [r for r in report.results if r.level in ("warn", "fail") or (verbose and not r.is_blocked)]
+    lines += [f"      {_result(result)}" for result in shown]
+    if blocked:
+        lines.append(f"      {blocked} {'check needs' if blocked == 1 else 'checks need'} what is damaged.")
+    return lines
 
 
 def _result(result: Result) -> str:

@@ -11,8 +11,10 @@ from typing import TYPE_CHECKING, Any
 from tyro.conf import Positional
 
 from demorec.cli.output import say, say_json
-from demorec.errors import ConfigError, ExportError, RecordingError
-from demorec.lerobot.paths import INFO_PATH, is_dataset
+from demorec.errors import ConfigError, ExportError, in_words
+from demorec.lerobot.paths import INFO_PATH
+from demorec.runs.find import Found, expect
+from demorec.safety.text import display_width, printable
 from demorec.scene.features import IMAGE_PREFIX
 
 if TYPE_CHECKING:
@@ -52,28 +54,20 @@ class Info:
 
 def _describe(path: Path) -> tuple[dict[str, Any], list[str]]:
     """Plain data for --json, and the lines for people."""
-    if not path.exists():
-        raise ConfigError(f"There is no such file or folder: {path}")
-    if path.is_file():
+    found = expect(path, "recording", "run", "dataset", "recordings", "evaluation")
+    if found.kind == "recording":
         return _recording(path)
-    if (path / "run.json").is_file():
+    if found.kind == "run":
         return _run(path)
-    if is_dataset(path):
+    if found.kind == "dataset":
         return _dataset(path)
-    recordings = sorted(path.glob("*.mcap"))
-    if recordings:
-        return _folder(path, recordings)
-    parts = sorted(path.glob("*.mcap.part"))
-    hint = f" It has unfinished recordings; demorec recover {parts[0].name} reads one." if parts else ""
-    raise ConfigError(f"The folder holds no run (run.json), dataset ({INFO_PATH}) or recording (*.mcap).{hint} {path}")
+    return _folder(found)
 
 
 def _recording(path: Path) -> tuple[dict[str, Any], list[str]]:
     from demorec.plain import to_plain
     from demorec.recording.summary import summarize
 
-    if path.suffix == ".part":
-        raise RecordingError(f"The recording is unfinished; demorec recover makes a readable one of it: {path}")
     summary = summarize(path)
     return {"kind": "recording", **to_plain(summary)}, _recording_lines(summary)
 
@@ -190,7 +184,7 @@ def _dataset(path: Path) -> tuple[dict[str, Any], list[str]]:
             shape = "x".join(map(str, feature["shape"]))
             rows.append((name, str(feature["dtype"]), shape, _names(feature.get("names"))))
     except (OSError, ValueError, KeyError, TypeError, AttributeError, ArithmeticError) as error:
-        raise ConfigError(f"The dataset's info.json is damaged ({type(error).__name__}: {error}): {file}") from error
+        raise ConfigError(f"The dataset's info.json is damaged ({in_words(error)}): {file}") from error
     return {"kind": "dataset", "path": str(path), "info": info}, [*_aligned(facts), "", *_aligned(rows)]
 
 
@@ -216,9 +210,10 @@ def _names(names: object) -> str:
     return ", ".join(map(str, names)) if len(names) <= 4 else f"{names[0]} .. {names[-1]}"
 
 
-def _folder(path: Path, recordings: Sequence[Path]) -> tuple[dict[str, Any], list[str]]:
+def _folder(found: Found) -> tuple[dict[str, Any], list[str]]:
     from demorec.recording import Recording
 
+    path, recordings = found.path, (*found.recordings, *found.failed)
     rows = [("file", "task", "seed", "episode", "outcome", "frames", "size")]
     items = []
     for file in recordings:
@@ -229,7 +224,7 @@ def _folder(path: Path, recordings: Sequence[Path]) -> tuple[dict[str, Any], lis
         word = {None: "recovered", True: "success", False: "failure"}[success]
         rows.append(
             (
-                file.name,
+                str(file.relative_to(path)),
                 info.task,
                 str(info.root_seed),
                 str(info.episode_index),
@@ -243,10 +238,13 @@ def _folder(path: Path, recordings: Sequence[Path]) -> tuple[dict[str, Any], lis
 
 
 def _aligned(rows: Iterable[Sequence[str]]) -> list[str]:
-    """Columns of equal width, two spaces between them."""
-    table = [list(row) for row in rows]
-    widths = [max(len(row[column]) for row in table) for column in range(len(table[0]))]
-    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in table]
+    """Columns of equal width, two spaces between them, on a terminal that shows `printable` text."""
+    table = [[printable(cell) for cell in row] for row in rows]
+    widths = [max(map(display_width, column)) for column in zip(*table, strict=True)]
+    return [
+        "  ".join(cell + " " * (width - display_width(cell)) for cell, width in zip(row, widths, strict=True)).rstrip()
+        for row in table
+    ]
 
 
 def _size(num_bytes: int) -> str:

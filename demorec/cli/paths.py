@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from demorec.errors import ConfigError
-from demorec.lerobot.paths import is_dataset
+from demorec.runs.find import EPISODE_FOLDERS, find
+from demorec.runs.run_file import DATASET
 
 
 def places_read(paths: Sequence[Path]) -> list[Path]:
@@ -14,7 +15,7 @@ def places_read(paths: Sequence[Path]) -> list[Path]:
 
     A run's own folder is none: an .rrd file or a picture beside its recordings may be replaced.
     """
-    return [path if path.is_file() or is_dataset(path) else path / "dataset" for path in paths]
+    return [path / DATASET if find(path).kind in EPISODE_FOLDERS else path for path in paths]
 
 
 def refuse_sources(sources: Sequence[Path], targets: Sequence[Path]) -> None:

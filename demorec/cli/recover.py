@@ -8,7 +8,7 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from demorec.cli.output import say
-from demorec.errors import ConfigError
+from demorec.runs.find import expect
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,8 +34,7 @@ class Recover:
         """Recover and say how much was kept."""
         from demorec.recording import recover
 
-        if not self.file.is_file():
-            raise ConfigError(f"There is no such file: {self.file}")
+        expect(self.file, "recording", "unfinished")
         result = recover(self.file, self.out or _default_target(self.file), overwrite=self.overwrite)
         if result.is_complete:
             say(f"Complete: all {result.num_frames} frames and the outcome are there: {result.path}")

@@ -17,6 +17,7 @@ from demorec.cli.progress import ProgressBar
 from demorec.config import VideoConfig
 from demorec.errors import ConfigError
 from demorec.processes import SPAWN
+from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings
 from demorec.safety.user_modules import modules_of
 
 if TYPE_CHECKING:
@@ -141,12 +142,12 @@ def _jobs(paths: Sequence[Path], out: Path) -> list[tuple[Path, Path]]:
     """(source, new recording) of everything; a run's folders episodes/ and failed/ are kept."""
     jobs: list[tuple[Path, Path]] = []
     for path in paths:
-        if path.is_file():
+        found = expect(path, "recording", *EPISODE_FOLDERS)
+        if found.kind == "recording":
             jobs.append((path, out if out.suffix == ".mcap" else out / path.name))
             continue
-        files = [*path.glob("*.mcap"), *path.glob("episodes/*.mcap"), *path.glob("failed/*.mcap")]
-        if not files:
-            raise ConfigError(f"There is no recording or run here: {path}")
+        files = (*found.recordings, *found.failed)
+        expect_recordings(found, files)
         jobs += [(file, out / file.relative_to(path)) for file in sorted(files)]
     if out.suffix == ".mcap" and len(jobs) > 1:
         raise ConfigError(f"{len(jobs)} recordings cannot become one file: name a folder with --out.")

@@ -16,7 +16,7 @@ from demorec.cli.output import say, say_json, tell
 from demorec.cli.paths import refuse_sources
 from demorec.cli.progress import ProgressBar
 from demorec.errors import ConfigError
-from demorec.lerobot.paths import is_dataset
+from demorec.runs.find import EPISODE_FOLDERS, Found, expect, expect_recordings
 
 if TYPE_CHECKING:
     from demorec.replay import Demonstration, ReplayOptions, ReplayReport
@@ -117,7 +117,7 @@ class Replay:
 
 def _check_out(paths: Sequence[Path], out: Path) -> None:
     """Refuse to write replays over recordings that are replayed, or over each other."""
-    files = [file for path in paths if not is_dataset(path) for file in _recordings(path)]
+    files = [file for path in paths for file in _replayable(path).recordings]
     names = [file.name for file in files]
     if len(set(names)) != len(names):
         raise ConfigError("Two recordings have the same name and would get into each other's way: replay them apart.")
@@ -152,10 +152,11 @@ def _found(
 
     wanted = parse_episodes(episodes)
     for path in paths:
-        if is_dataset(path):
+        found = _replayable(path)
+        if found.kind == "dataset":
             yield from dataset_demonstrations(path, wanted, options, limit=limit)
             continue
-        files = _recordings(path)
+        files: Sequence[Path] = found.recordings
         if limit is not None and len(files) > limit:
             files = [files[number * len(files) // limit] for number in range(limit)]
         for file in files:
@@ -164,13 +165,12 @@ def _found(
                 yield demonstration
 
 
-def _recordings(path: Path) -> list[Path]:
-    if path.is_file():
-        return [path]
-    files = [*sorted(path.glob("*.mcap")), *sorted((path / "episodes").glob("*.mcap"))]
-    if not files:
-        raise ConfigError(f"There is no recording, run or dataset here: {path}")
-    return files
+def _replayable(path: Path) -> Found:
+    """What a path holds to be replayed: a dataset, or recordings."""
+    found = expect(path, "recording", "dataset", *EPISODE_FOLDERS)
+    if found.kind != "dataset":
+        expect_recordings(found, found.recordings)
+    return found
 
 
 def told(report: ReplayReport) -> str:

@@ -14,6 +14,7 @@ from demorec.cli.allow import Allow, allowed_modules
 from demorec.cli.output import say, tell
 from demorec.cli.paths import places_read
 from demorec.errors import ConfigError
+from demorec.runs.find import expect
 from demorec.safety.replacing import PICTURE, RERUN_FILE, check_replaceable
 from demorec.scene.assets import allow_models
 
@@ -143,8 +144,7 @@ class View:
         if self.compare or self.save is not None or self.episodes or self.include_failures:
             raise ConfigError("An .rrd file is shown as it is: --compare, --save and --episodes are for recordings.")
         for path in self.paths:
-            if not path.is_file():
-                raise ConfigError(f"There is no such file: {path}")
+            expect(path, "rrd")
         self._check_targets(())
         return self._show(self.paths, ())
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.errors import ConfigError, MissingDependencyError, NotAllowedError
+from demorec.errors import ConfigError, MissingDependencyError, NotAllowedError, in_words
 from demorec.lerobot.paths import INFO_PATH
 from demorec.safety.user_modules import is_allowed
 from demorec.scene.features import ActionKind
@@ -46,7 +46,7 @@ def policy_summary(checkpoint: Path) -> tuple[dict[str, Any], str]:
     try:
         config: dict[str, Any] = json.loads((checkpoint / CONFIG_NAME).read_text())
     except ValueError as error:
-        raise ConfigError(f"{CONFIG_NAME} of the policy is no JSON ({error}): {checkpoint}") from error
+        raise ConfigError(f"{CONFIG_NAME} of the policy is no JSON ({in_words(error)}): {checkpoint}") from error
     return config, sha.hexdigest()[:16]
 
 
@@ -126,7 +126,7 @@ class Policy:
                 preprocessor_overrides={"device_processor": {"device": device}},
             )
         except Exception as error:  # whatever a foreign format may lack
-            raise ConfigError(f"LeRobot cannot load this policy ({error}): {checkpoint}") from error
+            raise ConfigError(f"LeRobot cannot load this policy ({in_words(error)}): {checkpoint}") from error
         self.inputs = tuple(config.input_features)
         if action_steps is not None:
             chunk = getattr(config, "chunk_size", None)

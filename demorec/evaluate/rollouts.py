@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from demorec.config import EpisodePlan, GenerateConfig
-from demorec.errors import ConfigError, DemorecError
+from demorec.errors import ConfigError, DemorecError, in_words
 from demorec.evaluate.policy import Policy, check_steps, find_checkpoint, policy_summary, trained_action
 from demorec.evaluate.progress import EvaluationObserver, factors_of
 from demorec.evaluate.statistics import Rate
@@ -31,13 +31,13 @@ from demorec.gym_env import DemorecEnv
 from demorec.loop import prepare
 from demorec.plain import from_plain, to_plain
 from demorec.recording import EpisodeWriter
+from demorec.runs.find import EVALUATION_NAME
 from demorec.runs.run_file import EPISODES, FAILED, Attempt
 from demorec.safety.replacing import Kind, check_replaceable, json_object, replaced_parts, settle_parts
 from demorec.scene.episode import Outcome
 from demorec.scene.features import ENVIRONMENT_STATE, IMAGE_PREFIX, ActionKind
 from demorec.tables import camera_name
 
-EVALUATION_NAME = "evaluation.json"
 MAKE_ROLLOUT = "demorec.evaluate.rollouts:make_rollout"
 
 
@@ -191,7 +191,7 @@ def load_evaluation(folder: Path) -> Evaluation:
     except FileNotFoundError as error:
         raise ConfigError(f"No {EVALUATION_NAME}, so this is no output of demorec evaluate: {folder}") from error
     except (OSError, ValueError) as error:
-        raise ConfigError(f"{EVALUATION_NAME} is damaged ({error}): {path}") from error
+        raise ConfigError(f"{EVALUATION_NAME} is damaged ({in_words(error)}): {path}") from error
 
 
 def make_rollout(plan: EpisodePlan, folder: Path) -> Attempt:

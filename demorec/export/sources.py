@@ -10,6 +10,7 @@ from demorec.errors import ConfigError, ExportError
 from demorec.export.options import CommonOptions, parse_episodes
 from demorec.plain import digest
 from demorec.recording import Recording
+from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings
 from demorec.scene.features import ENVIRONMENT_STATE, IMAGE_PREFIX, observation_names
 
 
@@ -34,17 +35,10 @@ def find_recordings(paths: Sequence[Path], *, include_failures: bool) -> list[Ex
     """
     found: list[ExportSource] = []
     for path in paths:
-        if path.is_file():
-            found.append(ExportSource(path=path))
-            continue
-        if not path.is_dir():
-            raise ConfigError(f"No such recording or run: {path}")
-        episodes = path / "episodes" if (path / "episodes").is_dir() else path
-        failed = sorted((path / "failed").glob("*.mcap")) if (path / "failed").is_dir() else []
-        of_path = [ExportSource(path=file) for file in sorted(episodes.glob("*.mcap"))]
-        of_path += [ExportSource(path=file, is_chosen=include_failures) for file in failed]
-        if not of_path:
-            raise ConfigError(f"No finished recordings (*.mcap) in episodes/ of the folder: {path}")
+        there = expect(path, "recording", *EPISODE_FOLDERS)
+        of_path = [ExportSource(path=file) for file in there.recordings]
+        of_path += [ExportSource(path=file, is_chosen=include_failures) for file in there.failed]
+        expect_recordings(there, [source.path for source in of_path])
         found += sorted(of_path, key=_attempt_order)
     seen: set[Path] = set()
     for source in found:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from demorec.config import GenerateConfig, parse_config
-from demorec.errors import ConfigError, DemorecError, resource_error
+from demorec.errors import ConfigError, DemorecError, in_words, resource_error
 from demorec.generate.contents import is_dataset_of_run
 from demorec.generate.options import RunOptions
 from demorec.generate.run import RunObserver, RunResult, generate
@@ -21,7 +21,8 @@ from demorec.lerobot import ExportOptions, export_lerobot
 from demorec.lerobot.files import read_json, read_table
 from demorec.lerobot.paths import SIDECAR_DIR
 from demorec.lerobot.sidecar import CONFIGS_PATH, EXPORT_PATH
-from demorec.runs.run_file import DATASET, RUN_NAME, load_run_file
+from demorec.runs.find import expect
+from demorec.runs.run_file import DATASET, load_run_file
 from demorec.safety.own_versions import version_differences
 from demorec.safety.replacing import use_as_source
 from demorec.scene.validity import read_episode_info
@@ -123,7 +124,7 @@ def _is_such_a_copy(target: Path, original: Original, config_digest: str) -> boo
 
 def read_original(source: Path) -> Original:
     """What a run or a dataset says about itself; ConfigError when that is not enough to make it again."""
-    if (source / RUN_NAME).is_file():
+    if expect(source, "run", "dataset").kind == "run":
         run = load_run_file(source)
         if not run.attempts:
             raise ConfigError(f"The run has no episodes yet: {source}")
@@ -135,9 +136,9 @@ def read_original(source: Path) -> Original:
             digests={(a.episode_index, a.attempt): a.digest for a in run.attempts},
             export=None,
         )
-    if (source / CONFIGS_PATH).is_file():
-        return _read_dataset(source)
-    raise ConfigError(f"No run (run.json) and no dataset of demorec (demorec/configs.json): {source}")
+    if not os.path.lexists(source / CONFIGS_PATH):
+        raise ConfigError(f"The dataset does not say what it was made with ({CONFIGS_PATH} is missing): {source}")
+    return _read_dataset(source)
 
 
 def _read_dataset(source: Path) -> Original:
@@ -172,7 +173,7 @@ def _read_dataset(source: Path) -> Original:
             ),
         )
     except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
-        raise ConfigError(f"The dataset does not say enough about itself ({error}): {source}") from error
+        raise ConfigError(f"The dataset does not say enough about itself ({in_words(error)}): {source}") from error
 
 
 def _dataset_digests(dataset: Path) -> dict[Key, str]:

@@ -9,15 +9,13 @@ from typing import Self
 
 import h5py
 
-from demorec.safety.files import open_regular
+from demorec.safety.files import HDF5_MAGIC, open_regular
 from demorec.safety.replacing import Kind
-
-_MAGIC = b"\x89HDF\r\n\x1a\n"
 
 
 def _begins_as_hdf5(path: Path) -> bool:
     with open_regular(path) as file:
-        return file.read(len(_MAGIC)) == _MAGIC
+        return file.read(len(HDF5_MAGIC)) == HDF5_MAGIC
 
 
 def _is_robomimic_dataset(path: Path) -> bool:
@@ -100,7 +98,7 @@ class NewFile:
         self.root = h5py.File(self._storage, "w")
         # HDF5 writes its first bytes late; without them nobody would know whose file a killed export has left.
         self._storage.seek(0)
-        self._storage.write(memoryview(_MAGIC))
+        self._storage.write(memoryview(HDF5_MAGIC))
 
     def __enter__(self) -> Self:
         return self

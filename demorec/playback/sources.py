@@ -9,12 +9,10 @@ from functools import partial
 from pathlib import Path
 
 from demorec.errors import ConfigError
-from demorec.lerobot.paths import INFO_PATH, is_dataset
 from demorec.playback.episode import PlayedEpisode
 from demorec.playback.from_dataset import dataset_episodes, open_dataset_episode
 from demorec.playback.from_recording import open_recording
-
-_MCAP_MAGIC = b"\x89MCAP0\r\n"
+from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,40 +41,17 @@ def find_episodes(paths: Sequence[Path], *, include_failures: bool = False) -> l
 
 
 def _sources(path: Path, include_failures: bool) -> list[PlaybackSource]:
-    if not path.exists():
-        raise ConfigError(f"There is no such file or folder: {path}")
-    if path.suffix == ".part":
-        raise ConfigError(f"The recording is not finished; demorec recover makes one of what there is: {path}")
-    if path.is_file():
-        if path.suffix != ".mcap" and not _is_mcap(path):
-            raise ConfigError(
-                "Recordings (.mcap), runs, exported datasets, folders of recordings and Rerun's .rrd files can be "
-                f"shown, this file is none of them: {path}"
-            )
-        return [_recording(path)]
-    if not path.is_dir():
-        raise ConfigError(f"This is neither a file nor a folder: {path}")
-    if is_dataset(path):
+    found = expect(path, "recording", "dataset", *EPISODE_FOLDERS)
+    if found.kind == "dataset":
         return [
             PlaybackSource(name=f"{path}: episode {index}", open=partial(open_dataset_episode, path, index))
             for index in dataset_episodes(path)
         ]
-    files = sorted(path.glob("*.mcap")) + sorted((path / "episodes").glob("*.mcap"))
-    if include_failures:
-        files += sorted((path / "failed").glob("*.mcap"))
-    if files:
-        return [_recording(file) for file in files]
-    hint = ""
-    if any((path / "failed").glob("*.mcap")):
-        hint = " Its failures are shown with --include-failures."
-    elif below := sorted(folder.parent.name for folder in path.glob("*/episodes")):
-        hint = f" It holds runs, name one: {', '.join(below[:5])}{', ...' if below[5:] else ''}."
-    raise ConfigError(f"The folder holds no recording (*.mcap), run (episodes/) or dataset ({INFO_PATH}).{hint} {path}")
-
-
-def _is_mcap(path: Path) -> bool:
-    with path.open("rb") as file:
-        return file.read(len(_MCAP_MAGIC)) == _MCAP_MAGIC
+    files = [*found.recordings, *(found.failed if include_failures else ())]
+    if not files and found.failed:
+        raise ConfigError(f"The folder holds failed attempts only, which --include-failures shows: {path}")
+    expect_recordings(found, files)
+    return [_recording(file) for file in files]
 
 
 def _recording(path: Path) -> PlaybackSource:

@@ -16,6 +16,11 @@ from typing import Any
 
 from demorec.errors import ConfigError
 
+MCAP_MAGIC = b"\x89MCAP0\r\n"
+RERUN_MAGICS = (b"RRF", b"RRIO")
+HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
+"""First bytes by which files are known."""
+
 _KINDS = {
     stat.S_IFIFO: "a FIFO",
     stat.S_IFSOCK: "a socket",
@@ -83,7 +88,11 @@ def make_folder(path: Path) -> None:
         ) from error
 
 
+def irregular_kind(mode: int) -> str:
+    """What something that is no regular file is, by its `st_mode`: "a FIFO"."""
+    return _KINDS.get(stat.S_IFMT(mode), "something else")
+
+
 def _refuse_irregular(path: Path, mode: int) -> None:
     if not stat.S_ISREG(mode):
-        kind = _KINDS.get(stat.S_IFMT(mode), "something else")
-        raise OSError(errno.EINVAL, f"it is {kind}, not a regular file", str(path))
+        raise OSError(errno.EINVAL, f"it is {irregular_kind(mode)}, not a regular file", str(path))

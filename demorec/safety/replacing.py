@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from demorec.errors import ConfigError, DemorecError
+from demorec.safety.files import MCAP_MAGIC, RERUN_MAGICS
 
 _SHOWN = 5
 """How many foreign files a refusal names."""
@@ -55,8 +56,8 @@ def _begins_with(*magics: bytes) -> Callable[[Path], bool]:
     return recognises
 
 
-RECORDING = Kind(name="a recording (MCAP)", recognises=_begins_with(b"\x89MCAP0\r\n"))
-RERUN_FILE = Kind(name="a Rerun file (.rrd)", recognises=_begins_with(b"RRF", b"RRIO"))
+RECORDING = Kind(name="a recording (MCAP)", recognises=_begins_with(MCAP_MAGIC))
+RERUN_FILE = Kind(name="a Rerun file (.rrd)", recognises=_begins_with(*RERUN_MAGICS))
 PICTURE = Kind(name="a picture (PNG)", recognises=_begins_with(b"\x89PNG\r\n\x1a\n"))
 
 

@@ -21,6 +21,19 @@ def printable(text: str) -> str:
     return "".join(_spelt(character) for character in text)
 
 
+def display_width(text: str) -> int:
+    """How many columns of a terminal a printable text takes: wide characters (CJK) take two, combining marks none."""
+    if text.isascii():
+        return len(text)
+    return sum(_columns(character) for character in text)
+
+
+def _columns(character: str) -> int:
+    if unicodedata.category(character) in ("Mn", "Me"):
+        return 0
+    return 2 if unicodedata.east_asian_width(character) in "WF" else 1
+
+
 def _spelt(character: str) -> str:
     if unicodedata.category(character) not in _INVISIBLE_KINDS:
         return character

@@ -75,7 +75,7 @@ def test_a_dataset_in_the_way(run: Path, tmp_path: Path, capsys: pytest.CaptureF
     assert (tmp_path / "d" / "thesis.txt").read_text() == "years of work"
 
 
-@pytest.mark.parametrize(("source", "message"), [("nothing", "No such recording"), ("", "No finished recordings")])
+@pytest.mark.parametrize(("source", "message"), [("nothing", "There is no such file"), ("", "holds no recording")])
 def test_a_source_that_is_none(tmp_path: Path, capsys: pytest.CaptureFixture[str], source: str, message: str) -> None:
     assert demorec("export", "lerobot", tmp_path / source, "--out", tmp_path / "d") == 2
     assert message in capsys.readouterr().err

@@ -192,5 +192,5 @@ def test_reproduce_needs_a_run_or_a_dataset(capsys, tmp_path):
     with pytest.raises(SystemExit) as ended:
         main(["reproduce", str(tmp_path), "--out", str(tmp_path / "copy")])
     assert ended.value.code == 2
-    assert "No run (run.json) and no dataset of demorec" in capsys.readouterr().err
+    assert "The folder holds no recording (*.mcap), run (run.json) or dataset" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []

@@ -98,9 +98,13 @@ def test_info_of_a_dataset(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     ("make", "code", "message"),
     [
         (lambda folder: folder / "nothing", 2, "There is no such file or folder"),
-        (lambda folder: folder, 2, "holds no run"),
+        (
+            lambda folder: folder,
+            2,
+            "The folder holds no recording (*.mcap), run (run.json) or dataset (meta/info.json)",
+        ),
         (lambda folder: folder / "text.mcap", 1, "no MCAP file"),
-        (lambda folder: folder / "x.mcap.part", 1, "unfinished; demorec recover"),
+        (lambda folder: folder / "x.mcap.part", 2, "found an unfinished recording (.part); demorec recover"),
     ],
 )
 def test_info_of_something_else(

@@ -59,7 +59,7 @@ def test_bad_requests_are_one_sentence(
 @pytest.mark.parametrize(
     ("name", "flags", "words"),
     [
-        ("video.mp4", (), "this file is none of them"),
+        ("video.mp4", (), "The file is no recording (.mcap)"),
         ("cut.mcap.part", (), "demorec recover"),
         ("folder", (), "The folder holds no recording"),
         ("runs", (), "It holds runs, name one: cubes"),

@@ -11,10 +11,11 @@ import pytest
 
 from demorec.config import EpisodePlan, GenerateConfig
 from demorec.evaluate import rollouts
-from demorec.evaluate.rollouts import EVALUATION_NAME, Evaluation, Settings, make_rollout
+from demorec.evaluate.rollouts import Evaluation, Settings, make_rollout
 from demorec.plain import to_plain
 from demorec.recording import Recording
 from demorec.replay import ReplayOptions, open_file, replay_all
+from demorec.runs.find import EVALUATION_NAME
 
 LENGTH = 8
 

@@ -503,9 +503,9 @@ def test_impossible_options(options: dict[str, object], message: str) -> None:
 
 
 def test_no_recordings(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="No finished recordings"):
+    with pytest.raises(ConfigError, match="holds no recording"):
         export(tmp_path, tmp_path / "d")
-    with pytest.raises(ConfigError, match="No such recording"):
+    with pytest.raises(ConfigError, match="There is no such file"):
         export(tmp_path / "nothing", tmp_path / "d")
 
 

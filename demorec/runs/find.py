@@ -1,0 +1,196 @@
+"""What a path is: a recording, a run, a dataset, something of another program, nothing, or something unreadable.
+
+Every command that is given a path asks here, so that all of them take the same things and refuse the rest in the same
+words. Nothing is opened that could block: a FIFO, a socket or a device is told as what it is.
+"""
+
+from __future__ import annotations
+
+import stat
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from demorec.errors import ConfigError, resource_error
+from demorec.lerobot.paths import INFO_PATH
+from demorec.runs.run_file import EPISODES, FAILED, RUN_NAME
+from demorec.safety.files import HDF5_MAGIC, MCAP_MAGIC, RERUN_MAGICS, irregular_kind, open_regular
+
+Kind = Literal[
+    "recording",
+    "unfinished",
+    "rrd",
+    "hdf5",
+    "rosbag",
+    "run",
+    "evaluation",
+    "dataset",
+    "recordings",
+    "nothing",
+    "unreadable",
+]
+"""What a path can be. "recordings" is a folder of recordings without a run.json."""
+
+EPISODE_FOLDERS: tuple[Kind, ...] = ("run", "recordings", "evaluation")
+"""What holds recordings, in itself or in episodes/ and failed/."""
+
+EVALUATION_NAME = "evaluation.json"
+
+_NAMES: dict[Kind, str] = {
+    "recording": "a recording (.mcap)",
+    "unfinished": "an unfinished recording (.part)",
+    "rrd": "a Rerun file (.rrd)",
+    "hdf5": "an HDF5 file",
+    "rosbag": "a rosbag",
+    "run": "a run",
+    "evaluation": "an evaluation",
+    "dataset": "a LeRobot dataset",
+    "recordings": "a folder of recordings",
+}
+_ADVICE: dict[Kind, str] = {
+    "unfinished": "; demorec recover makes a readable one of it",
+    "rrd": "; demorec view shows it by a name that ends in .rrd",
+    "hdf5": "; name the run that it was made from",
+    "dataset": "; name the run that it was made from",
+    "run": "; name one of its recordings",
+    "evaluation": "; name one of its recordings",
+    "recordings": "; name one of them",
+}
+_MAGICS: tuple[tuple[bytes, Kind], ...] = (
+    (MCAP_MAGIC, "recording"),
+    *((magic, "rrd") for magic in RERUN_MAGICS),
+    (HDF5_MAGIC, "hdf5"),
+    (b"#ROSBAG", "rosbag"),
+    (b"SQLite format 3", "rosbag"),
+)
+_SUFFIXES: dict[str, Kind] = {".mcap": "recording", ".part": "unfinished", ".rrd": "rrd", ".hdf5": "hdf5"}
+_MARKS: tuple[tuple[str, Kind], ...] = (
+    (RUN_NAME, "run"),
+    (INFO_PATH, "dataset"),
+    (EVALUATION_NAME, "evaluation"),
+    ("metadata.yaml", "rosbag"),
+)
+"""The file by whose presence a folder is known."""
+
+_SHOWN = 5
+
+
+@dataclass(frozen=True, kw_only=True)
+class Found:
+    """What a path is.
+
+    Attributes:
+        path: As it was given.
+        kind: What is there.
+        reason: Of "nothing" and "unreadable": why, as a sentence without its end.
+        recordings: Finished recordings, in order: of a run or an evaluation those in episodes/, of any other folder
+            those in itself and in episodes/; of a recording itself.
+        failed: Recordings of failed attempts, in failed/.
+    """
+
+    path: Path
+    kind: Kind
+    reason: str = ""
+    recordings: tuple[Path, ...] = ()
+    failed: tuple[Path, ...] = ()
+
+
+def find(path: Path) -> Found:
+    """What a path is: files are known by their first bytes, or else by their suffix, folders by what they hold.
+
+    Raises:
+        ResourceError: This machine lacks what it takes to look.
+    """
+    try:
+        mode = path.stat().st_mode
+        if stat.S_ISDIR(mode):
+            return _folder(path)
+        if not stat.S_ISREG(mode):
+            return Found(path=path, kind="unreadable", reason=f"This is {irregular_kind(mode)}, no file and no folder")
+        return _file(path)
+    except FileNotFoundError:
+        if path.is_symlink():
+            return Found(path=path, kind="nothing", reason="This is a link to something that is not there")
+        return Found(path=path, kind="nothing", reason="There is no such file or folder")
+    except OSError as error:
+        if (lack := resource_error(error, path)) is not None:
+            raise lack from error
+        return Found(path=path, kind="unreadable", reason=f"This cannot be read ({error.strerror})")
+
+
+def expect(path: Path, *kinds: Kind) -> Found:
+    """What a path is, if it is of one of these kinds and, as a folder of episodes, has a recording.
+
+    Raises:
+        ConfigError: It is something else, nothing, or cannot be read.
+        ResourceError: As `find`.
+    """
+    found = find(path)
+    if found.reason:
+        raise ConfigError(f"{found.reason}: {path}")
+    if found.kind not in kinds:
+        taken = [_NAMES[kind] for kind in kinds]
+        allowed = " or ".join(filter(None, (", ".join(taken[:-1]), taken[-1])))
+        raise ConfigError(f"Expected {allowed}, found {_NAMES[found.kind]}{_ADVICE.get(found.kind, '')}: {path}")
+    return found
+
+
+def expect_recordings(found: Found, files: Sequence[Path]) -> None:
+    """Raise ConfigError when `files`, those that a command takes of what was found, are none."""
+    if files:
+        return
+    only = " but failed attempts, in failed/" if found.failed else ""
+    raise ConfigError(f"There is no finished recording in {_NAMES[found.kind]}{only}: {found.path}")
+
+
+def _file(path: Path) -> Found:
+    with open_regular(path) as file:
+        head = file.read(max(len(magic) for magic, _ in _MAGICS))
+    kind = _SUFFIXES.get(path.suffix)
+    if kind != "unfinished":
+        kind = next((kind for magic, kind in _MAGICS if head.startswith(magic)), kind)
+    if kind is None:
+        reason = "The file is no recording (.mcap)" if head else "The file is empty"
+        return Found(path=path, kind="nothing", reason=reason)
+    return Found(path=path, kind=kind, recordings=(path,) if kind == "recording" else ())
+
+
+def _folder(path: Path) -> Found:
+    entries = [entry.name for entry in path.iterdir()]
+    kind = next((kind for name, kind in _MARKS if _is_there(path / name)), None)
+    if kind in ("dataset", "rosbag"):
+        return Found(path=path, kind=kind)
+    here = _recordings_in(path) if kind is None else ()
+    recordings, failed = (*here, *_recordings_in(path / EPISODES)), _recordings_in(path / FAILED)
+    if kind is None and not recordings and not failed:
+        return Found(path=path, kind="nothing", reason=_nothing_in(path, entries))
+    return Found(path=path, kind=kind or "recordings", recordings=recordings, failed=failed)
+
+
+def _is_there(path: Path) -> bool:
+    """Whether there is anything of that name; OSError when that cannot be seen."""
+    try:
+        path.lstat()
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    return True
+
+
+def _recordings_in(folder: Path) -> tuple[Path, ...]:
+    try:
+        return tuple(sorted(path for path in folder.iterdir() if path.suffix == ".mcap"))
+    except (FileNotFoundError, NotADirectoryError):
+        return ()
+
+
+def _nothing_in(path: Path, entries: Sequence[str]) -> str:
+    """Why a folder is taken for nothing, with what may have been meant."""
+    reason = f"The folder holds no recording (*.mcap), run ({RUN_NAME}) or dataset ({INFO_PATH})"
+    parts = sorted(name for name in entries if name.endswith(".mcap.part"))
+    if parts:
+        return f"{reason}. It has unfinished recordings; demorec recover {parts[0]} reads one"
+    below = sorted(name for name in entries if _is_there(path / name / RUN_NAME) or _is_there(path / name / EPISODES))
+    if below:
+        return f"{reason}. It holds runs, name one: {', '.join(below[:_SHOWN])}{', ...' if below[_SHOWN:] else ''}"
+    return reason

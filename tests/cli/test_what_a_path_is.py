@@ -1,0 +1,183 @@
+"""Whatever lies in the place of a recording, a run or a dataset, every command says the same true sentence about it."""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import pytest
+from support.recording import write_episode
+
+from demorec.cli import main
+from demorec.errors import ConfigError
+from demorec.lerobot.paths import INFO_PATH
+from demorec.runs.find import Kind, expect, find
+
+
+def make_fifo(path: Path) -> None:
+    os.mkfifo(path)
+
+
+def make_socket(path: Path) -> None:
+    here = Path.cwd()
+    os.chdir(path.parent)  # the name of a socket may have some hundred characters only
+    try:
+        with socket.socket(socket.AF_UNIX) as listening:
+            listening.bind(path.name)
+    finally:
+        os.chdir(here)
+
+
+def make_device(path: Path) -> None:
+    path.symlink_to("/dev/zero")
+
+
+def make_dangling(path: Path) -> None:
+    path.symlink_to(path.with_name("gone"))
+
+
+def make_loop(path: Path) -> None:
+    path.symlink_to(path)
+
+
+def make_empty_folder(path: Path) -> None:
+    path.mkdir()
+
+
+def make_nothing(path: Path) -> None:
+    assert not path.exists()
+
+
+def make_hdf5(path: Path) -> None:
+    with h5py.File(path, "w") as file:
+        file["data"] = 1
+
+
+ODD: tuple[tuple[Callable[[Path], None], str], ...] = (
+    (make_fifo, "This is a FIFO, no file and no folder"),
+    (make_socket, "This is a socket, no file and no folder"),
+    (make_device, "This is a device, no file and no folder"),
+    (make_dangling, "This is a link to something that is not there"),
+    (make_loop, "This cannot be read (Too many levels of symbolic links)"),
+    (make_empty_folder, "The folder holds no recording (*.mcap), run (run.json) or dataset (meta/info.json)"),
+    (make_nothing, "There is no such file or folder"),
+    (make_hdf5, "Expected a r"),
+)
+COMMANDS = {
+    "info": (),
+    "check": (),
+    "recover": ("--out", "out.mcap"),
+    "view": ("--save", "out.rrd"),
+    "export": ("--out", "out"),
+    "replay": (),
+    "render": ("--out", "out"),
+    "reproduce": ("--out", "out"),
+}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize(("make", "sentence"), ODD)
+def test_every_command_tells_the_same_about_a_path(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    command: str,
+    make: Callable[[Path], None],
+    sentence: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "x.mcap"
+    make(path)
+    before = sorted(tmp_path.iterdir())
+    words = ["export", "lerobot"] if command == "export" else [command]
+    with pytest.raises(SystemExit) as done:
+        main([*words, str(path), *COMMANDS[command]])
+    told = capsys.readouterr().err
+    assert done.value.code == 2
+    assert told.startswith(f"demorec {command}: {sentence}")
+    assert told.endswith(f": {path}\n")
+    assert told.count("\n") == 1
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_what_cannot_be_seen_is_not_called_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "run" / "meta").mkdir(parents=True)
+
+    def forbidden(self: Path) -> os.stat_result:
+        raise PermissionError(13, "Permission denied", str(self))
+
+    monkeypatch.setattr(Path, "lstat", forbidden)  # these tests may run as a user to whom nothing is forbidden
+    found = find(tmp_path / "run")
+    assert (found.kind, found.reason) == ("unreadable", "This cannot be read (Permission denied)")
+
+
+def write(name: str, content: bytes = b"") -> Callable[[Path], Path]:
+    def make(folder: Path) -> Path:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(content)
+        return folder / name.partition("/")[0]
+
+    return make
+
+
+def a_recording(name: str) -> Callable[[Path], Path]:
+    def make(folder: Path) -> Path:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        write_episode(folder / name, num_frames=2, cameras=())
+        return folder / name.partition("/")[0]
+
+    return make
+
+
+@pytest.mark.parametrize(
+    ("make", "kind"),
+    [
+        (a_recording("x.mcap"), "recording"),
+        (a_recording("without_a_suffix"), "recording"),
+        (write("damaged.mcap", b"\0" * 100), "recording"),
+        (write("x.mcap.part", b"\x89MCAP0\r\n"), "unfinished"),
+        (write("x.rrd", b"RRF2"), "rrd"),
+        (write("x.db3", b"SQLite format 3\0"), "rosbag"),
+        (write("x.bag", b"#ROSBAG V2.0\n"), "rosbag"),
+        (write("notes.txt", b"words"), "nothing"),
+        (write("run/run.json"), "run"),
+        (write(f"dataset/{INFO_PATH}"), "dataset"),
+        (write("evaluation/evaluation.json"), "evaluation"),
+        (write("bag/metadata.yaml"), "rosbag"),
+        (a_recording("folder/x.mcap"), "recordings"),
+        (a_recording("lost/episodes/x.mcap"), "recordings"),
+        (a_recording("failures/failed/x.mcap"), "recordings"),
+        (write("other/x.txt"), "nothing"),
+    ],
+)
+def test_what_there_is_gets_its_name(tmp_path: Path, make: Callable[[Path], Path], kind: Kind) -> None:
+    assert find(make(tmp_path)).kind == kind
+
+
+def test_a_mark_that_is_no_file_is_not_overlooked(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "run.json")
+    assert find(tmp_path).kind == "run"
+
+
+def test_a_run_has_the_recordings_of_its_folders_alone(tmp_path: Path) -> None:
+    for name in ("mine.mcap", "episodes/b.mcap", "episodes/a.mcap", "failed/c.mcap", "episodes/d.mcap.part"):
+        write(name)(tmp_path)
+    found = find(tmp_path)
+    assert found.recordings == tuple(tmp_path / name for name in ("mine.mcap", "episodes/a.mcap", "episodes/b.mcap"))
+    write("run.json")(tmp_path)
+    found = find(tmp_path)
+    assert found.recordings == tuple(tmp_path / name for name in ("episodes/a.mcap", "episodes/b.mcap"))
+    assert found.failed == (tmp_path / "failed/c.mcap",)
+
+
+def test_what_is_not_taken_is_named_with_what_is(tmp_path: Path) -> None:
+    write(INFO_PATH)(tmp_path)
+    with pytest.raises(ConfigError) as refused:
+        expect(tmp_path, "recording", "run", "recordings")
+    assert str(refused.value) == (
+        "Expected a recording (.mcap), a run or a folder of recordings, found a LeRobot dataset; name the run that it "
+        f"was made from: {tmp_path}"
+    )
