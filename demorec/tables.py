@@ -107,6 +107,8 @@ CHECKS: Registry[Check] = Registry(
         "pictures_decode": "demorec.check.pictures:pictures_decode",
         "pictures_exposed": "demorec.check.pictures:pictures_exposed",
         "exposure": "demorec.check.pictures:exposure",
+        "pictures_as_drawn": "demorec.check.pictures:pictures_as_drawn",
+        "odd_pictures": "demorec.check.pictures:odd_pictures",
         "frozen": "demorec.check.pictures:frozen",
         "repeated_pictures": "demorec.check.pictures:repeated_pictures",
         "distinct_cameras": "demorec.check.pictures:distinct_cameras",

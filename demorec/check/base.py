@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, Literal
+from dataclasses import dataclass, replace
+from typing import Any, Literal, overload
 
 from demorec.errors import DemorecError, MissingDependencyError, resource_error
 
@@ -37,6 +37,21 @@ class Measurement:
 
 
 @dataclass(frozen=True, kw_only=True)
+class NotMeasured:
+    """That there is something to measure, but nothing can be told of it: neither good nor bad.
+
+    Attributes:
+        why: For people: "too little moves before the camera".
+    """
+
+    why: str
+
+
+Found = Measurement | NotMeasured | None
+"""What a check returns; None where the thing does not exist (no cameras, no depth)."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Check:
     """One check.
 
@@ -48,7 +63,7 @@ class Check:
         unit: Of the value and the limits; "" for counts and ratios.
         warn, fail: The value passes up to `warn`, is a warning up to `fail`, and a failure above.
         needs_pictures: Whether pictures have to be decoded.
-        measure: The function: a measurement, or None where the thing does not exist (no cameras, no depth).
+        measure: The function.
     """
 
     name: str
@@ -59,7 +74,7 @@ class Check:
     warn: float
     fail: float
     needs_pictures: bool
-    measure: Callable[[Any], Measurement | None]
+    measure: Callable[[Any], Found]
 
     @property
     def summary(self) -> str:
@@ -83,7 +98,9 @@ class Check:
                 raise lack from error
             return self._result("fail", Measurement(value=math.nan, detail=str(error)))
         if found is None:
-            return self._result("skip", Measurement(value=math.nan, detail="nothing to measure"))
+            return self.skipped("nothing to measure")
+        if isinstance(found, NotMeasured):
+            return self.skipped(f"not measured: {found.why}")
         return self._result(self.judge(found.value), found)
 
     def blocked(self) -> Result:
@@ -150,10 +167,10 @@ def check(
     unit: str = "",
     scope: Scope = "recording",
     needs_pictures: bool = False,
-) -> Callable[[Callable[[Any], Measurement | None]], Check]:
+) -> Callable[[Callable[[Any], Found]], Check]:
     """Make a `Check` of a function; its name is the function's. Without `fail` there is no range for warnings."""
 
-    def wrap(function: Callable[[Any], Measurement | None]) -> Check:
+    def wrap(function: Callable[[Any], Found]) -> Check:
         return Check(
             name=function.__name__,
             group=group,
@@ -169,7 +186,24 @@ def check(
     return wrap
 
 
-def worst(*found: Measurement | None) -> Measurement | None:
-    """The measurement of the largest value (a NaN counts as largest); None when there is none."""
-    known = [measurement for measurement in found if measurement is not None]
-    return max(known, key=lambda m: math.inf if math.isnan(m.value) else m.value, default=None)
+@overload
+def worst(*found: Measurement | None) -> Measurement | None: ...
+
+
+@overload
+def worst(*found: Found) -> Found: ...
+
+
+def worst(*found: Found) -> Found:
+    """The measurement of the largest value (a NaN counts as largest), which names what was not measured beside it.
+
+    Where nothing was measured: why not, or None when there is nothing.
+    """
+    known = [measurement for measurement in found if isinstance(measurement, Measurement)]
+    reasons = [row.why for row in found if isinstance(row, NotMeasured)]
+    if not known:
+        return NotMeasured(why="; ".join(reasons)) if reasons else None
+    largest = max(known, key=lambda m: math.inf if math.isnan(m.value) else m.value)
+    if not reasons:
+        return largest
+    return replace(largest, detail="; ".join([largest.detail, *(f"not measured: {why}" for why in reasons)]))

@@ -13,6 +13,8 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from demorec.check.base import NotMeasured
+from demorec.check.drawn import NOT_DRAWABLE, Cells, Comparison, Kind, compare, draw_all
 from demorec.check.pictures_summary import PictureSummary, summarise
 from demorec.check.rows import inverse, link_matrices, matrices
 from demorec.errors import RecordingError
@@ -62,7 +64,8 @@ class RecordedEpisode:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._recording: Recording | None = None
-        self._pictures: dict[str, PictureSummary] = {}
+        self._pictures: dict[tuple[str, Kind], PictureSummary] = {}
+        self._comparisons: dict[tuple[str, Kind], Comparison] = {}
 
     def __enter__(self) -> Self:
         return self
@@ -188,11 +191,39 @@ class RecordedEpisode:
         """(3, 3) K as the camera's own calibration message has it, which is what other programs read."""
         return self.recording.calibration(camera).intrinsics
 
-    def pictures(self, camera: Camera) -> PictureSummary:
+    def kinds(self, camera: str) -> tuple[Kind, ...]:
+        """Which pictures of a camera were recorded."""
+        depth: tuple[Kind, ...] = ("depth",) if self.recording.has_depth(camera) else ()
+        labels: tuple[Kind, ...] = ("labels",) if self.recording.has_segmentation(camera) else ()
+        return ("color", *depth, *labels)
+
+    def pictures(self, camera: Camera, kind: Kind = "color") -> PictureSummary:
         """What the checks need of a camera's decoded pictures; decoded once."""
-        if camera.name not in self._pictures:
-            self._pictures[camera.name] = summarise(self, camera)
-        return self._pictures[camera.name]
+        if (camera.name, kind) not in self._pictures:
+            self._pictures[camera.name, kind] = summarise(self, camera, kind)
+        return self._pictures[camera.name, kind]
+
+    @cached_property
+    def _drawn(self) -> dict[tuple[str, Kind], Cells] | NotMeasured:
+        """Every picture as the recorded numbers make it."""
+        try:
+            return draw_all(self.info, self.columns, {camera.name: self.kinds(camera.name) for camera in self.cameras})
+        except NOT_DRAWABLE as error:
+            return NotMeasured(why=f"the recording cannot be drawn here: {error}")
+
+    def compared(self, camera: Camera, kind: Kind = "color") -> Comparison | NotMeasured:
+        """A camera's pictures against what the recorded numbers make of them."""
+        renderer = self.info.config.get("renderer", "raster")
+        if kind == "color" and renderer != "raster":
+            return NotMeasured(why=f"colours of the renderer {renderer!r} are others than those that are drawn here")
+        if isinstance(self._drawn, NotMeasured):
+            return self._drawn
+        seen = self.pictures(camera, kind).cells
+        if len(seen) < 3:
+            return NotMeasured(why=f"camera {camera.name} has {len(seen)} pictures")
+        if (camera.name, kind) not in self._comparisons:
+            self._comparisons[camera.name, kind] = compare(seen, self._drawn[camera.name, kind])
+        return self._comparisons[camera.name, kind]
 
 
 def _stamp(data: bytes) -> int:

@@ -5,30 +5,22 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.check.base import Measurement, check, worst
+from demorec.check.base import Found, Measurement, NotMeasured, check, worst
+from demorec.check.drawn import Comparison
 from demorec.check.episode import RecordedEpisode
 from demorec.check.rows import longest_run
 from demorec.geometry import Array
 from demorec.scene.scene import Camera
 
-STILL_CHANGE = 1.5
-"""Change of a block of pixels, of 255, below which two pictures are the same to the eye. A still picture coded as
-keyframes and predicted pictures in turn changes by 1.1 to 1.3 in its most changed block."""
-
-MOVING_CHANGE = 4.5
-"""Change of a block, of 255, that motion makes beyond doubt: before a bare floor a predicted picture can leave a small
-motion to the next keyframe, whose change is then up to 3.3."""
-
-
-REPEATED_CHANGE = 3.0
-REPEATED_SHARE = 0.18
-"""Change of a block, of 255 and of the changes before and after, below which a picture repeats the one before. Of
-pictures that were repeated on purpose 82 % are below both, the others being mostly keyframes after a predicted one;
-of 68,013 pictures each of two cameras none, though a swinging hand came to 2.8 and to 0.22."""
+MIN_MOTION = 2.5
+"""Root mean square change of the drawn cells from frame to frame, of 255, that a picture must show."""
+STALE_SHARE, STALE_EXCESS = 0.3, 1.5
+"""A picture is stale that shows less than this share of the motion, and is more unlike the drawn one than the usual
+picture by more than this, of 255: a predicted picture may leave a small motion to the next keyframe."""
 
 
 @check(group="pictures", measures="frames without a picture that decodes", warn=0, needs_pictures=True)
-def pictures_decode(episode: RecordedEpisode) -> Measurement | None:
+def pictures_decode(episode: RecordedEpisode) -> Found:
     """Every camera's video decodes to its end, one picture a frame."""
     found = []
     for camera in episode.cameras:
@@ -43,7 +35,7 @@ def pictures_decode(episode: RecordedEpisode) -> Measurement | None:
 
 
 @check(group="pictures", measures="pictures that are nearly all black or nearly all white", warn=0, needs_pictures=True)
-def pictures_exposed(episode: RecordedEpisode) -> Measurement | None:
+def pictures_exposed(episode: RecordedEpisode) -> Found:
     """No picture is black or burnt out: 95 % of its pixels darker than 12 or brighter than 250 of 255."""
     found = []
     for camera in episode.cameras:
@@ -61,7 +53,7 @@ def pictures_exposed(episode: RecordedEpisode) -> Measurement | None:
     fail=0.95,
     needs_pictures=True,
 )
-def exposure(episode: RecordedEpisode) -> Measurement | None:
+def exposure(episode: RecordedEpisode) -> Found:
     """Most of every picture is neither under- nor overexposed."""
     found = []
     for camera in episode.cameras:
@@ -73,34 +65,55 @@ def exposure(episode: RecordedEpisode) -> Measurement | None:
     return worst(*found)
 
 
-def _motion(episode: RecordedEpisode, camera: Camera) -> tuple[Array, NDArray[np.bool_]]:
-    """(T - 1,) how much moves before a camera from frame to frame, and whether the picture must change for it.
+@check(
+    group="pictures",
+    measures="difference of the pictures from what the recorded numbers make of them, median of 255",
+    warn=9.0,
+    fail=14.0,
+    needs_pictures=True,
+)
+def pictures_as_drawn(episode: RecordedEpisode) -> Found:
+    """The pictures show robot, objects, colours and light as recorded: drawn anew and compared in every frame."""
+    found: list[Found] = []
+    for camera in episode.cameras:
+        compared = episode.compared(camera)
+        if isinstance(compared, NotMeasured):
+            found.append(compared)
+            continue
+        found.append(Measurement(value=float(np.median(compared.unlike)), detail=f"camera {camera.name}"))
+    return worst(*found)
 
-    For a camera on the hand its own motion, metres; for one in the world that of the TCP in the picture, pixels.
-    """
-    world_from_camera = episode.columns.world_from_camera[camera.name]
-    if camera.mount != "world":
-        own = np.linalg.norm(np.diff(world_from_camera[:, :3], axis=0), axis=1)
-        own = own + 0.3 * np.abs(np.diff(world_from_camera[:, 3:], axis=0)).max(axis=1, initial=0.0)
-        return own, own > 0.004
-    offset = episode.world_from_tcp[:, :3, 3] - world_from_camera[:, :3]
-    in_camera = np.einsum("tij,tj->ti", episode.camera_from_world(camera.name)[:, :3, :3], offset)
-    depth = np.maximum(in_camera[:, 2], 1e-3)
-    u, v, _ = episode.recorded_intrinsics(camera.name) @ (in_camera / depth[:, None]).T
-    inside = (u > 0) & (u < camera.width) & (v > 0) & (v < camera.height) & (in_camera[:, 2] > 0)
-    step = np.hypot(np.diff(u), np.diff(v))
-    return step, (step > 0.5 * max(camera.height, camera.width) / 160) & inside[1:] & inside[:-1]
+
+@check(
+    group="pictures",
+    measures="difference of a single picture from what was recorded at its frame, beyond the usual, of 255",
+    warn=3.5,
+    fail=5.0,
+    needs_pictures=True,
+)
+def odd_pictures(episode: RecordedEpisode) -> Found:
+    """No single picture is another one, torn, blurred, shifted or off in colour."""
+    found: list[Found] = []
+    for camera in episode.cameras:
+        compared = episode.compared(camera)
+        if isinstance(compared, NotMeasured):
+            found.append(compared)
+            continue
+        excess = _excess(compared)
+        frame = int(np.argmax(excess))
+        found.append(Measurement(value=float(excess[frame]), frame=frame, detail=f"camera {camera.name}"))
+    return worst(*found)
 
 
-def _relative_change(episode: RecordedEpisode, camera: Camera) -> tuple[Array, NDArray[np.bool_]]:
-    """(N - 1,) change of the pictures in units of what the motion usually makes of it, and where it must be seen."""
-    change = episode.pictures(camera).change
-    motion, must = _motion(episode, camera)
-    motion, must = motion[: len(change)], must[: len(change)]
-    rate = float(np.median(change[must] / motion[must])) if must.any() else 0.0
-    expected = np.maximum(rate * motion, 1e-9)
-    # What no eye and no coder sees is no change, however little was to be expected.
-    return np.where(change < STILL_CHANGE, 0.0, change / expected), must
+def _excess(compared: Comparison) -> Array:
+    """(T,) by how much each picture is more unlike the drawn one than the usual picture."""
+    return np.maximum(compared.unlike - np.median(compared.unlike), 0.0)
+
+
+def _stale(compared: Comparison) -> NDArray[np.bool_]:
+    """(T,) pictures that show what was before, though something moves."""
+    still = (compared.motion > MIN_MOTION) & (compared.shown < STALE_SHARE)
+    return np.asarray(still & (_excess(compared) > STALE_EXCESS))
 
 
 @check(
@@ -110,39 +123,35 @@ def _relative_change(episode: RecordedEpisode, camera: Camera) -> tuple[Array, N
     fail=4,
     needs_pictures=True,
 )
-def frozen(episode: RecordedEpisode) -> Measurement | None:
-    """A camera does not stand still while the arm moves in its view."""
-    found = []
-    for camera in episode.cameras:
-        relative, must = _relative_change(episode, camera)
-        # Not 0: the same picture, coded once more, differs a little.
-        length, start = longest_run((relative < 0.06) & must)
-        frame = start + 1 if length else None
-        found.append(Measurement(value=length, frame=frame, detail=f"camera {camera.name}"))
-    return worst(*found)
+def frozen(episode: RecordedEpisode) -> Found:
+    """A camera does not stand still while something moves in its view."""
+    return worst(*(_stale_frames(episode, camera, in_runs=True) for camera in episode.cameras))
 
 
 @check(
     group="pictures",
-    measures="single pictures that repeat the one before, in the midst of motion",
+    measures="pictures that repeat the one before, in the midst of motion",
     warn=0,
     fail=2,
     needs_pictures=True,
 )
-def repeated_pictures(episode: RecordedEpisode) -> Measurement | None:
+def repeated_pictures(episode: RecordedEpisode) -> Found:
     """No picture was dropped and the one before shown in its place."""
-    found = []
-    for camera in episode.cameras:
-        change = episode.pictures(camera).change
-        if len(change) < 3:
-            continue
-        must = _motion(episode, camera)[1][: len(change)]
-        around = np.minimum(change[:-2], change[2:])
-        alone = must[1:-1] & (change[1:-1] < np.minimum(REPEATED_CHANGE, REPEATED_SHARE * around))
-        alone &= around > MOVING_CHANGE
-        frame = int(np.argmax(alone)) + 2 if alone.any() else None
-        found.append(Measurement(value=int(alone.sum()), frame=frame, detail=f"camera {camera.name}"))
-    return worst(*found)
+    return worst(*(_stale_frames(episode, camera, in_runs=False) for camera in episode.cameras))
+
+
+def _stale_frames(episode: RecordedEpisode, camera: Camera, *, in_runs: bool) -> Found:
+    """How many pictures of a camera are stale: the longest run of them, or all."""
+    compared = episode.compared(camera)
+    if isinstance(compared, NotMeasured):
+        return compared
+    num_moving = int((compared.motion > MIN_MOTION).sum())
+    if not num_moving:
+        return NotMeasured(why=f"too little moves before camera {camera.name}")
+    stale = _stale(compared)
+    value, start = longest_run(stale) if in_runs else (int(stale.sum()), int(np.argmax(stale)))
+    detail = f"camera {camera.name}, of {num_moving} frames with motion"
+    return Measurement(value=value, frame=start if value else None, detail=detail)
 
 
 @check(
@@ -151,12 +160,12 @@ def repeated_pictures(episode: RecordedEpisode) -> Measurement | None:
     warn=0.98,
     needs_pictures=True,
 )
-def distinct_cameras(episode: RecordedEpisode) -> Measurement | None:
+def distinct_cameras(episode: RecordedEpisode) -> Found:
     """Two cameras in different places do not show the same pictures."""
     found = []
     for number, camera in enumerate(episode.cameras):
         for other in episode.cameras[number + 1 :]:
-            first, second = episode.pictures(camera).thumbnails, episode.pictures(other).thumbnails
+            first, second = episode.pictures(camera).cells, episode.pictures(other).cells
             count = min(len(first), len(second))
             if first.shape[1:] != second.shape[1:] or count < 2 or _same_place(episode, camera, other):
                 continue
@@ -183,7 +192,7 @@ def _correlation(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
     fail=8.0,
     needs_pictures=True,
 )
-def pixel_statistics(episode: RecordedEpisode) -> Measurement | None:
+def pixel_statistics(episode: RecordedEpisode) -> Found:
     """The histograms, counted before coding, are those of the pictures: catches swapped channels and other pictures."""
     found = []
     for camera in episode.cameras:
