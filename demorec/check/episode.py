@@ -191,7 +191,7 @@ class RecordedEpisode:
     def pictures(self, camera: Camera) -> PictureSummary:
         """What the checks need of a camera's decoded pictures; decoded once."""
         if camera.name not in self._pictures:
-            self._pictures[camera.name] = summarise(self, camera)
+            self._pictures[camera.name] = summarise(self.recording, self.columns, camera)
         return self._pictures[camera.name]
 
 

@@ -7,19 +7,18 @@ the picture, and drawn where its recorded pose, the extrinsics and K say it must
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.check.rows import matrices
+from demorec.check.rows import inverse, matrices
+from demorec.errors import RecordingError
 from demorec.geometry import Array
+from demorec.recording import Recording
+from demorec.scene.episode import EpisodeColumns
 from demorec.scene.scene import Body, Camera, Rgba, Scene
-
-if TYPE_CHECKING:
-    from demorec.check.episode import RecordedEpisode
 
 LONGER_SIDE = 160
 """Colour is looked for on every n-th pixel of every n-th row, n such that no more than this many are left."""
@@ -75,18 +74,17 @@ class PictureSummary:
     tracks: Mapping[str, Track] = field(default_factory=dict)
 
 
-def summarise(episode: RecordedEpisode, camera: Camera) -> PictureSummary:
+def summarise(recording: Recording, columns: EpisodeColumns, camera: Camera) -> PictureSummary:
     """Decode all pictures of a camera once."""
-    from demorec.errors import RecordingError
-
-    bodies = tracked_bodies(episode.info.scene)
-    finder = _Finder(camera, [_expected_color(body, episode.info.scene) for body in bodies])
-    drawer = _Drawer(episode, camera, bodies, finder)
+    scene = recording.info.scene
+    bodies = tracked_bodies(scene)
+    finder = _Finder(camera, [_expected_color(body, scene) for body in bodies])
+    drawer = _Drawer(columns, camera, recording.calibration(camera.name).intrinsics, bodies, finder)
     means, dark, bright, thumbnails = [], [], [], []
     rows: list[list[tuple[float, ...]]] = [[] for _ in bodies]
     error = ""
     try:
-        for start, batch in _batches(episode, camera):
+        for start, batch in _batches(recording.images(camera.name)):
             # Channel by channel: NumPy is slow over a last axis of three.
             planes = [np.ascontiguousarray(batch[..., c]).astype(np.float32) for c in range(3)]
             means.append(np.stack([plane.mean(axis=(1, 2)) for plane in planes], axis=1))
@@ -111,10 +109,9 @@ def summarise(episode: RecordedEpisode, camera: Camera) -> PictureSummary:
     )
 
 
-def _batches(episode: RecordedEpisode, camera: Camera) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+def _batches(pictures: Iterable[NDArray[np.uint8]]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
     batch: list[NDArray[np.uint8]] = []
     start = 0
-    pictures = episode.recording.images(camera.name)
     try:
         for picture in pictures:
             batch.append(picture)
@@ -233,15 +230,14 @@ class _Finder:
 class _Drawer:
     """Draws the outlines of bodies on the finder's grid, from recorded poses, extrinsics and K."""
 
-    def __init__(self, episode: RecordedEpisode, camera: Camera, bodies: list[Body], finder: _Finder) -> None:
+    def __init__(self, columns: EpisodeColumns, camera: Camera, k: Array, bodies: list[Body], finder: _Finder) -> None:
         self._camera = camera
         self._u, self._v = finder.u, finder.v
         self._pixels = float(finder.step**2)
-        camera_from_world = episode.camera_from_world(camera.name)
-        k = episode.recorded_intrinsics(camera.name)
+        camera_from_world = inverse(matrices(columns.world_from_camera[camera.name]))
         self._points: list[Array] = []  # per body (T, P, 3): u, v, depth
         for body in bodies:
-            poses = episode.columns.object_poses.get(body.name)
+            poses = columns.object_poses.get(body.name)
             pose = body.world_from_body.matrix()[None] if poses is None else matrices(poses)
             corners = _outline_points(body)
             relative = camera_from_world @ pose

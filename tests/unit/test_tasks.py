@@ -15,10 +15,10 @@ from demorec.loop import Episode, make_world
 from demorec.scene.scene import Body, Shape
 from demorec.sim.robots.panda import PANDA
 from demorec.tasks import skills
-from demorec.tasks.base import Behaviour
 from demorec.tasks.conditions import lasting
 from demorec.tasks.grasping import grasp_yaws, grasps_beside, hand_down, hand_yaw, raised, symmetric_yaws
 from demorec.tasks.sampling import WORKSPACE, Region, Sampler
+from demorec.tasks.script import Behaviour
 
 
 def sampler(seed: int = 0) -> Sampler:
