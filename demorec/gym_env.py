@@ -147,15 +147,13 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
                 cameras=tuple(cameras),
                 width=width,
                 height=height,
+                renderer=renderer or GenerateConfig.renderer,
             )
-            if renderer is not None:
-                config = replace(config, renderer=renderer)
         config.validate()
         check_action_kind(action)
         if render_mode not in (None, "rgb_array"):
             raise ConfigError(f"render_mode is {render_mode!r}, allowed are None and 'rgb_array'.")
-        self.config = config
-        self.render_mode = render_mode
+        self.config, self.render_mode = config, render_mode
         self.metadata = {**type(self).metadata, "render_fps": config.fps}
         self._action_kind: ActionKind = action
         self._render_size = (render_width, render_height)
@@ -165,24 +163,7 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         self._max_episode_steps = episode_length or round(SECONDS_PER_GOAL * config.fps * max(1, len(info.scene.goals)))
         self.privileged = self._is_privileged() if privileged is None else privileged
         self._vector_lengths = _lengths(info, privileged=self.privileged)
-        self.observation_space = spaces.Dict(
-            {
-                _KEYS[name]: spaces.Box(-np.inf, np.inf, shape=(length,), dtype=np.float32)
-                for name, length in self._vector_lengths.items()
-            }
-            | (
-                {
-                    "pixels": spaces.Dict(
-                        {
-                            camera.name: spaces.Box(0, 255, shape=(camera.height, camera.width, 3), dtype=np.uint8)
-                            for camera in info.scene.cameras
-                        }
-                    )
-                }
-                if info.scene.cameras
-                else {}
-            )
-        )
+        self.observation_space = _observation_space(info, self._vector_lengths)
         self.action_space = _box(action_bounds(info.robot, action, fps=config.fps))
         self._resources = ExitStack()
         self._world: World | None = None
@@ -364,6 +345,20 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
 def _lengths(info: EpisodeInfo, *, privileged: bool) -> dict[str, int]:
     names = features.observation_names(info.robot, info.scene, privileged=privileged)
     return {name: len(components) for name, components in names.items()}
+
+
+def _observation_space(info: EpisodeInfo, vector_lengths: Mapping[str, int]) -> spaces.Dict:
+    found: dict[str, spaces.Space[Any]] = {
+        _KEYS[name]: spaces.Box(-np.inf, np.inf, shape=(length,), dtype=np.float32)
+        for name, length in vector_lengths.items()
+    }
+    if info.scene.cameras:
+        pictures = {
+            camera.name: spaces.Box(0, 255, shape=(camera.height, camera.width, 3), dtype=np.uint8)
+            for camera in info.scene.cameras
+        }
+        found["pixels"] = spaces.Dict(pictures)
+    return spaces.Dict(found)
 
 
 def _box(bounds: tuple[Array, Array]) -> spaces.Box:

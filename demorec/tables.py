@@ -58,7 +58,7 @@ RENDERERS: Registry[type[Renderer]] = Registry(
 
 EXPORTERS: Registry[Exporter[Any]] = Registry(
     kind="format",
-    rows={"lerobot": "demorec.lerobot.options:LEROBOT", "hdf5": "demorec.hdf5.options:HDF5"},
+    rows={"lerobot": "demorec.lerobot.exporter:LEROBOT", "hdf5": "demorec.hdf5.exporter:HDF5"},
 )
 
 CHECKS: Registry[Check] = Registry(

@@ -15,7 +15,7 @@ from demorec.errors import ConfigError
 from demorec.geometry import Array
 from demorec.safety.replacing import PICTURE, written_whole
 from demorec.scene.episode import EpisodeInfo
-from demorec.scene.scene import Goal, Scene, yaw_of
+from demorec.scene.scene import Scene, yaw_of
 
 MIN_EPISODES = 50
 """With fewer, gaps are chance: the largest of 80 good runs of 50 is 0.26 of a range, of runs of 30 it is 0.38."""
@@ -65,12 +65,6 @@ def _values(scene: Scene) -> dict[str, float]:
         position = goal.onto_from_goal.position
         values[f"{goal_label} x"], values[f"{goal_label} y"] = float(position[0]), float(position[1])
     return values
-
-
-def world_from_goal(scene: Scene, goal: Goal) -> Array:
-    """(3,) where the object shall end, as things stand at the start."""
-    pose = scene.body(goal.onto).world_from_body @ goal.onto_from_goal if goal.onto else goal.onto_from_goal
-    return pose.position
 
 
 def largest_gap(infos: Sequence[EpisodeInfo]) -> Measurement | None:
@@ -162,7 +156,9 @@ def draw_coverage(infos: Sequence[EpisodeInfo], path: Path) -> CoveragePicture:
 
 
 def _draw_map(draw: ImageDraw.ImageDraw, infos: Sequence[EpisodeInfo]) -> None:
-    starts = [(info.scene.body(g.object), world_from_goal(info.scene, g)) for info in infos for g in info.scene.goals]
+    starts = [
+        (info.scene.body(g.object), info.scene.world_from_goal(g).position) for info in infos for g in info.scene.goals
+    ]
     draw.rectangle((_LEFT, _TOP, _LEFT + _SIZE, _TOP + _SIZE), outline="grey")
     if not starts:
         return

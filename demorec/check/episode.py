@@ -200,7 +200,7 @@ class RecordedEpisode:
     def pictures(self, camera: Camera, kind: Kind = "color") -> PictureSummary:
         """What the checks need of a camera's decoded pictures; decoded once."""
         if (camera.name, kind) not in self._pictures:
-            self._pictures[camera.name, kind] = summarise(self, camera, kind)
+            self._pictures[camera.name, kind] = summarise(self.recording, camera, kind)
         return self._pictures[camera.name, kind]
 
     @cached_property

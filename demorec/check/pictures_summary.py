@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,10 +12,8 @@ from numpy.typing import NDArray
 from demorec.check.drawn import CellGrid, Cells, Kind, planes_of
 from demorec.errors import RecordingError
 from demorec.geometry import Array
+from demorec.recording import Recording
 from demorec.scene.scene import Camera
-
-if TYPE_CHECKING:
-    from demorec.check.episode import RecordedEpisode
 
 _BATCH = 16
 
@@ -43,9 +41,8 @@ class PictureSummary:
         return len(self.cells)
 
 
-def summarise(episode: RecordedEpisode, camera: Camera, kind: Kind) -> PictureSummary:
+def summarise(recording: Recording, camera: Camera, kind: Kind) -> PictureSummary:
     """Decode all pictures of a camera once."""
-    recording = episode.recording
     read: dict[Kind, Callable[[str], Iterator[NDArray[Any]]]] = {
         "color": recording.images,
         "depth": recording.depth,

@@ -16,7 +16,7 @@ from demorec.config import GenerateConfig
 from demorec.generate.options import RunOptions, default_out, default_repo_id
 
 if TYPE_CHECKING:
-    from demorec.generate.run import RunResult
+    from demorec.generate.observer import RunResult
     from demorec.runs.run_file import Attempt
 
 

@@ -14,8 +14,8 @@ from pathlib import Path
 from demorec.cli.output import say, tell
 from demorec.cli.progress import duration
 from demorec.generate.estimate import Estimate
+from demorec.generate.observer import RunResult
 from demorec.generate.options import RunOptions, available_cores
-from demorec.generate.run import RunResult
 from demorec.runs.run_file import DATASET, EPISODES, STARTING, UNFINISHED, Attempt, ExportRecord, RunFile
 
 _WORTH_PROCESSES = 50

@@ -111,7 +111,7 @@ class ProgressBar:
 
 
 class RunProgress:
-    """How a run goes (`demorec.generate.run.Progress`), one bar after another; a context manager.
+    """How a run goes (`demorec.generate.observer.RunObserver`), one bar after another; a context manager.
 
     `watch` is called with every attempt that has ended.
     """

@@ -64,10 +64,7 @@ def factors_of(scene: Scene) -> dict[str, float]:
         values[f"{prefix}object.size"] = max(body.shape.extents)
         values[f"{prefix}object.mass"] = body.mass
         values[f"{prefix}object.friction"] = body.lateral_friction
-        if not goal.onto:
-            wanted = goal.onto_from_goal.position
-        else:
-            wanted = (scene.body(goal.onto).world_from_body @ goal.onto_from_goal).position
+        wanted = scene.world_from_goal(goal).position
         values[f"{prefix}goal.x"], values[f"{prefix}goal.y"] = (float(v) for v in wanted[:2])
         values[f"{prefix}distance"] = math.dist(place.position[:2], wanted[:2])
     return values

@@ -11,12 +11,12 @@ from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from demorec.config import GenerateConfig, deciding_versions
 from demorec.errors import ConfigError, DemorecError, GenerationError, resource_error
 from demorec.generate.contents import PARTS, RUN
 from demorec.generate.executor import peak_memory
+from demorec.generate.observer import RunObserver, RunResult
 from demorec.generate.options import RunOptions, available_cores
 from demorec.generate.plan import differences
 from demorec.generate.survey import Inspector, recordings_of, survey
@@ -43,9 +43,6 @@ from demorec.safety.replacing import (
     settle_parts,
     shown,
 )
-
-if TYPE_CHECKING:
-    from demorec.generate.run import RunObserver, RunResult
 
 
 class RunFolder:
@@ -135,8 +132,6 @@ class RunFolder:
 
     def result(self, *, interrupted: bool) -> RunResult:
         """What this session has come to."""
-        from demorec.generate.run import RunResult
-
         return RunResult(
             folder=self.path,
             run=self.run,

@@ -15,8 +15,9 @@ from typing import Any
 from demorec.config import GenerateConfig, parse_config
 from demorec.errors import ConfigError, DemorecError, in_words, resource_error
 from demorec.generate.contents import is_dataset_of_run
+from demorec.generate.observer import RunObserver, RunResult
 from demorec.generate.options import RunOptions
-from demorec.generate.run import RunObserver, RunResult, generate
+from demorec.generate.run import generate
 from demorec.lerobot import ExportOptions, export_lerobot
 from demorec.lerobot.files import read_json, read_table
 from demorec.lerobot.paths import SIDECAR_DIR

@@ -10,9 +10,7 @@ import errno
 import time
 from collections.abc import Iterable
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 from demorec.config import EpisodePlan, GenerateConfig
 from demorec.errors import ConfigError, GenerationError
@@ -20,12 +18,13 @@ from demorec.generate.executor import MAKE_EPISODE, Executor, Lost, Made, Raised
 from demorec.generate.folder import RunFolder, open_run
 from demorec.generate.interrupts import catch_interrupts
 from demorec.generate.local import LocalExecutor
+from demorec.generate.observer import NoProgress, RunObserver, RunResult
 from demorec.generate.options import RunOptions, available_cores
 from demorec.generate.plan import Schedule
 from demorec.generate.survey import Inspector
-from demorec.render import warm_up_renderer
+from demorec.render.warm_up import warm_up_renderer
 from demorec.runs.recordings import inspect_recording
-from demorec.runs.run_file import UNFINISHED, Attempt, RunFile, Session
+from demorec.runs.run_file import UNFINISHED, RunFile
 
 MAX_LOSSES = 5
 """How often one attempt may lose its worker before the run stops: chance takes few, too little memory takes all."""
@@ -41,57 +40,6 @@ _REFUSED = {
     errno.EACCES: "permission is denied",
     errno.EPERM: "permission is denied",
 }
-
-
-class RunObserver(Protocol):
-    """Told how a run goes; every method does nothing by default in `NoProgress`."""
-
-    def verifying(self, done: int, total: int) -> None:
-        """Recordings of an earlier session are being verified."""
-
-    def started(self, run: RunFile, workers: int) -> None:
-        """The work begins; `run` knows what is there already."""
-
-    def ended(self, attempt: Attempt) -> None:
-        """An attempt has come to its end."""
-
-    def says(self, message: str) -> None:
-        """Something that a person should know."""
-
-
-class NoProgress:
-    """Says nothing."""
-
-    def verifying(self, done: int, total: int) -> None:
-        """Nothing."""
-
-    def started(self, run: RunFile, workers: int) -> None:
-        """Nothing."""
-
-    def ended(self, attempt: Attempt) -> None:
-        """Nothing."""
-
-    def says(self, message: str) -> None:
-        """Nothing."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class RunResult:
-    """What a session has come to.
-
-    Attributes:
-        folder: Of the run.
-        run: All that is known now, earlier sessions included.
-        session: This one.
-        made: The attempts of this session.
-        interrupted: Whether Ctrl-C or SIGTERM ended it.
-    """
-
-    folder: Path
-    run: RunFile
-    session: Session
-    made: tuple[Attempt, ...]
-    interrupted: bool
 
 
 def generate(

@@ -1,14 +1,11 @@
-"""What a user chooses about an export to HDF5; its row in the table of exporters."""
+"""What a user chooses about an export to HDF5."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 from demorec.errors import ConfigError
-from demorec.export.exporter import Exporter
-from demorec.export.options import CommonOptions, ExportReport, ProgressCallback
+from demorec.export.options import CommonOptions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,18 +24,3 @@ class Hdf5Options(CommonOptions):
             raise ConfigError(f"valid-share is {self.valid_share}, it must be at least 0 and below 1.")
         if not 0 <= self.compression <= 9:
             raise ConfigError(f"compression is {self.compression}, it must be from 0 to 9.")
-
-
-def _export(
-    sources: Sequence[Path], out: Path, options: Hdf5Options, progress: ProgressCallback | None
-) -> ExportReport:
-    from demorec.hdf5.export import export_hdf5
-
-    return export_hdf5(sources, out, options, progress)
-
-
-HDF5 = Exporter(
-    summary="robomimic's layout, one HDF5 file: decoded pictures, the same numbers, masks for training and validation",
-    options=Hdf5Options,
-    export=_export,
-)

@@ -1,17 +1,14 @@
-"""What a user chooses about an export to LeRobot; its row in the table of exporters."""
+"""What a user chooses about an export to LeRobot."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal
 
 from demorec.config import VideoConfig
 from demorec.errors import ConfigError
-from demorec.export.exporter import Exporter
-from demorec.export.options import CommonOptions, ExportReport, ProgressCallback
+from demorec.export.options import CommonOptions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,18 +70,3 @@ def check_repo_id(repo_id: str) -> None:
             f"repo-id is {repo_id!r}, but must be OWNER/NAME, for example me/cubes, of letters, digits and underscores "
             "with single dots and dashes between them."
         )
-
-
-def _export(
-    sources: Sequence[Path], out: Path, options: ExportOptions, progress: ProgressCallback | None
-) -> ExportReport:
-    from demorec.lerobot.export import export_lerobot
-
-    return export_lerobot(sources, out, options, progress)
-
-
-LEROBOT = Exporter(
-    summary="LeRobot v3.0, a folder: recorded video as it is, numbers bit for bit, statistics, card",
-    options=ExportOptions,
-    export=_export,
-)

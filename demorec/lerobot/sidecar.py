@@ -22,7 +22,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from demorec.geometry import Array, Pose
+from demorec.geometry import Array
 from demorec.lerobot.layout import SIDECAR_ATTEMPTS_PATH, SIDECAR_CAMERAS_PATH, SIDECAR_EPISODES_PATH, FilePosition
 from demorec.lerobot.parquet import RollingParquet, vector_array
 from demorec.lerobot.paths import SIDECAR_DIR
@@ -30,7 +30,7 @@ from demorec.lerobot.writer import WrittenEpisode, write_text
 from demorec.plain import to_json, to_plain
 from demorec.recording import Recording
 from demorec.scene.episode import EpisodeColumns, Outcome
-from demorec.scene.scene import Goal, Scene
+from demorec.scene.scene import Scene
 
 CONFIGS_PATH = f"{SIDECAR_DIR}/configs.json"
 EXPORT_PATH = f"{SIDECAR_DIR}/export.json"
@@ -135,7 +135,7 @@ class AttemptRecord:
             name = goal.object
             x, y, _ = info.scene.body(goal.object).world_from_body.position.tolist()
             object_position = (x, y)
-            x, y, _ = world_from_goal(info.scene, goal).position.tolist()
+            x, y, _ = info.scene.world_from_goal(goal).position.tolist()
             goal_position = (x, y)
         return cls(
             source=recording.path.name,
@@ -173,11 +173,6 @@ class EpisodeRecord:
     def of(cls, recording: Recording, columns: EpisodeColumns, rows: NDArray[np.intp]) -> EpisodeRecord:
         """Of a recording of which the frames `rows` are exported; frame numbers are those of the dataset."""
         info, outcome = recording.info, _outcome(recording)
-        scene = info.scene
-        phases = []
-        for name, group in groupby(range(len(rows)), key=lambda index: columns.phase[rows[index]]):
-            numbers = list(group)
-            phases.append({"name": name, "from": numbers[0], "to": numbers[-1] + 1})
         row = {
             "source": recording.path.name,
             "run_episode_index": info.episode_index,
@@ -194,41 +189,14 @@ class EpisodeRecord:
             "final_state_digest": outcome.final_state_digest,
             "checks": [to_plain(check) for check in outcome.checks],
             "behaviour": sorted(info.behaviour.items()),
-            "phases": phases,
+            "phases": _phases(columns, rows),
             "deliberate_miss_frames": np.flatnonzero(columns.is_deliberate_miss[rows]).tolist(),
-            "objects": [
-                {
-                    "name": name,
-                    "world_from_object_start": poses[0].tolist(),
-                    "world_from_object_end": poses[-1].tolist(),
-                }
-                for name, poses in columns.object_poses.items()
-            ],
-            "goals": [
-                {
-                    "object": goal.object,
-                    "onto": goal.onto,
-                    "world_from_goal_start": world_from_goal(scene, goal).vector().tolist(),
-                }
-                for goal in scene.goals
-            ],
-            "cameras": [
-                {
-                    "name": camera.name,
-                    "width": camera.width,
-                    "height": camera.height,
-                    "intrinsics": camera.intrinsics.reshape(-1).tolist(),
-                    "mount": camera.mount,
-                    "mount_from_camera": camera.mount_from_camera.vector().tolist(),
-                    "world_from_camera_start": columns.world_from_camera[camera.name][0].tolist(),
-                }
-                for camera in scene.cameras
-            ],
+            **_things(info.scene, columns),
             "episode_info": to_json(info),
         }
         moving = {
             camera.name: columns.world_from_camera[camera.name][rows]
-            for camera in scene.cameras
+            for camera in info.scene.cameras
             if camera.mount != "world"
         }
         return cls(
@@ -240,18 +208,54 @@ class EpisodeRecord:
         )
 
 
+def _phases(columns: EpisodeColumns, rows: NDArray[np.intp]) -> list[dict[str, Any]]:
+    """Name, first frame and frame after the last, of each phase."""
+    phases = []
+    for name, group in groupby(range(len(rows)), key=lambda index: columns.phase[rows[index]]):
+        numbers = list(group)
+        phases.append({"name": name, "from": numbers[0], "to": numbers[-1] + 1})
+    return phases
+
+
+def _things(scene: Scene, columns: EpisodeColumns) -> dict[str, list[dict[str, Any]]]:
+    """Where the objects, goals and cameras are, at the start and at the end."""
+    return {
+        "objects": [
+            {
+                "name": name,
+                "world_from_object_start": poses[0].tolist(),
+                "world_from_object_end": poses[-1].tolist(),
+            }
+            for name, poses in columns.object_poses.items()
+        ],
+        "goals": [
+            {
+                "object": goal.object,
+                "onto": goal.onto,
+                "world_from_goal_start": scene.world_from_goal(goal).vector().tolist(),
+            }
+            for goal in scene.goals
+        ],
+        "cameras": [
+            {
+                "name": camera.name,
+                "width": camera.width,
+                "height": camera.height,
+                "intrinsics": camera.intrinsics.reshape(-1).tolist(),
+                "mount": camera.mount,
+                "mount_from_camera": camera.mount_from_camera.vector().tolist(),
+                "world_from_camera_start": columns.world_from_camera[camera.name][0].tolist(),
+            }
+            for camera in scene.cameras
+        ],
+    }
+
+
 def _outcome(recording: Recording) -> Outcome:
     """That of the recording; one that a crash cut off counts as failed."""
     return recording.outcome or Outcome(
         success=False, checks=(), failure_reason="interrupted", num_frames=recording.num_frames
     )
-
-
-def world_from_goal(scene: Scene, goal: Goal) -> Pose:
-    """Where the object shall end, as things stand at the start."""
-    if not goal.onto:
-        return goal.onto_from_goal
-    return scene.body(goal.onto).world_from_body @ goal.onto_from_goal
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,7 +10,7 @@ from demorec.loop.noise import ActionNoise
 from demorec.loop.prepare import Episode
 from demorec.scene.episode import Action, Event
 from demorec.sim.world import World
-from demorec.tasks.base import Step
+from demorec.tasks.script import Step
 from demorec.tasks.skills import Expert, GaveUp
 
 

@@ -10,7 +10,7 @@ from demorec.geometry import Array
 from demorec.scene.episode import Action
 from demorec.scene.features import NOISE_DECAY
 from demorec.sim.world import World
-from demorec.tasks.base import Step
+from demorec.tasks.script import Step
 
 
 class ActionNoise:

@@ -22,8 +22,9 @@ from demorec.scene.variation import Ranges, resolve
 from demorec.seeding import Purpose, generator
 from demorec.sim.world import World
 from demorec.tables import CAMERAS, RENDERERS, TASKS, camera_name, load_robot
-from demorec.tasks.base import Behaviour, Task
+from demorec.tasks.base import Task
 from demorec.tasks.sampling import Sampler, stratified_point
+from demorec.tasks.script import Behaviour
 from demorec.tasks.vary import calibration_errors, draw_behaviour, vary_cameras, vary_looks, vary_physics
 
 EVAL_SEED_OFFSET = 2**63

@@ -20,8 +20,7 @@ from demorec.playback.robot import as_mesh3d
 from demorec.playback.style import GOAL
 from demorec.playback.times import indexes
 from demorec.scene.assets import asset_path
-from demorec.scene.episode import EpisodeInfo
-from demorec.scene.scene import Body, Goal, Rgba, Shape, Texture
+from demorec.scene.scene import Body, Rgba, Shape, Texture
 from demorec.scene.textures import texture_pixels
 from demorec.scene.urdf import Urdf
 
@@ -55,16 +54,7 @@ def log_bodies(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpiso
         recording.log(paths.end(name), _transform(pose), wire, static=True)
     for goal in scene.goals:
         wire = rr.Boxes3D(sizes=[scene.body(goal.object).shape.extents], colors=[GOAL], radii=[-1.5])
-        recording.log(
-            paths.goal(goal.object), _transform(world_from_goal(episode.info, goal).vector()), wire, static=True
-        )
-
-
-def world_from_goal(info: EpisodeInfo, goal: Goal) -> Pose:
-    """Where the object shall end, as things stand at the start."""
-    if not goal.onto:
-        return goal.onto_from_goal
-    return info.scene.body(goal.onto).world_from_body @ goal.onto_from_goal
+        recording.log(paths.goal(goal.object), _transform(scene.world_from_goal(goal).vector()), wire, static=True)
 
 
 def _transform(pose: Array) -> rr.Transform3D:

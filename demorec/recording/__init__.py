@@ -11,7 +11,7 @@ with Recording(path) as recording:
 """
 
 from demorec.recording.pixels import PixelStatistics
-from demorec.recording.reader import Recording
+from demorec.recording.recording import Recording
 from demorec.recording.recover import Recovered, recover
 from demorec.recording.video import VideoPacket, VideoSettings
 from demorec.recording.writer import EpisodeWriter, WriteStats

@@ -236,10 +236,6 @@ class CdrReader:
             raise ValueError("a string without its closing NUL")
         return raw[:-1].decode()
 
-    def octets(self) -> bytes:
-        """A sequence of uint8."""
-        return self._take(self.u32())
-
     def integers(self) -> NDArray[np.int64]:
         """A sequence of int64."""
         count = self.u32()

@@ -167,7 +167,6 @@ class Container:
         for channel in channels.values():
             if channel.schema_id not in self.schemas:
                 raise ValueError(f"no schema {channel.schema_id} for the topic {channel.topic!r}")
-        self._topics = {channel.id: channel.topic for channel in channels.values()}
         self.channels = {channel.topic: channel for channel in channels.values()}
         self.counts = {channel.topic: counts.get(channel.id, 0) for channel in channels.values()}
 
@@ -206,11 +205,6 @@ class Container:
         with damage_as_recording_error(self.path):
             record = self._record_at(index.offset, index.length, Opcode.METADATA, Metadata)
             return dict(record.metadata)
-
-    @property
-    def metadata_names(self) -> tuple[str, ...]:
-        """Names of all metadata records."""
-        return tuple(self._metadata)
 
     @property
     def attachment_names(self) -> tuple[str, ...]:

@@ -5,18 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from itertools import islice
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from demorec.recording.reader import RecordingReader
 from demorec.recording.streams import action_at, command_at, observation_at, pose_of
 from demorec.scene.episode import CameraImages, EpisodeColumns, Event, Frame, JointSample
 
-if TYPE_CHECKING:
-    from demorec.recording.reader import Recording
 
-
-def frames_of(recording: Recording, columns: EpisodeColumns | None = None) -> Iterator[Frame]:
+def frames_of(recording: RecordingReader, columns: EpisodeColumns | None = None) -> Iterator[Frame]:
     """Every frame without its pictures: numbers, phase, events, and the joint samples before it.
 
     Args:
@@ -44,7 +41,7 @@ def frames_of(recording: Recording, columns: EpisodeColumns | None = None) -> It
         )
 
 
-def _samples_before_frames(recording: Recording, times: list[int]) -> dict[int, tuple[JointSample, ...]]:
+def _samples_before_frames(recording: RecordingReader, times: list[int]) -> dict[int, tuple[JointSample, ...]]:
     number = {time_ns: index for index, time_ns in enumerate(times)}
     result: dict[int, tuple[JointSample, ...]] = {}
     waiting: list[JointSample] = []
@@ -58,7 +55,7 @@ def _samples_before_frames(recording: Recording, times: list[int]) -> dict[int, 
     return result
 
 
-def decoded_images(recording: Recording, columns: EpisodeColumns) -> Iterator[Mapping[str, CameraImages]]:
+def decoded_images(recording: RecordingReader, columns: EpisodeColumns) -> Iterator[Mapping[str, CameraImages]]:
     """The recorded pictures of every frame, decoded (so not those that were coded), with the recorded camera poses."""
     streams = {
         name: (
@@ -80,14 +77,14 @@ def decoded_images(recording: Recording, columns: EpisodeColumns) -> Iterator[Ma
         }
 
 
-def frames_with_images(recording: Recording) -> Iterator[Frame]:
+def frames_with_images(recording: RecordingReader) -> Iterator[Frame]:
     """Every frame with its decoded pictures, one after the other: a few pictures are in memory at a time."""
     columns = recording.columns()
     for frame, images in zip(frames_of(recording, columns), decoded_images(recording, columns), strict=True):
         yield replace(frame, images=images)
 
 
-def images_at(recording: Recording, columns: EpisodeColumns, frame: int) -> Mapping[str, CameraImages]:
+def images_at(recording: RecordingReader, columns: EpisodeColumns, frame: int) -> Mapping[str, CameraImages]:
     """The pictures of one frame; only those from the keyframe before it on are decoded."""
 
     def at[P](pictures: Callable[[str], Iterator[P]], camera: str) -> P:

@@ -13,24 +13,23 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from demorec.errors import MissingDependencyError
+from demorec.recording.reader import RecordingReader
 from demorec.safety.text import printable
 
 if TYPE_CHECKING:
     import pandas as pd
-
-    from demorec.recording.reader import Recording
 
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _WRENCH = ("fx", "fy", "fz", "tx", "ty", "tz")
 _MOMENTS, _PICTURE_HEIGHT = 5, 120
 
 
-def described(recording: Recording) -> str:
+def described(recording: RecordingReader) -> str:
     """The facts about a recording in one line, without control characters."""
     return printable(", ".join(f"{name} {value}" if name else value for name, value in _facts(recording)))
 
 
-def _facts(recording: Recording) -> Iterator[tuple[str, str]]:
+def _facts(recording: RecordingReader) -> Iterator[tuple[str, str]]:
     info, outcome = recording.info, recording.outcome
     yield "", f"{recording.num_frames} frames ({recording.num_frames / info.fps:.1f} s at {info.fps} Hz)"
     yield "task", f"{info.task} with {info.robot.name}"
@@ -42,7 +41,7 @@ def _facts(recording: Recording) -> Iterator[tuple[str, str]]:
     yield "cameras", " and ".join(recording.cameras) or "none"
 
 
-def html_page(recording: Recording) -> str:
+def html_page(recording: RecordingReader) -> str:
     """The facts, and pictures of every camera from the first to the last frame, as one piece of HTML."""
     facts = (("instruction", recording.info.instruction), *_facts(recording), ("file", str(recording.path)))
     rows = [
@@ -66,7 +65,7 @@ def _picture(pixels: NDArray[np.uint8]) -> str:
     return f"<img style='display: inline' src='data:image/jpeg;base64,{data}'>"
 
 
-def frame_table(recording: Recording) -> pd.DataFrame:
+def frame_table(recording: RecordingReader) -> pd.DataFrame:
     """All numbers as a table, one row a frame, float64 to the bit; the index is `frame_index`.
 
     Columns are named as in `demorec.scene.episode.EpisodeColumns`, vectors with their component:

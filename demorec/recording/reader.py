@@ -1,4 +1,4 @@
-"""Reads a recording: frame by frame, or numbers as columns and pictures as packets, one chunk in memory at a time."""
+"""Reads a recording: numbers as columns, pictures as packets, one chunk in memory at a time."""
 
 from __future__ import annotations
 
@@ -6,11 +6,10 @@ import dataclasses
 import hashlib
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import cached_property
 from itertools import islice
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Self, overload
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,25 +20,16 @@ from demorec.recording import channels, messages, metadata
 from demorec.recording.chunks import Block
 from demorec.recording.container import Container, damage_as_recording_error
 from demorec.recording.depth import decode_depth
-from demorec.recording.frames import frames_of, frames_with_images, images_at
 from demorec.recording.labels import decode_labels, from_labels
-from demorec.recording.notebook import described, frame_table, html_page
 from demorec.recording.pixels import PixelCounter, PixelStatistics
 from demorec.recording.streams import Columns, FrameStream, frame_streams, merged_columns
 from demorec.recording.video import Rgb, VideoPacket, VideoSettings, decode, is_keyframe
-from demorec.scene.episode import EpisodeColumns, Event, Frame, JointSample, frame_time_ns
+from demorec.scene.episode import EpisodeColumns, Event, JointSample, frame_time_ns
 from demorec.scene.urdf import check_primitives
 
-if TYPE_CHECKING:
-    import pandas as pd
 
-
-class Recording:
-    """Context manager over one recording, and the sequence of its frames.
-
-    `for frame in recording` gives numbers and pictures together, `recording[120]`, `recording[-1]` and
-    `recording[::30]` any of them; `columns` gives all numbers at once, which is much faster where pictures are not
-    needed.
+class RecordingReader:
+    """What one file holds: numbers as columns, pictures as packets or decoded, labels; a context manager.
 
     Attributes:
         path: Of the file.
@@ -71,37 +61,6 @@ class Recording:
     def close(self) -> None:
         """Close the file; harmless when called twice."""
         self._container.close()
-
-    def __len__(self) -> int:
-        return self.num_frames
-
-    def __iter__(self) -> Iterator[Frame]:
-        return frames_with_images(self)
-
-    @overload
-    def __getitem__(self, index: int) -> Frame: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> list[Frame]: ...
-
-    def __getitem__(self, index: int | slice) -> Frame | list[Frame]:
-        if isinstance(index, slice):
-            return [self[number] for number in range(self.num_frames)[index]]
-        columns, frames = self._numbers
-        frame = frames[index]
-        return dataclasses.replace(frame, images=images_at(self, columns, frame.frame_index))
-
-    @cached_property
-    def _numbers(self) -> tuple[EpisodeColumns, list[Frame]]:
-        """All numbers, kept from the first frame on that is asked for."""
-        columns = self.columns()
-        return columns, list(frames_of(self, columns))
-
-    def __repr__(self) -> str:
-        return f"Recording({str(self.path)!r}: {described(self)})"
-
-    def _repr_html_(self) -> str:
-        return html_page(self)
 
     def _read_metadata(self) -> None:
         found = self._container.metadata(metadata.EPISODE)
@@ -316,14 +275,6 @@ class Recording:
         keyframe = max(index for index, packet in enumerate(packets) if packet.is_keyframe)
         *_, picture = decode(self.video_settings(camera), packets[keyframe:])
         return picture
-
-    def to_pandas(self) -> pd.DataFrame:
-        """All numbers as a table, one row a frame; see `demorec.recording.notebook.frame_table`.
-
-        Raises:
-            MissingDependencyError: pandas is not installed.
-        """
-        return frame_table(self)
 
     def calibration(self, camera: str) -> messages.Calibration:
         """What the calibration message of a camera says, which is what other programs go by."""

@@ -15,7 +15,7 @@ from demorec.errors import RecordingError, resource_error
 from demorec.recording import channels, messages, metadata
 from demorec.recording.container import SalvagedMessage, SalvagedMetadata, salvage
 from demorec.recording.part_file import PartFile
-from demorec.recording.reader import Recording
+from demorec.recording.recording import Recording
 from demorec.recording.ros2 import DEFINITIONS
 from demorec.recording.streams import frame_streams
 from demorec.scene.episode import frame_time_ns

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from demorec.recording.reader import Recording
+from demorec.recording.recording import Recording
 from demorec.recording.video import VideoSettings
 from demorec.scene.episode import SuccessCheck
 

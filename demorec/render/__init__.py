@@ -127,11 +127,3 @@ def first_rows(bodies: Sequence[VisualBody]) -> list[int]:
         rows.append(count)
         count += 1 + body.num_links
     return rows
-
-
-def warm_up_renderer(renderer: str) -> None:
-    """Do what a renderer needs once on a machine, before several processes that use it start: compiling, for raster."""
-    if renderer == "raster":
-        from demorec.render.raster import warm_up
-
-        warm_up()

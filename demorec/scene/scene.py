@@ -250,6 +250,10 @@ class Scene:
                 return body
         raise KeyError(name)
 
+    def world_from_goal(self, goal: Goal) -> Pose:
+        """Where the goal's object shall end, as things stand at the start."""
+        return self.body(goal.onto).world_from_body @ goal.onto_from_goal if goal.onto else goal.onto_from_goal
+
     @property
     def fixed(self) -> tuple[Body, ...]:
         """The bodies that stand still; worlds load and number them first, then the robot, then what is movable."""

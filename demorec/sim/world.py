@@ -160,10 +160,6 @@ class World:
         """The scene's body called `name`; KeyError when there is none."""
         return self._specs[name]
 
-    def body_index(self, name: str) -> int:
-        """PyBullet's index of a body of the scene; KeyError when there is none."""
-        return self._bodies[name]
-
     def visuals(self) -> tuple[VisualBody, ...]:
         """What can be seen, in the order of loading; the same object as long as no colour or shape is changed.
 

@@ -11,10 +11,11 @@ from demorec.scene.episode import SuccessCheck
 from demorec.scene.robot import RobotSpec
 from demorec.scene.scene import Goal, Scene
 from demorec.sim.world import World
-from demorec.tasks.base import Step, Task
+from demorec.tasks.base import Task
 from demorec.tasks.checks import gripper_open_check, placement_checks
 from demorec.tasks.furniture import cube, mark, robot_at_origin, table_and_floor
 from demorec.tasks.sampling import WORKSPACE, Sampler, wording
+from demorec.tasks.script import Step
 from demorec.tasks.skills import Expert
 
 

@@ -11,10 +11,11 @@ from demorec.geometry import Pose
 from demorec.scene.episode import SuccessCheck
 from demorec.scene.scene import Body, Goal, Rgba, Shape
 from demorec.sim.world import World
-from demorec.tasks.base import Step, Task
+from demorec.tasks.base import Task
 from demorec.tasks.checks import at_most, gripper_open_check, placement_checks
 from demorec.tasks.furniture import COLORS, cube
 from demorec.tasks.sampling import Sampler
+from demorec.tasks.script import Step
 from demorec.tasks.skills import Expert
 
 TRAY_FLOOR = 0.004

@@ -15,7 +15,7 @@ from demorec.scene.episode import SuccessCheck
 from demorec.scene.robot import RobotSpec
 from demorec.scene.scene import Body, Goal, RobotPlacement, Scene, Shape
 from demorec.sim.world import World
-from demorec.tasks.base import Step, Task
+from demorec.tasks.base import Task
 from demorec.tasks.checks import (
     MAX_SPEED,
     MAX_SPIN,
@@ -29,6 +29,7 @@ from demorec.tasks.conditions import lasting, steady_width
 from demorec.tasks.furniture import COLORS
 from demorec.tasks.grasping import raised
 from demorec.tasks.sampling import Sampler, wording
+from demorec.tasks.script import Step
 from demorec.tasks.skills import Expert
 
 ROBOT_SCALE = 1.3

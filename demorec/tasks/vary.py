@@ -11,8 +11,8 @@ import numpy as np
 from demorec.geometry import Pose
 from demorec.scene.scene import Body, Camera, Light, Rgba, Scene, Shape, Texture, Vector3
 from demorec.scene.variation import Ranges
-from demorec.tasks.base import Behaviour
 from demorec.tasks.sampling import WORKSPACE, Region, Sampler
+from demorec.tasks.script import Behaviour
 
 NEUTRAL_COLORS: tuple[Rgba, ...] = (
     (0.15, 0.15, 0.16, 1.0),
@@ -100,7 +100,7 @@ def _with_distractors(scene: Scene, count: int, rng: np.random.Generator) -> Sce
     sampler = Sampler(rng)
     others = [body for body in scene.bodies if body.role in ("object", "target", "distractor")]
     taken = [_footprint(body.world_from_body) for body in others]
-    taken += [_footprint(_world_from_goal(scene, index)) for index in range(len(scene.goals))]
+    taken += [_footprint(scene.world_from_goal(goal)) for goal in scene.goals]
     bodies = list(scene.bodies)
     for index in range(count):
         point = sampler.point(
@@ -124,11 +124,6 @@ def _from_outline(body: Body, point: tuple[float, float]) -> float:
 
 def _footprint(pose: Pose) -> tuple[float, float]:
     return float(pose.position[0]), float(pose.position[1])
-
-
-def _world_from_goal(scene: Scene, index: int) -> Pose:
-    goal = scene.goals[index]
-    return scene.body(goal.onto).world_from_body @ goal.onto_from_goal if goal.onto else goal.onto_from_goal
 
 
 def _distractor(name: str, point: tuple[float, float], sampler: Sampler) -> Body:

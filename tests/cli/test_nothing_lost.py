@@ -21,8 +21,8 @@ from demorec.config import GenerateConfig
 from demorec.errors import ConfigError, DemorecError
 from demorec.evaluate.rollouts import Settings, _open
 from demorec.generate import reproduce as reproducing
+from demorec.generate.observer import NoProgress
 from demorec.generate.options import RunOptions
-from demorec.generate.run import NoProgress
 from demorec.lerobot import ExportOptions
 from demorec.runs.find import EVALUATION_NAME
 from demorec.safety.replacing import PICTURE, RECORDING, RERUN_FILE, check_replaceable, settle_parts, written_whole

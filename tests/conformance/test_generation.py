@@ -11,8 +11,9 @@ import pytest
 from demorec.cli import generate_dataset_main, main
 from demorec.config import EpisodePlan, GenerateConfig, deciding_versions
 from demorec.generate.export_step import export_run
+from demorec.generate.observer import NoProgress, RunResult
 from demorec.generate.options import RunOptions
-from demorec.generate.run import NoProgress, RunResult, generate
+from demorec.generate.run import generate
 from demorec.lerobot import ExportOptions, dataset_digest, export_lerobot
 from demorec.recording import Recording
 from demorec.runs.run_file import load_run_file

@@ -17,8 +17,9 @@ from support.generate import Remembers, expected_attempts, inspect, run_fake
 from demorec.config import GenerateConfig
 from demorec.errors import ConfigError, GenerationError
 from demorec.generate import on_ray
+from demorec.generate.observer import NoProgress, RunResult
 from demorec.generate.options import RunOptions
-from demorec.generate.run import NoProgress, RunResult, generate
+from demorec.generate.run import generate
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 NUM_EPISODES = 60

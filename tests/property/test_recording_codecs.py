@@ -125,7 +125,7 @@ def test_a_layout_refuses_another_message() -> None:
 @given(st.binary(max_size=40))
 def test_reading_junk_raises_nothing_but_value_errors(junk: bytes) -> None:
     for data in (junk, b"\0\1\0\0" + junk):
-        for read in ("text", "octets", "integers", "time", "u32", "header"):
+        for read in ("text", "integers", "time", "u32", "header"):
             with contextlib.suppress(ValueError):
                 getattr(CdrReader(data), read)()
 

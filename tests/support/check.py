@@ -28,6 +28,7 @@ from demorec.recording.part_file import PartFile
 from demorec.runs.recordings import inspect_recording
 from demorec.runs.run_file import RunFile, save_run_file
 from demorec.scene.episode import CameraImages, EpisodeColumns, EpisodeInfo, Frame, Outcome
+from support.mcap import metadata_of
 
 Pictures = list[dict[str, CameraImages]]
 
@@ -166,11 +167,9 @@ def rewrite_messages(
     container = Container(source)
     writer = PartFile(target)
     changed = 0
-    for name in container.metadata_names:
-        values = container.metadata(name)
-        assert values is not None
+    for name, values in metadata_of(source).items():
         new = metadata(name, dict(values))
-        changed += int(new != dict(values))
+        changed += int(new != values)
         if new is not None:
             writer.metadata(name, new)
     schemas = {topic: container.schemas[c.schema_id].name for topic, c in container.channels.items()}

@@ -11,8 +11,9 @@ from pathlib import Path
 
 from demorec.config import GenerateConfig
 from demorec.errors import DemorecError
+from demorec.generate.observer import NoProgress, RunResult
 from demorec.generate.options import RunOptions
-from demorec.generate.run import NoProgress, RunResult, generate
+from demorec.generate.run import generate
 from demorec.runs.recordings import Inspected
 from demorec.safety.files import read_text_limited
 from support.makers import line_of, succeeds

@@ -52,6 +52,12 @@ def sealed(values: Mapping[str, str]) -> dict[str, str]:
     return {**content, "crc32": f"{zlib.crc32(json.dumps(content, sort_keys=True).encode()):08x}"}
 
 
+def metadata_of(source: Path) -> dict[str, dict[str, str]]:
+    """Name -> values of all metadata records, as the library's reader finds them."""
+    with source.open("rb") as file:
+        return {item.name: dict(item.metadata) for item in make_reader(file).iter_metadata()}
+
+
 def rewritten(
     source: Path,
     *,
@@ -76,10 +82,7 @@ def rewritten(
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
     rows: list[tuple[int, int, bytes]] = []
-    described: dict[str, Mapping[str, str]] = {}
-    with source.open("rb") as file:
-        for item in make_reader(file).iter_metadata():
-            described[item.name] = item.metadata
+    described: dict[str, Mapping[str, str]] = {**metadata_of(source)}
     with source.open("rb") as file:
         for item in StreamReader(file).records:
             assert not isinstance(item, Chunk)  # the reader opens them

@@ -22,7 +22,7 @@ from demorec.recording import Recording
 from demorec.runs.recordings import inspect_recording
 from demorec.runs.run_file import RunFile, save_run_file
 from support.export import export
-from support.mcap import rewritten
+from support.mcap import metadata_of, rewritten
 from support.recording import write_episode
 
 VALUES: tuple[Any, ...] = (
@@ -113,7 +113,7 @@ class Odd:
         export([self.plain], self.dataset)
         self.film_dataset = good / "film"
         export([self.filmed], self.film_dataset)
-        self.metadata = {path: _metadata(path) for path in (self.plain, self.filmed)}
+        self.metadata = {path: metadata_of(path) for path in (self.plain, self.filmed)}
         self.kinds: tuple[Callable[[random.Random, Path], list[Any]], ...] = (
             self._description, self._description, self._outcome, self._messages, self._messages, self._run_file,
             self._dataset_json, self._dataset_json, self._dataset_table,
@@ -226,9 +226,3 @@ class Odd:
                 ["reproduce", path, "--out", place / "again", "--workers", "0"],
             )
         )  # fmt: skip
-
-
-def _metadata(path: Path) -> dict[str, dict[str, str]]:
-    with Recording(path) as recording:
-        container = recording._container
-        return {name: container.metadata(name) or {} for name in container.metadata_names}

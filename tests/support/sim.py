@@ -25,3 +25,8 @@ def run(prepared: Episode, world: World | None = None) -> tuple[list[Frame], Out
         session = Session.of_episode(world, prepared, renderer)
         frames = list(session.run(ScriptAgent(prepared)))
     return frames, session.outcome
+
+
+def body_index(world: World, name: str) -> int:
+    """PyBullet's index of a body: worlds show bodies in the order of loading, which is how PyBullet numbers them."""
+    return [body.name for body in world.visuals()].index(name)

@@ -14,7 +14,7 @@ from demorec.check.report import CheckOptions, SubjectReport, check_subjects, fi
 from demorec.cli import main
 from demorec.cli.generate_report import check_run
 from demorec.config import GenerateConfig
-from demorec.generate.run import RunResult
+from demorec.generate.observer import RunResult
 from demorec.runs.recordings import inspect_recording
 from demorec.runs.run_file import RunFile, Session, save_run_file
 

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 import pytest
-from support.sim import episode, run
+from support.sim import body_index, episode, run
 
 from demorec.errors import SceneError
 from demorec.geometry import Pose, wrap_angle
@@ -15,10 +15,10 @@ from demorec.loop import Episode, make_world
 from demorec.scene.scene import Body, Shape
 from demorec.sim.robots.panda import PANDA
 from demorec.tasks import skills
-from demorec.tasks.base import Behaviour
 from demorec.tasks.conditions import lasting
 from demorec.tasks.grasping import grasp_yaws, grasps_beside, hand_down, hand_yaw, raised, symmetric_yaws
 from demorec.tasks.sampling import WORKSPACE, Region, Sampler
+from demorec.tasks.script import Behaviour
 
 
 def sampler(seed: int = 0) -> Sampler:
@@ -141,7 +141,7 @@ def test_a_cube_that_lies_wrong_fails_its_check(finished, name):
 
 def test_a_cube_that_floats_moves_or_is_held_fails(finished):
     prepared, world = finished
-    cube, good = world.body_index("red_cube"), world.pose("red_cube")
+    cube, good = body_index(world, "red_cube"), world.pose("red_cube")
     world.set_state(object_poses={"red_cube": raised(good, 0.003)})
     world.client.performCollisionDetection()
     assert failed(prepared, world) == {"on_support"}

@@ -8,7 +8,7 @@ import sys
 
 import numpy as np
 import pytest
-from support.sim import episode, run
+from support.sim import body_index, episode, run
 
 from demorec.errors import ConfigError, SceneError
 from demorec.geometry import Pose
@@ -52,7 +52,7 @@ def test_observation_agrees_with_the_simulator(world, scene):
     world.reset(scene)
     hold(world, 3)
     seen = world.observe()
-    position, quat = world.client.getBasePositionAndOrientation(world.body_index("red_cube"))
+    position, quat = world.client.getBasePositionAndOrientation(body_index(world, "red_cube"))
     assert seen.object_poses["red_cube"] == Pose(position=np.array(position), quat_xyzw=np.array(quat))
     assert set(seen.object_poses) == {"red_cube"}
     state = world.client.getLinkState(
@@ -144,7 +144,7 @@ def test_a_body_whose_centre_of_mass_is_off_its_origin_is_where_the_scene_says(w
     world.reset(with_bodies(scene, duck))
     # It falls while the world settles, and does not move sideways.
     assert np.abs(world.pose("duck").position - pose.position)[:2].max() < 1e-6
-    assert world.client.getDynamicsInfo(world.body_index("duck"), -1)[0] == 0.1
+    assert world.client.getDynamicsInfo(body_index(world, "duck"), -1)[0] == 0.1
     world.set_state(object_poses={"duck": pose})
     assert np.allclose(world.pose("duck").vector(), pose.vector(), atol=1e-9)
 
@@ -163,7 +163,7 @@ def test_shapes_have_the_size_that_they_say(world, scene, shape, height):
         name="thing", role="object", shape=shape, world_from_body=Pose(position=np.array([0.5, 0.4, 1.0])), mass=0.1
     )
     world.reset(with_bodies(scene, body))
-    low, high = world.client.getAABB(world.body_index("thing"))
+    low, high = world.client.getAABB(body_index(world, "thing"))
     assert abs(high[2] - low[2] - height) < 0.005
     assert abs(shape.extents[2] - height) < 1e-12
 
@@ -279,7 +279,7 @@ def test_visuals_are_read_anew_when_a_colour_is_changed(world, scene):
     world.reset(scene)
     before = world.visuals()
     assert world.visuals() is before
-    cube = world.body_index("red_cube")
+    cube = body_index(world, "red_cube")
     assert before[cube].name == "red_cube"
     world.client.changeVisualShape(cube, -1, rgbaColor=[0.0, 0.0, 1.0, 1.0])
     assert world.visuals()[cube].visuals[0].rgba == (0.0, 0.0, 1.0, 1.0)

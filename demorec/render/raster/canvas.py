@@ -204,26 +204,8 @@ class Canvas:
         batch, stage = self._batch, self._stage
         lowest = layout.BACKGROUND if everything else first
         heights = stage.heights if still is None else stage.still_heights
-        edge_count = mixed_count = 0
         self._flags[first:last] = 0
-        if self.samples == 2:
-            edge_count, mixed_count = resolve(
-                left,
-                right,
-                lowest,
-                self.ids,
-                self.values,
-                self._faces,
-                batch.face_table,
-                self.pixel_ids,
-                self.edges,
-                0,
-                self._mixed,
-                self.want_depth or self.want_segments,
-                self._flags,
-            )
-        else:
-            flag_owners(left, right, first, self.ids, self._flags)
+        edge_count, mixed_count = self._find_owners(left, right, first, lowest)
         set_up_records(
             first,
             last,
@@ -259,6 +241,28 @@ class Canvas:
             images.depth,
             self.want_segments,
             images.segments,
+        )
+        return edge_count, mixed_count
+
+    def _find_owners(self, left: Int32s, right: Int32s, first: int, lowest: int) -> tuple[int, int]:
+        """Flag the records that own pixels, list the edges between them; returns the numbers of edges and mixed."""
+        if self.samples != 2:
+            flag_owners(left, right, first, self.ids, self._flags)
+            return 0, 0
+        edge_count, mixed_count = resolve(
+            left,
+            right,
+            lowest,
+            self.ids,
+            self.values,
+            self._faces,
+            self._batch.face_table,
+            self.pixel_ids,
+            self.edges,
+            0,
+            self._mixed,
+            self.want_depth or self.want_segments,
+            self._flags,
         )
         return edge_count, mixed_count
 

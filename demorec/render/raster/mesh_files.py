@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -61,51 +62,70 @@ def _materials(path: Path) -> dict[str, tuple[Floats, Path | None]]:
     return found
 
 
-def load_obj(path: Path) -> RasterMesh:
-    """An OBJ file with its materials; polygons are cut into fans.
+@dataclass
+class _ObjText:
+    """What the lines of an OBJ file say.
 
-    As in PyBullet the first texture of the file covers all of it. The materials' colours count where there are
-    several and no texture; PyBullet ignores them unless told otherwise.
+    Attributes:
+        points, uvs, normals: Three, two and three numbers each.
+        corners: Numbers of point, texture coordinate and normal, from 1, of each corner of each triangle; 0: none.
+        face_material: Name of the material of each triangle.
+        materials: Name -> diffuse colour and texture.
     """
-    points: list[list[float]] = []
-    uvs: list[list[float]] = []
-    normals: list[list[float]] = []
-    corners: list[tuple[int, int, int]] = []
-    face_material: list[str] = []
-    materials: dict[str, tuple[Floats, Path | None]] = {}
-    material = ""
 
-    def parse(corner: str) -> tuple[int, int, int]:
-        parts = (corner + "//").split("/")[:3]
+    points: list[list[float]] = field(default_factory=list)
+    uvs: list[list[float]] = field(default_factory=list)
+    normals: list[list[float]] = field(default_factory=list)
+    corners: list[tuple[int, int, int]] = field(default_factory=list)
+    face_material: list[str] = field(default_factory=list)
+    materials: dict[str, tuple[Floats, Path | None]] = field(default_factory=dict)
+
+    @classmethod
+    def read(cls, path: Path) -> _ObjText:
+        """Of a file and the material libraries that it names."""
+        found, material = cls(), ""
+        for line in path.read_text(errors="replace").splitlines():
+            words = line.split()
+            if not words:
+                continue
+            key = words[0]
+            if key == "v":
+                found.points.append([float(words[1]), float(words[2]), float(words[3])])
+            elif key == "vt":
+                found.uvs.append([float(words[1]), float(words[2]) if len(words) > 2 else 0.0])
+            elif key == "vn":
+                found.normals.append([float(words[1]), float(words[2]), float(words[3])])
+            elif key == "f":
+                polygon = [found._corner(word) for word in words[1:]]
+                for i in range(1, len(polygon) - 1):
+                    found.corners += [polygon[0], polygon[i], polygon[i + 1]]
+                    found.face_material.append(material)
+            elif key == "mtllib":
+                found.materials |= _materials(path.parent / " ".join(words[1:]))
+            elif key == "usemtl":
+                material = " ".join(words[1:])
+        return found
+
+    def _corner(self, word: str) -> tuple[int, int, int]:
+        parts = (word + "//").split("/")[:3]
         # Negative numbers count back from the latest; 0 stands for "none".
-        counts = (len(points), len(uvs), len(normals))
+        counts = (len(self.points), len(self.uvs), len(self.normals))
         a, b, c = (
             0 if not part else int(part) + (count + 1 if part[0] == "-" else 0)
             for part, count in zip(parts, counts, strict=True)
         )
         return a, b, c
 
-    for line in path.read_text(errors="replace").splitlines():
-        words = line.split()
-        if not words:
-            continue
-        key = words[0]
-        if key == "v":
-            points.append([float(words[1]), float(words[2]), float(words[3])])
-        elif key == "vt":
-            uvs.append([float(words[1]), float(words[2]) if len(words) > 2 else 0.0])
-        elif key == "vn":
-            normals.append([float(words[1]), float(words[2]), float(words[3])])
-        elif key == "f":
-            polygon = [parse(word) for word in words[1:]]
-            for i in range(1, len(polygon) - 1):
-                corners += [polygon[0], polygon[i], polygon[i + 1]]
-                face_material.append(material)
-        elif key == "mtllib":
-            materials |= _materials(path.parent / " ".join(words[1:]))
-        elif key == "usemtl":
-            material = " ".join(words[1:])
-    index = np.array(corners, dtype=np.int64).reshape(-1, 3, 3)
+
+def load_obj(path: Path) -> RasterMesh:
+    """An OBJ file with its materials; polygons are cut into fans.
+
+    As in PyBullet the first texture of the file covers all of it. The materials' colours count where there are
+    several and no texture; PyBullet ignores them unless told otherwise.
+    """
+    text = _ObjText.read(path)
+    points, uvs, normals, materials = text.points, text.uvs, text.normals, text.materials
+    index = np.array(text.corners, dtype=np.int64).reshape(-1, 3, 3)
     faces = index[:, :, 0] - 1
     if len(faces) and (faces.min() < 0 or faces.max() >= len(points)):
         raise ValueError(f"a face names vertex {int(faces.max()) + 1} of {len(points)}")
@@ -119,7 +139,7 @@ def load_obj(path: Path) -> RasterMesh:
     colors = None
     if texture is None and len({tuple(kd) for kd, _ in materials.values()}) > 1:
         white = (np.ones(3), None)
-        colors = np.array([materials.get(name, white)[0] for name in face_material])
+        colors = np.array([materials.get(name, white)[0] for name in text.face_material])
     corner_normals = None
     if normals and len(faces) and index[:, :, 2].min() > 0:
         if index[:, :, 2].max() > len(normals):
@@ -152,89 +172,96 @@ def load_stl(path: Path) -> RasterMesh:
 
 def load_collada(path: Path) -> RasterMesh:
     """The triangles and polygons of a COLLADA file, placed by the nodes of its scene, in metres."""
-    root = ElementTree.parse(path).getroot()
-    tag = root.tag.removesuffix("COLLADA")
-
-    def all_of(node: ElementTree.Element, name: str) -> list[ElementTree.Element]:
-        return node.findall(f".//{tag}{name}")
-
-    by_id = {"#" + node.attrib["id"]: node for node in root.iter() if "id" in node.attrib}
-    points: list[Floats] = []
-    normals: list[Floats] = []
-    asset = root.find(f"{tag}asset")
-    unit = None if asset is None else asset.find(f"{tag}unit")
-    scale = 1.0 if unit is None else float(unit.attrib.get("meter", 1.0))
-    # PyBullet heeds the unit but not up_axis; shapes must lie as its physics has them.
-    axes = np.diag([scale, scale, scale, 1.0])
-
-    def numbers(source: ElementTree.Element) -> Floats:
-        array = source.find(f"{tag}float_array")
-        stride = source.find(f".//{tag}accessor")
-        width = 3 if stride is None else int(stride.attrib.get("stride", 3))
-        values = [] if array is None or array.text is None else array.text.split()
-        return np.array(values, dtype=np.float64).reshape(-1, width)[:, :3]
-
-    def resolve(reference: str) -> Floats:
-        node = by_id[reference]
-        if node.tag == f"{tag}vertices":
-            position = next(i for i in node.findall(f"{tag}input") if i.attrib["semantic"] == "POSITION")
-            return resolve(position.attrib["source"])
-        return numbers(node)
-
-    def add(geometry: ElementTree.Element, matrix: Floats) -> None:
-        for kind in ("triangles", "polylist", "polygons"):
-            for part in all_of(geometry, kind):
-                inputs = part.findall(f"{tag}input")
-                stride = 1 + max(int(i.attrib.get("offset", 0)) for i in inputs)
-                semantic = {i.attrib["semantic"]: i for i in inputs}
-                rows: list[NDArray[np.int64]] = [
-                    np.array((p.text or "").split(), dtype=np.int64).reshape(-1, stride)
-                    for p in part.findall(f"{tag}p")
-                ]
-                if kind == "polylist":
-                    counts = [int(v) for v in (part.findtext(f"{tag}vcount") or "").split()]
-                    rows = np.split(rows[0], np.cumsum(counts)[:-1]) if rows and counts else []
-                elif kind == "triangles":
-                    rows = list(rows[0].reshape(-1, 3, stride)) if rows else []
-                fans = [row[[0, i, i + 1]] for row in rows for i in range(1, len(row) - 1)]
-                if not fans:
-                    continue
-                index = np.concatenate(fans)
-                vertex = semantic["VERTEX"]
-                place = resolve(vertex.attrib["source"])[index[:, int(vertex.attrib.get("offset", 0))]]
-                linear = matrix[:3, :3]
-                points.append(place @ linear.T + matrix[:3, 3])
-                if "NORMAL" in semantic:
-                    normal = semantic["NORMAL"]
-                    direction = resolve(normal.attrib["source"])[index[:, int(normal.attrib.get("offset", 0))]]
-                    normals.append(direction @ np.linalg.inv(linear))
-                else:
-                    normals.append(np.zeros((0, 3)))
-
-    def visit(node: ElementTree.Element, matrix: Floats) -> None:
-        for child in node:
-            name = child.tag.removeprefix(tag)
-            value = np.array((child.text or "").split(), dtype=np.float64) if name in _TRANSFORMS else np.zeros(0)
-            if name in _TRANSFORMS:
-                matrix = matrix @ _transform(name, value)
-        for instance in node.findall(f"{tag}instance_geometry"):
-            add(by_id[instance.attrib["url"]], matrix)
-        for child in node.findall(f"{tag}node"):
-            visit(child, matrix)
-
-    for scene in all_of(root, "visual_scene"):
-        for node in scene.findall(f"{tag}node"):
-            visit(node, axes)
-    if not points:
+    scene = _ColladaScene(ElementTree.parse(path).getroot())
+    if not scene.points:
         raise ValueError("no visual scene with triangles")
-    corners = np.concatenate(points)
-    corner_normals = np.concatenate(normals)
+    corners = np.concatenate(scene.points)
+    corner_normals = np.concatenate(scene.normals)
     complete = len(corner_normals) == len(corners)
     return make_mesh(
         corners,
         np.arange(len(corners)).reshape(-1, 3),
         normals=corner_normals.reshape(-1, 3, 3) if complete else None,
     )
+
+
+class _ColladaScene:
+    """The triangles of the visual scenes of a COLLADA document.
+
+    Attributes:
+        points, normals: (3 n, 3) of the corners of each part's triangles; no normals where the part has none.
+    """
+
+    def __init__(self, root: ElementTree.Element) -> None:
+        self.points: list[Floats] = []
+        self.normals: list[Floats] = []
+        self._tag = root.tag.removesuffix("COLLADA")
+        self._by_id = {"#" + node.attrib["id"]: node for node in root.iter() if "id" in node.attrib}
+        asset = root.find(f"{self._tag}asset")
+        unit = None if asset is None else asset.find(f"{self._tag}unit")
+        scale = 1.0 if unit is None else float(unit.attrib.get("meter", 1.0))
+        # PyBullet heeds the unit but not up_axis; shapes must lie as its physics has them.
+        axes = np.diag([scale, scale, scale, 1.0])
+        for scene in self._all_of(root, "visual_scene"):
+            for node in scene.findall(f"{self._tag}node"):
+                self._visit(node, axes)
+
+    def _all_of(self, node: ElementTree.Element, name: str) -> list[ElementTree.Element]:
+        return node.findall(f".//{self._tag}{name}")
+
+    def _visit(self, node: ElementTree.Element, matrix: Floats) -> None:
+        """Take in a node and all below it; (4, 4) is the transform of what the node hangs on."""
+        for child in node:
+            name = child.tag.removeprefix(self._tag)
+            if name in _TRANSFORMS:
+                matrix = matrix @ _transform(name, np.array((child.text or "").split(), dtype=np.float64))
+        for instance in node.findall(f"{self._tag}instance_geometry"):
+            for kind in ("triangles", "polylist", "polygons"):
+                for part in self._all_of(self._by_id[instance.attrib["url"]], kind):
+                    self._add(part, kind, matrix)
+        for child in node.findall(f"{self._tag}node"):
+            self._visit(child, matrix)
+
+    def _add(self, part: ElementTree.Element, kind: str, matrix: Floats) -> None:
+        inputs = {i.attrib["semantic"]: i for i in part.findall(f"{self._tag}input")}
+        stride = 1 + max(int(i.attrib.get("offset", 0)) for i in part.findall(f"{self._tag}input"))
+        index = self._fans(part, kind, stride)
+        if not len(index):
+            return
+        linear = matrix[:3, :3]
+        self.points.append(self._values(inputs["VERTEX"], index) @ linear.T + matrix[:3, 3])
+        if "NORMAL" in inputs:
+            self.normals.append(self._values(inputs["NORMAL"], index) @ np.linalg.inv(linear))
+        else:
+            self.normals.append(np.zeros((0, 3)))
+
+    def _fans(self, part: ElementTree.Element, kind: str, stride: int) -> NDArray[np.int64]:
+        """(3 n, stride) numbers of the inputs at the corners of a part's triangles, polygons being cut into fans."""
+        rows: list[NDArray[np.int64]] = [
+            np.array((p.text or "").split(), dtype=np.int64).reshape(-1, stride) for p in part.findall(f"{self._tag}p")
+        ]
+        if kind == "polylist":
+            counts = [int(v) for v in (part.findtext(f"{self._tag}vcount") or "").split()]
+            rows = np.split(rows[0], np.cumsum(counts)[:-1]) if rows and counts else []
+        elif kind == "triangles":
+            rows = list(rows[0].reshape(-1, 3, stride)) if rows else []
+        fans = [row[[0, i, i + 1]] for row in rows for i in range(1, len(row) - 1)]
+        return np.concatenate(fans) if fans else np.zeros((0, stride), dtype=np.int64)
+
+    def _values(self, source: ElementTree.Element, index: NDArray[np.int64]) -> Floats:
+        """(3 n, 3) what an input has at the corners."""
+        return self._resolve(source.attrib["source"])[index[:, int(source.attrib.get("offset", 0))]]
+
+    def _resolve(self, reference: str) -> Floats:
+        node = self._by_id[reference]
+        if node.tag == f"{self._tag}vertices":
+            position = next(i for i in node.findall(f"{self._tag}input") if i.attrib["semantic"] == "POSITION")
+            return self._resolve(position.attrib["source"])
+        array = node.find(f"{self._tag}float_array")
+        accessor = node.find(f".//{self._tag}accessor")
+        width = 3 if accessor is None else int(accessor.attrib.get("stride", 3))
+        values = [] if array is None or array.text is None else array.text.split()
+        return np.array(values, dtype=np.float64).reshape(-1, width)[:, :3]
 
 
 _TRANSFORMS = ("matrix", "translate", "scale", "rotate")

@@ -31,13 +31,11 @@ class Model:
     Attributes:
         key: Digest of what it was made from: equal keys, equal meshes.
         mesh: All its triangles.
-        is_palette: Whether the file's texture was turned into face colours.
         coarse: For the shadow map, of a primitive; primitives are always drawn whole.
     """
 
     key: str
     mesh: RasterMesh
-    is_palette: bool = False
     coarse: RasterMesh | None = None
     _pieces: dict[Any, Piece] = field(default_factory=dict)
     _spheres: dict[bytes, tuple[Floats, float]] = field(default_factory=dict)
@@ -141,7 +139,7 @@ class ModelStore:
                 colors = palette_colors(mesh, picture)
             if colors is not None:
                 mesh = replace(mesh, colors=colors, texture=None)
-            self._models[place] = Model(key=digest, mesh=mesh, is_palette=colors is not None)
+            self._models[place] = Model(key=digest, mesh=mesh)
         return self._models[place]
 
     def primitive(self, name: str, *size: float) -> Model:

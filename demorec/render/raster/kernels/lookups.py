@@ -5,13 +5,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from demorec.render.raster.kernels import layout as at
 from demorec.render.raster.kernels.jit import f4, i4, index, inlined, u4
 
 KNEE = 0.8 * 255
 """Brightness up to which colours are kept as they are."""
 ROOM = 255 - KNEE
-MAX_MIP = at.MIP_LEVELS - 1
 
 
 @inlined

@@ -1,0 +1,62 @@
+"""What the expert is told about an episode, and the steps that its script is made of."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+from demorec.scene.episode import Action, Event
+
+
+@dataclass(frozen=True, kw_only=True)
+class Behaviour:
+    """How the expert does it in one episode; recorded as `EpisodeInfo.behaviour`.
+
+    Attributes:
+        speed: Factor on the speeds of all motions; touching down with an object is never faster than at 1.
+        approach_height, lift_height: Above the grasp, metres.
+        grasp_offset: Shift of the grasp along the fingers' faces, metres.
+        action_noise: Standard deviation of the exploration noise on the executed joint targets, rad.
+        miss_x, miss_y: Deliberate error of the first grasp in the hand's frame, metres, x along the fingers' faces; 0
+            for none. What is done may be farther, to the other side or left out, so that nothing is touched.
+        perception_x, perception_y: Error of every perceived object position, metres.
+        perception_yaw: Error of every perceived object yaw, rad.
+    """
+
+    speed: float = 1.0
+    approach_height: float = 0.12
+    lift_height: float = 0.15
+    grasp_offset: float = 0.0
+    action_noise: float = 0.02
+    miss_x: float = 0.0
+    miss_y: float = 0.0
+    perception_x: float = 0.0
+    perception_y: float = 0.0
+    perception_yaw: float = 0.0
+
+    @property
+    def misses(self) -> bool:
+        """Whether the first grasp is missed on purpose."""
+        return self.miss_x != 0.0 or self.miss_y != 0.0
+
+    def as_mapping(self) -> dict[str, float]:
+        """name -> value."""
+        return {name: float(value) for name, value in asdict(self).items()}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Step:
+    """One control step of a script.
+
+    Attributes:
+        action: What the expert wants.
+        phase: "approach", "lift", ...
+        noise_allowed: Whether exploration noise does no harm now (free motion, away from objects).
+        events: What happened since the step before.
+        is_deliberate_miss: Whether this belongs to a deliberate miss.
+    """
+
+    action: Action
+    phase: str
+    noise_allowed: bool = False
+    events: tuple[Event, ...] = ()
+    is_deliberate_miss: bool = False

@@ -1,0 +1,151 @@
+"""The import rules of pyproject.toml hold in every folder, and no modules import each other in a circle."""
+
+from __future__ import annotations
+
+import itertools
+import tomllib
+from collections.abc import Iterator
+from copy import deepcopy
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import grimp
+import importlinter.application.use_cases as import_linter
+import pytest
+from importlinter.configuration import configure
+from importlinter.domain.contract import registry
+
+PROJECT = Path(__file__).parents[2] / "pyproject.toml"
+HOMES = {
+    "pybullet": "demorec.sim",
+    "pybullet_data": "demorec.sim",
+    "mcap": "demorec.recording",
+    "foxglove": "demorec.recording",
+    "rerun": "demorec.playback",
+    "tyro": "demorec.cli",
+    "tqdm": "demorec.cli",
+    "h5py": "demorec.hdf5",
+    "ray": "demorec.generate.on_ray",
+}
+"""Heavy library -> the folder or module of demorec that alone imports it (CONTRIBUTING.md)."""
+NEW_FOLDER = "demorec.made_for_trial"
+
+
+@cache
+def _graph(*, with_type_checking: bool) -> grimp.ImportGraph:
+    return grimp.build_graph(
+        "demorec", include_external_packages=True, exclude_type_checking_imports=not with_type_checking, cache_dir=None
+    )
+
+
+def _rules() -> list[dict[str, Any]]:
+    rules: list[dict[str, Any]] = tomllib.loads(PROJECT.read_text())["tool"]["importlinter"]["contracts"]
+    return rules
+
+
+def _is_broken(rule: dict[str, Any], *extra: tuple[str, str]) -> bool:
+    """Whether import-linter finds a rule broken once these (importer, imported) are added to the imports there are."""
+    configure()
+    options = import_linter.read_user_options(str(PROJECT))
+    import_linter._register_contract_types(options)
+    graph = deepcopy(_graph(with_type_checking=False))
+    for importer, imported in extra:
+        graph.add_import(importer=importer, imported=imported)
+    (contract,) = (option for option in options.contracts_options if option["name"] == rule["name"])
+    kind = registry.get_contract_class(contract["type"])
+    checked = kind(name=rule["name"], session_options=options.session_options, contract_options=contract)
+    return not checked.check(graph, verbose=False).kept
+
+
+def _one_home_rules() -> list[dict[str, Any]]:
+    return [rule for rule in _rules() if rule["name"].endswith("one home")]
+
+
+def _rule(name: str) -> dict[str, Any]:
+    return next(rule for rule in _rules() if rule["name"] == name)
+
+
+def _folders() -> list[str]:
+    """Every folder and loose module of the package, and one that somebody makes tomorrow."""
+    return [*sorted(_graph(with_type_checking=False).find_children("demorec")), NEW_FOLDER]
+
+
+def _circles(graph: grimp.ImportGraph) -> Iterator[list[str]]:
+    """Modules that import each other in a circle, directly or not (Tarjan's strongly connected components)."""
+    number: dict[str, int] = {}
+    lowest: dict[str, int] = {}
+    waiting: list[str] = []
+    found: list[list[str]] = []
+
+    def visit(module: str) -> None:
+        number[module] = lowest[module] = len(number)
+        waiting.append(module)
+        for imported in graph.find_modules_directly_imported_by(module):
+            if imported not in number:
+                visit(imported)
+                lowest[module] = min(lowest[module], lowest[imported])
+            elif imported in waiting:
+                lowest[module] = min(lowest[module], number[imported])
+        if lowest[module] == number[module]:
+            place = waiting.index(module)
+            if len(waiting) - place > 1:
+                found.append(sorted(waiting[place:]))
+            del waiting[place:]
+
+    for module in sorted(graph.modules):
+        if module not in number:
+            visit(module)
+    yield from found
+
+
+def test_no_modules_import_each_other() -> None:
+    """Neither at the top, nor inside functions, nor for the type checker alone."""
+    assert list(_circles(_graph(with_type_checking=True))) == []
+
+
+def test_a_circle_would_be_found() -> None:
+    graph = deepcopy(_graph(with_type_checking=True))
+    graph.add_import(importer="demorec.scene.robot", imported="demorec.sim.arm")
+    (circle,) = _circles(graph)
+    assert {"demorec.scene.robot", "demorec.sim.arm"} <= set(circle)
+
+
+@pytest.mark.parametrize("library", HOMES)
+def test_a_library_is_imported_at_home_alone(library: str) -> None:
+    """A module that is added to any folder, a new folder's first one too, may not import it."""
+    (rule,) = (rule for rule in _one_home_rules() if library in rule["forbidden_modules"])
+    assert not _is_broken(rule)
+    for folder in _folders():
+        importer = f"{folder}.made_for_trial"
+        assert _is_broken(rule, (importer, library)) == (folder != HOMES[library]), importer
+
+
+def test_every_library_with_one_home_is_tried() -> None:
+    named = {name for rule in _one_home_rules() for name in rule["forbidden_modules"]}
+    imported = {name for name in _graph(with_type_checking=False).modules if not name.startswith("demorec")}
+    assert named & imported <= HOMES.keys()
+
+
+@pytest.mark.parametrize("name", [rule["name"] for rule in _rules() if rule["type"] == "forbidden"])
+def test_each_forbidden_import_is_caught(name: str) -> None:
+    rule = _rule(name)
+    for source in rule["source_modules"]:
+        for forbidden in rule["forbidden_modules"]:
+            importer = NEW_FOLDER if source == "demorec" else source
+            assert _is_broken(rule, (importer, forbidden)), f"{importer} -> {forbidden}"
+
+
+def test_the_pipeline_runs_one_way() -> None:
+    rule = _rule("The pipeline runs one way")
+    layers = [f"demorec.{layer.strip('()')}" for layer in rule["layers"]]
+    for above, below in itertools.pairwise(layers):
+        assert _is_broken(rule, (below, above)), f"{below} -> {above}"
+
+
+def test_every_folder_stands_in_a_rule_of_its_own() -> None:
+    """Whoever makes a folder says which way its imports run."""
+    placed = {f"demorec.{layer.strip('()')}" for layer in _rule("The pipeline runs one way")["layers"]}
+    for rule in _rules():
+        placed |= set(rule.get("source_modules", ()))
+    assert set(_folders()) - placed == {NEW_FOLDER}
