@@ -12,7 +12,7 @@ from demorec.check.base import Check, Group, Level, Result, Scope
 from demorec.check.dataset import Dataset
 from demorec.check.episode import RecordedEpisode
 from demorec.check.run import RUN_NAME, CheckedRun
-from demorec.errors import ConfigError, DemorecError, resource_error
+from demorec.errors import ConfigError, DemorecError, check_option, resource_error
 from demorec.lerobot.paths import is_dataset
 from demorec.processes import SPAWN
 from demorec.scene.assets import allow_models
@@ -43,8 +43,7 @@ class CheckOptions:
         """Raise ConfigError for unknown names or impossible numbers."""
         for name in self.only:
             CHECKS.check_name(name)
-        if not 1 <= self.workers <= 1024:
-            raise ConfigError(f"workers is {self.workers}, allowed are 1 to 1024.")
+        check_option("workers", self.workers, 1, 1024)
 
     def checks(self, scope: Scope) -> list[Check]:
         """Those of a scope, in the order of the table."""

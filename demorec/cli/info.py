@@ -190,7 +190,7 @@ def _dataset(path: Path) -> tuple[dict[str, Any], list[str]]:
             shape = "x".join(map(str, feature["shape"]))
             rows.append((name, str(feature["dtype"]), shape, _names(feature.get("names"))))
     except (OSError, ValueError, KeyError, TypeError, AttributeError, ArithmeticError) as error:
-        raise ConfigError(f"The dataset's info.json is damaged ({type(error).__name__}: {error}): {file}") from error
+        raise RecordingError(f"The dataset's info.json is damaged ({type(error).__name__}: {error}): {file}") from error
     return {"kind": "dataset", "path": str(path), "info": info}, [*_aligned(facts), "", *_aligned(rows)]
 
 
