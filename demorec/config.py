@@ -14,7 +14,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
 
-from demorec.errors import ConfigError
+from demorec.errors import ConfigError, OptionError, check_option
 from demorec.plain import from_plain
 from demorec.safety.user_modules import modules_of
 from demorec.scene.variation import PRESET_NAMES, Preset, Ranges
@@ -40,10 +40,10 @@ class VideoConfig:
 
     def validate(self) -> None:
         """Raise ConfigError for impossible values."""
-        _check("video.gop", self.gop, 1, 600)
+        check_option("gop", self.gop, 1, 600)
         if self.crf is not None:
-            _check("video.crf", self.crf, 0, 51 if self.codec == "h264" else 63)
-        _check("video.jpeg_quality", self.jpeg_quality, 1, 100)
+            check_option("crf", self.crf, 0, 51 if self.codec == "h264" else 63)
+        check_option("jpeg_quality", self.jpeg_quality, 1, 100)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,21 +139,22 @@ class GenerateConfig:
         self.check_names(self.modules)
         if len({camera_name(name) for name in self.cameras}) != len(self.cameras):
             raise ConfigError(f"A camera is named twice: {' '.join(self.cameras)}.")
-        _check("seed", self.seed, 0, 2**63 - 1)
-        _check("physics-hz", self.physics_hz, 60, MAX_PHYSICS_HZ)
-        _check("fps", self.fps, 1, MAX_PHYSICS_HZ)
+        check_option("seed", self.seed, 0, 2**63 - 1)
+        check_option("physics_hz", self.physics_hz, 60, MAX_PHYSICS_HZ)
+        check_option("fps", self.fps, 1, MAX_PHYSICS_HZ)
         if self.physics_hz % self.fps:
             steps = -(-self.physics_hz // self.fps)  # a frame, rounded up
             other = f", or --physics-hz {steps * self.fps}" if steps * self.fps <= MAX_PHYSICS_HZ else ""
-            raise ConfigError(
-                f"fps is {self.fps}, which does not divide the physics rate of {self.physics_hz} Hz: use "
-                f"{_nearest_divisors(self.physics_hz, self.fps)}{other}."
+            raise OptionError(
+                "fps",
+                f"is {self.fps}, which does not divide the physics rate of {self.physics_hz} Hz: use "
+                f"{_nearest_divisors(self.physics_hz, self.fps)}{other}.",
             )
         for name, value in (("width", self.width), ("height", self.height)):
-            _check(name, value, 16, 8192)
+            check_option(name, value, 16, 8192)
             if value % 2:
-                raise ConfigError(
-                    f"{name} is {value}, but yuv420p video needs even sizes: use {value - 1} or {value + 1}."
+                raise OptionError(
+                    name, f"is {value}, but yuv420p video needs even sizes: use {value - 1} or {value + 1}."
                 )
         if self.width * self.height > MAX_PIXELS:
             raise ConfigError(f"{self.width}x{self.height} is over {MAX_PIXELS} pixels a picture.")
@@ -163,9 +164,9 @@ class GenerateConfig:
                 f"Allowed: {', '.join(PRESET_NAMES)}."
             )
         self.ranges.validate()
-        _check("sampling-block", self.sampling_block, 2, 100_000)
-        _check("max-attempts", self.max_attempts, 1, 100)
-        _check("max-episode-seconds", self.max_episode_seconds, 1.0, 3600.0)
+        check_option("sampling_block", self.sampling_block, 2, 100_000)
+        check_option("max_attempts", self.max_attempts, 1, 100)
+        check_option("max_episode_seconds", self.max_episode_seconds, 1.0, 3600.0)
         self.video.validate()
 
 
@@ -226,8 +227,3 @@ def _nearest_divisors(rate: int, wanted: int) -> str:
     divisors = [n for n in range(1, rate + 1) if rate % n == 0]
     below = [n for n in divisors if n < wanted][-1:]
     return " or ".join(str(n) for n in below + [n for n in divisors if n > wanted][:1])
-
-
-def _check(name: str, value: float, low: float, high: float) -> None:
-    if not low <= value <= high:
-        raise ConfigError(f"{name} is {value}, allowed are {low:g} to {high:g}.")

@@ -26,6 +26,33 @@ class ConfigError(DemorecError):
     exit_code = 2
 
 
+class OptionError(ConfigError):
+    """The value of one option is impossible. Told with the name of the field, as Python and TOML files have it.
+
+    Args:
+        option: Name of the field ("max_attempts").
+        problem: The rest of the sentence ("is 0, allowed are 1 to 100.").
+    """
+
+    def __init__(self, option: str, problem: str) -> None:
+        super().__init__(option, problem)
+
+    def __str__(self) -> str:
+        return " ".join(self.args)
+
+    def of_flag(self) -> str:
+        """The sentence with the name of the flag, for the command line ("--max-attempts is 0, ...")."""
+        option, problem = self.args
+        return f"--{option.replace('_', '-')} {problem}"
+
+
+def check_option(option: str, value: float, low: float, high: float, unit: str = "") -> None:
+    """Raise OptionError unless low <= value <= high."""
+    if not low <= value <= high:
+        least, most = (f"{limit:,}" if isinstance(limit, int) else f"{limit:g}" for limit in (low, high))
+        raise OptionError(option, f"is {value}, allowed are {least} to {most}{unit and ' '}{unit}.")
+
+
 class NotAllowedError(ConfigError):
     """A file names a module from outside of demorec, and the user has not said that it may be run."""
 

@@ -8,25 +8,35 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from multiprocessing import connection
+from multiprocessing import connection, resource_tracker
 from multiprocessing.context import SpawnContext, SpawnProcess
 from typing import Any
 
 _hiding = threading.Lock()
+_starting = threading.Lock()
 
 
 class _Process(SpawnProcess):
     def start(self) -> None:
+        _start_tracker()
         with _main_hidden():
             super().start()
 
     def run(self) -> None:
         threading.Thread(target=_end_with_parent, daemon=True).start()
-        super().run()
+        try:
+            super().run()
+        except KeyboardInterrupt:  # Ctrl-C reaches the whole process group; the parent is the one who tells
+            os._exit(130)
 
 
 class _Context(SpawnContext):
     Process = _Process
+
+    def Lock(self) -> Any:
+        """A lock, as of multiprocessing."""
+        _start_tracker()
+        return super().Lock()
 
 
 SPAWN = _Context()
@@ -35,6 +45,25 @@ SPAWN = _Context()
 They end when the process that started them ends, whatever it dies of. All that they carry out is imported by name: a
 script that calls demorec needs no `if __name__ == "__main__"`, and a worker does not load the command line's libraries.
 """
+
+
+def _start_tracker() -> None:
+    """Start Python's tracker of resources, unless it runs, so that it keeps to itself what it does when we are killed.
+
+    It removes the semaphores that a killed process leaves, and would call them leaked on the terminal.
+    """
+    name = "PYTHONWARNINGS"
+    before = os.environ.get(name)
+    quiet = f"ignore::UserWarning:{resource_tracker.__name__}"
+    with _starting:
+        os.environ[name] = f"{before},{quiet}" if before else quiet
+        try:
+            resource_tracker.ensure_running()
+        finally:
+            if before is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = before
 
 
 def _end_with_parent() -> None:

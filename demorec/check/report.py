@@ -12,7 +12,7 @@ from demorec.check.base import Check, Group, Level, Result, Scope
 from demorec.check.dataset import Dataset
 from demorec.check.episode import RecordedEpisode
 from demorec.check.run import CheckedRun
-from demorec.errors import ConfigError, DemorecError, resource_error
+from demorec.errors import DemorecError, check_option, resource_error
 from demorec.processes import SPAWN
 from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings, find
 from demorec.runs.run_file import DATASET
@@ -44,8 +44,7 @@ class CheckOptions:
         """Raise ConfigError for unknown names or impossible numbers."""
         for name in self.only:
             CHECKS.check_name(name)
-        if not 1 <= self.workers <= 1024:
-            raise ConfigError(f"workers is {self.workers}, allowed are 1 to 1024.")
+        check_option("workers", self.workers, 1, 1024)
 
     def checks(self, scope: Scope) -> list[Check]:
         """Those of a scope, in the order of the table."""

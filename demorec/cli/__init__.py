@@ -1,6 +1,7 @@
 """The command line: one file per command, exit codes, errors as one sentence.
 
-Exit codes: 0 done; 1 it did not work (or a check failed); 2 the request was wrong; 130 interrupted.
+Exit codes: 0 done; 1 it did not work, a check failed, or data are damaged; 2 the request was wrong (an impossible
+option, a missing path, a target that is in the way); 130 interrupted.
 Modules of this package import heavy libraries inside `run` only, so that `--help` is quick.
 """
 
@@ -17,7 +18,7 @@ from typing import Protocol
 
 from demorec.cli.flags import parse, terminal_width
 from demorec.cli.output import PrintableFormatter, say, tell
-from demorec.errors import DemorecError, resource_error
+from demorec.errors import DemorecError, OptionError, resource_error
 from demorec.registry import Registry, nearest_match
 
 
@@ -87,6 +88,9 @@ def run_command(command: type[Command], args: Sequence[str], *, prog: str) -> in
     logging.captureWarnings(True)  # so that Python's warnings, too, come through the formatter
     try:
         return parse_command(command, args, prog=prog).run()
+    except OptionError as error:
+        tell(f"{prog}: {error.of_flag()}")
+        return error.exit_code
     except DemorecError as error:
         tell(f"{prog}: {error}")
         return error.exit_code

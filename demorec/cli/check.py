@@ -13,7 +13,7 @@ from demorec.cli.allow import Allow, allowed_modules
 from demorec.cli.output import say, say_json
 from demorec.cli.paths import places_read
 from demorec.cli.progress import ProgressBar
-from demorec.errors import ConfigError
+from demorec.errors import ConfigError, OptionError
 from demorec.safety.replacing import PICTURE, check_replaceable
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ class Check:
         if not self.paths:
             raise ConfigError("No path is given: name a recording, a run or a dataset, e.g. demorec check recordings.")
         if self.replay < 0:
-            raise ConfigError(f"replay is {self.replay}, it must be 0 or more.")
+            raise OptionError("replay", f"is {self.replay}, it must be 0 or more.")
         if self.coverage_picture is not None:
             self._check_picture(self.coverage_picture)
         from demorec.check.report import CheckOptions, check_subjects, find_subjects

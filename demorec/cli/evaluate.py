@@ -10,7 +10,7 @@ from demorec.cli.allow import Allow, allowed_modules
 from demorec.cli.output import say, say_json
 from demorec.cli.progress import ProgressBar
 from demorec.config import GenerateConfig, VideoConfig
-from demorec.errors import ConfigError
+from demorec.errors import ConfigError, check_option
 
 if TYPE_CHECKING:
     from demorec.evaluate.rollouts import Evaluation
@@ -79,10 +79,9 @@ class Evaluate:
             return self._compare(*self.compare)
         if self.policy is None:
             raise ConfigError("Nothing to evaluate: give --policy FOLDER, or --compare FOLDER FOLDER.")
-        if not 1 <= self.num_episodes <= 1_000_000:
-            raise ConfigError(f"num-episodes is {self.num_episodes}, allowed are 1 to 1000000.")
-        if self.workers is not None and self.workers < 1:
-            raise ConfigError(f"workers is {self.workers}, at least 1 is needed.")
+        check_option("num_episodes", self.num_episodes, 1, 1_000_000)
+        if self.workers is not None:
+            check_option("workers", self.workers, 1, 1024)
         from demorec.evaluate.rollouts import evaluate, settings_for
         from demorec.generate.options import available_cores
         from demorec.loop.actions import check_action_kind

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from tyro.conf import Positional
 
 from demorec.cli.output import say, say_json
-from demorec.errors import ConfigError, ExportError, in_words
+from demorec.errors import ConfigError, ExportError, RecordingError, in_words
 from demorec.lerobot.paths import INFO_PATH
 from demorec.runs.find import Found, expect
 from demorec.safety.text import display_width, printable
@@ -184,7 +184,7 @@ def _dataset(path: Path) -> tuple[dict[str, Any], list[str]]:
             shape = "x".join(map(str, feature["shape"]))
             rows.append((name, str(feature["dtype"]), shape, _names(feature.get("names"))))
     except (OSError, ValueError, KeyError, TypeError, AttributeError, ArithmeticError) as error:
-        raise ConfigError(f"The dataset's info.json is damaged ({in_words(error)}): {file}") from error
+        raise RecordingError(f"The dataset's info.json is damaged ({in_words(error)}): {file}") from error
     return {"kind": "dataset", "path": str(path), "info": info}, [*_aligned(facts), "", *_aligned(rows)]
 
 

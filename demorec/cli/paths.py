@@ -1,4 +1,4 @@
-"""What commands must not write over, since they read it."""
+"""Where commands must not write, since they read it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from pathlib import Path
 
 from demorec.errors import ConfigError
 from demorec.runs.find import EPISODE_FOLDERS, find
-from demorec.runs.run_file import DATASET
+from demorec.runs.run_file import DATASET, EPISODES, FAILED
+from demorec.safety.replacing import use_as_source
 
 
 def places_read(paths: Sequence[Path]) -> list[Path]:
@@ -18,11 +19,22 @@ def places_read(paths: Sequence[Path]) -> list[Path]:
     return [path / DATASET if find(path).kind in EPISODE_FOLDERS else path for path in paths]
 
 
-def refuse_sources(sources: Sequence[Path], targets: Sequence[Path]) -> None:
-    """Raise ConfigError when a recording that is to be made would replace one that the same command reads."""
-    read = {source.resolve() for source in sources}
+def refuse_sources(paths: Sequence[Path], targets: Sequence[Path]) -> None:
+    """Raise ConfigError when a recording that is to be made would lie in, or replace, what the same command reads.
+
+    Args:
+        paths: As the user named them: recordings, runs, folders of recordings, datasets. A run counts as a whole,
+            also where only one of its recordings is named.
+        targets: Of the new recordings.
+    """
+    sources = [run_of(path) or path for path in paths]
     for target in targets:
-        if target.resolve() in read:
-            raise ConfigError(
-                f"The new recording would replace one that this command reads, choose another --out: {target}"
-            )
+        reason = use_as_source(target.resolve(), sources)
+        if reason:
+            raise ConfigError(f"No new recording can be made here, since {reason}: choose another --out: {target}")
+
+
+def run_of(recording: Path) -> Path | None:
+    """The run that a recording belongs to by its place; None for one elsewhere."""
+    folder = recording.resolve().parent
+    return folder.parent if folder.name in (EPISODES, FAILED) else None

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Literal
 from tyro.conf import Positional
 
 from demorec.cli.allow import Allow, allowed_modules
-from demorec.cli.output import say
+from demorec.cli.output import say, tell
 from demorec.cli.paths import refuse_sources
 from demorec.cli.progress import ProgressBar
 from demorec.config import VideoConfig
-from demorec.errors import ConfigError
+from demorec.errors import ConfigError, check_option
 from demorec.processes import SPAWN
 from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings
 from demorec.safety.user_modules import modules_of
@@ -29,8 +29,8 @@ class Render:
     """Draw recordings anew: other cameras, sizes, renderers, looks; every number stays.
 
     Writes new recordings that name their origin. With the recording's own cameras and looks the pictures come out
-    again to the bit, which is checked (exit code 1 when they do not). Cameras may be described in a TOML file, one
-    table each:
+    again to the bit, which is checked (exit code 1 when they do not). The same command again goes on where it stopped.
+    Cameras may be described in a TOML file, one table each:
 
       [side]
       position = [0.5, 0.9, 0.5]
@@ -91,18 +91,26 @@ class Render:
         jobs = _jobs(self.paths, self.out)
         from demorec.generate.options import available_cores
 
-        if self.workers is not None and not 1 <= self.workers <= 1024:
-            raise ConfigError(f"workers is {self.workers}, allowed are 1 to 1024.")
+        if self.workers is not None:
+            check_option("workers", self.workers, 1, 1024)
         workers = min(self.workers or available_cores(), len(jobs))
-        differing = compared = pictures = 0
-        with ProgressBar("rendering", total=len(jobs)) as bar:
-            for report in _rendered(jobs, options, self.overwrite, workers):
-                bar.advance()
-                pictures += report.num_pictures
-                compared += len(report.compared)
-                differing += len(report.differing)
-                for camera, frame in report.differing.items():
-                    say(f"{report.source.name}: camera {camera} differs from the recording at frame {frame}")
+        done = differing = compared = pictures = kept = 0
+        try:
+            with ProgressBar("rendering", total=len(jobs)) as bar:
+                for report in _rendered(jobs, options, self.overwrite, workers):
+                    bar.advance()
+                    done += 1
+                    pictures += report.num_pictures
+                    compared += len(report.compared)
+                    differing += len(report.differing)
+                    kept += report.was_there
+                    for camera, frame in report.differing.items():
+                        say(f"{report.source.name}: camera {camera} differs from the recording at frame {frame}")
+        except KeyboardInterrupt:
+            tell(f"Interrupted: {done} of {len(jobs)} recordings are drawn; the same command goes on: {self.out}")
+            return 130
+        if kept:
+            say(f"{kept} of {len(jobs)} had been drawn before and are kept (--overwrite draws them again).")
         say(f"{len(jobs)} {'recording' if len(jobs) == 1 else 'recordings'}, {pictures} pictures: {self.out}")
         if compared:
             say(f"{compared - differing} of {compared} unchanged cameras give the recorded pictures to the bit.")
@@ -114,8 +122,8 @@ class Render:
 
         if self.renderer is not None:
             RENDERERS.check_name(self.renderer)
-        if self.looks is not None and not 0 <= self.looks < 2**63:
-            raise ConfigError(f"looks is {self.looks}, allowed are 0 to {2**63 - 1}.")
+        if self.looks is not None:
+            check_option("looks", self.looks, 0, 2**63 - 1)
         changes = {
             name: getattr(self, name)
             for name in ("codec", "gop", "crf", "preset", "jpeg_quality")
@@ -154,7 +162,7 @@ def _jobs(paths: Sequence[Path], out: Path) -> list[tuple[Path, Path]]:
     targets = [target for _, target in jobs]
     if len(set(targets)) != len(targets):
         raise ConfigError("Two recordings have the same name and would get into each other's way: render them apart.")
-    refuse_sources([file for file, _ in jobs], targets)
+    refuse_sources(paths, targets)
     return jobs
 
 

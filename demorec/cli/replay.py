@@ -15,7 +15,7 @@ from demorec.cli.allow import Allow, allowed_modules
 from demorec.cli.output import say, say_json, tell
 from demorec.cli.paths import refuse_sources
 from demorec.cli.progress import ProgressBar
-from demorec.errors import ConfigError
+from demorec.errors import ConfigError, OptionError
 from demorec.runs.find import EPISODE_FOLDERS, Found, expect, expect_recordings
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ class Replay:
         if not self.paths:
             raise ConfigError("No path is given: name a recording, a run or a dataset, e.g. demorec replay recordings.")
         if self.tolerance < 0:
-            raise ConfigError(f"tolerance is {self.tolerance}, it must be 0 or more.")
+            raise OptionError("tolerance", f"is {self.tolerance}, it must be 0 or more.")
         from demorec.replay import ReplayOptions, is_as_recorded, replay_all
 
         options = ReplayOptions(
@@ -116,12 +116,12 @@ class Replay:
 
 
 def _check_out(paths: Sequence[Path], out: Path) -> None:
-    """Refuse to write replays over recordings that are replayed, or over each other."""
+    """Refuse to write replays into what is replayed, or over each other."""
     files = [file for path in paths for file in _replayable(path).recordings]
     names = [file.name for file in files]
     if len(set(names)) != len(names):
         raise ConfigError("Two recordings have the same name and would get into each other's way: replay them apart.")
-    refuse_sources(files, [out / name for name in names])
+    refuse_sources(paths, [out / name for name in names] or [out])
 
 
 def demonstrations(

@@ -13,7 +13,7 @@ from tyro.conf import Positional
 from demorec.cli.allow import Allow, allowed_modules
 from demorec.cli.output import say, tell
 from demorec.cli.paths import places_read
-from demorec.errors import ConfigError
+from demorec.errors import ConfigError, check_option
 from demorec.runs.find import expect
 from demorec.safety.replacing import PICTURE, RERUN_FILE, check_replaceable
 from demorec.scene.assets import allow_models
@@ -116,8 +116,8 @@ class View:
     def _validate(self) -> None:
         if self.web and (self.save is not None or self.screenshot is not None):
             raise ConfigError("--web serves until Ctrl-C: give --save or --screenshot in a call of its own.")
-        if self.port is not None and not 0 < self.port < 65536:
-            raise ConfigError(f"--port is {self.port}, allowed are 1 to 65535.")
+        if self.port is not None:
+            check_option("port", self.port, 1, 65535)
         if self.port is not None and not self.web:
             raise ConfigError("--port belongs to --web.")
         if min(self.size) < 200 or max(self.size) > 8192:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.errors import ConfigError, MissingDependencyError, NotAllowedError, in_words
+from demorec.errors import ConfigError, MissingDependencyError, NotAllowedError, OptionError, in_words
 from demorec.lerobot.paths import INFO_PATH
 from demorec.safety.user_modules import is_allowed
 from demorec.scene.features import ActionKind
@@ -131,7 +131,7 @@ class Policy:
         if action_steps is not None:
             chunk = getattr(config, "chunk_size", None)
             if chunk is None or not 1 <= action_steps <= chunk:
-                raise ConfigError(f"action-steps is {action_steps}, allowed are 1 to {chunk} (the policy's chunk).")
+                raise OptionError("action_steps", f"is {action_steps}, allowed are 1 to {chunk} (the policy's chunk).")
             config.n_action_steps = action_steps
             self._policy.config.n_action_steps = action_steps
         self._policy.eval()

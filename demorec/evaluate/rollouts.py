@@ -183,7 +183,7 @@ def evaluate(
 
 
 def load_evaluation(folder: Path) -> Evaluation:
-    """Read evaluation.json; ConfigError where there is none."""
+    """Read evaluation.json; ConfigError where there is none, DemorecError where it is damaged."""
     path = folder / EVALUATION_NAME
     try:
         plain = json.loads(path.read_text())
@@ -191,7 +191,7 @@ def load_evaluation(folder: Path) -> Evaluation:
     except FileNotFoundError as error:
         raise ConfigError(f"No {EVALUATION_NAME}, so this is no output of demorec evaluate: {folder}") from error
     except (OSError, ValueError) as error:
-        raise ConfigError(f"{EVALUATION_NAME} is damaged ({in_words(error)}): {path}") from error
+        raise DemorecError(f"{EVALUATION_NAME} is damaged ({in_words(error)}): {path}") from error
 
 
 def make_rollout(plan: EpisodePlan, folder: Path) -> Attempt:

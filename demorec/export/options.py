@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from demorec.errors import ConfigError
+from demorec.errors import OptionError
 from demorec.scene.features import ACTION, STATE, ActionKind
 
 ProgressCallback = Callable[[int, int], None]
@@ -45,7 +45,7 @@ class CommonOptions:
         """Raise ConfigError for impossible values and combinations."""
         parse_episodes(self.episodes)
         if self.fps is not None and self.fps < 1:
-            raise ConfigError(f"fps is {self.fps}, it must be at least 1.")
+            raise OptionError("fps", f"is {self.fps}, it must be at least 1.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,20 +83,20 @@ def parse_episodes(text: str) -> Callable[[int], bool]:
     """A test of episode numbers from "0:100", "::2", "7" and commas between them; "" takes all.
 
     Raises:
-        ConfigError: Something else.
+        OptionError: Something else.
     """
     parts: list[range] = []
     for part in text.split(",") if text.strip() else []:
         match = re.fullmatch(r"\s*(\d*)(?:(:)(\d*)(?::(\d*))?)?\s*", part)
         if match is None or (not match[2] and not match[1]) or match[4] == "0":
-            raise ConfigError(f"episodes is {text!r}, expected numbers and ranges such as 0:100, ::2 or 3,5,8:10.")
+            raise OptionError("episodes", f"is {text!r}, expected numbers and ranges such as 0:100, ::2 or 3,5,8:10.")
         first = int(match[1] or 0)
         if not match[2]:
             parts.append(range(first, first + 1))
         else:
             parts.append(range(first, int(match[3]) if match[3] else 2**62, int(match[4] or 1)))
         if not parts[-1]:
-            raise ConfigError(f"episodes is {text!r}, but {part.strip()} ends before it begins.")
+            raise OptionError("episodes", f"is {text!r}, but {part.strip()} ends before it begins.")
     if not parts:
         return lambda index: True
     return lambda index: any(index in part for part in parts)

@@ -60,9 +60,9 @@ def goes_in(source: ExportSource, recording: Recording, options: CommonOptions) 
     return source.is_chosen and (success or options.include_failures)
 
 
-def nothing_to_export(num_recordings: int, num_failures: int) -> ExportError:
+def nothing_to_export(num_recordings: int, num_failures: int) -> ConfigError:
     """What to raise when not one recording goes in."""
-    return ExportError(
+    return ConfigError(
         f"Nothing to export: of {num_recordings} recordings, {num_failures} are failed attempts and the "
         "others are not among the wanted episodes (--include-failures, --episodes)."
     )

@@ -18,7 +18,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from demorec.errors import ExportError
+from demorec.errors import ConfigError, ExportError
 from demorec.safety.replacing import Kind, check_replaceable
 
 _RENAME_EXCHANGE = 2
@@ -41,13 +41,13 @@ def staged_folder(target: Path, kind: Kind, *, replace: bool, sources: Iterable[
         sources: What the new folder is made from, which is never replaced.
 
     Raises:
-        ExportError: The target is there and not to be replaced, another export is writing to it, or the disk is full.
-        ConfigError: The target must not be replaced.
+        ConfigError: The target is there and not to be replaced, or another export is writing to it.
+        ExportError: It cannot be written; the disk is full, for example.
     """
     target, sources = Path.cwd() / target, tuple(sources)
 
     def check() -> None:
-        check_replaceable(target, kind, overwrite=replace, sources=sources, already=ExportError)
+        check_replaceable(target, kind, overwrite=replace, sources=sources)
 
     check()
     target = target.resolve()
@@ -81,7 +81,7 @@ def _check_ours(workshop: Path) -> None:
     lock = workshop / _LOCK
     is_marked = lock.is_file() and lock.read_bytes() == _MARK
     if not found <= {NEW, OLD, CODED, _LOCK} or (found - {_LOCK} and not is_marked):
-        raise ExportError(f"This folder was not made by demorec and is in the way, move it elsewhere: {workshop}")
+        raise ConfigError(f"This folder was not made by demorec and is in the way, move it elsewhere: {workshop}")
 
 
 @contextmanager
@@ -94,7 +94,7 @@ def _locked(workshop: Path, target: Path) -> Iterator[None]:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             os.close(handle)
-            raise ExportError(f"Another export is writing this dataset, wait until it is done: {target}") from error
+            raise ConfigError(f"Another export is writing this dataset, wait until it is done: {target}") from error
         # The holder before us may have removed the folder, and its lock file with it, between the two calls.
         if (workshop / _LOCK).exists() and os.path.samestat(os.fstat(handle), (workshop / _LOCK).stat()):
             break

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from demorec.errors import DemorecError, ExportError, resource_error
+from demorec.errors import ConfigError, DemorecError, resource_error
 from demorec.generate.contents import is_dataset_of_run
 from demorec.lerobot import ExportOptions, ExportReport, dataset_digest, export_lerobot
 from demorec.lerobot.inspect import check_tables
@@ -48,7 +48,8 @@ def export_run(
         What run.json says about the dataset now, and the export's own report if it was made just now.
 
     Raises:
-        ExportError: Somebody else's dataset, or a link to nothing, is in the way, or the export failed.
+        ConfigError: Somebody else's dataset, or a link to nothing, is in the way.
+        ExportError: The export failed.
     """
     target = folder / DATASET
     with run_lock(folder):
@@ -56,10 +57,10 @@ def export_run(
         present = run.export
         if os.path.lexists(target):
             if not target.exists():
-                raise ExportError(f"The dataset is a link to something that is not there, mend or remove it: {target}")
+                raise ConfigError(f"The dataset is a link to something that is not there, mend or remove it: {target}")
             if present is None:  # run.json was lost, or the dataset is somebody's
                 if not is_dataset_of_run(target, run.config_digest):
-                    raise ExportError(
+                    raise ConfigError(
                         f"A dataset that this run did not make is in the way: move it elsewhere: {target}"
                     )
             elif not _is_as_made(target, present, run):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from demorec.errors import ConfigError
+from demorec.errors import ConfigError, check_option
 from demorec.lerobot.options import check_repo_id
 from demorec.runs.run_file import MAX_EPISODES
 
@@ -43,12 +43,12 @@ class RunOptions:
 
     def validate(self) -> None:
         """Raise ConfigError for impossible values."""
-        _check("num-episodes", self.num_episodes, 1, MAX_EPISODES)
+        check_option("num_episodes", self.num_episodes, 1, MAX_EPISODES)
         if self.workers is not None:
-            _check("workers", self.workers, 1, 100_000)
-        _check("recycle-after", self.recycle_after, 1, 1_000_000)
-        _check("cpus-per-worker", self.cpus_per_worker, 0.01, 1024)
-        _check("gpus-per-worker", self.gpus_per_worker, 0, 64)
+            check_option("workers", self.workers, 1, 100_000)
+        check_option("recycle_after", self.recycle_after, 1, 1_000_000)
+        check_option("cpus_per_worker", self.cpus_per_worker, 0.01, 1024)
+        check_option("gpus_per_worker", self.gpus_per_worker, 0, 64)
         if self.executor == "local":
             given = [
                 name
@@ -87,8 +87,3 @@ def available_cores() -> int:
     except (OSError, ValueError):
         pass  # no control groups of version 2: the affinity mask is all there is
     return count
-
-
-def _check(name: str, value: float, low: float, high: float) -> None:
-    if not low <= value <= high:
-        raise ConfigError(f"{name} is {value}, allowed are {low:,} to {high:,}.")

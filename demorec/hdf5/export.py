@@ -36,16 +36,15 @@ def export_hdf5(
         progress: Called after every recording.
 
     Raises:
-        ConfigError: Impossible options, or something at `out` that is never replaced.
-        ExportError: Nothing to export, recordings that differ, a file in the way, a full disk. What was at `out` is
-            still there then.
+        ConfigError: Impossible options, or a file in the way.
+        ExportError: Nothing to export, recordings that differ, a full disk. What was at `out` is still there then.
         RecordingError: A recording is damaged, or lacks pictures that were asked for.
     """
     options.validate()
     found = find_recordings(sources, include_failures=options.include_failures)
 
     def check() -> None:
-        check_replaceable(out, DATASET, overwrite=options.overwrite, sources=places_of(found), already=ExportError)
+        check_replaceable(out, DATASET, overwrite=options.overwrite, sources=places_of(found))
 
     check()
     target = out.resolve()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from demorec.errors import ConfigError
+from demorec.errors import OptionError, check_option
 from demorec.export.options import CommonOptions
 
 
@@ -21,6 +21,5 @@ class Hdf5Options(CommonOptions):
         """Raise ConfigError for impossible values."""
         super().validate()
         if not 0 <= self.valid_share < 1:
-            raise ConfigError(f"valid-share is {self.valid_share}, it must be at least 0 and below 1.")
-        if not 0 <= self.compression <= 9:
-            raise ConfigError(f"compression is {self.compression}, it must be from 0 to 9.")
+            raise OptionError("valid_share", f"is {self.valid_share}, it must be at least 0 and below 1.")
+        check_option("compression", self.compression, 0, 9)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from demorec.config import VideoConfig
-from demorec.errors import ConfigError
+from demorec.errors import ConfigError, OptionError
 from demorec.export.options import CommonOptions
 
 
@@ -55,10 +55,10 @@ class ExportOptions(CommonOptions):
         if self.allow_duplicates and not self.append:
             raise ConfigError("--allow-duplicates belongs to --append.")
         if self.workers < 0:
-            raise ConfigError(f"workers is {self.workers}, it must be 0 (as many as pay) or more.")
+            raise OptionError("workers", f"is {self.workers}, it must be 0 (as many as pay) or more.")
         check_repo_id(self.repo_id)
         if self.data_files_mb <= 0 or self.video_files_mb <= 0 or self.files_per_chunk < 1:
-            raise ConfigError("data-files-mb, video-files-mb and files-per-chunk must be above 0.")
+            raise ConfigError("--data-files-mb, --video-files-mb and --files-per-chunk must be above 0.")
         self.transcode.validate()
 
 
@@ -66,7 +66,8 @@ def check_repo_id(repo_id: str) -> None:
     """Raise ConfigError for what cannot be OWNER/NAME on the Hub; LeRobot takes a dataset's name apart at the slash."""
     word = r"(?!.*(?:--|\.\.))[A-Za-z0-9_](?:[A-Za-z0-9_.-]*[A-Za-z0-9_])?"
     if len(repo_id) > 96 or repo_id.endswith(".git") or not re.fullmatch(f"{word}/{word}", repo_id):
-        raise ConfigError(
-            f"repo-id is {repo_id!r}, but must be OWNER/NAME, for example me/cubes, of letters, digits and underscores "
-            "with single dots and dashes between them."
+        raise OptionError(
+            "repo_id",
+            f"is {repo_id!r}, but must be OWNER/NAME, for example me/cubes, of letters, digits and underscores "
+            "with single dots and dashes between them.",
         )

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from demorec.errors import ConfigError
+from demorec.errors import ConfigError, OptionError
 from demorec.playback.episode import PlayedEpisode
 from demorec.playback.from_dataset import dataset_episodes, open_dataset_episode
 from demorec.playback.from_recording import open_recording
@@ -33,7 +33,7 @@ def find_episodes(paths: Sequence[Path], *, include_failures: bool = False) -> l
 
     Raises:
         ConfigError: A path is not there, or holds nothing that can be shown.
-        RecordingError: A dataset cannot be read.
+        RecordingError: A recording is unfinished, or a dataset cannot be read.
     """
     if not paths:
         raise ConfigError("No path is given: name a recording, a run or a dataset, e.g. demorec view recordings.")
@@ -79,7 +79,7 @@ def select(sources: Sequence[PlaybackSource], episodes: str) -> list[PlaybackSou
             low = int(first or 0)
             high = (int(last) if last else len(sources)) if colon else low + 1
         except ValueError as error:
-            raise ConfigError(f"--episodes is {episodes!r}, expected numbers and ranges like 7 or 0:20.") from error
+            raise OptionError("episodes", f"is {episodes!r}, expected numbers and ranges like 7 or 0:20.") from error
         part = list(sources[low:high]) if 0 <= low < high else []
         if not part:
             raise ConfigError(f"--episodes {word}: there are {len(sources)} episodes, numbered from 0.")

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import foxglove
 from foxglove.mcap import MCAPCompression, MCAPWriteOptions
 from foxglove.messages import CompressedVideo
 
-from demorec.errors import RecordingError
+from demorec.errors import ConfigError, RecordingError
 from demorec.recording import messages
 from demorec.recording.ros2 import DEFINITIONS
 from demorec.safety.replacing import RECORDING, check_replaceable, lock_part
@@ -89,8 +89,8 @@ class PartFile:
             so that it is replaced whether or not that is asked for.
 
     Raises:
-        RecordingError: A file of that name, or an unfinished one, is there already; or it cannot be written.
-        ConfigError: What is there is no recording, which is not replaced by one.
+        ConfigError: A file of that name, or an unfinished one, is there already and not to be replaced.
+        RecordingError: It cannot be written.
     """
 
     def __init__(
@@ -105,10 +105,10 @@ class PartFile:
         self._check_free()
         try:
             # Held until the file has its name or is left: no other process takes it for what a dead one left.
-            self._lock: int | None = lock_part(self.part, RECORDING, refused=RecordingError)
+            self._lock: int | None = lock_part(self.part, RECORDING)
             try:
                 if os.fstat(self._lock).st_size and not overwrite and not is_worthless(self.part):
-                    raise RecordingError(
+                    raise ConfigError(
                         "An unfinished recording of that name is there already; recover it, delete it, or --overwrite: "
                         f"{self.part}"
                     )
@@ -132,11 +132,11 @@ class PartFile:
         self._is_open = True
 
     def _check_free(self) -> None:
-        check_replaceable(self.path, RECORDING, overwrite=self._overwrite, already=RecordingError)
+        check_replaceable(self.path, RECORDING, overwrite=self._overwrite)
 
     def _unwritable(self, error: Exception) -> RecordingError:
         reason = error.strerror if isinstance(error, OSError) else str(error)
-        return RecordingError(f"The recording cannot be written ({reason}): {self.part}")
+        return RecordingError(f"The recording cannot be written ({reason}): {self.path}")
 
     def log(self, topic: str, schema: str, data: bytes, time_ns: int, *, latched: bool = False) -> None:
         """Add a message; every topic has one type."""
@@ -211,11 +211,19 @@ class PartFile:
                 os.close(self._lock)
                 self._lock = None
 
+    def discard(self) -> None:
+        """Give it up and remove what was written; harmless when called twice, and after `publish`."""
+        if self._lock is not None:
+            self.part.unlink(missing_ok=True)  # while the lock is held: nobody else's file has that name
+        with suppress(RecordingError):
+            self.close()
+
     def publish(self) -> None:
         """End the file and give it its name.
 
         Raises:
-            RecordingError: A file of that name has appeared meanwhile, or the disk is full.
+            ConfigError: A file of that name has appeared meanwhile.
+        RecordingError: The disk is full.
         """
         try:
             self.end()

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from demorec.errors import RecordingError, resource_error
+from demorec.errors import ConfigError, RecordingError, resource_error
 from demorec.recording import channels, messages, metadata
 from demorec.recording.container import SalvagedMessage, SalvagedMetadata, salvage
 from demorec.recording.part_file import PartFile
@@ -44,10 +44,11 @@ def recover(source: Path, target: Path, *, overwrite: bool = False) -> Recovered
     """Write an indexed recording of all whole frames of `source`, which stays as it is.
 
     Raises:
-        RecordingError: Not one frame could be kept, `target` is there already, or a file cannot be read or written.
+        ConfigError: `target` is `source`, or is there already.
+        RecordingError: Not one frame could be kept, or a file cannot be read or written.
     """
     if source.resolve() == target.resolve():
-        raise RecordingError(f"The recovered recording needs another name than the damaged one: {source}")
+        raise ConfigError(f"The recovered recording needs another name than the damaged one: {source}")
     try:
         survey = _survey(source)
     except RecordingError as error:
@@ -80,8 +81,9 @@ def recover(source: Path, target: Path, *, overwrite: bool = False) -> Recovered
         with Recording(part) as recording:
             recording.columns()  # a recovered file that cannot be read would be worse than none
         file.publish()
-    finally:
-        file.close()
+    except BaseException:
+        file.discard()  # it holds nothing that the source does not
+        raise
     return Recovered(
         path=target,
         num_frames=survey.num_frames,
@@ -106,7 +108,7 @@ def can_be_made_again(part: Path, *, origin: str) -> bool:
             return item == "the end is missing"  # after nothing: the writer was killed before the first frame
         if item is not None:
             return False
-    return False
+    return True  # it ended in order, before the first frame
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from demorec.config import VideoConfig
-from demorec.errors import RecordingError
+from demorec.errors import ConfigError, RecordingError
 from demorec.recording.scheduling import ordinary_scheduling
 
 Rgb = NDArray[np.uint8]
@@ -145,7 +145,7 @@ class _StreamEncoder:
             with ordinary_scheduling():
                 context.open()
         except (av.FFmpegError, ValueError) as error:
-            raise RecordingError(
+            raise ConfigError(
                 f"The video encoder {encoder} does not start with {width}x{height} pixels, crf {self.settings.crf}, "
                 f"preset {self.settings.preset} ({error}): choose another preset, or --codec jpeg."
             ) from error

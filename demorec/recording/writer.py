@@ -73,10 +73,9 @@ class EpisodeWriter:
         overwrite: Whether a recording of that name may be replaced.
 
     Raises:
-        RecordingError: The file, or an unfinished one of that name, is there already; or it cannot be written; or the
-            robot's joints are not those of its URDF. What a killed replay or rendering of the same recording left is
-            replaced.
-        ConfigError: To be overwritten is what is no recording.
+        ConfigError: The file, or an unfinished one of that name, is there already and not to be replaced. What a killed
+            replay or rendering of the same recording left is replaced.
+        RecordingError: It cannot be written, or the robot's joints are not those of its URDF.
     """
 
     def __init__(
@@ -211,8 +210,8 @@ class EpisodeWriter:
         """Write the rest, make the file durable and give it its name.
 
         Raises:
-            RecordingError: The outcome speaks of another number of frames, a file of that name has appeared
-                meanwhile, or the disk is full.
+            ConfigError: A file of that name has appeared meanwhile.
+            RecordingError: The outcome speaks of another number of frames, or the disk is full.
         """
         if outcome.num_frames != self._num_frames:
             raise RecordingError(f"The outcome has {outcome.num_frames} frames, the recording {self._num_frames}.")

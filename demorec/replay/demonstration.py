@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from demorec.errors import ConfigError, RecordingError
+from demorec.errors import ConfigError, OptionError, RecordingError, check_option
 from demorec.geometry import Array
 from demorec.recording import Recording
 from demorec.recording.frames import frames_of
@@ -39,10 +39,8 @@ class ReplayOptions:
 
     def validate(self) -> None:
         """Raise ConfigError for impossible values and combinations."""
-        if not 0.0 <= self.noise <= 1.0:
-            raise ConfigError(f"noise is {self.noise}, allowed are 0 to 1 rad.")
-        if not 0 <= self.delay <= 1000:
-            raise ConfigError(f"delay is {self.delay}, allowed are 0 to 1000 steps.")
+        check_option("noise", self.noise, 0, 1, "rad")
+        check_option("delay", self.delay, 0, 1000, "steps")
         if self.states and (self.noise or self.delay or self.export_hz):
             raise ConfigError("--states sends no commands: leave out --noise, --delay and --export-hz.")
 
@@ -113,7 +111,7 @@ def open_demonstration(recording: Recording, options: ReplayOptions) -> Demonstr
     fps = options.export_hz or info.fps
     if info.fps % fps:
         divisors = ", ".join(str(n) for n in range(1, info.fps + 1) if info.fps % n == 0)
-        raise ConfigError(f"export-hz is {fps}, which does not divide the recording's {info.fps}: use {divisors}.")
+        raise OptionError("export_hz", f"is {fps}, which does not divide the recording's {info.fps}: use {divisors}.")
     stride = info.fps // fps
     rows = np.arange(0, columns.num_frames, stride)
     # As the export does: where the arm shall be when the next observation is taken.

@@ -67,8 +67,7 @@ def record_replay(
     """Replay and record it, with pictures of the recording's cameras, into a file of the same name in `out`.
 
     Raises:
-        ConfigError: The new recording would replace the one that is replayed.
-        RecordingError: A recording of that name is there already.
+        ConfigError: The new recording would replace the one that is replayed, or one of that name is there already.
     """
     d = demonstration
     path = out / (d.name if d.source is not None else f"{d.name}.mcap")

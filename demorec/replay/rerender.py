@@ -18,7 +18,7 @@ from demorec.config import EpisodePlan, GenerateConfig, VideoConfig, read_toml
 from demorec.errors import ConfigError, DemorecError, NotAllowedError, RecordingError
 from demorec.geometry import Pose, look_at
 from demorec.loop import prepare
-from demorec.plain import digest, from_plain
+from demorec.plain import digest, from_plain, to_json
 from demorec.recording import EpisodeWriter, Recording
 from demorec.recording.frames import frames_of
 from demorec.registry import nearest_match
@@ -144,6 +144,7 @@ class RerenderReport:
         compared: Cameras whose coded pictures were compared with the recorded ones, because nothing about them was
             to change.
         differing: Of these, camera -> first frame whose packet differs.
+        was_there: Whether an earlier call had drawn it, so that nothing was drawn now.
     """
 
     source: Path
@@ -152,6 +153,7 @@ class RerenderReport:
     num_pictures: int
     compared: tuple[str, ...] = ()
     differing: Mapping[str, int] = field(default_factory=dict)
+    was_there: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -287,17 +289,17 @@ def drawing_config(info: EpisodeInfo, options: RerenderOptions) -> dict[str, Any
 
 
 def rerender(source: Path, out: Path, options: RerenderOptions, *, overwrite: bool = False) -> RerenderReport:
-    """Draw a recording anew.
+    """Draw a recording anew, unless `out` is what the same call has made before.
 
     Args:
         source: The recording.
         out: The file to be made.
         options: What is to change.
-        overwrite: Whether `out` may be replaced.
+        overwrite: Whether `out` may be replaced; it is drawn then, whatever is there.
 
     Raises:
-        RecordingError: The source is damaged or empty, or `out` is there already.
-        ConfigError: The options cannot be.
+        RecordingError: The source is damaged or empty.
+        ConfigError: The options cannot be, or something else is at `out` already.
         SceneError: A model file of the scene is missing or broken.
         RenderError: The renderer cannot draw the scene.
     """
@@ -319,20 +321,22 @@ def rerender(source: Path, out: Path, options: RerenderOptions, *, overwrite: bo
             config_digest=digest(config),
             origin=f"render of {recording.digest()[:16]}",
         )
-        make_folder(out.parent)
-        world = RecordedWorld(
-            info.robot, view.scene, joint_position=columns.joint_position, object_poses=columns.object_poses
-        )
-        with (
-            RENDERERS.load(str(config.get("renderer", "raster")))() as renderer,
-            EpisodeWriter(out, new_info, video=video, overwrite=overwrite) as writer,
-        ):
-            painter = view_painter(renderer, view, config)
-            painter.setup(world)
-            for frame in frames_of(recording, columns):
-                world.frame = frame.frame_index
-                writer.write(replace(frame, images=painter.images()))
-            writer.finish(_outcome(recording))
+        was_there = not overwrite and _is_drawn(out, new_info, _outcome(recording))
+        if not was_there:
+            make_folder(out.parent)
+            world = RecordedWorld(
+                info.robot, view.scene, joint_position=columns.joint_position, object_poses=columns.object_poses
+            )
+            with (
+                RENDERERS.load(str(config.get("renderer", "raster")))() as renderer,
+                EpisodeWriter(out, new_info, video=video, overwrite=overwrite) as writer,
+            ):
+                painter = view_painter(renderer, view, config)
+                painter.setup(world)
+                for frame in frames_of(recording, columns):
+                    world.frame = frame.frame_index
+                    writer.write(replace(frame, images=painter.images()))
+                writer.finish(_outcome(recording))
         compared, differing = _compare(recording, out, options)
     return RerenderReport(
         source=source,
@@ -341,7 +345,21 @@ def rerender(source: Path, out: Path, options: RerenderOptions, *, overwrite: bo
         num_pictures=columns.num_frames * len(view.scene.cameras),
         compared=compared,
         differing=differing,
+        was_there=was_there,
     )
+
+
+def _is_drawn(out: Path, info: EpisodeInfo, outcome: Outcome) -> bool:
+    """Whether a whole recording is there whose description is the one that would be written now.
+
+    The description holds the digest of the source, the cameras, the looks and every option of the drawing.
+    """
+    try:
+        with Recording(out) as drawn:
+            is_same = to_json(drawn.info) == to_json(info) and drawn.outcome == outcome
+            return is_same and bool(drawn.digest())  # which reads it to its end, against its checksums
+    except RecordingError:
+        return False
 
 
 def _outcome(recording: Recording) -> Outcome:

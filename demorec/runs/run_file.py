@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from demorec.config import GenerateConfig
-from demorec.errors import ConfigError, resource_error
+from demorec.errors import ConfigError, DemorecError, resource_error
 from demorec.plain import digest, from_plain, to_plain
 from demorec.safety.files import open_regular, read_json_limited
 
@@ -35,7 +35,7 @@ _MAX_REASON = 1000
 """Characters of a reason: it may name many keys, and quotes what the file holds."""
 
 
-class DamagedRunFileError(ConfigError):
+class DamagedRunFileError(DemorecError):
     """run.json is there but cannot be read; the recordings tell what it held."""
 
 

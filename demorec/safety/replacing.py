@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from demorec.errors import ConfigError, DemorecError
+from demorec.errors import ConfigError
 from demorec.safety.files import MCAP_MAGIC, RERUN_MAGICS
 
 _SHOWN = 5
@@ -67,7 +67,6 @@ def check_replaceable(
     *,
     overwrite: bool,
     sources: Iterable[Path] = (),
-    already: type[DemorecError] = ConfigError,
 ) -> None:
     """Raise unless `target` is free, or may be replaced by something of its kind and the user asks for that.
 
@@ -78,10 +77,9 @@ def check_replaceable(
         kind: What is made there.
         overwrite: Whether the user asks for replacing.
         sources: What the command reads; neither it nor what holds it is replaced, nor anything in it.
-        already: The error where something is there and the user does not ask for replacing.
 
     Raises:
-        ConfigError: What is there must not be replaced, whatever the user asks for.
+        ConfigError: Something is there, and the user does not ask for replacing it, or it must never be replaced.
     """
     if not os.path.lexists(target):
         return
@@ -94,8 +92,8 @@ def check_replaceable(
         return
     if not overwrite:
         if reason:
-            raise already(f"Something is there already, and not to be replaced, since {reason}: {target}")
-        raise already(f"{kind.name[0].upper()}{kind.name[1:]} is there already: {kind.advice}: {target}")
+            raise ConfigError(f"Something is there already, and not to be replaced, since {reason}: {target}")
+        raise ConfigError(f"{kind.name[0].upper()}{kind.name[1:]} is there already: {kind.advice}: {target}")
     if reason:
         raise ConfigError(f"This is never replaced, since {reason}: choose another name: {target}")
 
@@ -244,30 +242,30 @@ def _put_back(folder: Path, names: Sequence[str]) -> None:
     aside.rmdir()
 
 
-def lock_part(part: Path, kind: Kind, *, refused: type[DemorecError] = ConfigError) -> int:
+def lock_part(part: Path, kind: Kind) -> int:
     """Open an unfinished file for writing, locked until the descriptor is closed or the process dies.
 
     What a dead process left there stays as it is; the caller decides about it.
 
     Raises:
-        ConfigError: Another process is writing it, or it is none of ours; `refused` names another class.
+        ConfigError: Another process is writing it, or it is none of ours.
         OSError: It cannot be written.
     """
     while True:
         if os.path.lexists(part) and (part.is_symlink() or not part.is_file()):
-            raise refused(f"This is no unfinished file and is in the way, move it elsewhere: {part}")
+            raise ConfigError(f"This is no unfinished file and is in the way, move it elsewhere: {part}")
         handle = os.open(part, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
         try:
             try:
                 fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:
-                raise refused(f"Another process is writing this file, wait until it is done: {part}") from error
+                raise ConfigError(f"Another process is writing this file, wait until it is done: {part}") from error
             # The owner before us may have given the file its final name between the two calls.
             if not part.exists() or not os.path.samestat(os.fstat(handle), part.stat()):
                 os.close(handle)
                 continue
             if os.fstat(handle).st_size and not kind.recognises(part):
-                raise refused(f"This is not the unfinished beginning of {kind.name}, move it elsewhere: {part}")
+                raise ConfigError(f"This is not the unfinished beginning of {kind.name}, move it elsewhere: {part}")
             return handle
         except BaseException:
             os.close(handle)

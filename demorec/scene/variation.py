@@ -13,7 +13,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from demorec.errors import ConfigError
+from demorec.errors import OptionError
 
 Range = tuple[float, float]
 Preset = Literal["none", "mild", "full"]
@@ -114,7 +114,7 @@ class Ranges:
         return float(rng.uniform(*self.range(name)))
 
     def validate(self) -> None:
-        """Raise ConfigError for a range that is upside down or beyond what makes sense."""
+        """Raise OptionError for a range that is upside down or beyond what makes sense."""
         for field in fields(self):
             value = getattr(self, field.name)
             if value is None:
@@ -123,8 +123,8 @@ class Ranges:
             pair = value if isinstance(value, tuple) else (value, value)
             if not (low <= pair[0] <= pair[1] <= high):
                 what = f"from {pair[0]:g} to {pair[1]:g}" if isinstance(value, tuple) else f"{value:g}"
-                raise ConfigError(
-                    f"The range {field.name} is {what}; it must lie within {low:g} to {high:g}, the lower end first."
+                raise OptionError(
+                    field.name, f"is {what}; it must lie within {low:g} to {high:g}, the lower end first."
                 )
 
 

@@ -68,7 +68,7 @@ def test_a_mistake_is_told_in_one_sentence(
 def test_a_dataset_in_the_way(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "d").mkdir()
     (tmp_path / "d" / "thesis.txt").write_text("years of work")
-    assert demorec("export", "lerobot", run, "--out", tmp_path / "d", "--no-verify") == 1
+    assert demorec("export", "lerobot", run, "--out", tmp_path / "d", "--no-verify") == 2
     assert "--overwrite" not in capsys.readouterr().err  # it would not help
     assert demorec("export", "lerobot", run, "--out", tmp_path / "d", "--no-verify", "--overwrite") == 2
     assert "it is not a LeRobot dataset" in capsys.readouterr().err

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import resource
 from pathlib import Path
 
 import pytest
@@ -90,7 +91,7 @@ def test_info_of_a_dataset(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     assert "90 (3.0 s at 30 Hz)" in text
     assert "j0 .. j7" in text
     (tmp_path / "meta" / "info.json").write_text("{}")
-    assert run("info", tmp_path) == 2
+    assert run("info", tmp_path) == 1
     assert "info.json is damaged" in capsys.readouterr().err
 
 
@@ -136,7 +137,7 @@ def test_recover(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert sorted(path.name for path in tmp_path.iterdir()) == ["c.mcap", "c.mcap.part"]
     assert run("info", tmp_path / "c.mcap") == 0
     assert "unknown: recovered after a crash" in capsys.readouterr().out
-    assert run("recover", part) == 1
+    assert run("recover", part) == 2
     assert "there already" in capsys.readouterr().err
     assert run("recover", part, "--overwrite") == 0
     assert run("recover", part, "--out", tmp_path / "d.mcap") == 0
@@ -152,6 +153,20 @@ def test_recovering_a_complete_file_keeps_everything(
     with Recording(source) as one, Recording(tmp_path / "a.recovered.mcap") as other:
         assert one.digest() == other.digest()
         assert one.pixel_statistics("front").counts.tolist() == other.pixel_statistics("front").counts.tolist()
+
+
+def test_recovering_onto_a_full_disk_leaves_nothing(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    target = tmp_path / "kept.mcap"
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2000, before[1]))
+    try:
+        assert run("recover", folder / "a.mcap", "--out", target) == 1
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert capsys.readouterr().err == (f"demorec recover: The recording cannot be written (File too large): {target}\n")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_recover_of_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

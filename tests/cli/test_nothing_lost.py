@@ -94,7 +94,7 @@ def test_export_replaces_nothing_but_a_dataset(place: Path, capsys: pytest.Captu
     said = capsys.readouterr().err
     assert TARGETS[target] in said
     assert len(said.splitlines()) == 1
-    assert demorec(*arguments) == 1  # and without the flag nobody is told to use it
+    assert demorec(*arguments) == 2  # and without the flag nobody is told to use it
     assert "--overwrite" not in capsys.readouterr().err
     assert files_of(place.parent) == before
 
@@ -136,7 +136,7 @@ def test_a_workshop_of_somebody_else_is_left_alone(place: Path, capsys: pytest.C
     (workshop / "new").mkdir(parents=True)
     (workshop / "new" / "chapter_2.tex").write_text("years of work")
     before = files_of(place)
-    assert demorec("export", "lerobot", place / "runs/run", "--out", place / "new", "--no-verify") == 1
+    assert demorec("export", "lerobot", place / "runs/run", "--out", place / "new", "--no-verify") == 2
     assert "not made by demorec" in capsys.readouterr().err
     assert files_of(place) == before
 
@@ -315,11 +315,10 @@ def test_recover_replaces_recordings_only(place: Path, capsys: pytest.CaptureFix
     (place / "broken.mcap").write_bytes((place / "alone.mcap").read_bytes()[:-500])
     before = files_of(place.parent)
     for target in ("thesis.tex", "thesis", "link_to_thesis", "link_to_nothing", "broken.mcap"):
-        code = demorec("recover", place / "broken.mcap", "--out", place / target, "--overwrite")
-        assert code == (1 if target == "broken.mcap" else 2), target
+        assert demorec("recover", place / "broken.mcap", "--out", place / target, "--overwrite") == 2, target
         assert len(capsys.readouterr().err.splitlines()) == 1
     (place / "x.mcap.recovering").write_text("years of work")
-    assert demorec("recover", place / "broken.mcap", "--out", place / "x.mcap") == 1
+    assert demorec("recover", place / "broken.mcap", "--out", place / "x.mcap") == 2
     assert files_of(place.parent) == {**before, "home/x.mcap.recovering": b"years of work"}
     assert demorec("recover", place / "broken.mcap", "--out", place / "alone.mcap", "--overwrite") == 0
 
@@ -341,9 +340,12 @@ def test_render_and_replay_never_replace_what_they_read(
         ((place / "link",), copy),
         ((place / "alone.mcap", copy / "second.mcap"), copy),
         ((place / "runs/run", copy), copy),
+        ((place / "runs/run",), place / "runs/run"),
+        ((place / "runs/run",), place / "runs/run/new"),
+        ((place / "runs/run/episodes/episode_000000.mcap",), place / "runs/run"),
     ):
         assert demorec(command, *sources, "--out", out, "--overwrite") == 2
-        assert "that this command reads" in capsys.readouterr().err
+        assert "this command reads" in capsys.readouterr().err
     assert files_of(place.parent) == before
 
 

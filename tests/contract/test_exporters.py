@@ -61,7 +61,7 @@ def test_the_same_recordings_give_the_same_bytes(exporter: str, run: Path, tmp_p
 def test_a_dataset_is_replaced_only_when_asked_for(exporter: str, run: Path, tmp_path: Path) -> None:
     export(run, tmp_path / "d", exporter, episodes="0")
     before = content(tmp_path / "d")
-    with pytest.raises(ExportError, match="is there already"):
+    with pytest.raises(ConfigError, match="is there already"):
         export(run, tmp_path / "d", exporter)
     assert content(tmp_path / "d") == before
     assert export(run, tmp_path / "d", exporter, overwrite=True).num_episodes == 3
@@ -88,7 +88,7 @@ def test_what_is_no_dataset_is_never_replaced(exporter: str, run: Path, tmp_path
 @pytest.mark.parametrize(
     ("options", "error", "message"),
     [
-        ({"episodes": "7"}, ExportError, "Nothing to export"),
+        ({"episodes": "7"}, ConfigError, "Nothing to export"),
         ({"episodes": "x"}, ConfigError, "0:100"),
         ({"fps": 7}, ConfigError, "does not divide"),
         ({"fps": 0}, ConfigError, "at least 1"),

@@ -31,7 +31,7 @@ from demorec.scene.episode import frame_time_ns
         ({"height": 0}, "height is 0"),
         ({"width": 8000, "height": 8000}, "pixels a picture"),
         ({"seed": -1}, "seed is -1"),
-        ({"max_attempts": 0}, "max-attempts is 0"),
+        ({"max_attempts": 0}, "max_attempts is 0"),
         ({"video": VideoConfig(crf=99)}, "crf is 99"),
         ({"video": VideoConfig(gop=0)}, "gop is 0"),
         ({"video": VideoConfig(codec="jpeg", jpeg_quality=0)}, "quality is 0"),

@@ -244,7 +244,7 @@ def test_empty_episode_ranges(text: str) -> None:
 def test_chosen_episodes(run: Path, tmp_path: Path) -> None:
     export(run, tmp_path / "d", episodes="1,3")
     assert [row["length"] for row in episode_rows(tmp_path / "d")] == [15, 9]
-    with pytest.raises(ExportError, match="Nothing to export"):
+    with pytest.raises(ConfigError, match="Nothing to export"):
         export(run, tmp_path / "e", episodes="90:")
     assert not (tmp_path / "e").exists()
 
@@ -278,7 +278,7 @@ def test_a_dataset_in_the_way_stays(run: Path, tmp_path: Path) -> None:
     out = tmp_path / "d"
     export(run, out, episodes="0")
     before = files_of(out)
-    with pytest.raises(ExportError, match=r"--append, --overwrite"):
+    with pytest.raises(ConfigError, match=r"--append, --overwrite"):
         export(run, out)
     assert files_of(out) == before
     export(run, out, overwrite=True)

@@ -11,7 +11,7 @@ import pytest
 from support.export import export, files_of, make_run
 
 from demorec.config import GenerateConfig, deciding_versions
-from demorec.errors import ExportError
+from demorec.errors import ConfigError
 from demorec.generate import export_step
 from demorec.generate.export_step import export_run
 from demorec.lerobot import ExportOptions, dataset_digest
@@ -105,7 +105,7 @@ def test_after_a_kill_in_the_export_only_the_runs_own_dataset_is_replaced(run: P
 def test_a_link_to_nothing_is_told(run: Path) -> None:
     shutil.rmtree(run / "dataset")
     (run / "dataset").symlink_to(run / "nowhere")
-    with pytest.raises(ExportError, match="a link to something that is not there"):
+    with pytest.raises(ConfigError, match="a link to something that is not there"):
         export_run(run, repo_id="me/cubes")
     assert (run / "dataset").is_symlink()
 
@@ -115,7 +115,7 @@ def test_a_dataset_of_somebody_else_is_left_alone(run: Path) -> None:
     plain["export"] = None
     (run / "run.json").write_text(json.dumps(plain))
     before = files_of(run / "dataset")
-    with pytest.raises(ExportError, match="did not make"):
+    with pytest.raises(ConfigError, match="did not make"):
         export_run(run, repo_id="me/cubes")
     assert files_of(run / "dataset") == before
 
@@ -136,6 +136,6 @@ def test_a_dataset_of_other_episodes_is_left_alone_when_the_run_file_was_lost(ru
     configs.write_text(json.dumps({**json.loads(configs.read_text()), "0" * 16: {}}))
     before = files_of(run / "dataset")
     save_run_file(replace(load_run_file(run), export=None), run)
-    with pytest.raises(ExportError, match="in the way"):
+    with pytest.raises(ConfigError, match="in the way"):
         export_run(run, repo_id="me/cubes")
     assert files_of(run / "dataset") == before

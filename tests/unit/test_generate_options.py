@@ -14,11 +14,11 @@ from demorec.generate.options import RunOptions, available_cores, default_out, d
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"num_episodes": 0}, "num-episodes is 0, allowed are 1 to"),
+        ({"num_episodes": 0}, "num_episodes is 0, allowed are 1 to"),
         ({"workers": 0}, "workers is 0"),
-        ({"recycle_after": 0}, "recycle-after is 0"),
-        ({"cpus_per_worker": 0.0}, "cpus-per-worker is 0"),
-        ({"gpus_per_worker": -1.0}, "gpus-per-worker is -1"),
+        ({"recycle_after": 0}, "recycle_after is 0"),
+        ({"cpus_per_worker": 0.0}, "cpus_per_worker is 0"),
+        ({"gpus_per_worker": -1.0}, "gpus_per_worker is -1"),
         ({"address": "auto"}, "--address is for Ray: add --executor ray"),
         ({"gpus_per_worker": 1.0}, "--gpus-per-worker is for Ray"),
         ({"repo_id": "cubes"}, "must be OWNER/NAME"),

@@ -11,7 +11,7 @@ import pytest
 from support.recording import make_episode, write_episode
 
 from demorec.config import VideoConfig
-from demorec.errors import RecordingError
+from demorec.errors import ConfigError, RecordingError
 from demorec.recording import EpisodeWriter, Recording, part_file, recover
 from demorec.scene.episode import Event, Frame, Outcome
 
@@ -31,7 +31,7 @@ def test_nothing_is_overwritten(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     path.write_bytes(b"mine")
     info, _, _ = make_episode(num_frames=1)
-    with pytest.raises(RecordingError, match="there already"):
+    with pytest.raises(ConfigError, match="there already"):
         EpisodeWriter(path, info)
     assert path.read_bytes() == b"mine"
     assert names(tmp_path) == ["a.mcap"]
@@ -41,7 +41,7 @@ def test_an_unfinished_recording_is_not_overwritten(tmp_path: Path) -> None:
     part = tmp_path / "a.mcap.part"
     part.write_bytes(b"what a crash left")
     info, _, _ = make_episode(num_frames=1)
-    with pytest.raises(RecordingError, match="unfinished"):
+    with pytest.raises(ConfigError, match="unfinished"):
         EpisodeWriter(tmp_path / "a.mcap", info)
     assert part.read_bytes() == b"what a crash left"
 
@@ -52,7 +52,7 @@ def test_a_file_that_appears_meanwhile_is_not_overwritten(tmp_path: Path) -> Non
     with EpisodeWriter(path, info) as writer:
         write_all(writer, frames)
         path.write_bytes(b"mine")
-        with pytest.raises(RecordingError, match="there already"):
+        with pytest.raises(ConfigError, match="there already"):
             writer.finish(outcome)
     assert path.read_bytes() == b"mine"
     recover(tmp_path / "a.mcap.part", tmp_path / "b.mcap")
@@ -149,7 +149,7 @@ def test_an_impossible_preset_is_told_in_one_sentence(tmp_path: Path) -> None:
     info, frames, _ = make_episode(num_frames=1)
     with (
         EpisodeWriter(tmp_path / "a.mcap", info, video=VideoConfig(preset="quickest")) as writer,
-        pytest.raises(RecordingError, match=r"libx264 .* preset quickest") as caught,
+        pytest.raises(ConfigError, match=r"libx264 .* preset quickest") as caught,
     ):
         writer.write(frames[0])
     assert "\n" not in str(caught.value)
@@ -203,7 +203,7 @@ def test_what_a_killed_rendering_left_is_replaced_by_the_same_rendering(tmp_path
 def test_what_cannot_be_made_again_by_the_same_command_stays(tmp_path: Path, left: str, new: str) -> None:
     before = leftover(tmp_path, left)
     info, _, _ = make_episode(num_frames=5, cameras=())
-    with pytest.raises(RecordingError, match="unfinished recording"):
+    with pytest.raises(ConfigError, match="unfinished recording"):
         EpisodeWriter(tmp_path / "a.mcap", replace(info, origin=new))
     assert (tmp_path / "a.mcap.part").read_bytes() == before
 
@@ -214,7 +214,7 @@ def test_what_another_process_is_writing_is_left_alone(tmp_path: Path) -> None:
     with EpisodeWriter(tmp_path / "a.mcap", info) as writer:
         write_all(writer, frames)
         for overwrite in (False, True):
-            with pytest.raises(RecordingError, match="Another process is writing"):
+            with pytest.raises(ConfigError, match="Another process is writing"):
                 EpisodeWriter(tmp_path / "a.mcap", info, overwrite=overwrite)
         writer.finish(outcome)
     assert Recording(tmp_path / "a.mcap").num_frames == 40

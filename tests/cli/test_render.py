@@ -1,0 +1,136 @@
+"""`demorec render` that was ended in the middle: the same command goes on, another one is refused."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from support.export import files_of, make_run
+
+from demorec.cli import main
+from demorec.replay import rerender as rerendering
+
+DEMOREC = [sys.executable, "-c", "from demorec.cli import main; main()"]
+
+
+def demorec(*arguments: object) -> int:
+    with pytest.raises(SystemExit) as done:
+        main([str(argument) for argument in arguments])
+    return int(done.value.code or 0)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_run(tmp_path_factory.mktemp("render") / "run", (3, 4, 5), cameras=("front",))
+
+
+def recordings(out: Path) -> dict[str, int]:
+    """Name -> when it was written, ns."""
+    return {path.name: path.stat().st_mtime_ns for path in sorted((out / "episodes").glob("*.mcap"))}
+
+
+def test_the_same_command_keeps_what_is_drawn(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+    command = ("render", run, "--out", out, "--width", 32, "--height", 32, "--looks", 1, "--workers", 1)
+    drawn: list[Path] = []
+    write = rerendering.EpisodeWriter.finish
+
+    def until_the_second(writer: rerendering.EpisodeWriter, outcome: rerendering.Outcome) -> object:
+        if drawn:
+            raise KeyboardInterrupt
+        stats = write(writer, outcome)
+        drawn.append(stats.path)
+        return stats
+
+    with monkeypatch.context() as patch:
+        patch.setattr(rerendering.EpisodeWriter, "finish", until_the_second)
+        assert demorec(*command) == 130
+    assert "Interrupted: 1 of 3 recordings are drawn; the same command goes on" in capsys.readouterr().err
+    before = recordings(out)
+    assert len(before) == 1
+    assert list((out / "episodes").glob("*.part"))  # the half file
+    assert demorec(*command) == 0
+    said = capsys.readouterr().out
+    assert "1 of 3 had been drawn before and are kept" in said
+    assert "3 recordings, 12 pictures" in said
+    after = recordings(out)
+    assert before.items() <= after.items()
+    assert len(after) == 3
+    assert not list((out / "episodes").glob("*.part"))
+    assert demorec("render", run, "--out", tmp_path / "once", *command[4:]) == 0
+    assert files_of(tmp_path / "once") == files_of(out)
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        ("--looks", 2),
+        ("--width", 80),
+        ("--depth",),
+        ("--gop", 1),
+        ("--cameras", "wrist"),
+        ("--no-antialias",),
+    ],
+)
+def test_another_request_is_refused(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], other: tuple[object, ...]
+) -> None:
+    source, out = run / "episodes" / "episode_000000.mcap", tmp_path / "out"
+    same = ("render", source, "--out", out, "--looks", 1)
+    assert demorec(*same) == 0
+    before = files_of(out)
+    capsys.readouterr()
+    assert demorec(*same, *other) == 2
+    assert "is there already" in capsys.readouterr().err
+    another = run / "episodes" / "episode_000001.mcap"
+    assert demorec("render", another, "--out", out / source.name, "--looks", 1) == 2
+    assert files_of(out) == before
+    assert demorec(*same, *other, "--overwrite") == 0
+    assert files_of(out) != before
+
+
+def test_a_damaged_one_is_not_taken_for_drawn(run: Path, tmp_path: Path) -> None:
+    source, target = run / "episodes" / "episode_000000.mcap", tmp_path / "new.mcap"
+    command = ("render", source, "--out", target, "--looks", 1)
+    assert demorec(*command) == 0
+    whole = target.read_bytes()
+    middle = len(whole) // 2
+    target.write_bytes(whole[:middle] + bytes([whole[middle] ^ 255]) + whole[middle + 1 :])
+    assert demorec(*command) == 2
+    assert demorec(*command, "--overwrite") == 0
+    assert target.read_bytes() == whole
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_ended_from_outside_it_is_quiet_and_goes_on(run: Path, tmp_path: Path, number: signal.Signals) -> None:
+    """With two workers, which hold semaphores that Python would call leaked."""
+    out = tmp_path / "out"
+    options = ("--width", "1024", "--height", "1024", "--workers", "2", "--looks", "1")
+    command = [*DEMOREC, "render", str(run), "--out", str(out), *options]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, start_new_session=True)
+    deadline = time.monotonic() + 120
+    while not list(out.glob("episodes/*.part")):
+        assert process.poll() is None, "it ended before it could be ended"
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    if number == signal.SIGINT:
+        os.killpg(process.pid, number)  # as Ctrl-C does
+    else:
+        process.kill()
+    _, errors = process.communicate(timeout=120)  # until Python's tracker of resources, which writes there, has ended
+    lines = [line for line in errors.decode().splitlines() if "rendering" not in line]
+    if number == signal.SIGINT:
+        assert process.returncode == 130
+        assert len(lines) == 1
+        assert "the same command goes on" in lines[0]
+    else:
+        assert lines == []
+    assert demorec(*command[3:]) == 0
+    assert len(recordings(out)) == 3
