@@ -86,7 +86,7 @@ def scene_pictures(frames: int, width: int, height: int, seed: int) -> list[NDAr
 
 def made_up(pictures: Pictures, episode: int) -> tuple[EpisodeInfo, list[Frame], Outcome]:
     """An episode of made-up numbers and the given pictures."""
-    from support.recording import make_episode  # type: ignore[import-not-found]
+    from support.recording import make_episode
 
     length = len(next(iter(pictures.values())))
     info, frames, outcome = make_episode(

@@ -1,8 +1,9 @@
-"""Shared by all tests: no network, one thread per process, a cache folder that is not the user's only when asked."""
+"""Shared by all tests: no network, one thread per process, compiled bytecode is kept."""
 
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Iterator
 
 import pytest
@@ -12,7 +13,11 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
 os.environ.setdefault("HF_DATASETS_OFFLINE", "1")
+# Containers often forbid Python to write bytecode; every process that a test starts would then compile PyTorch anew.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 from demorec.recording.scheduling import ordinary_scheduling
+
+sys.dont_write_bytecode = False
 
 
 @pytest.fixture(autouse=True)

@@ -6,11 +6,9 @@ import shutil
 from pathlib import Path
 
 import pytest
+from support.commands import exit_code
 from support.export import episode_rows, files_of, make_run
 
-import demorec.lerobot.hub
-import demorec.lerobot.prepare
-from demorec.cli import main
 from demorec.lerobot import ExportOptions, dataset_digest, export_lerobot
 
 
@@ -19,15 +17,9 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_run(tmp_path_factory.mktemp("run") / "run", (8, 7), failures=(1,))
 
 
-def demorec(*arguments: object) -> int:
-    with pytest.raises(SystemExit) as done:
-        main([str(argument) for argument in arguments])
-    return int(done.value.code or 0)
-
-
 def test_an_export(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "d"
-    assert demorec("export", "lerobot", run, "--out", out, "--repo-id", "me/cubes", "--no-verify") == 0
+    assert exit_code("export", "lerobot", run, "--out", out, "--repo-id", "me/cubes", "--no-verify") == 0
     printed = capsys.readouterr()
     assert "2 episodes, 15 frames" in printed.out
     assert "1 failed attempts left out" in printed.out
@@ -39,7 +31,7 @@ def test_an_export(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 def test_options_reach_the_export(run: Path, tmp_path: Path) -> None:
     out = tmp_path / "d"
     arguments = ("--include-failures", "--episodes", "1", "--action", "ee_delta", "--privileged", "--fps", "15")
-    assert demorec("export", "lerobot", run, "--out", out, "--no-verify", *arguments) == 0
+    assert exit_code("export", "lerobot", run, "--out", out, "--no-verify", *arguments) == 0
     assert [row["length"] for row in episode_rows(out)] == [6, 4]
 
 
@@ -58,7 +50,7 @@ def test_options_reach_the_export(run: Path, tmp_path: Path) -> None:
 def test_a_mistake_is_told_in_one_sentence(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], code: int, message: str
 ) -> None:
-    assert demorec("export", "lerobot", run, "--out", tmp_path / "d", "--no-verify", *arguments) == code
+    assert exit_code("export", "lerobot", run, "--out", tmp_path / "d", "--no-verify", *arguments) == code
     printed = capsys.readouterr()
     assert message in printed.err
     assert "Traceback" not in printed.err
@@ -68,21 +60,21 @@ def test_a_mistake_is_told_in_one_sentence(
 def test_a_dataset_in_the_way(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "d").mkdir()
     (tmp_path / "d" / "thesis.txt").write_text("years of work")
-    assert demorec("export", "lerobot", run, "--out", tmp_path / "d", "--no-verify") == 2
+    assert exit_code("export", "lerobot", run, "--out", tmp_path / "d", "--no-verify") == 2
     assert "--overwrite" not in capsys.readouterr().err  # it would not help
-    assert demorec("export", "lerobot", run, "--out", tmp_path / "d", "--no-verify", "--overwrite") == 2
+    assert exit_code("export", "lerobot", run, "--out", tmp_path / "d", "--no-verify", "--overwrite") == 2
     assert "it is not a LeRobot dataset" in capsys.readouterr().err
     assert (tmp_path / "d" / "thesis.txt").read_text() == "years of work"
 
 
 @pytest.mark.parametrize(("source", "message"), [("nothing", "There is no such file"), ("", "holds no recording")])
 def test_a_source_that_is_none(tmp_path: Path, capsys: pytest.CaptureFixture[str], source: str, message: str) -> None:
-    assert demorec("export", "lerobot", tmp_path / source, "--out", tmp_path / "d") == 2
+    assert exit_code("export", "lerobot", tmp_path / source, "--out", tmp_path / "d") == 2
     assert message in capsys.readouterr().err
 
 
 def test_no_recordings_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert demorec("export", "lerobot", "--out", tmp_path / "d") == 2
+    assert exit_code("export", "lerobot", "--out", tmp_path / "d") == 2
     assert "No recordings are given" in capsys.readouterr().err
 
 
@@ -92,7 +84,7 @@ def test_uploading_without_a_token_keeps_the_dataset(
     monkeypatch.setattr("huggingface_hub.get_token", lambda: None)
     out = tmp_path / "d"
     arguments = ("--no-verify", "--push-to-hub", "--repo-id", "me/cubes")
-    assert demorec("export", "lerobot", run, "--out", out, *arguments) == 1
+    assert exit_code("export", "lerobot", run, "--out", out, *arguments) == 1
     assert "hf auth login" in capsys.readouterr().err
     assert len(episode_rows(out)) == 2
 
@@ -104,7 +96,7 @@ def test_uploading_without_a_network_keeps_the_dataset(
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
     out = tmp_path / "d"
     arguments = ("--no-verify", "--push-to-hub", "--repo-id", "me/cubes")
-    assert demorec("export", "lerobot", run, "--out", out, *arguments) == 1
+    assert exit_code("export", "lerobot", run, "--out", out, *arguments) == 1
     printed = capsys.readouterr().err
     assert "was not uploaded to me/cubes" in printed
     assert "Traceback" not in printed
@@ -114,7 +106,7 @@ def test_uploading_without_a_network_keeps_the_dataset(
 def test_an_upload_is_private_and_tagged(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    calls = []
+    calls: list[tuple[object, ...]] = []
 
     class Hub:
         def create_repo(self, repo_id: str, **arguments: object) -> str:
@@ -131,7 +123,7 @@ def test_an_upload_is_private_and_tagged(
     monkeypatch.setattr("huggingface_hub.get_token", lambda: "hf_made_up")
     out = tmp_path / "d"
     arguments = ("--no-verify", "--push-to-hub", "--repo-id", "me/cubes")
-    assert demorec("export", "lerobot", run, "--out", out, *arguments) == 0
+    assert exit_code("export", "lerobot", run, "--out", out, *arguments) == 0
     assert calls[0] == ("create", "me/cubes", {"repo_type": "dataset", "private": True, "exist_ok": True})
     assert calls[1] == ("upload", out, len(files_of(out)))
     assert calls[2] == ("tag", "me/cubes", "v3.0")
@@ -161,7 +153,7 @@ def test_verification_passes_a_good_dataset_and_drops_a_bad_one(run: Path, tmp_p
 
 def test_info_tells_the_digest_and_the_attempts(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     report = export_lerobot([run], tmp_path / "d", ExportOptions(verify=False))
-    assert demorec("info", tmp_path / "d") == 0
+    assert exit_code("info", tmp_path / "d") == 0
     printed = capsys.readouterr().out
     assert report.digest in printed
     assert "2, of 3 attempts" in printed

@@ -12,8 +12,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from support.check import Spoilt
+from support.commands import exit_code
 
-from demorec.cli import main
 from demorec.config import GenerateConfig
 from demorec.errors import ConfigError, NotAllowedError
 from demorec.lerobot import ExportOptions, export_lerobot
@@ -33,14 +33,6 @@ class Mine(PickPlace):
     """A task like another."""
 '''
 HARMFUL = ["os:abort", "builtins:exit", "demorec.errors:DemorecError", "no colon", "a:b:c", ""]
-
-
-def exit_code(*args: object) -> int:
-    try:
-        main([str(arg) for arg in args])
-    except SystemExit as ended:
-        return int(ended.code or 0)
-    return 0
 
 
 @pytest.fixture
@@ -105,7 +97,9 @@ COMMANDS = {
 
 
 @pytest.mark.parametrize("kind", ["recording", "run", "dataset"])
-def test_no_command_imports_what_a_file_names(kind: str, tmp_path: Path, marker: Path, capsys) -> None:
+def test_no_command_imports_what_a_file_names(
+    kind: str, tmp_path: Path, marker: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     name = f"{MODULE}:Mine"
     path = recording_of(name, tmp_path / "alone.mcap") if kind == "recording" else run_of(name, tmp_path / "run")
     if kind == "dataset":
@@ -134,14 +128,18 @@ def test_no_command_imports_what_a_file_names(kind: str, tmp_path: Path, marker:
     [["check", "--no-pictures", "--replay", "1"], ["replay"], ["render", "--workers", "1", "--out", "new.mcap"]],
     ids=lambda words: words[0],
 )
-def test_allowed_modules_are_imported(words: list[str], tmp_path: Path, marker: Path, capsys) -> None:
+def test_allowed_modules_are_imported(
+    words: list[str], tmp_path: Path, marker: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = recording_of(f"{MODULE}:Mine", tmp_path / "alone.mcap")
     exit_code(*words, path, "--allow", MODULE)
     assert marker.exists()
     assert "add --allow" not in capsys.readouterr().err
 
 
-def test_reproduce_goes_to_work_with_an_allowed_module(tmp_path: Path, marker: Path, monkeypatch) -> None:
+def test_reproduce_goes_to_work_with_an_allowed_module(
+    tmp_path: Path, marker: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     asked: list[GenerateConfig] = []
 
     class Reached(BaseException):
@@ -159,7 +157,9 @@ def test_reproduce_goes_to_work_with_an_allowed_module(tmp_path: Path, marker: P
 
 
 @pytest.mark.parametrize("name", HARMFUL)
-def test_harmful_names_are_one_sentence_even_if_their_module_is_allowed(name: str, tmp_path: Path, capsys) -> None:
+def test_harmful_names_are_one_sentence_even_if_their_module_is_allowed(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     run = run_of(name, tmp_path / "run")
     for words in (COMMANDS["replay"], COMMANDS["reproduce"]):
         command = [word.format(path=run, out=tmp_path / "out") for word in words]
@@ -173,7 +173,7 @@ def test_harmful_names_are_one_sentence_even_if_their_module_is_allowed(name: st
 
 
 @pytest.mark.parametrize("name", ["my_tasks:Mine", "my tasks", "", "../my_tasks", "my_tasks.py:"])
-def test_what_can_be_no_module_is_refused(name: str, tmp_path: Path, capsys) -> None:
+def test_what_can_be_no_module_is_refused(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert exit_code("replay", tmp_path / "any.mcap", "--allow", name) == 2
     assert "--allow names a module or package, for example my_tasks, found" in capsys.readouterr().err
 

@@ -8,6 +8,7 @@ import json
 import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ HOSTILE = "\x1b[2Jx\n\u202ey\x9b31m"
 NAME = "\x1b[31mred\u202e.mcap"
 
 
-def _spoken(arguments: list[str | Path]) -> str:
+def _spoken(arguments: Sequence[object]) -> str:
     """All that a command wrote, which must hold nothing that a terminal obeys but the ends of its lines."""
     said = io.StringIO()
     with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said), contextlib.suppress(SystemExit):
@@ -128,7 +129,7 @@ def test_recordings(hostile: Path, name: str, tmp_path: Path) -> None:
         ["replay", path], ["render", path, "--cameras", HOSTILE, "--out", tmp_path / "new.mcap", "--workers", "1"],
         ["recover", path, "--out", tmp_path / NAME], ["reproduce", path, "--out", tmp_path / "again"],
     ):  # fmt: skip
-        _spoken(list(arguments))
+        _spoken(arguments)
 
 
 def test_that_the_fields_are_printed_at_all(hostile: Path) -> None:
@@ -146,7 +147,7 @@ def test_runs_and_datasets(hostile: Path, name: str, tmp_path: Path) -> None:
         ["export", "lerobot", hostile / "good.mcap", "--out", path, "--append", "--no-verify"],
         ["reproduce", path, "--out", tmp_path / NAME],
     ):  # fmt: skip
-        _spoken(list(arguments))
+        _spoken(arguments)
 
 
 def test_flags_and_names_on_the_command_line() -> None:
@@ -155,7 +156,7 @@ def test_flags_and_names_on_the_command_line() -> None:
         ["generate", f"--{HOSTILE}"], ["generate", "--seed", HOSTILE], ["generate", "--task", HOSTILE, "--out", "/x"],
         ["check", "x", "--only", HOSTILE], ["check", "--workers", HOSTILE], ["view", "x", "--size", HOSTILE, "1"],
     ):  # fmt: skip
-        _spoken(list(arguments))
+        _spoken(arguments)
 
 
 def test_warnings_of_python() -> None:

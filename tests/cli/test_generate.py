@@ -8,9 +8,10 @@ from pathlib import Path
 import pytest
 
 from demorec.cli import generate_dataset_main, main
+from demorec.cli.generate import Generate
 
 
-def run(capsys, *args: str) -> tuple[int, str, str]:
+def run(capsys: pytest.CaptureFixture[str], *args: str) -> tuple[int, str, str]:
     with pytest.raises(SystemExit) as ended:
         generate_dataset_main(list(args))
     told = capsys.readouterr()
@@ -43,7 +44,9 @@ def run(capsys, *args: str) -> tuple[int, str, str]:
         (["--config", "missing.toml"], "The config file cannot be read (No such file or directory): missing.toml"),
     ],
 )
-def test_impossible_requests_end_with_one_sentence_and_leave_nothing(capsys, tmp_path, monkeypatch, args, message):
+def test_impossible_requests_end_with_one_sentence_and_leave_nothing(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, args: list[str], message: str
+) -> None:
     monkeypatch.chdir(tmp_path)
     code, out, err = run(capsys, *args)
     assert code == 2
@@ -61,7 +64,13 @@ def test_impossible_requests_end_with_one_sentence_and_leave_nothing(capsys, tmp
         (["--executor", "slurm"], ["invalid choice 'slurm'", "local", "ray"]),
     ],
 )
-def test_unknown_options_name_the_nearest(capsys, tmp_path, monkeypatch, args, words):
+def test_unknown_options_name_the_nearest(
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    args: list[str],
+    words: list[str],
+) -> None:
     monkeypatch.chdir(tmp_path)
     code, out, err = run(capsys, *args)
     assert code == 2
@@ -82,7 +91,9 @@ def test_unknown_options_name_the_nearest(capsys, tmp_path, monkeypatch, args, w
         ('out = "x"\ntempo = 1\nwidht = 3', "an unknown key 'widht'. Did you mean 'width'?"),
     ],
 )
-def test_bad_config_files_are_told(capsys, tmp_path, monkeypatch, content, message):
+def test_bad_config_files_are_told(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, content: str, message: str
+) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "run.toml").write_text(content)
     code, _, err = run(capsys, "--config", "run.toml")
@@ -91,19 +102,24 @@ def test_bad_config_files_are_told(capsys, tmp_path, monkeypatch, content, messa
     assert [p.name for p in tmp_path.iterdir()] == ["run.toml"]
 
 
-def parsed(monkeypatch, args: list[str]):
+def parsed(monkeypatch: pytest.MonkeyPatch, args: list[str]) -> Generate:
     """What the command would run with."""
-    from demorec.cli.generate import Generate
+    seen: list[Generate] = []
 
-    seen = []
-    monkeypatch.setattr(Generate, "run", lambda self: seen.append(self) or 0)
+    def remember(command: Generate) -> int:
+        seen.append(command)
+        return 0
+
+    monkeypatch.setattr(Generate, "run", remember)
     with pytest.raises(SystemExit) as ended:
         generate_dataset_main(args)
     assert ended.value.code == 0
     return seen[0]
 
 
-def test_a_flag_wins_over_the_file_and_the_file_over_the_default(monkeypatch, tmp_path):
+def test_a_flag_wins_over_the_file_and_the_file_over_the_default(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     file = tmp_path / "run.toml"
     file.write_text(
         'num_episodes = 7\nseed = 5\ncameras = "wrist"\ncodec = "av1"\ncrf = 20\nout = "there"\nexport = false\n'
@@ -116,14 +132,14 @@ def test_a_flag_wins_over_the_file_and_the_file_over_the_default(monkeypatch, tm
     assert command.episodes.max_episode_seconds == 30.0
 
 
-def test_flags_of_the_file_can_be_taken_back(monkeypatch, tmp_path):
+def test_flags_of_the_file_can_be_taken_back(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     file = tmp_path / "run.toml"
     file.write_text("depth = true\nexport = false\n")
     command = parsed(monkeypatch, ["--config", str(file), "--no-depth", "--export", "--cameras", "none"])
     assert (command.episodes.depth, command.options.export, command.episodes.cameras) == (False, True, ())
 
 
-def test_ranges_take_two_numbers_or_auto(monkeypatch, tmp_path):
+def test_ranges_take_two_numbers_or_auto(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     file = tmp_path / "run.toml"
     file.write_text("cube_mass = [0.1, 0.2]\ncube_side = [0.03, 0.04]\n")
     args = ["--cube-mass", "auto", "--distractors", "1", "3", "--gravity-offset", "-1", "2"]
@@ -133,13 +149,13 @@ def test_ranges_take_two_numbers_or_auto(monkeypatch, tmp_path):
     assert ranges.gravity_offset == (-1.0, 2.0)
 
 
-def test_underscores_and_equals_signs_work_too(monkeypatch):
+def test_underscores_and_equals_signs_work_too(monkeypatch: pytest.MonkeyPatch) -> None:
     command = parsed(monkeypatch, ["--num_episodes=3", "--repo_id=me/cubes", "--joint-rate=physics"])
     assert (command.options.num_episodes, command.options.repo_id) == (3, "me/cubes")
     assert command.episodes.joint_rate == "physics"
 
 
-def test_the_demo_file_is_valid(monkeypatch):
+def test_the_demo_file_is_valid(monkeypatch: pytest.MonkeyPatch) -> None:
     file = Path(__file__).parents[2] / "demo.toml"
     command = parsed(monkeypatch, ["--config", str(file)])
     command.episodes.validate()
@@ -147,7 +163,7 @@ def test_the_demo_file_is_valid(monkeypatch):
     assert command.options.num_episodes == 5
 
 
-def test_help_has_examples_and_every_option(capsys):
+def test_help_has_examples_and_every_option(capsys: pytest.CaptureFixture[str]) -> None:
     code, out, _ = run(capsys, "--help")
     assert code == 0
     assert "Examples:\n  generate-dataset --num-episodes 50 --out recordings/cubes" in out
@@ -177,7 +193,7 @@ def test_help_has_examples_and_every_option(capsys):
         ("checks", "opens"),
     ],
 )
-def test_list_tells_every_row_in_one_line(capsys, what, names):
+def test_list_tells_every_row_in_one_line(capsys: pytest.CaptureFixture[str], what: str, names: str) -> None:
     from demorec import tables
 
     with pytest.raises(SystemExit) as ended:
@@ -189,7 +205,7 @@ def test_list_tells_every_row_in_one_line(capsys, what, names):
     assert all(re.match(r"\S+\s+\S+", line) for line in lines), "a row without a summary"
 
 
-def test_reproduce_needs_a_run_or_a_dataset(capsys, tmp_path):
+def test_reproduce_needs_a_run_or_a_dataset(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     with pytest.raises(SystemExit) as ended:
         main(["reproduce", str(tmp_path), "--out", str(tmp_path / "copy")])
     assert ended.value.code == 2

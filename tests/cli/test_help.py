@@ -34,7 +34,9 @@ def words(lines: list[str]) -> list[str]:
 
 @pytest.mark.parametrize("width", [60, 80, 120])
 @pytest.mark.parametrize("program", PROGRAMS)
-def test_lines_fit_the_terminal(program, width, capsys, monkeypatch):
+def test_lines_fit_the_terminal(
+    program: str, width: int, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     lines = help_of(program, width, capsys, monkeypatch)
     assert len(lines) > 8
     examples = [line for line in lines if line.startswith("  ") and program != "demorec"]
@@ -44,7 +46,7 @@ def test_lines_fit_the_terminal(program, width, capsys, monkeypatch):
 
 
 @pytest.mark.parametrize("program", PROGRAMS)
-def test_no_word_is_cut(program, capsys, monkeypatch):
+def test_no_word_is_cut(program: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever the width, the same words: in lines of 1000 columns nothing has to be broken."""
     known = set(words(help_of(program, 1000, capsys, monkeypatch)))
     found = words(help_of(program, 80, capsys, monkeypatch))
@@ -52,7 +54,9 @@ def test_no_word_is_cut(program, capsys, monkeypatch):
 
 
 @pytest.mark.parametrize("program", PROGRAMS[1:])
-def test_a_default_is_told_only_where_it_is_a_value(program, capsys, monkeypatch):
+def test_a_default_is_told_only_where_it_is_a_value(
+    program: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     text = " ".join(words(help_of(program, 1000, capsys, monkeypatch)))
     told = re.findall(r"\(default:([^)]*)\)", text)
     assert told
@@ -60,13 +64,13 @@ def test_a_default_is_told_only_where_it_is_a_value(program, capsys, monkeypatch
     assert "{None" not in text
 
 
-def test_required_flags_say_so(capsys, monkeypatch):
+def test_required_flags_say_so(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     lines = help_of("demorec export", 80, capsys, monkeypatch)
     assert any(line.startswith("│ --out PATH") and "(required)" in line for line in lines)
     text = " ".join(" ".join(lines).replace("│", " ").split())
     assert "Runs, recordings, or folders of recordings. (required)" in text
 
 
-def test_an_empty_hint_leaves_no_empty_row(capsys, monkeypatch):
+def test_an_empty_hint_leaves_no_empty_row(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     for width in range(70, 90):
         assert not [line for line in help_of("demorec view", width, capsys, monkeypatch) if re.fullmatch(r"│ +│", line)]

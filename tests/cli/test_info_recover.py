@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import resource
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -109,7 +110,7 @@ def test_info_of_a_dataset(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     ],
 )
 def test_info_of_something_else(
-    tmp_path: Path, make, code: int, message: str, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, make: Callable[[Path], Path], code: int, message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = make(tmp_path)
     if path.suffix:

@@ -12,11 +12,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from PIL import Image
+from support.commands import exit_code
 from support.export import export, files_of, make_run
 from support.generate import run_fake
 from support.recording import write_episode
 
-from demorec.cli import main
 from demorec.config import GenerateConfig
 from demorec.errors import ConfigError, DemorecError
 from demorec.evaluate.rollouts import Settings, _open
@@ -26,12 +26,6 @@ from demorec.generate.options import RunOptions
 from demorec.lerobot import ExportOptions
 from demorec.runs.find import EVALUATION_NAME
 from demorec.safety.replacing import PICTURE, RECORDING, RERUN_FILE, check_replaceable, settle_parts, written_whole
-
-
-def demorec(*arguments: object) -> int:
-    with pytest.raises(SystemExit) as done:
-        main([str(argument) for argument in arguments])
-    return int(done.value.code or 0)
 
 
 @pytest.fixture(scope="module")
@@ -90,11 +84,11 @@ TARGETS = {
 def test_export_replaces_nothing_but_a_dataset(place: Path, capsys: pytest.CaptureFixture[str], target: str) -> None:
     before = files_of(place.parent)
     arguments = ("export", "lerobot", place / "runs/run", "--out", place / target, "--no-verify")
-    assert demorec(*arguments, "--overwrite") == 2
+    assert exit_code(*arguments, "--overwrite") == 2
     said = capsys.readouterr().err
     assert TARGETS[target] in said
     assert len(said.splitlines()) == 1
-    assert demorec(*arguments) == 2  # and without the flag nobody is told to use it
+    assert exit_code(*arguments) == 2  # and without the flag nobody is told to use it
     assert "--overwrite" not in capsys.readouterr().err
     assert files_of(place.parent) == before
 
@@ -103,7 +97,7 @@ def test_the_home_folder_is_no_target(place: Path, capsys: pytest.CaptureFixture
     before = files_of(place.parent)
     elsewhere = write_episode(place.parent / "other.mcap", num_frames=3, cameras=())
     for target, word in ((place, "home folder"), (place.parent, "reads something in it"), (Path("/"), "reads")):
-        assert demorec("export", "lerobot", elsewhere, "--out", target, "--overwrite", "--no-verify") == 2
+        assert exit_code("export", "lerobot", elsewhere, "--out", target, "--overwrite", "--no-verify") == 2
         assert word in capsys.readouterr().err
     assert before.items() <= files_of(place.parent).items()
 
@@ -113,7 +107,7 @@ def test_append_takes_over_what_is_there_or_refuses(place: Path, target: str) ->
     """Foreign files are taken over; where they cannot be, and in a repository, nothing is appended."""
     before = files_of(place)
     other = make_run(place.parent / "other", (6,), cameras=("front",), seed=1)
-    code = demorec("export", "lerobot", other, "--out", place / target, "--append", "--no-verify")
+    code = exit_code("export", "lerobot", other, "--out", place / target, "--append", "--no-verify")
     assert code == (0 if target == "mixed" else code or 1)
     after = files_of(place)
     kept = {name: data for name, data in before.items() if not name.startswith(target) or code}
@@ -124,7 +118,7 @@ def test_append_takes_over_what_is_there_or_refuses(place: Path, target: str) ->
 def test_a_dataset_is_replaced_and_its_neighbours_are_not(place: Path) -> None:
     before = files_of(place)
     other = write_episode(place.parent / "other.mcap", num_frames=3, cameras=("front",))
-    assert demorec("export", "lerobot", other, "--out", place / "dataset", "--overwrite", "--no-verify") == 0
+    assert exit_code("export", "lerobot", other, "--out", place / "dataset", "--overwrite", "--no-verify") == 0
     after = files_of(place)
     for name, data in before.items():
         assert name.startswith("dataset/") or after[name] == data
@@ -136,7 +130,7 @@ def test_a_workshop_of_somebody_else_is_left_alone(place: Path, capsys: pytest.C
     (workshop / "new").mkdir(parents=True)
     (workshop / "new" / "chapter_2.tex").write_text("years of work")
     before = files_of(place)
-    assert demorec("export", "lerobot", place / "runs/run", "--out", place / "new", "--no-verify") == 2
+    assert exit_code("export", "lerobot", place / "runs/run", "--out", place / "new", "--no-verify") == 2
     assert "not made by demorec" in capsys.readouterr().err
     assert files_of(place) == before
 
@@ -171,13 +165,16 @@ def spoil_dataset(run: Path, made: Path) -> None:
     shutil.copytree(made / "dataset", run / "dataset")
 
 
+def write_a_chapter(run: Path, made: Path) -> None:
+    (run / "failed/chapter").mkdir()
+    (run / "failed/chapter/1.tex").write_text("mine")
+
+
 SPOILERS: dict[str, Callable[[Path, Path], object]] = {
     "episodes/notes.txt": lambda run, made: (run / "episodes/notes.txt").write_text("mine"),
     "episodes/episode_000077.mcap": lambda run, made: (run / "episodes/episode_000077.mcap").write_text("mine"),
     "episodes/mine.mcap": lambda run, made: shutil.copy(made / "alone.mcap", run / "episodes/mine.mcap"),
-    "failed/chapter/1.tex": lambda run, made: [
-        (run / "failed/chapter").mkdir(), (run / "failed/chapter/1.tex").write_text("mine")
-    ],
+    "failed/chapter/1.tex": write_a_chapter,
     "unfinished/ideas.txt": lambda run, made: (run / "unfinished/ideas.txt").write_text("mine"),
     "dataset": spoil_dataset,
 }  # fmt: skip
@@ -315,12 +312,12 @@ def test_recover_replaces_recordings_only(place: Path, capsys: pytest.CaptureFix
     (place / "broken.mcap").write_bytes((place / "alone.mcap").read_bytes()[:-500])
     before = files_of(place.parent)
     for target in ("thesis.tex", "thesis", "link_to_thesis", "link_to_nothing", "broken.mcap"):
-        assert demorec("recover", place / "broken.mcap", "--out", place / target, "--overwrite") == 2, target
+        assert exit_code("recover", place / "broken.mcap", "--out", place / target, "--overwrite") == 2, target
         assert len(capsys.readouterr().err.splitlines()) == 1
     (place / "x.mcap.recovering").write_text("years of work")
-    assert demorec("recover", place / "broken.mcap", "--out", place / "x.mcap") == 2
+    assert exit_code("recover", place / "broken.mcap", "--out", place / "x.mcap") == 2
     assert files_of(place.parent) == {**before, "home/x.mcap.recovering": b"years of work"}
-    assert demorec("recover", place / "broken.mcap", "--out", place / "alone.mcap", "--overwrite") == 0
+    assert exit_code("recover", place / "broken.mcap", "--out", place / "alone.mcap", "--overwrite") == 0
 
 
 @pytest.mark.parametrize("command", ["render", "replay"])
@@ -344,7 +341,7 @@ def test_render_and_replay_never_replace_what_they_read(
         ((place / "runs/run",), place / "runs/run/new"),
         ((place / "runs/run/episodes/episode_000000.mcap",), place / "runs/run"),
     ):
-        assert demorec(command, *sources, "--out", out, "--overwrite") == 2
+        assert exit_code(command, *sources, "--out", out, "--overwrite") == 2
         assert "this command reads" in capsys.readouterr().err
     assert files_of(place.parent) == before
 
@@ -385,9 +382,9 @@ def test_view_saves_over_rerun_files_only(place: Path, capsys: pytest.CaptureFix
     (place / "folder.rrd").mkdir()
     (place / "dangling.rrd").symlink_to(place / "nothing")
     before = files_of(place.parent)
-    assert demorec("view", place / "alone.mcap", "--save", place / target, "--overwrite") == 2
+    assert exit_code("view", place / "alone.mcap", "--save", place / target, "--overwrite") == 2
     assert VIEWED[target] in capsys.readouterr().err
-    assert demorec("view", place / "alone.mcap", "--save", place / target) == 2
+    assert exit_code("view", place / "alone.mcap", "--save", place / target) == 2
     assert "--overwrite" not in capsys.readouterr().err
     assert files_of(place.parent) == before
 
@@ -407,9 +404,9 @@ def test_pictures_replace_pictures_only(place: Path, capsys: pytest.CaptureFixtu
         ("alone.mcap", "link.png", "this command reads it"),
         ("dataset", frame, "it lies in what this command reads"),
     ):
-        assert demorec(command, place / source, flag, place / target, "--overwrite") == 2
+        assert exit_code(command, place / source, flag, place / target, "--overwrite") == 2
         assert word in capsys.readouterr().err
-    assert demorec(command, place / "alone.mcap", flag, place / "photo.png") == 2
+    assert exit_code(command, place / "alone.mcap", flag, place / "photo.png") == 2
     assert "--overwrite to replace it" in capsys.readouterr().err
     assert files_of(place.parent) == before
 
@@ -417,7 +414,7 @@ def test_pictures_replace_pictures_only(place: Path, capsys: pytest.CaptureFixtu
 def test_a_coverage_picture_is_replaced_on_request(place: Path) -> None:
     target = place / "c.png"
     for flags in ((), ("--overwrite",)):
-        demorec("check", place / "alone.mcap", "--only", "opens", "--coverage-picture", target, *flags)
+        exit_code("check", place / "alone.mcap", "--only", "opens", "--coverage-picture", target, *flags)
         assert target.read_bytes().startswith(b"\x89PNG")
     assert not [path for path in place.iterdir() if path.name.endswith("demorec-part")]
 
@@ -457,7 +454,7 @@ def test_reproduce_needs_a_place_beside_its_source(
     original = SimpleNamespace(config=GenerateConfig(), num_episodes=1, versions={}, digests={(0, 0): "x"}, export=None)
     monkeypatch.setattr(reproducing, "read_original", lambda source: original)
     before = files_of(place / "runs")
-    assert demorec("reproduce", place / "runs" / "run", "--out", place / out) == 2
+    assert exit_code("reproduce", place / "runs" / "run", "--out", place / out) == 2
     assert "needs a place of its own" in capsys.readouterr().err
     assert files_of(place / "runs") == before
 
@@ -483,6 +480,6 @@ def test_a_file_where_the_folder_of_results_would_be_is_told(
     place: Path, command: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = files_of(place)
-    assert demorec(command, place / "alone.mcap", "--out", place / "thesis.tex") == 2
+    assert exit_code(command, place / "alone.mcap", "--out", place / "thesis.tex") == 2
     assert len(capsys.readouterr().err.splitlines()) == 1
     assert files_of(place) == before

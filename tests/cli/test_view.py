@@ -188,13 +188,19 @@ def test_the_viewer_shows_a_dataset(run_folder: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.viewer
-def test_screenshots_of_an_episode_and_of_a_comparison(run_folder: Path, tmp_path: Path) -> None:
+def test_a_screenshot_of_an_episode(run_folder: Path, tmp_path: Path) -> None:
     need_vulkan()
     episode = run_folder / "episodes" / "episode_000000.mcap"
     assert view(episode, "--screenshot", tmp_path / "x.png", "--size", 900, 600) == 0
     picture = pixels((tmp_path / "x.png").read_bytes())
     assert picture.shape == (600, 900, 3)
     assert num_colors(picture) > 200
+
+
+@pytest.mark.slow
+@pytest.mark.viewer
+def test_a_screenshot_of_a_comparison(run_folder: Path, tmp_path: Path) -> None:
+    need_vulkan()
     assert view(run_folder, "--compare", "--screenshot", tmp_path / "c.png") == 0
     assert num_colors(pixels((tmp_path / "c.png").read_bytes())) > 200
 

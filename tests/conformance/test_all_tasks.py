@@ -35,7 +35,7 @@ def test_all_tasks_go_into_one_dataset(tmp_path: Path) -> None:
             columns, instruction = recording.columns(), recording.info.instruction
         item = dataset[row]
         assert item["task"] == instruction
-        expected = np.float32([*columns.joint_position[0, :7], columns.gripper_width[0]])
+        expected = np.array([*columns.joint_position[0, :7], columns.gripper_width[0]], np.float32)
         assert np.array_equal(item["observation.state"].numpy(), expected)
         row += len(columns.time_ns)
     assert row == dataset.num_frames

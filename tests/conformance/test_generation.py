@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from support.export import without_verification
 
 from demorec.cli import generate_dataset_main, main
 from demorec.config import EpisodePlan, GenerateConfig, deciding_versions
@@ -15,6 +17,7 @@ from demorec.generate.observer import NoProgress, RunResult
 from demorec.generate.options import RunOptions
 from demorec.generate.run import generate
 from demorec.lerobot import ExportOptions, dataset_digest, export_lerobot
+from demorec.lerobot.verify import Verifier
 from demorec.recording import Recording
 from demorec.runs.run_file import load_run_file
 
@@ -27,13 +30,18 @@ def make(out: Path, *, workers: int, episodes: list[int] | None = None, num_epis
     return generate(CONFIG, options, progress=NoProgress(), episodes=episodes)
 
 
+@pytest.fixture
+def unverified(monkeypatch: pytest.MonkeyPatch) -> None:
+    without_verification(monkeypatch)
+
+
 @pytest.fixture(scope="module")
-def reference(tmp_path_factory) -> RunResult:
+def reference(tmp_path_factory: pytest.TempPathFactory) -> RunResult:
     """Made by one worker in order."""
     return make(tmp_path_factory.mktemp("reference") / "run", workers=1)
 
 
-def test_the_run_is_what_was_asked_for(reference):
+def test_the_run_is_what_was_asked_for(reference: RunResult) -> None:
     assert len(reference.run.successes) == NUM_EPISODES
     assert load_run_file(reference.folder) == reference.run
     assert sorted(p.name for p in (reference.folder / "episodes").iterdir()) == [
@@ -46,7 +54,7 @@ def test_the_run_is_what_was_asked_for(reference):
     assert all(value > 0 for seconds in (first, *later) for value in seconds.values())
 
 
-def test_two_workers_in_reversed_order_make_the_same_bytes(tmp_path, reference):
+def test_two_workers_in_reversed_order_make_the_same_bytes(tmp_path: Path, reference: RunResult) -> None:
     result = make(tmp_path / "run", workers=2, episodes=list(reversed(range(NUM_EPISODES))))
     assert result.run.digest == reference.run.digest
     assert [a.sha256 for a in result.run.attempts] == [a.sha256 for a in reference.run.attempts]
@@ -54,7 +62,7 @@ def test_two_workers_in_reversed_order_make_the_same_bytes(tmp_path, reference):
         assert (result.folder / attempt.file).read_bytes() == (reference.folder / attempt.file).read_bytes()
 
 
-def test_recordings_know_the_run_that_they_belong_to(tmp_path, reference):
+def test_recordings_know_the_run_that_they_belong_to(tmp_path: Path, reference: RunResult) -> None:
     """run.json is lost: everything in it that matters is read back from the recordings."""
     out = tmp_path / "run"
     shutil.copytree(reference.folder, out)
@@ -65,14 +73,17 @@ def test_recordings_know_the_run_that_they_belong_to(tmp_path, reference):
     assert [a.sha256 for a in result.run.attempts] == [a.sha256 for a in reference.run.attempts]
 
 
-def test_a_run_knows_the_versions_that_its_recordings_know(reference):
+def test_a_run_knows_the_versions_that_its_recordings_know(reference: RunResult) -> None:
     from demorec.loop import prepare
 
     assert reference.run.versions == deciding_versions()
     assert prepare(EpisodePlan(config=CONFIG, episode_index=0)).info.versions == deciding_versions()
 
 
-def test_reproduce_makes_runs_and_datasets_again_and_sees_a_difference(tmp_path, capsys, reference):
+@pytest.mark.usefixtures("unverified")
+def test_reproduce_makes_runs_and_datasets_again_and_sees_a_difference(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], reference: RunResult
+) -> None:
     source = tmp_path / "source"
     shutil.copytree(reference.folder, source)
     record, _ = export_run(source, repo_id="me/cubes")
@@ -89,7 +100,8 @@ def test_reproduce_makes_runs_and_datasets_again_and_sees_a_difference(tmp_path,
     assert "Different: 0 (attempt 0)" in capsys.readouterr().err
 
 
-def test_a_dataset_of_few_features_is_made_again_and_can_be_shown(tmp_path, reference):
+@pytest.mark.usefixtures("unverified")
+def test_a_dataset_of_few_features_is_made_again_and_can_be_shown(tmp_path: Path, reference: RunResult) -> None:
     from demorec.playback.from_dataset import open_dataset_episode
 
     few = ExportOptions(features=("observation.images.wrist",), action="ee_delta", verify=False)
@@ -113,22 +125,34 @@ def reproduce(source: Path, out: Path) -> int:
     return int(ended.value.code or 0)
 
 
-def test_the_export_is_made_once_and_again_when_the_run_has_grown(tmp_path, reference):
+@pytest.mark.usefixtures("unverified")
+def test_the_export_is_made_once_and_again_when_the_run_has_grown(tmp_path: Path, reference: RunResult) -> None:
     out = tmp_path / "run"
     shutil.copytree(reference.folder, out)
+    make(out, workers=1, num_episodes=NUM_EPISODES - 1)
     first, report = export_run(out, repo_id="me/cubes")
     assert report is not None
-    assert report.num_episodes == NUM_EPISODES
+    assert report.num_episodes == NUM_EPISODES - 1
     again, report = export_run(out, repo_id="me/cubes")
     assert (again, report) == (first, None)
-    make(out, workers=1, num_episodes=NUM_EPISODES + 1)
+    make(out, workers=1, num_episodes=NUM_EPISODES)
     grown, report = export_run(out, repo_id="me/cubes")
     assert report is not None
-    assert report.num_episodes == NUM_EPISODES + 1
+    assert report.num_episodes == NUM_EPISODES
     assert grown.dataset_digest != first.dataset_digest
 
 
-def test_the_command_does_it_all_and_says_so(tmp_path, capsys):
+def test_the_command_does_it_all_and_says_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    verified: list[int] = []
+
+    def remember(verifier: Verifier, *arguments: Any) -> int:
+        verified.append(verify(verifier, *arguments))
+        return verified[-1]
+
+    verify = Verifier.verify
+    monkeypatch.setattr(Verifier, "verify", remember)
     out = tmp_path / "run"
     args = ["--out", str(out), "--num-episodes", "1", "--workers", "1", "--seed", "11", "--cameras", "wrist"]
     args += ["--width", "48", "--height", "32"]
@@ -141,6 +165,7 @@ def test_the_command_does_it_all_and_says_so(tmp_path, capsys):
         assert load_run_file(out).digest in told
         for word in ("success", "frames", "recordings", "dataset", "simulation", "rendering", "export", "checks"):
             assert word in told
+    assert verified == [2], "once, two frames of the episode"
     with pytest.raises(SystemExit) as ended:
         generate_dataset_main([*args, "--fps", "60"])
     assert ended.value.code == 2

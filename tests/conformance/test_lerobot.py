@@ -18,8 +18,9 @@ from support.export import data_table, episode_rows, export, make_run
 from support.recording import make_episode
 
 import demorec.lerobot.writer
-from demorec.lerobot import dataset_digest
+from demorec.lerobot import ExportOptions, dataset_digest, export_lerobot, verify
 from demorec.lerobot.depth import code_values, quantised
+from demorec.lerobot.verify import Sample
 from demorec.recording import Recording
 
 LENGTHS = (20, 15, 17, 9, 31, 12)
@@ -59,12 +60,12 @@ def open_dataset(root: Path, **arguments: Any) -> Any:
     return LeRobotDataset("local/test", root=root, **{"video_backend": "pyav", "return_uint8": True, **arguments})
 
 
-def recorded_pictures(run: Path, episode: int) -> dict[str, list[np.ndarray]]:
+def recorded_pictures(run: Path, episode: int) -> dict[str, list[np.ndarray[Any, Any]]]:
     with Recording(run / "episodes" / f"episode_{episode:06d}.mcap") as recording:
         return {camera: list(recording.images(camera)) for camera in CAMERAS}
 
 
-def picture(item: dict[str, Any], camera: str) -> np.ndarray:
+def picture(item: dict[str, Any], camera: str) -> np.ndarray[Any, Any]:
     return np.asarray(item[f"observation.images.{camera}"].numpy().transpose(1, 2, 0))
 
 
@@ -84,9 +85,11 @@ def test_lerobot_reads_every_frame_as_it_was_recorded(run: Path, dataset: Path, 
         for t in range(length):
             item = found[row]
             observation, action = frames[t].observation, frames[t].action
-            state = np.float32([*observation.joint_position[:7], observation.gripper_width])
+            state = np.array([*observation.joint_position[:7], observation.gripper_width], np.float32)
             assert np.array_equal(item["observation.state"].numpy(), state)
-            assert np.array_equal(item["action"].numpy(), np.float32([*action.joint_target, action.gripper_target]))
+            assert np.array_equal(
+                item["action"].numpy(), np.array([*action.joint_target, action.gripper_target], np.float32)
+            )
             assert (int(item["episode_index"]), int(item["frame_index"]), int(item["index"])) == (episode, t, row)
             assert item["task"] == "pick up the red cube and place it on the green target"
             assert bool(item["next.done"]) is bool(item["next.success"]) is (t == length - 1)
@@ -188,8 +191,13 @@ def test_depth_is_read_as_metres(tmp_path: Path) -> None:
 
 def test_depth_without_its_colour_is_verified(tmp_path: Path) -> None:
     run = make_run(tmp_path / "run", (6, 5), depth=True)
-    report = export(run, tmp_path / "d", depth=True, features=("observation.images.front_depth",), verify=True)
-    assert report.verified_frames == 4
+    options = ExportOptions(
+        repo_id="local/test", depth=True, features=("observation.images.front_depth",), verify=False
+    )
+    export_lerobot([run], tmp_path / "d", options)
+    episodes = sorted((run / "episodes").iterdir())
+    samples = tuple(Sample(episode_index=index, recording=path) for index, path in enumerate(episodes))
+    assert verify._verify(tmp_path / "d", samples, options) == 4  # in this process, which has loaded LeRobot already
     assert open_dataset(tmp_path / "d").meta.camera_keys == ["observation.images.front_depth"]
 
 

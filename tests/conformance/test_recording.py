@@ -8,6 +8,7 @@ import subprocess
 import sys
 import zlib
 from pathlib import Path
+from typing import Any
 
 import av
 import cv2
@@ -18,11 +19,13 @@ from mcap.stream_reader import StreamReader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from support.recording import frame_number, make_episode, write_episode
+from support.present import present
+from support.recording import Codec, frame_number, make_episode, write_episode
 
 from demorec.config import VideoConfig
 from demorec.recording.ros2 import DEFINITIONS
 from demorec.scene.assets import asset_path
+from demorec.scene.episode import EpisodeInfo, Frame, Outcome
 
 NUM_FRAMES = 40
 
@@ -36,7 +39,7 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def episode():
+def episode() -> tuple[EpisodeInfo, list[Frame], Outcome]:
     return make_episode(num_frames=NUM_FRAMES, depth=True, segmentation=True, physics_rate_joints=True)
 
 
@@ -57,11 +60,11 @@ def test_the_mcap_reader_finds_every_checksum_right(path: Path) -> None:
         assert data_end[0].data_section_crc not in (0, zlib.crc32(stream.read()))
 
 
-def test_mcap_decodes_what_was_written(path: Path, episode) -> None:
+def test_mcap_decodes_what_was_written(path: Path, episode: tuple[EpisodeInfo, list[Frame], Outcome]) -> None:
     _, frames, _ = episode
     with path.open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-        decoded: dict[str, list] = {}
+        decoded: dict[str, list[tuple[int, Any]]] = {}
         for _, channel, message, content in reader.iter_decoded_messages():
             decoded.setdefault(channel.topic, []).append((message.log_time, content))
     assert len(decoded["/joint_states"]) == (NUM_FRAMES - 1) * 8 + 1
@@ -91,10 +94,10 @@ def test_mcap_decodes_what_was_written(path: Path, episode) -> None:
         force, torque = content.wrench.force, content.wrench.torque
         assert (time, content.header.frame_id) == (frame.time_ns, "panda_hand")
         found = [force.x, force.y, force.z, torque.x, torque.y, torque.z]
-        assert found == frame.observation.wrench.tolist()
+        assert found == present(frame.observation.wrench).tolist()
     info = decoded["/camera/front/camera_info"][0][1]
     assert (info.width, info.height) == (64, 48)
-    assert np.allclose(np.reshape(info.k, (3, 3)), [[49.68, 0, 32], [0, 49.68, 24], [0, 0, 1]], atol=0.01)
+    assert np.allclose(info.k, [49.68, 0, 32, 0, 49.68, 24, 0, 0, 1], atol=0.01)
     assert np.array_equal(np.reshape(info.p, (3, 4))[:, :3], np.reshape(info.k, (3, 3)))
     assert [content.data for _, content in decoded["/phase"]] == list(dict.fromkeys(frame.phase for frame in frames))
     assert [content.msg for _, content in decoded["/events"] if content.name == "grasp"] == [
@@ -106,11 +109,12 @@ def test_mcap_decodes_what_was_written(path: Path, episode) -> None:
     assert labels[(2 + 1) * 256 + 5] == "panda/panda_link5"
     for frame, (_, content) in zip(frames, decoded["/camera/front/segmentation"], strict=True):
         picture = cv2.imdecode(np.frombuffer(bytes(content.data), dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+        assert picture is not None
         assert picture.dtype == np.uint16
-        assert (picture == 0).tolist() == (frame.images["front"].segmentation == -1).tolist()
+        assert ((picture == 0) == (present(frame.images["front"].segmentation) == -1)).all()
 
 
-def test_rosbags_deserialises_every_message(path: Path, episode) -> None:
+def test_rosbags_deserialises_every_message(path: Path, episode: tuple[EpisodeInfo, list[Frame], Outcome]) -> None:
     _, frames, _ = episode
     store = get_typestore(Stores.EMPTY)
     for name, definition in DEFINITIONS.items():
@@ -129,7 +133,7 @@ def test_rosbags_deserialises_every_message(path: Path, episode) -> None:
                 wrenches.append([force.x, force.y, force.z, torque.x, torque.y, torque.z])
     assert count > 1000
     assert np.array_equal(positions, [frame.observation.base_from_tcp.position for frame in frames])
-    assert np.array_equal(wrenches, [frame.observation.wrench for frame in frames])
+    assert np.array_equal(wrenches, [present(frame.observation.wrench) for frame in frames])
 
 
 def test_definitions_are_those_of_ros(path: Path) -> None:
@@ -146,7 +150,7 @@ def test_definitions_are_those_of_ros(path: Path) -> None:
 
 
 @pytest.mark.parametrize("codec", ["h264", "av1", "jpeg"])
-def test_ffmpeg_decodes_the_bytes_of_the_topic(tmp_path: Path, codec: str) -> None:
+def test_ffmpeg_decodes_the_bytes_of_the_topic(tmp_path: Path, codec: Codec) -> None:
     path = write_episode(tmp_path / "a.mcap", num_frames=NUM_FRAMES, video=VideoConfig(codec=codec))
     topic = {"h264": "/camera/wrist/h264", "av1": "/camera/wrist/video", "jpeg": "/camera/wrist/image/compressed"}
     with path.open("rb") as stream:
@@ -157,9 +161,9 @@ def test_ffmpeg_decodes_the_bytes_of_the_topic(tmp_path: Path, codec: str) -> No
         packets = [cdr_compressed_image(message) for message in messages]
     assert len(packets) == NUM_FRAMES
     name = {"h264": "h264", "av1": "obu", "jpeg": "mjpeg"}[codec]
-    with av.open(io.BytesIO(b"".join(packets)), format=name) as container:
+    with av.open(io.BytesIO(b"".join(packets)), "r", format=name) as container:
         pictures = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
-    assert [frame_number(picture) for picture in pictures] == list(range(NUM_FRAMES))
+    assert [frame_number(picture.astype(np.uint8)) for picture in pictures] == list(range(NUM_FRAMES))
 
 
 def cdr_compressed_image(message: bytes) -> bytes:
@@ -183,7 +187,7 @@ def protobuf_field(message: bytes, number: int) -> bytes:
     kind = message_factory.GetMessageClass(pool.FindMessageTypeByName("foxglove.CompressedVideo"))
     parsed = kind.FromString(message)
     assert parsed.format == "av1"
-    return getattr(parsed, kind.DESCRIPTOR.fields_by_number[number].name)
+    return bytes(getattr(parsed, kind.DESCRIPTOR.fields_by_number[number].name))
 
 
 def rerun_entities(path: Path, folder: Path) -> dict[str, set[str]]:
@@ -233,7 +237,7 @@ def test_rerun_shows_everything_without_code_of_ours(path: Path, tmp_path: Path)
     ("codec", "entity", "archetype"),
     [("av1", "/camera/front/video", "VideoStream"), ("jpeg", "/camera/front/image/compressed", "EncodedImage")],
 )
-def test_rerun_shows_the_other_codecs(tmp_path: Path, codec: str, entity: str, archetype: str) -> None:
+def test_rerun_shows_the_other_codecs(tmp_path: Path, codec: Codec, entity: str, archetype: str) -> None:
     path = write_episode(tmp_path / "a.mcap", num_frames=5, video=VideoConfig(codec=codec))
     assert archetype in rerun_entities(path, tmp_path)[entity]
 
@@ -265,12 +269,14 @@ def test_no_description_needs_another_file(path: Path) -> None:
             assert word not in text, word
 
 
-def test_coordinate_frames_are_where_pybullet_has_the_links(path: Path, episode) -> None:
+def test_coordinate_frames_are_where_pybullet_has_the_links(
+    path: Path, episode: tuple[EpisodeInfo, list[Frame], Outcome]
+) -> None:
     """Every link's pose from /tf and /tf_static alone, against PyBullet's own forward kinematics."""
     pybullet = pytest.importorskip("pybullet")
     info, frames, _ = episode
-    transforms: dict[str, tuple[str, np.ndarray]] = {}
-    moving: dict[int, dict[str, tuple[str, np.ndarray]]] = {}
+    transforms: dict[str, tuple[str, np.ndarray[Any, Any]]] = {}
+    moving: dict[int, dict[str, tuple[str, np.ndarray[Any, Any]]]] = {}
     with path.open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
         for _, channel, message, content in reader.iter_decoded_messages(topics=["/tf", "/tf_static"]):
@@ -304,7 +310,7 @@ def test_coordinate_frames_are_where_pybullet_has_the_links(path: Path, episode)
         pybullet.disconnect(client)
 
 
-def matrix_of(transform) -> np.ndarray:
+def matrix_of(transform: Any) -> np.ndarray[Any, Any]:
     q = transform.rotation
     x, y, z, w = q.x, q.y, q.z, q.w
     matrix = np.eye(4)
@@ -317,7 +323,7 @@ def matrix_of(transform) -> np.ndarray:
     return matrix
 
 
-def world_from(frame: str, tree: dict[str, tuple[str, np.ndarray]]) -> np.ndarray:
+def world_from(frame: str, tree: dict[str, tuple[str, np.ndarray[Any, Any]]]) -> np.ndarray[Any, Any]:
     result = np.eye(4)
     while frame != "world":
         frame, parent_from_child = tree[frame]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -212,7 +213,7 @@ def test_wrong_counters(column: str, dataset: Path, tmp_path: Path) -> None:
 def test_a_changed_number(dataset: Path, tmp_path: Path) -> None:
     spoilt = copy(dataset, tmp_path / "ds")
 
-    def nudge(rows: np.ndarray) -> np.ndarray:
+    def nudge(rows: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
         rows[100, 3] += 1e-5
         return rows
 

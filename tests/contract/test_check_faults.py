@@ -7,10 +7,12 @@ import struct
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from support.check import Message, Spoilt, checked, flip_bits, level_of, rewrite_messages, simulate
+from support.present import present
 
 from demorec.recording import channels, messages
 from demorec.scene.episode import SuccessCheck
@@ -40,7 +42,7 @@ def test_the_good_ones_pass_without_a_warning(good: Path, filmed: Path) -> None:
 # ------------------------------------------------------------------------------------------------- numbers
 
 
-def shift(rows: np.ndarray, by: int) -> np.ndarray:
+def shift(rows: np.ndarray[Any, Any], by: int) -> np.ndarray[Any, Any]:
     """Rows of `by` frames earlier (the first is repeated)."""
     return np.concatenate([np.repeat(rows[:1], by, axis=0), rows[:-by]])
 
@@ -137,22 +139,22 @@ def not_a_number(s: Spoilt) -> None:
 
 
 def wrench_not_a_number(s: Spoilt) -> None:
-    wrench = s.columns.wrench.copy()
+    wrench = present(s.columns.wrench).copy()
     wrench[40, 5] = np.nan
     s.set(wrench=wrench)
 
 
 def wrench_of_the_load(s: Spoilt) -> None:
     # What the hand does to the arm, in place of what the arm does to the hand.
-    s.set(wrench=-s.columns.wrench)
+    s.set(wrench=-present(s.columns.wrench))
 
 
 def torque_before_force(s: Spoilt) -> None:
-    s.set(wrench=s.columns.wrench[:, [3, 4, 5, 0, 1, 2]])
+    s.set(wrench=present(s.columns.wrench)[:, [3, 4, 5, 0, 1, 2]])
 
 
 def wrench_along_other_axes(s: Spoilt) -> None:
-    s.set(wrench=s.columns.wrench[:, [2, 0, 1, 5, 3, 4]])
+    s.set(wrench=present(s.columns.wrench)[:, [2, 0, 1, 5, 3, 4]])
 
 
 def a_jump_while_untouched(s: Spoilt) -> None:
@@ -553,7 +555,7 @@ def test_depth_and_segmentation(tmp_path: Path) -> None:
     fine = simulate(tmp_path / "f.mcap", seed=7, cameras=("front",), depth=True, segmentation=True)
     assert level_of(fine, "depth_matches_scene") == "pass"
     assert level_of(fine, "segmentation_matches_scene") == "pass"
-    faults = {
+    faults: dict[str, Callable[[Any], Any]] = {
         "millimetres": lambda i: replace(i, depth=np.minimum(i.depth * 10, 60).astype(np.float32)),
         "upside down": lambda i: replace(i, depth=i.depth[::-1].copy()),
         "mirrored labels": lambda i: replace(i, segmentation=i.segmentation[::-1, ::-1].copy()),

@@ -32,11 +32,11 @@ def check(task: str, robot: str, variation: str) -> None:
 
 
 @pytest.mark.parametrize(("task", "robot", "variation"), FAST)
-def test_repeats_and_replays_to_the_bit(task, robot, variation):
+def test_repeats_and_replays_to_the_bit(task: str, robot: str, variation: str) -> None:
     check(task, robot, variation)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("task", "robot", "variation"), [case for case in CASES if case not in FAST])
-def test_every_row_repeats_and_replays_to_the_bit(task, robot, variation):
+def test_every_row_repeats_and_replays_to_the_bit(task: str, robot: str, variation: str) -> None:
     check(task, robot, variation)

@@ -12,6 +12,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 from support.docs import run_examples
+from support.present import present
 from support.sim import episode
 
 import demorec.gym_env
@@ -123,7 +124,7 @@ def columns_of(frames: list[Any]) -> Any:
 
 
 def test_pictures_are_those_of_the_rollout() -> None:
-    options = {"cameras": ("front", "wrist"), "width": 64, "height": 48}
+    options: dict[str, Any] = {"cameras": ("front", "wrist"), "width": 64, "height": 48}
     prepared = episode(5, **options)
     env = make(split="all", **options)
     assert "environment_state" not in env.observation_space.spaces
@@ -215,7 +216,7 @@ def test_render_shows_the_world() -> None:
     assert picture.std() > 10
     for _ in range(8):
         env.step(np.append(np.array(env.info.scene.robot.joint_position) + 0.4, 0.08))
-    assert not np.array_equal(picture, env.render())
+    assert not np.array_equal(picture, present(env.render()))
     env.close()
 
 

@@ -10,9 +10,10 @@ from pathlib import Path
 
 import pytest
 from support.check import simulate
+from support.commands import exit_code
 from support.generate import inspect
 
-from demorec.cli import generate_dataset_main, main
+from demorec.cli import generate_dataset_main
 from demorec.config import EpisodePlan, GenerateConfig, deciding_versions
 from demorec.errors import ConfigError, SceneError
 from demorec.generate.options import RunOptions
@@ -26,12 +27,6 @@ from demorec.safety.own_versions import changed_sources, own_versions, source_di
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "own_robot"
 XARM6 = "my_robots:XARM6"
-
-
-def call(entry, *args: object) -> int:
-    with pytest.raises(SystemExit) as ended:
-        entry([str(arg) for arg in args])
-    return int(ended.value.code or 0)
 
 
 def forget(*modules: str) -> None:
@@ -56,10 +51,12 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 @pytest.mark.slow
-def test_the_example_makes_checks_and_replays_a_dataset(folder: Path, tmp_path: Path, capsys, monkeypatch) -> None:
+def test_the_example_makes_checks_and_replays_a_dataset(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     run = tmp_path / "run"
     flags = ["--robot", XARM6, "--cameras", "front", "my_robots:TOP", "--width", "64", "--height", "64"]
-    assert call(generate_dataset_main, *flags, "--num-episodes", "2", "--workers", "1", "--out", run) == 0
+    assert exit_code(*flags, "--num-episodes", "2", "--workers", "1", "--out", run, program=generate_dataset_main) == 0
     told = capsys.readouterr().out
     assert "2 of 2 asked" in told
     assert re.search(r"checks +none failed", told)
@@ -74,23 +71,23 @@ def test_the_example_makes_checks_and_replays_a_dataset(folder: Path, tmp_path: 
     (folder / "xarm6.urdf").rename(tmp_path / "xarm6.urdf")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("demorec.scene.assets._modules_with_models", set())
-    assert call(main, "check", recording, "--no-pictures") == 0
-    assert call(main, "view", recording, "--save", tmp_path / "view.rrd") == 0
+    assert exit_code("check", recording, "--no-pictures") == 0
+    assert exit_code("view", recording, "--save", tmp_path / "view.rrd") == 0
     capsys.readouterr()
-    assert call(main, "replay", recording) == 2
+    assert exit_code("replay", recording) == 2
     assert "add --allow my_robots." in capsys.readouterr().err
 
     (tmp_path / "xarm6.urdf").rename(folder / "xarm6.urdf")
     monkeypatch.chdir(folder)
-    assert call(main, "replay", recording, "--allow", "my_robots") == 0
+    assert exit_code("replay", recording, "--allow", "my_robots") == 0
     assert "identical, succeeds" in capsys.readouterr().out
 
     # What the file says has changed since: the run is not gone on with, and replay says so.
     (folder / "my_robots.py").write_text((folder / "my_robots.py").read_text() + "\nFASTER = True\n")
     forget("my_robots")
-    assert call(generate_dataset_main, *flags, "--num-episodes", "3", "--workers", "1", "--out", run) == 2
+    assert exit_code(*flags, "--num-episodes", "3", "--workers", "1", "--out", run, program=generate_dataset_main) == 2
     assert "holds another run (the source of my_robots has changed)" in capsys.readouterr().err
-    assert call(main, "replay", recording, "--allow", "my_robots") == 0
+    assert exit_code("replay", recording, "--allow", "my_robots") == 0
     assert "Note: the source of my_robots has changed since this was recorded." in capsys.readouterr().err
 
 

@@ -6,13 +6,14 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from support.check import Spoilt, simulate, simulate_run
+from support.commands import exit_code
 from support.recording import make_episode
 
-from demorec.cli import main
 from demorec.errors import ConfigError
 from demorec.lerobot.export import export_lerobot
 from demorec.lerobot.options import ExportOptions
@@ -29,12 +30,6 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def _replay(path: Path, **options: object) -> ReplayReport:
     chosen = ReplayOptions(**options)  # type: ignore[arg-type]
     return next(iter(replay_all([open_file(path, chosen)], chosen)))[0]
-
-
-def _exit_code(*args: object) -> int:
-    with pytest.raises(SystemExit) as ended:
-        main([str(arg) for arg in args])
-    return int(ended.value.code or 0)
 
 
 @pytest.mark.parametrize("task", TASKS.names())
@@ -104,16 +99,17 @@ def test_noise_delay_and_rate_change_the_motion(recorded: Path) -> None:
 
 
 def test_options_that_cannot_be(recorded: Path) -> None:
-    for options in ({"noise": -1.0}, {"delay": -1}, {"states": True, "delay": 1}):
+    impossible: tuple[dict[str, Any], ...] = ({"noise": -1.0}, {"delay": -1}, {"states": True, "delay": 1})
+    for options in impossible:
         with pytest.raises(ConfigError):
-            ReplayOptions(**options).validate()  # type: ignore[arg-type]
+            ReplayOptions(**options).validate()
     with pytest.raises(ConfigError, match="7"):
         _replay(recorded, export_hz=7)
 
 
 def test_a_recording_of_the_replay(tmp_path: Path) -> None:
     source = simulate(tmp_path / "e.mcap", seed=11, cameras=("front",), width=64, height=64)
-    assert _exit_code("replay", source, "--out", tmp_path / "out") == 0
+    assert exit_code("replay", source, "--out", tmp_path / "out") == 0
     with Recording(source) as a, Recording(tmp_path / "out" / "e.mcap") as b:
         assert b.info.origin == f"replay of {a.digest()[:16]}"
         x, y = a.columns(), b.columns()
@@ -123,28 +119,28 @@ def test_a_recording_of_the_replay(tmp_path: Path) -> None:
         assert [p.data for p in a.packets("front")] == [p.data for p in b.packets("front")]
         assert b.outcome == a.outcome
     # Not over what is there, unless asked for; never over the source.
-    assert _exit_code("replay", source, "--out", tmp_path / "out") == 1
-    assert _exit_code("replay", source, "--out", tmp_path / "out", "--overwrite") == 0
-    assert _exit_code("replay", source, "--out", tmp_path, "--overwrite") == 2
+    assert exit_code("replay", source, "--out", tmp_path / "out") == 1
+    assert exit_code("replay", source, "--out", tmp_path / "out", "--overwrite") == 0
+    assert exit_code("replay", source, "--out", tmp_path, "--overwrite") == 2
 
 
 def test_the_command(recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert _exit_code("replay", recorded) == 0
+    assert exit_code("replay", recorded) == 0
     assert "identical, succeeds" in capsys.readouterr().out
-    assert _exit_code("replay", recorded, "--json") == 0
+    assert exit_code("replay", recorded, "--json") == 0
     assert json.loads(capsys.readouterr().out)[0]["is_identical"] is True
-    assert _exit_code("replay", recorded, "--states") == 0
-    assert _exit_code("replay", recorded, "--noise", "0.5") == 1
-    assert _exit_code("replay", recorded, "--episodes", "5:9") == 2
-    assert _exit_code("replay", tmp_path / "nothing") == 2
+    assert exit_code("replay", recorded, "--states") == 0
+    assert exit_code("replay", recorded, "--noise", "0.5") == 1
+    assert exit_code("replay", recorded, "--episodes", "5:9") == 2
+    assert exit_code("replay", tmp_path / "nothing") == 2
     spoilt = Spoilt(recorded)
     targets = spoilt.columns.command_joint_target.copy()
     targets[70, 2] += 1e-12
     spoilt.set(command_joint_target=targets)
     path = spoilt.write(tmp_path / "s.mcap")
-    assert _exit_code("replay", path) == 1
+    assert exit_code("replay", path) == 1
     assert "differs from step 71" in capsys.readouterr().out
-    assert _exit_code("replay", path, "--tolerance", "0.001") == 0
+    assert exit_code("replay", path, "--tolerance", "0.001") == 0
 
 
 @pytest.mark.parametrize("action", ["joint", "joint_increment", "ee", "ee_delta"])
@@ -160,25 +156,25 @@ def test_datasets_of_every_kind_of_action(action: str, tmp_path: Path) -> None:
     # Inverse kinematics may bend the elbow another way; the joints themselves come back to rounding and drift.
     limit = 2e-3 if action.startswith("joint") else 0.5
     assert max(report.joint_error for report in found) < limit
-    assert _exit_code("replay", tmp_path / "ds", "--episodes", "1") == 0
+    assert exit_code("replay", tmp_path / "ds", "--episodes", "1") == 0
 
 
 def test_a_dataset_with_noise_still_succeeds(tmp_path: Path) -> None:
     run = simulate_run(tmp_path / "run", 2, seed=3)
     export_lerobot([run], tmp_path / "ds", ExportOptions(verify=False, fps=10))
-    assert _exit_code("replay", tmp_path / "ds") == 0
-    assert _exit_code("check", tmp_path / "ds", "--no-pictures", "--replay", "2") == 0
+    assert exit_code("replay", tmp_path / "ds") == 0
+    assert exit_code("check", tmp_path / "ds", "--no-pictures", "--replay", "2") == 0
 
 
 def test_what_a_dataset_differs_in_is_in_its_total(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = simulate_run(tmp_path / "run", 1, seed=5)
     export_lerobot([run], tmp_path / "d", ExportOptions(verify=False))
-    assert _exit_code("replay", tmp_path / "d") == 0
+    assert exit_code("replay", tmp_path / "d") == 0
     episode, total = capsys.readouterr().out.splitlines()
     (gripper,) = re.findall(r"gripper (\S+) mm", episode)
     assert float(gripper) > 0
     assert total.endswith(f"gripper {gripper} mm.")  # and nothing of objects, whose places a dataset does not hold
-    assert _exit_code("replay", run) == 0
+    assert exit_code("replay", run) == 0
     assert capsys.readouterr().out.endswith("gripper 0 mm, objects 0 mm.\n")
 
 
@@ -191,7 +187,7 @@ def test_a_robot_without_a_gripper_is_one_sentence(tmp_path: Path, capsys: pytes
             arm = {f"joint_{name}": getattr(seen, f"joint_{name}")[:7] for name in ("position", "velocity", "effort")}
             writer.write(replace(frame, observation=replace(seen, **arm)))
         writer.finish(outcome)
-    assert _exit_code("replay", tmp_path / "e.mcap") == 1
+    assert exit_code("replay", tmp_path / "e.mcap") == 1
     said = capsys.readouterr().err
     assert "has 0 finger joints" in said
     assert len(said.splitlines()) == 1

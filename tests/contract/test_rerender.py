@@ -5,12 +5,13 @@ from __future__ import annotations
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from support.check import checked, simulate
+from support.commands import exit_code
 
-from demorec.cli import main
 from demorec.errors import ConfigError
 from demorec.recording import Recording
 from demorec.replay.rerender import RerenderOptions, read_cameras, rerender
@@ -27,12 +28,6 @@ fov_y_degrees = 50
 def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("rerender") / "filmed.mcap"
     return simulate(path, seed=13, cameras=("front", "wrist"), width=64, height=64)
-
-
-def _exit_code(*args: object) -> int:
-    with pytest.raises(SystemExit) as ended:
-        main([str(arg) for arg in args])
-    return int(ended.value.code or 0)
 
 
 def test_own_cameras_and_looks_give_the_recorded_pictures_again(filmed: Path, tmp_path: Path) -> None:
@@ -64,7 +59,7 @@ def test_other_cameras_sizes_and_looks_pass_the_checks(filmed: Path, tmp_path: P
     (tmp_path / "cameras.toml").write_text(SIDE)
     out = tmp_path / "out"
     args = ("--cameras", "side", "front", "--camera-file", tmp_path / "cameras.toml", "--width", 128, "--height", 96)
-    assert _exit_code("render", filmed, "--out", out, *args, "--looks", 3, "--depth", "--segmentation") == 0
+    assert exit_code("render", filmed, "--out", out, *args, "--looks", 3, "--depth", "--segmentation") == 0
     report = checked(out / "filmed.mcap")
     assert [r for r in report.results if r.level in ("warn", "fail")] == []
     passed = {r.check for r in report.results if r.level == "pass"}
@@ -92,16 +87,16 @@ def test_a_spoilt_picture_is_found(filmed: Path, tmp_path: Path) -> None:
     spoilt = Spoilt(filmed)
     spoilt.picture("front", lambda t, p: p[::-1] if t == 20 else p)
     path = spoilt.write(tmp_path / "s.mcap")
-    assert _exit_code("render", path, "--out", tmp_path / "out") == 1
+    assert exit_code("render", path, "--out", tmp_path / "out") == 1
 
 
 def test_impossible_requests(filmed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert _exit_code("render", filmed, "--out", tmp_path, "--cameras", "frnt") == 2
+    assert exit_code("render", filmed, "--out", tmp_path, "--cameras", "frnt") == 2
     assert "Did you mean 'front'" in capsys.readouterr().err
-    assert _exit_code("render", filmed, "--out", tmp_path, "--width", 65) == 2
-    assert _exit_code("render", filmed, "--out", filmed.parent) == 2  # over its own source
-    assert _exit_code("render", tmp_path, "--out", tmp_path / "x") == 2
-    assert _exit_code("render", filmed, "--out", tmp_path, "--renderer", "rastr") == 2
+    assert exit_code("render", filmed, "--out", tmp_path, "--width", 65) == 2
+    assert exit_code("render", filmed, "--out", filmed.parent) == 2  # over its own source
+    assert exit_code("render", tmp_path, "--out", tmp_path / "x") == 2
+    assert exit_code("render", filmed, "--out", tmp_path, "--renderer", "rastr") == 2
 
 
 @pytest.mark.parametrize(
@@ -131,7 +126,7 @@ def test_several_processes_give_the_same(filmed: Path, tmp_path: Path) -> None:
         simulate(
             tmp_path / "in" / f"{index}.mcap", seed=13, episode_index=index, cameras=("front",), width=64, height=64
         )
-    assert _exit_code("render", tmp_path / "in", "--out", tmp_path / "out", "--workers", 2) == 0
+    assert exit_code("render", tmp_path / "in", "--out", tmp_path / "out", "--workers", 2) == 0
     assert sorted(path.name for path in (tmp_path / "out").glob("*.mcap")) == ["0.mcap", "1.mcap"]
 
 
@@ -149,7 +144,13 @@ USING_IT = "from demorec.sim.client import connect; connect()"
 @pytest.mark.parametrize(("robot", "task"), [("panda", "pick_shapes"), ("iiwa", "tutorial")])
 def test_the_recording_alone_is_drawn_without_a_simulator(robot: str, task: str, tmp_path: Path) -> None:
     # Both arms, one of them scaled; primitives, meshes and URDFs; textures, segmentation, a camera on the hand.
-    config = {"robot": robot, "task": task, "variation": "full", "segmentation": True, "max_episode_seconds": 2.0}
+    config: dict[str, Any] = {
+        "robot": robot,
+        "task": task,
+        "variation": "full",
+        "segmentation": True,
+        "max_episode_seconds": 2.0,
+    }
     source = simulate(tmp_path / "e.mcap", seed=4, cameras=("front", "wrist"), width=64, height=64, **config)
     command = ("render", source, "--out", tmp_path / "again.mcap")
     done = subprocess.run(

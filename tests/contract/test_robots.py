@@ -6,9 +6,12 @@ import math
 import xml.etree.ElementTree as ET
 from contextlib import nullcontext
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from support.present import present
 from support.sim import episode, run
 
 from demorec.errors import SceneError
@@ -26,11 +29,11 @@ from demorec.tasks.grasping import hand_down
 
 
 @pytest.fixture(params=ROBOTS.names())
-def spec(request) -> RobotSpec:
+def spec(request: pytest.FixtureRequest) -> RobotSpec:
     return ROBOTS.load(request.param)
 
 
-def test_the_spec_names_what_the_urdf_has(spec):
+def test_the_spec_names_what_the_urdf_has(spec: RobotSpec) -> None:
     urdf = Urdf.load(asset_path(spec.urdf))
     joints = {joint.name: joint for joint in urdf.joints}
     links = {joint.child for joint in urdf.joints} | {urdf.root}
@@ -48,7 +51,9 @@ def test_the_spec_names_what_the_urdf_has(spec):
     assert from_json(to_json(spec), RobotSpec) == spec
 
 
-def test_the_wrench_holds_the_weight_of_the_hand(spec, monkeypatch, tmp_path):
+def test_the_wrench_holds_the_weight_of_the_hand(
+    spec: RobotSpec, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     """At rest in a tilted pose, against statics; whichever way the axes of the hand's inertia are turned.
 
     The fingers' motion stays horizontal: docs/recording.md tells what PyBullet loses otherwise.
@@ -62,7 +67,7 @@ def test_the_wrench_holds_the_weight_of_the_hand(spec, monkeypatch, tmp_path):
     root = ET.parse(urdf).getroot()
     for mesh in root.iter("mesh"):
         mesh.attrib["filename"] = str(mesh_path(urdf.parent, mesh.attrib["filename"]))
-    root.find(f"link[@name='{spec.hand_link}']/inertial/origin").attrib["rpy"] = "0.4 -0.7 1.9"
+    present(root.find(f"link[@name='{spec.hand_link}']/inertial/origin")).attrib["rpy"] = "0.4 -0.7 1.9"
     turned.write_text(ET.tostring(root, encoding="unicode"))
     found = {}
     for name, model in (("as it is", None), ("turned", turned)):
@@ -74,7 +79,7 @@ def test_the_wrench_holds_the_weight_of_the_hand(spec, monkeypatch, tmp_path):
             wrenches = []
             for _ in range(150):
                 world.apply(command)
-                wrenches.append(world.observe().wrench)
+                wrenches.append(present(world.observe().wrench))
             found[name] = np.mean(wrenches[-90:], axis=0), _weight(world)
     for wrench, expected in found.values():
         assert np.abs(expected[[0, 2]]).min() > 4.0, "the hand is tilted"
@@ -84,7 +89,7 @@ def test_the_wrench_holds_the_weight_of_the_hand(spec, monkeypatch, tmp_path):
     assert np.allclose(found["as it is"][1], found["turned"][1], atol=0.01)
 
 
-def _weight(world: World) -> np.ndarray:
+def _weight(world: World) -> np.ndarray[Any, Any]:
     """(6,) force and torque that balance gravity on hand and fingers, about the hand's origin and along its axes."""
     client, arm = world.client, world.arm
     hand = arm.links[arm.spec.hand_link]
@@ -100,7 +105,7 @@ def _weight(world: World) -> np.ndarray:
 
 
 @pytest.mark.parametrize("hand", ["no_such_link", "base"])
-def test_a_hand_that_no_joint_carries_is_refused(spec, hand):
+def test_a_hand_that_no_joint_carries_is_refused(spec: RobotSpec, hand: str) -> None:
     name = spec.base_link if hand == "base" else hand
     scene = episode(0, robot=spec.name, variation="none").info.scene
     with (
@@ -110,14 +115,14 @@ def test_a_hand_that_no_joint_carries_is_refused(spec, hand):
         world.reset(scene)
 
 
-def test_home_points_the_hand_down_with_the_fingers_across(spec):
+def test_home_points_the_hand_down_with_the_fingers_across(spec: RobotSpec) -> None:
     pose = arm_kinematics(spec).forward(np.array(spec.home_q))
     assert np.abs(pose.rotation - hand_down((0, 0, 0), 0.0).rotation).max() < 0.01
     assert 0.2 < pose.position[0] < 0.6
     assert abs(pose.position[1]) < 0.01
 
 
-def test_the_fingers_move_along_y_of_the_tcp_and_reach_as_far_as_the_spec_says(spec):
+def test_the_fingers_move_along_y_of_the_tcp_and_reach_as_far_as_the_spec_says(spec: RobotSpec) -> None:
     scene = episode(0, robot=spec.name, variation="none").info.scene
     with World(spec) as world:
         world.reset(scene)
@@ -136,7 +141,7 @@ def test_the_fingers_move_along_y_of_the_tcp_and_reach_as_far_as_the_spec_says(s
         assert abs(tcp.position[2] - min(tips) - spec.gripper.finger_depth) < 0.005
 
 
-def test_the_whole_workspace_is_within_reach(spec):
+def test_the_whole_workspace_is_within_reach(spec: RobotSpec) -> None:
     arm = arm_kinematics(spec)
     home = np.array(spec.home_q)
     for x in (0.35, 0.5, 0.65):
@@ -148,7 +153,7 @@ def test_the_whole_workspace_is_within_reach(spec):
                     assert arm.inverse(hand_down((x, y, z), yaw), start=rest, rest=rest) is not None, (x, y, z, yaw)
 
 
-def test_it_picks_and_places(spec):
+def test_it_picks_and_places(spec: RobotSpec) -> None:
     prepared = episode(1, robot=spec.name)
     frames, outcome = run(prepared)
     assert outcome.success
@@ -161,13 +166,13 @@ def test_it_picks_and_places(spec):
         assert world.state_digest() == outcome.final_state_digest
 
 
-def test_the_open_hand_is_no_larger_than_a_deliberate_miss_thinks(spec):
+def test_the_open_hand_is_no_larger_than_a_deliberate_miss_thinks(spec: RobotSpec) -> None:
     """Bounding boxes that Bullet tells of (its margin included), the hand pointing down along the world's axes."""
     with World(spec) as world:
         world.reset(episode(robot=spec.name).info.scene)
         goal = world.arm.world_from_base.inverse() @ hand_down((0.5, 0.0, 0.4), 0.0)
         found = world.arm.kinematics.inverse(goal, start=np.array(spec.home_q))
-        world.arm.place(found, spec.gripper.max_width)
+        world.arm.place(present(found), spec.gripper.max_width)
         world.client.performCollisionDetection()
         tcp = world.arm.world_from_tcp().position
         boxes = {

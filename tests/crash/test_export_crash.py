@@ -40,11 +40,12 @@ def exit_code(context: Any, *arguments: Any, **limits: int) -> int:
 def test_killed_at_any_moment(context: Any, run: Path, tmp_path: Path, mode: str) -> None:
     out = tmp_path / "d"
     before: dict[str, bytes] = {}
-    options: dict[str, Any] = {
+    of_mode: dict[str, dict[str, Any]] = {
         "new": {},
         "overwrite": {"overwrite": True},
         "append": {"append": True, "episodes": "2:"},
-    }[mode]
+    }
+    options = of_mode[mode]
 
     def start_anew() -> None:
         shutil.rmtree(out, ignore_errors=True)

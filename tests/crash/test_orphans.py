@@ -10,6 +10,7 @@ from pathlib import Path
 
 import psutil
 import pytest
+from support.commands import workers_of
 from support.export import make_run
 
 
@@ -25,14 +26,6 @@ def command(run: Path, out: Path, name: str) -> list[str]:
         "render": ["render", run, "--out", out / "r", "--workers", "2"],
     }[name]
     return [sys.executable, "-c", "from demorec.cli import main; main()", *map(str, arguments)]
-
-
-def workers_of(process: subprocess.Popen[bytes]) -> list[psutil.Process]:
-    try:
-        found = psutil.Process(process.pid).children(recursive=True)
-        return [child for child in found if "spawn_main" in " ".join(child.cmdline())]
-    except psutil.Error:
-        return []
 
 
 @pytest.mark.parametrize("name", ["export", "check", "render"])

@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
@@ -27,7 +28,7 @@ REAL = GenerateConfig(seed=5, cameras=("wrist",), width=32, height=32)
 NUM_REAL = 20
 
 
-def run_on_ray(out: Path, *, maker: str, progress: NoProgress | None = None, **options: float) -> RunResult:
+def run_on_ray(out: Path, *, maker: str, progress: NoProgress | None = None, **options: Any) -> RunResult:
     return generate(
         GenerateConfig(cameras=()),
         RunOptions(out=out, num_episodes=NUM_EPISODES, executor="ray", **options),
@@ -38,7 +39,7 @@ def run_on_ray(out: Path, *, maker: str, progress: NoProgress | None = None, **o
 
 
 @pytest.fixture(scope="module")
-def reference(tmp_path_factory) -> str:
+def reference(tmp_path_factory: pytest.TempPathFactory) -> str:
     result = run_fake(tmp_path_factory.mktemp("reference") / "run", num_episodes=NUM_EPISODES)
     return result.run.digest
 
@@ -80,7 +81,7 @@ def processes_of_ray() -> set[psutil.Process]:
     return found
 
 
-def add_node(cluster, **options: object) -> object:
+def add_node(cluster: Any, **options: object) -> object:
     """One more node, with one CPU and no services that these tests have no use for. Returns when it is ready.
 
     A node gives up when its services need over 15 s to start, so a busy machine gets five tries.
@@ -123,7 +124,7 @@ class Killer:
     def worker_at(self, *counts: int) -> None:
         self._threads += [when_finished(self._out, count, self._kill_worker) for count in counts]
 
-    def node_at(self, count: int, cluster, node: object) -> None:
+    def node_at(self, count: int, cluster: Any, node: object) -> None:
         def kill() -> None:
             cluster.remove_node(node, allow_graceful=False)
             self.nodes += 1
@@ -143,7 +144,7 @@ class Killer:
                 return
 
 
-def test_two_nodes_make_the_same_run(tmp_path, cluster, reference):
+def test_two_nodes_make_the_same_run(tmp_path: Path, cluster: object, reference: str) -> None:
     result = run_on_ray(tmp_path / "run", maker="report_pid")
     assert result.run.digest == reference
     assert result.session.workers == 2
@@ -152,7 +153,7 @@ def test_two_nodes_make_the_same_run(tmp_path, cluster, reference):
     assert {name.split("-")[2] for name in seen} == {"1"}
 
 
-def test_a_node_that_is_killed_changes_nothing(tmp_path, cluster, reference):
+def test_a_node_that_is_killed_changes_nothing(tmp_path: Path, cluster: object, reference: str) -> None:
     heard, killer = Remembers(), Killer(tmp_path / "run")
     killer.node_at(10, cluster, add_node(cluster))
     result = run_on_ray(tmp_path / "run", maker="make_quickly", progress=heard)
@@ -162,7 +163,7 @@ def test_a_node_that_is_killed_changes_nothing(tmp_path, cluster, reference):
     assert {(a.episode_index, a.attempt): a.success for a in result.run.attempts} == expected_attempts(NUM_EPISODES)
 
 
-def test_killed_workers_are_made_up_for(tmp_path, cluster, reference):
+def test_killed_workers_are_made_up_for(tmp_path: Path, cluster: object, reference: str) -> None:
     killer = Killer(tmp_path / "run")
     killer.worker_at(5, 15, 25, 35)
     result = run_on_ray(tmp_path / "run", maker="make_quickly")
@@ -171,7 +172,7 @@ def test_killed_workers_are_made_up_for(tmp_path, cluster, reference):
     assert result.run.digest == reference
 
 
-def test_the_real_job_is_the_same_in_every_way(tmp_path, cluster):
+def test_the_real_job_is_the_same_in_every_way(tmp_path: Path, cluster: object) -> None:
     """One worker in order, two in reversed order, and Ray on two nodes with workers and a third node killed."""
     one = generate(REAL, RunOptions(out=tmp_path / "one", num_episodes=NUM_REAL, workers=1))
     backwards = list(reversed(range(NUM_REAL)))
@@ -189,20 +190,20 @@ def test_the_real_job_is_the_same_in_every_way(tmp_path, cluster):
         assert [a.sha256 for a in other.run.attempts] == [a.sha256 for a in one.run.attempts]
 
 
-def test_a_run_begun_on_ray_goes_on_without_it(tmp_path, cluster, reference):
+def test_a_run_begun_on_ray_goes_on_without_it(tmp_path: Path, cluster: object, reference: str) -> None:
     out = tmp_path / "run"
     with pytest.raises(GenerationError, match="the disk is full"):
         run_on_ray(out, maker="fill_the_disk")
     assert run_fake(out, num_episodes=NUM_EPISODES).run.digest == reference
 
 
-def test_too_large_workers_are_refused(tmp_path, cluster):
+def test_too_large_workers_are_refused(tmp_path: Path, cluster: object) -> None:
     # A node that an earlier test killed may still be counted.
     with pytest.raises(ConfigError, match=r"has \d CPUs and 0 GPUs, too few for one worker with 1 CPUs and 1 GPUs"):
         run_on_ray(tmp_path / "run", maker="make", gpus_per_worker=1.0)
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1:1", "nowhere.invalid:6379", "127.0.0.1:99999"])
-def test_an_unreachable_cluster_is_told_at_once(tmp_path, address):
+def test_an_unreachable_cluster_is_told_at_once(tmp_path: Path, address: str) -> None:
     with pytest.raises(ConfigError, match=r"cannot be reached .* give the address that `ray start --head` has printed"):
         on_ray._connect(address, 1)

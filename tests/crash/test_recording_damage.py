@@ -9,7 +9,9 @@ import random
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, Phase, given, settings
@@ -68,6 +70,10 @@ def swap_pieces(data: bytes, rng: random.Random) -> bytes:
     return data[:first] + b + data[first + length : second] + a + data[second + length :]
 
 
+def flip_bit_at(at: int, data: bytes, rng: random.Random) -> bytes:
+    return data[:at] + bytes([data[at] ^ (1 << at % 8)]) + data[at + 1 :]
+
+
 def damage_the_index(data: bytes, rng: random.Random) -> bytes:
     """A bit in the last fifth, where the summary is."""
     at = rng.randrange(len(data) * 4 // 5, len(data))
@@ -88,7 +94,7 @@ DAMAGES: tuple[Damage, ...] = (
 )
 
 
-def content(path: Path) -> tuple[object, ...]:
+def content(path: Path) -> tuple[Any, ...]:
     """Everything that a recording gives, read through every method."""
     with Recording(path) as recording:
         statistics = tuple(
@@ -227,9 +233,7 @@ def test_a_flipped_bit_all_over_the_file(tmp_path: Path, capsys: pytest.CaptureF
     places = range(0, len(fuzz.originals[0][0]), 17)
     with reported(capsys, fuzz, f"one flipped bit at each of {len(places)} places"):
         for at in places:
-            fuzz.try_one(
-                lambda data, rng, at=at: data[:at] + bytes([data[at] ^ (1 << at % 8)]) + data[at + 1 :], 3 * at
-            )
+            fuzz.try_one(partial(flip_bit_at, at), 3 * at)
 
 
 def test_recovering_damaged_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

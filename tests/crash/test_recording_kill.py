@@ -17,7 +17,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from support.recording import frame_number, make_episode, write_episode
+from support.recording import Codec, frame_number, make_episode, write_episode
 
 from demorec.config import VideoConfig
 from demorec.errors import RecordingError
@@ -67,7 +67,7 @@ def kill_while(write: Callable[[int], None], *, after: int, seconds: float) -> i
     ("codec", "kills"),
     [("h264", 8), pytest.param("h264", 50, marks=pytest.mark.slow), pytest.param("av1", 20, marks=pytest.mark.slow)],
 )
-def test_kill_at_random_moments(tmp_path: Path, codec: str, kills: int, capsys: pytest.CaptureFixture[str]) -> None:
+def test_kill_at_random_moments(tmp_path: Path, codec: Codec, kills: int, capsys: pytest.CaptureFixture[str]) -> None:
     rng = random.Random(5)
     info, frames, _ = make_episode(num_frames=2 * MOST_FRAMES, fps=FPS)
     write_episode(tmp_path / "warm.mcap", num_frames=2)  # what is compiled or loaded once is not what is killed

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import resource
+from pathlib import Path
 
 import pytest
 import zstandard
@@ -21,7 +22,9 @@ from demorec.runs.recordings import inspect_recording
         OSError("libllvmlite.so: failed to map segment from shared object"),
     ],
 )
-def test_a_recording_for_which_memory_is_too_small_is_not_called_damaged(tmp_path, monkeypatch, error):
+def test_a_recording_for_which_memory_is_too_small_is_not_called_damaged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
     path = write_episode(tmp_path / "good.mcap", cameras=(), num_frames=5)
 
     def fail(*_: object) -> bytes:
@@ -33,7 +36,7 @@ def test_a_recording_for_which_memory_is_too_small_is_not_called_damaged(tmp_pat
     assert "damaged" not in str(told.value)
 
 
-def test_other_errors_of_the_decompression_are_damage(tmp_path, monkeypatch):
+def test_other_errors_of_the_decompression_are_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write_episode(tmp_path / "good.mcap", cameras=(), num_frames=5)
 
     def fail(*_: object) -> bytes:
@@ -44,7 +47,7 @@ def test_other_errors_of_the_decompression_are_damage(tmp_path, monkeypatch):
         inspect_recording(path)
 
 
-def test_nor_is_one_that_cannot_be_opened_for_too_many_open_files(tmp_path):
+def test_nor_is_one_that_cannot_be_opened_for_too_many_open_files(tmp_path: Path) -> None:
     path = write_episode(tmp_path / "good.mcap", cameras=(), num_frames=5)
     before = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (3, before[1]))

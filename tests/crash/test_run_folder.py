@@ -7,28 +7,25 @@ import os
 import shutil
 import socket
 import sys
+from collections.abc import Callable
 from contextlib import chdir
 from pathlib import Path
 
 import pytest
 from support import generate as generating
-from support.generate import Remembers, expected_attempts, run_fake
+from support.generate import Remembers, attempts_of, expected_attempts, run_fake
 
 from demorec.cli import main
 from demorec.config import GenerateConfig
 from demorec.errors import ConfigError, GenerationError, MissingDependencyError, ResourceError
 from demorec.generate import survey
 from demorec.generate.options import RunOptions
-from demorec.generate.run import generate
+from demorec.generate.run import RunResult, generate
 from demorec.runs.run_file import load_run_file
 
 
-def attempts(result) -> dict[tuple[int, int], bool]:
-    return {(a.episode_index, a.attempt): a.success for a in result.run.attempts}
-
-
 @pytest.fixture(scope="module")
-def reference(tmp_path_factory):
+def reference(tmp_path_factory: pytest.TempPathFactory) -> RunResult:
     """Of 8 episodes."""
     return run_fake(tmp_path_factory.mktemp("reference") / "run")
 
@@ -55,7 +52,9 @@ def refuse_ray(out: Path) -> None:
 
 @pytest.mark.parametrize("refuse", [refuse_a_fixed_layout, refuse_an_unknown_module, refuse_ray])
 @pytest.mark.parametrize("there", ["nothing", "an empty folder", "a run", "files of somebody"])
-def test_a_refused_request_writes_nothing(tmp_path, monkeypatch, refuse, there):
+def test_a_refused_request_writes_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refuse: Callable[[Path], object], there: str
+) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)  # not installed
     monkeypatch.delitem(sys.modules, "demorec.generate.on_ray", raising=False)
     out = tmp_path / "out"
@@ -70,7 +69,7 @@ def test_a_refused_request_writes_nothing(tmp_path, monkeypatch, refuse, there):
     assert content_of(tmp_path) == before
 
 
-def test_neither_another_run_nor_a_strangers_folder_is_touched(tmp_path):
+def test_neither_another_run_nor_a_strangers_folder_is_touched(tmp_path: Path) -> None:
     run, stranger = tmp_path / "run", tmp_path / "stranger"
     run_fake(run, num_episodes=1)
     (run / ".lock").unlink()  # as after a copy that leaves such files out
@@ -85,12 +84,12 @@ def test_neither_another_run_nor_a_strangers_folder_is_touched(tmp_path):
     assert content_of(tmp_path) == before
 
 
-def test_a_run_without_an_episode_claims_nothing(tmp_path):
+def test_a_run_without_an_episode_claims_nothing(tmp_path: Path) -> None:
     out = tmp_path / "run"
     with pytest.raises(GenerationError):
         run_fake(out, seed=5, maker="raise_ours")
     assert load_run_file(out).config.seed == 5
-    assert attempts(run_fake(out, num_episodes=2)) == expected_attempts(2)
+    assert attempts_of(run_fake(out, num_episodes=2)) == expected_attempts(2)
     with pytest.raises(ConfigError, match="holds another run"):
         run_fake(out, seed=5)
 
@@ -111,7 +110,9 @@ def make_dangling_link(path: Path) -> None:
 
 @pytest.mark.parametrize("known", [True, False])
 @pytest.mark.parametrize("make", [os.mkfifo, make_folder, make_socket, make_dangling_link])
-def test_whatever_has_the_name_of_a_recording_is_set_aside(tmp_path, reference, make, known):
+def test_whatever_has_the_name_of_a_recording_is_set_aside(
+    tmp_path: Path, reference: RunResult, make: Callable[[Path], object], known: bool
+) -> None:
     out = tmp_path / "run"
     shutil.copytree(reference.folder, out)
     victim = out / reference.run.successes[3].file
@@ -132,7 +133,7 @@ def test_whatever_has_the_name_of_a_recording_is_set_aside(tmp_path, reference, 
         assert (aside / "mine.txt").read_text() == "mine"
 
 
-def test_other_files_among_the_recordings_stay_where_they_are(tmp_path, reference):
+def test_other_files_among_the_recordings_stay_where_they_are(tmp_path: Path, reference: RunResult) -> None:
     out = tmp_path / "run"
     shutil.copytree(reference.folder, out)
     (out / "episodes/notes.txt").write_text("mine")
@@ -140,7 +141,7 @@ def test_other_files_among_the_recordings_stay_where_they_are(tmp_path, referenc
     assert (out / "episodes/notes.txt").read_text() == "mine"
 
 
-def test_a_folder_of_somebodys_episodes_is_no_run(tmp_path):
+def test_a_folder_of_somebodys_episodes_is_no_run(tmp_path: Path) -> None:
     (tmp_path / "episodes").mkdir()
     (tmp_path / "episodes/s01e01.mkv").write_text("mine")
     (tmp_path / "notes.txt").write_text("mine")
@@ -151,7 +152,7 @@ def test_a_folder_of_somebodys_episodes_is_no_run(tmp_path):
 
 
 @pytest.mark.parametrize("make", [os.mkfifo, make_folder, make_socket, lambda path: path.symlink_to("run.json")])
-def test_a_lock_that_is_no_file_is_told(tmp_path, reference, make):
+def test_a_lock_that_is_no_file_is_told(tmp_path: Path, reference: RunResult, make: Callable[[Path], object]) -> None:
     out = tmp_path / "run"
     shutil.copytree(reference.folder, out)
     (out / ".lock").unlink()
@@ -171,7 +172,9 @@ def test_a_lock_that_is_no_file_is_told(tmp_path, reference, make):
     ],
 )
 @pytest.mark.parametrize("known", [True, False])
-def test_nothing_is_set_aside_for_what_the_machine_lacks(tmp_path, monkeypatch, reference, error, words, known):
+def test_nothing_is_set_aside_for_what_the_machine_lacks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reference: RunResult, error: Exception, words: str, known: bool
+) -> None:
     out = tmp_path / "run"
     shutil.copytree(reference.folder, out)
     if not known:
@@ -190,7 +193,9 @@ def test_nothing_is_set_aside_for_what_the_machine_lacks(tmp_path, monkeypatch, 
 
 @pytest.mark.parametrize("command", ["info", "check", "reproduce"])
 @pytest.mark.parametrize("make", [os.mkfifo, lambda path: path.write_text("[" * 100_000)])
-def test_a_run_json_that_cannot_be_read_is_one_sentence_for_every_command(tmp_path, capsys, command, make):
+def test_a_run_json_that_cannot_be_read_is_one_sentence_for_every_command(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str, make: Callable[[Path], object]
+) -> None:
     make(tmp_path / "run.json")
     out = ["--out", str(tmp_path / "copy")] if command == "reproduce" else []
     with pytest.raises(SystemExit) as ended:

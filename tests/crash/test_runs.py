@@ -8,20 +8,23 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import psutil
 import pytest
-from support.generate import Remembers, expected_attempts, run_fake
+from support.commands import workers_of
+from support.generate import Remembers, attempts_of, expected_attempts, num_finished, run_fake
 
 from demorec.errors import ConfigError, DemorecError, GenerationError
+from demorec.generate.run import GRACE_S, RunResult
 from demorec.runs.run_file import load_run_file
 
 
-def driver(out: Path, maker: str, num_episodes: int, workers: int = 2) -> subprocess.Popen[str]:
+def driver(out: Path, maker: str, num_episodes: int, grace_s: float = GRACE_S) -> subprocess.Popen[str]:
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[1]), *sys.path])}
     return subprocess.Popen(
-        [sys.executable, "-m", "support.generate", str(out), maker, str(num_episodes), str(workers)],
+        [sys.executable, "-m", "support.generate", str(out), maker, str(num_episodes), "2", str(grace_s)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -29,7 +32,7 @@ def driver(out: Path, maker: str, num_episodes: int, workers: int = 2) -> subpro
     )
 
 
-def wait_for(condition, seconds: float = 30.0) -> None:
+def wait_for(condition: Callable[[], bool], seconds: float = 30.0) -> None:
     deadline = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < deadline, "it never happened"
@@ -42,8 +45,10 @@ def assert_gone(processes: list[psutil.Process]) -> None:
     assert not alive
 
 
-def num_finished(out: Path) -> int:
-    return len(list((out / "episodes").glob("*"))) if out.exists() else 0
+def wait_until_busy(process: subprocess.Popen[str], out: Path) -> None:
+    """Until both workers have begun an episode that never ends."""
+    wait_for(lambda: len(list((out / "unfinished").glob("busy-*"))) == 2 or process.poll() is not None, 60)
+    assert process.poll() is None, process.communicate()
 
 
 def wait_for_progress(process: subprocess.Popen[str], out: Path, count: int) -> None:
@@ -51,16 +56,12 @@ def wait_for_progress(process: subprocess.Popen[str], out: Path, count: int) -> 
     wait_for(lambda: num_finished(out) >= enough or process.poll() is not None, 60)
 
 
-def attempts(result) -> dict[tuple[int, int], bool]:
-    return {(a.episode_index, a.attempt): a.success for a in result.run.attempts}
-
-
 @pytest.fixture(scope="module")
-def reference(tmp_path_factory):
+def reference(tmp_path_factory: pytest.TempPathFactory) -> RunResult:
     """Of 8 episodes, made by one worker without any trouble."""
     result = run_fake(tmp_path_factory.mktemp("reference") / "run", workers=1)
-    assert attempts(result) == expected_attempts(8)
-    assert any(not success for success in attempts(result).values()), "the seed must make some attempt fail"
+    assert attempts_of(result) == expected_attempts(8)
+    assert any(not success for success in attempts_of(result).values()), "the seed must make some attempt fail"
     return result
 
 
@@ -68,19 +69,21 @@ def reference(tmp_path_factory):
     ("workers", "episodes", "recycle_after"),
     [(2, None, 500), (1, list(reversed(range(8))), 500), (3, [5, 0, 7, 2, 1, 6, 3, 4], 2)],
 )
-def test_neither_workers_nor_order_nor_recycling_change_a_run(tmp_path, reference, workers, episodes, recycle_after):
+def test_neither_workers_nor_order_nor_recycling_change_a_run(
+    tmp_path: Path, reference: RunResult, workers: int, episodes: list[int] | None, recycle_after: int
+) -> None:
     result = run_fake(tmp_path / "run", workers=workers, episodes=episodes, recycle_after=recycle_after)
     assert result.run.digest == reference.run.digest
-    assert attempts(result) == attempts(reference)
+    assert attempts_of(result) == attempts_of(reference)
     files = sorted(p.name for p in (tmp_path / "run").rglob("*.mcap"))
     assert files == sorted(p.name for p in reference.folder.rglob("*.mcap"))
 
 
-def test_another_seed_is_another_run(tmp_path, reference):
+def test_another_seed_is_another_run(tmp_path: Path, reference: RunResult) -> None:
     assert run_fake(tmp_path / "run", seed=1).run.digest != reference.run.digest
 
 
-def test_workers_are_other_processes_with_one_thread_each_and_are_recycled(tmp_path):
+def test_workers_are_other_processes_with_one_thread_each_and_are_recycled(tmp_path: Path) -> None:
     run_fake(tmp_path / "run", maker="report_pid", workers=2, recycle_after=2)
     seen = [p.name.split("-")[1:] for p in (tmp_path / "run/unfinished").glob("pid-*")]
     assert {threads for _, threads in seen} == {"1"}
@@ -88,7 +91,7 @@ def test_workers_are_other_processes_with_one_thread_each_and_are_recycled(tmp_p
     assert len(seen) >= len(expected_attempts(8)) / 2
 
 
-def test_the_same_command_again_keeps_everything(tmp_path, reference):
+def test_the_same_command_again_keeps_everything(tmp_path: Path, reference: RunResult) -> None:
     first = run_fake(tmp_path / "run")
     before = {p: p.stat().st_mtime_ns for p in (tmp_path / "run").rglob("*.mcap")}
     second = run_fake(tmp_path / "run")
@@ -97,7 +100,9 @@ def test_the_same_command_again_keeps_everything(tmp_path, reference):
     assert before == {p: p.stat().st_mtime_ns for p in (tmp_path / "run").rglob("*.mcap")}
 
 
-def test_more_episodes_extend_a_run_and_fewer_are_the_run_that_they_would_have_been(tmp_path, reference):
+def test_more_episodes_extend_a_run_and_fewer_are_the_run_that_they_would_have_been(
+    tmp_path: Path, reference: RunResult
+) -> None:
     out = tmp_path / "run"
     alone = run_fake(out, num_episodes=3)
     grown = run_fake(out, num_episodes=8)
@@ -107,7 +112,7 @@ def test_more_episodes_extend_a_run_and_fewer_are_the_run_that_they_would_have_b
     shrunk = run_fake(out, num_episodes=3, progress=heard)
     assert shrunk.run.digest == alone.run.digest
     assert shrunk.run.is_complete
-    assert attempts(shrunk) == expected_attempts(3)
+    assert attempts_of(shrunk) == expected_attempts(3)
     assert num_finished(out) == num_finished(reference.folder), "what exists stays"
     (said,) = heard.said
     assert "asked for now (3), the folder holds recordings of later episodes (5): they stay, outside of" in said
@@ -116,7 +121,7 @@ def test_more_episodes_extend_a_run_and_fewer_are_the_run_that_they_would_have_b
     assert again.run.digest == reference.run.digest
 
 
-def test_fewer_episodes_than_an_interrupted_run_wanted_are_enough(tmp_path):
+def test_fewer_episodes_than_an_interrupted_run_wanted_are_enough(tmp_path: Path) -> None:
     """5000 were asked for and some were made; then 3 are asked for."""
     out = tmp_path / "run"
     with pytest.raises(GenerationError):
@@ -127,7 +132,7 @@ def test_fewer_episodes_than_an_interrupted_run_wanted_are_enough(tmp_path):
     assert result.run.digest == run_fake(tmp_path / "alone", num_episodes=3).run.digest
 
 
-def test_another_config_is_refused_and_nothing_is_touched(tmp_path):
+def test_another_config_is_refused_and_nothing_is_touched(tmp_path: Path) -> None:
     run_fake(tmp_path / "run")
     before = {p: p.read_bytes() for p in (tmp_path / "run").rglob("*") if p.is_file() and p.name != ".lock"}
     with pytest.raises(ConfigError, match=r"holds another run \(seed is 0 there and 1 here\).*--overwrite"):
@@ -135,16 +140,16 @@ def test_another_config_is_refused_and_nothing_is_touched(tmp_path):
     assert before == {p: p.read_bytes() for p in before}
 
 
-def test_overwrite_begins_anew_and_leaves_the_files_of_others(tmp_path):
+def test_overwrite_begins_anew_and_leaves_the_files_of_others(tmp_path: Path) -> None:
     run_fake(tmp_path / "run")
     (tmp_path / "run/notes.txt").write_text("mine")
     result = run_fake(tmp_path / "run", seed=1, num_episodes=2, overwrite=True)
-    assert attempts(result) == expected_attempts(2, seed=1)
+    assert attempts_of(result) == expected_attempts(2, seed=1)
     assert num_finished(tmp_path / "run") == sum(expected_attempts(2, seed=1).values())
     assert (tmp_path / "run/notes.txt").read_text() == "mine"
 
 
-def test_a_folder_with_other_files_is_refused_even_with_overwrite(tmp_path):
+def test_a_folder_with_other_files_is_refused_even_with_overwrite(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("mine")
     for overwrite in (False, True):
         with pytest.raises(ConfigError, match=r"of no run \(thesis.tex\)"):
@@ -153,7 +158,7 @@ def test_a_folder_with_other_files_is_refused_even_with_overwrite(tmp_path):
 
 
 @pytest.mark.parametrize("damage", ["truncate", "flip", "swap", "empty"])
-def test_damaged_recordings_are_set_aside_and_made_again(tmp_path, reference, damage):
+def test_damaged_recordings_are_set_aside_and_made_again(tmp_path: Path, reference: RunResult, damage: str) -> None:
     out = tmp_path / "run"
     run_fake(out)
     files = sorted((out / "episodes").glob("*"))
@@ -175,7 +180,7 @@ def test_damaged_recordings_are_set_aside_and_made_again(tmp_path, reference, da
     assert any(victim.name in said for said in heard.said)
 
 
-def test_missing_recordings_are_made_again(tmp_path, reference):
+def test_missing_recordings_are_made_again(tmp_path: Path, reference: RunResult) -> None:
     out = tmp_path / "run"
     result = run_fake(out)
     (out / result.run.failures[0].file).unlink()
@@ -186,7 +191,9 @@ def test_missing_recordings_are_made_again(tmp_path, reference):
 
 
 @pytest.mark.parametrize("content", [b"", b"{}", b"\xff\x00\xff", None])
-def test_a_lost_or_damaged_run_json_is_rebuilt_from_the_recordings(tmp_path, reference, content):
+def test_a_lost_or_damaged_run_json_is_rebuilt_from_the_recordings(
+    tmp_path: Path, reference: RunResult, content: bytes | None
+) -> None:
     out = tmp_path / "run"
     run_fake(out)
     if content is None:
@@ -202,7 +209,7 @@ def test_a_lost_or_damaged_run_json_is_rebuilt_from_the_recordings(tmp_path, ref
         assert "damaged" in heard.said[0]
 
 
-def test_without_run_json_another_config_is_still_refused(tmp_path):
+def test_without_run_json_another_config_is_still_refused(tmp_path: Path) -> None:
     out = tmp_path / "run"
     run_fake(out)
     (out / "run.json").unlink()
@@ -210,7 +217,7 @@ def test_without_run_json_another_config_is_still_refused(tmp_path):
         run_fake(out, seed=1)
 
 
-def test_a_recording_of_another_run_is_set_aside(tmp_path, reference):
+def test_a_recording_of_another_run_is_set_aside(tmp_path: Path, reference: RunResult) -> None:
     other = run_fake(tmp_path / "other", seed=1)
     out = tmp_path / "run"
     run_fake(out, num_episodes=3)
@@ -221,7 +228,7 @@ def test_a_recording_of_another_run_is_set_aside(tmp_path, reference):
     assert (out / "unfinished" / stranger.name).read_bytes() == stranger.read_bytes()
 
 
-def test_a_killed_worker_costs_one_attempt(tmp_path, reference):
+def test_a_killed_worker_costs_one_attempt(tmp_path: Path, reference: RunResult) -> None:
     heard = Remembers()
     result = run_fake(tmp_path / "run", maker="die_once", progress=heard)
     assert result.run.digest == reference.run.digest
@@ -229,14 +236,14 @@ def test_a_killed_worker_costs_one_attempt(tmp_path, reference):
     assert heard.said == ["Episode 2 is made again: its worker was ended by SIGKILL (out of memory?)."]
 
 
-def test_an_episode_that_kills_every_worker_ends_the_run_with_a_sentence(tmp_path):
+def test_an_episode_that_kills_every_worker_ends_the_run_with_a_sentence(tmp_path: Path) -> None:
     with pytest.raises(GenerationError, match=r"Episode 2 failed to be made 5 times.*SIGKILL.*are complete and kept"):
         run_fake(tmp_path / "run", maker="die_always")
     assert load_run_file(tmp_path / "run").sessions[-1].state == "stopped"
     assert num_finished(tmp_path / "run") > 0
 
 
-def test_a_bad_moment_of_the_file_system_is_survived(tmp_path, reference):
+def test_a_bad_moment_of_the_file_system_is_survived(tmp_path: Path, reference: RunResult) -> None:
     assert run_fake(tmp_path / "run", maker="flicker").run.digest == reference.run.digest
 
 
@@ -250,7 +257,9 @@ def test_a_bad_moment_of_the_file_system_is_survived(tmp_path, reference):
         ("raise_ours", GenerationError, r"Episode \d cannot be made: No OpenGL library was found."),
     ],
 )
-def test_what_stops_a_run_is_told_and_the_same_command_goes_on(tmp_path, reference, maker, error, message):
+def test_what_stops_a_run_is_told_and_the_same_command_goes_on(
+    tmp_path: Path, reference: RunResult, maker: str, error: type[DemorecError], message: str
+) -> None:
     out = tmp_path / "run"
     with pytest.raises(error, match=message) as caught:
         run_fake(out, maker=maker)
@@ -261,7 +270,7 @@ def test_what_stops_a_run_is_told_and_the_same_command_goes_on(tmp_path, referen
     assert run_fake(out).run.digest == reference.run.digest
 
 
-def test_a_vanished_folder_is_told(tmp_path):
+def test_a_vanished_folder_is_told(tmp_path: Path) -> None:
     with pytest.raises(GenerationError, match="has vanished"):
         run_fake(tmp_path / "run", maker="lose_the_folder")
     assert not (tmp_path / "run").exists(), "it must not be begun anew"
@@ -269,13 +278,13 @@ def test_a_vanished_folder_is_told(tmp_path):
 
 
 @pytest.mark.parametrize("place", ["a-file/run", "/proc/demorec-run"])
-def test_an_impossible_folder_is_told(tmp_path, place):
+def test_an_impossible_folder_is_told(tmp_path: Path, place: str) -> None:
     (tmp_path / "a-file").touch()
     with pytest.raises(ConfigError, match="cannot be made"):
         run_fake(tmp_path / place)
 
 
-def test_two_runs_into_one_folder_exclude_each_other_until_the_owner_dies(tmp_path):
+def test_two_runs_into_one_folder_exclude_each_other_until_the_owner_dies(tmp_path: Path) -> None:
     out = tmp_path / "run"
     first = driver(out, "make_for_ever", 4)
     try:
@@ -286,11 +295,13 @@ def test_two_runs_into_one_folder_exclude_each_other_until_the_owner_dies(tmp_pa
         first.kill()
         first.communicate()
     assert (out / ".lock").exists()
-    assert attempts(run_fake(out, num_episodes=4)) == expected_attempts(4)
+    assert attempts_of(run_fake(out, num_episodes=4)) == expected_attempts(4)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_the_first_interrupt_lets_current_episodes_end(tmp_path, reference, number):
+def test_the_first_interrupt_lets_current_episodes_end(
+    tmp_path: Path, reference: RunResult, number: signal.Signals
+) -> None:
     out = tmp_path / "run"
     process = driver(out, "make_slowly", 8)
     wait_for(lambda: num_finished(out) >= 1)
@@ -307,11 +318,10 @@ def test_the_first_interrupt_lets_current_episodes_end(tmp_path, reference, numb
 
 
 @pytest.mark.parametrize("maker", ["make_for_ever", "make_stubbornly"])
-def test_after_the_first_interrupt_nothing_goes_on_for_long(tmp_path, maker):
+def test_after_the_first_interrupt_nothing_goes_on_for_long(tmp_path: Path, maker: str) -> None:
     out = tmp_path / "run"
-    process = driver(out, maker, 4)
-    wait_for(lambda: len(psutil.Process(process.pid).children()) >= 2 and (out / "run.json").exists())
-    time.sleep(1.0)
+    process = driver(out, maker, 4, grace_s=0.3)
+    wait_until_busy(process, out)
     workers = psutil.Process(process.pid).children(recursive=True)
     process.send_signal(signal.SIGINT)
     process.communicate(timeout=25)
@@ -319,10 +329,10 @@ def test_after_the_first_interrupt_nothing_goes_on_for_long(tmp_path, maker):
     assert_gone(workers)
 
 
-def test_the_second_interrupt_ends_at_once(tmp_path):
+def test_the_second_interrupt_ends_at_once(tmp_path: Path) -> None:
     out = tmp_path / "run"
     process = driver(out, "make_stubbornly", 4)
-    wait_for(lambda: len(psutil.Process(process.pid).children()) >= 2 and (out / "run.json").exists())
+    wait_until_busy(process, out)
     workers = psutil.Process(process.pid).children(recursive=True)
     process.send_signal(signal.SIGINT)
     time.sleep(0.5)
@@ -332,10 +342,9 @@ def test_the_second_interrupt_ends_at_once(tmp_path):
     assert_gone(workers)
 
 
-def test_a_killed_driver_leaves_no_orphans(tmp_path):
+def test_a_killed_driver_leaves_no_orphans(tmp_path: Path) -> None:
     process = driver(tmp_path / "run", "make_for_ever", 4)
-    wait_for(lambda: len(psutil.Process(process.pid).children()) >= 2)
-    time.sleep(0.5)
+    wait_until_busy(process, tmp_path / "run")
     workers = psutil.Process(process.pid).children(recursive=True)
     process.kill()
     process.communicate()
@@ -343,7 +352,7 @@ def test_a_killed_driver_leaves_no_orphans(tmp_path):
 
 
 @pytest.mark.parametrize("kills", [4, pytest.param(40, marks=pytest.mark.slow)])
-def test_runs_that_are_killed_again_and_again_come_to_the_same_end(tmp_path, kills):
+def test_runs_that_are_killed_again_and_again_come_to_the_same_end(tmp_path: Path, kills: int) -> None:
     """SIGKILL to the driver or to a worker, at moments spread over the run."""
     num_episodes, chance = 20 * kills, random.Random(kills)
     reference = run_fake(tmp_path / "reference", num_episodes=num_episodes)
@@ -353,7 +362,7 @@ def test_runs_that_are_killed_again_and_again_come_to_the_same_end(tmp_path, kil
     while sum(killed.values()) < kills and process.poll() is None:
         wait_for_progress(process, out, chance.randrange(12))
         time.sleep(chance.random() * 0.05)
-        workers = [p for p in psutil.Process(process.pid).children() if "spawn_main" in " ".join(p.cmdline())]
+        workers = workers_of(process)
         if process.poll() is not None:
             break
         if workers and chance.random() < 0.5:
@@ -369,9 +378,9 @@ def test_runs_that_are_killed_again_and_again_come_to_the_same_end(tmp_path, kil
     assert min(killed.values()) > 0
     result = run_fake(out, num_episodes=num_episodes)
     assert result.run.digest == reference.run.digest
-    assert attempts(result) == expected_attempts(num_episodes)
+    assert attempts_of(result) == expected_attempts(num_episodes)
 
 
-def test_errors_are_of_the_tree():
+def test_errors_are_of_the_tree() -> None:
     assert issubclass(GenerationError, DemorecError)
     assert GenerationError("x").exit_code == 1

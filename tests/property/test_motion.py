@@ -30,7 +30,9 @@ LIMITS = MotionLimits(
     fps=st.sampled_from([10, 30, 60]),
     start=st.lists(st.floats(-0.2, 0.2), min_size=7, max_size=7),
 )
-def test_velocity_and_acceleration_limits_hold(x, y, z, yaw, speed, fps, start):
+def test_velocity_and_acceleration_limits_hold(
+    x: float, y: float, z: float, yaw: float, speed: float, fps: int, start: list[float]
+) -> None:
     q = HOME + np.array(start)
     goal = hand_down((x, y, z), yaw)
     path = plan_straight(ARM, start=q, goal=goal, rest=HOME, speed=speed, limits=LIMITS, dt=1 / fps)
@@ -48,7 +50,7 @@ def test_velocity_and_acceleration_limits_hold(x, y, z, yaw, speed, fps, start):
     assert np.linalg.norm(np.diff(hand, axis=0), axis=1).max() * fps <= speed * 1.02 + 2e-4 * fps
 
 
-def test_most_of_the_workspace_can_be_planned():
+def test_most_of_the_workspace_can_be_planned() -> None:
     points = [(x, y) for x in np.linspace(0.35, 0.65, 5) for y in np.linspace(-0.25, 0.25, 5)]
     paths = [
         plan_straight(ARM, start=HOME, goal=hand_down((*p, 0.02), 0.3), rest=HOME, speed=0.6, limits=LIMITS, dt=1 / 30)
@@ -57,8 +59,8 @@ def test_most_of_the_workspace_can_be_planned():
     assert all(path is not None for path in paths)
 
 
-def test_the_time_law_starts_and_ends_at_rest():
-    u = np.linspace(0, 1, 2001)
+def test_the_time_law_starts_and_ends_at_rest() -> None:
+    u = np.linspace(0, 1, 2001, dtype=np.float64)
     s = quintic(u)
     assert s[0] == 0
     assert abs(s[-1] - 1) < 1e-12
@@ -70,12 +72,12 @@ def test_the_time_law_starts_and_ends_at_rest():
     assert abs(acceleration[5:-5].max() - 10 / math.sqrt(3)) < 1e-2
 
 
-def test_slowdown_is_the_analytic_factor():
+def test_slowdown_is_the_analytic_factor() -> None:
     limits = MotionLimits(joint_velocity=np.array([1.0]), joint_acceleration=np.array([1e9]))
     path = np.array([[0.1], [0.3], [0.4]])
     assert math.isclose(slowdown(path, start=np.array([0.0]), limits=limits, dt=0.1), 2.0)
 
 
-def test_an_unreachable_goal_is_none():
+def test_an_unreachable_goal_is_none() -> None:
     goal = hand_down((1.5, 0.0, 0.2), 0.0)
     assert plan_straight(ARM, start=HOME, goal=goal, rest=HOME, speed=0.5, limits=LIMITS, dt=1 / 30) is None

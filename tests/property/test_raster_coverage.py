@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -15,7 +17,7 @@ SIZE = 96
 """Samples: room for triangles on both sides of what counts as narrow."""
 
 
-def hits(corners: np.ndarray) -> np.ndarray:
+def hits(corners: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
     """(SIZE, SIZE) whether each sample is covered by a triangle (3, 2) of 1/256 samples."""
     vertices = np.zeros((3, 8))
     geometry = merge([vertices], [np.array([[0, 1, 2]])])
@@ -55,7 +57,7 @@ def test_a_mesh_covers_every_sample_once(points: list[tuple[int, int]], step: in
         mesh = Delaunay(corners)
     except QhullError:
         return  # all on one line
-    count = sum(hits(corners[triangle]).astype(int) for triangle in mesh.simplices)
+    count = np.sum([hits(corners[triangle]) for triangle in mesh.simplices], axis=0)
     assert count.max(initial=0) <= 1
     middle = np.arange(SIZE) * 256 + 128
     x, y = np.meshgrid(middle, middle)

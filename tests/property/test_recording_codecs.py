@@ -7,6 +7,7 @@ import io
 import struct
 import xml.etree.ElementTree as ET
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from mcap_ros2._dynamic import generate_dynamic
+from support.present import present
 
 from demorec.errors import RecordingError
 from demorec.geometry import Pose
@@ -37,16 +39,16 @@ pictures = hnp.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=24)
         np.uint16, pictures, elements=st.one_of(st.just(0), st.integers(1, 12), st.integers(0, 65535)), fill=st.just(0)
     )
 )
-def test_depth_is_exact_to_the_millimetre(millimetres: np.ndarray) -> None:
+def test_depth_is_exact_to_the_millimetre(millimetres: np.ndarray[Any, Any]) -> None:
     metres = (millimetres / np.float32(1000)).astype(np.float32)
-    decoded = decode_depth(encode_depth(metres), metres.shape)
+    decoded = decode_depth(encode_depth(metres), (metres.shape[0], metres.shape[1]))
     assert decoded.shape == millimetres.shape
     assert np.array_equal(np.rint(decoded.astype(np.float64) * 1000), millimetres)
 
 
 def test_depth_beyond_its_range_counts_as_nothing_hit() -> None:
     metres = np.array([[np.nan, np.inf, -1.0, 65.6, 65.535, 0.0004, 0.0006, 1.2345]], dtype=np.float32)
-    found = decode_depth(encode_depth(metres), metres.shape)
+    found = decode_depth(encode_depth(metres), (1, 8))
     assert np.allclose(found, [[0, 0, 0, 0, 65.535, 0, 0.001, 1.234]], atol=1e-6)
 
 
@@ -64,11 +66,11 @@ def test_depth_is_rvl_of_the_paper() -> None:
     hnp.arrays(np.int32, pictures, elements=st.integers(0, 254)),
     hnp.arrays(np.int32, (24, 24), elements=st.integers(-1, 254)),
 )
-def test_labels(bodies: np.ndarray, links: np.ndarray) -> None:
+def test_labels(bodies: np.ndarray[Any, Any], links: np.ndarray[Any, Any]) -> None:
     height, width = bodies.shape
     values = np.where(links[:height, :width] == 7, -1, bodies + ((links[:height, :width] + 1) << 24 & 0x7F000000))
     values = values.astype(np.int32)
-    assert np.array_equal(decode_labels(encode_labels(values), values.shape), values)
+    assert np.array_equal(decode_labels(encode_labels(values), (height, width)), values)
 
 
 def test_too_many_bodies_for_labels() -> None:
@@ -130,7 +132,8 @@ def test_reading_junk_raises_nothing_but_value_errors(junk: bytes) -> None:
                 getattr(CdrReader(data), read)()
 
 
-def inside(primitive: Primitive, points: np.ndarray, slack: float) -> np.ndarray:
+def inside(primitive: Primitive, points: np.ndarray[Any, Any], slack: float) -> Any:
+    """(N,) whether points lie within a primitive."""
     offset = np.abs(points - np.array(primitive.center))
     if primitive.kind == "box":
         return np.all(offset <= np.array(primitive.size) / 2 + slack, axis=1)
@@ -173,14 +176,14 @@ def test_descriptions_are_urdf_that_pybullet_loads(tmp_path: Path) -> None:
     client = pybullet.connect(pybullet.DIRECT)
     try:
         texts = {"robot": (robot_description("franka_panda/panda.urdf", 1.0), 12)}
-        for kind, size in (
-            ("box", (0.1, 0.2, 0.3)),
-            ("sphere", (0.1,)),
-            ("cylinder", (0.1, 0.3)),
-            ("capsule", (0.1, 0.3)),
+        for shape in (
+            Shape(kind="box", size=(0.1, 0.2, 0.3)),
+            Shape(kind="sphere", size=(0.1,)),
+            Shape(kind="cylinder", size=(0.1, 0.3)),
+            Shape(kind="capsule", size=(0.1, 0.3)),
         ):
-            body = Body(name=kind, role="object", shape=Shape(kind=kind, size=size), world_from_body=Pose())
-            texts[kind] = (body_description(body), 0)
+            body = Body(name=shape.kind, role="object", shape=shape, world_from_body=Pose())
+            texts[shape.kind] = (body_description(body), 0)
         for name, (text, joints) in texts.items():
             path = tmp_path / f"{name}.urdf"
             path.write_text(text)
@@ -194,7 +197,10 @@ def test_descriptions_are_urdf_that_pybullet_loads(tmp_path: Path) -> None:
 def test_a_larger_robot_is_described_larger() -> None:
     small, large = (robot_description("franka_panda/panda.urdf", scale) for scale in (1.0, 2.0))
     origins = [
-        [[float(v) for v in joint.find("origin").get("xyz").split()] for joint in ET.fromstring(text).findall("joint")]
+        [
+            [float(value) for value in present(joint.find("origin")).attrib["xyz"].split()]
+            for joint in ET.fromstring(text).findall("joint")
+        ]
         for text in (small, large)
     ]
     assert np.allclose(2 * np.array(origins[0]), origins[1], atol=1e-4)

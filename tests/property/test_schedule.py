@@ -44,7 +44,7 @@ OUTCOMES = st.lists(st.lists(st.booleans(), min_size=MAX_ATTEMPTS, max_size=MAX_
 
 @settings(max_examples=300)
 @given(outcomes=OUTCOMES, seed=st.integers(0, 2**32))
-def test_every_order_and_every_interruption_come_to_the_same_attempts(outcomes, seed):
+def test_every_order_and_every_interruption_come_to_the_same_attempts(outcomes: list[list[bool]], seed: int) -> None:
     chance = random.Random(seed)
     everything = canonical(outcomes)
     config = GenerateConfig(max_attempts=MAX_ATTEMPTS)
@@ -75,7 +75,7 @@ def test_every_order_and_every_interruption_come_to_the_same_attempts(outcomes, 
     assert set(complete.given_up) == {i for i, of_episode in enumerate(outcomes) if not any(of_episode)}
 
 
-def test_differences_name_every_value_that_differs_and_only_those():
+def test_differences_name_every_value_that_differs_and_only_those() -> None:
     there = {"seed": 0, "cameras": ["front"], "video": {"codec": "h264", "gop": 2}}
     here = {"seed": 1, "cameras": ("front",), "video": {"codec": "av1", "gop": 2}, "new": 3}
     assert plain_differences(there, here) == (

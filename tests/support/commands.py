@@ -1,6 +1,7 @@
-"""Commands run one after the other in a process of their own, with the memory that each of them took.
+"""Commands as a user types them: in this process for their exit code, or in one of their own with what they took.
 
-Starting Python and its libraries takes longer than refusing a file, so one process serves a whole test module.
+Starting Python and its libraries takes longer than refusing a file, so one process serves a whole test module. It runs
+this file as a script.
 """
 
 from __future__ import annotations
@@ -11,12 +12,35 @@ import json
 import subprocess
 import sys
 import traceback
+from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
+
+import psutil
+
+from demorec.cli import COMMANDS, main
 
 MOST_BYTES = 500_000_000
 _PATIENCE_SECONDS = 240.0
+
+
+def exit_code(*arguments: object, program: Callable[[list[str]], object] = main) -> int:
+    """The exit code of a command that is run in this process: `demorec ARGUMENTS...`."""
+    try:
+        program([str(argument) for argument in arguments])
+    except SystemExit as ended:
+        return int(ended.code or 0)
+    raise AssertionError("a command ends by SystemExit")
+
+
+def workers_of(process: subprocess.Popen[Any]) -> list[psutil.Process]:
+    """The worker processes below a command that runs; none when it has ended."""
+    try:
+        below = psutil.Process(process.pid).children(recursive=True)
+        return [child for child in below if "spawn_main" in " ".join(child.cmdline())]
+    except psutil.Error:
+        return []
 
 
 class Told(NamedTuple):
@@ -33,7 +57,11 @@ class Commands:
 
     def __enter__(self) -> Self:
         self._process = subprocess.Popen(
-            [sys.executable, __file__], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+            # -P: the modules beside this file (mcap, docs ...) must not stand before the libraries of their names.
+            [sys.executable, "-P", __file__],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
         )
         return self
 
@@ -71,8 +99,6 @@ class Commands:
 def _serve() -> None:
     import os
     import time
-
-    from demorec.cli import COMMANDS, main
 
     for name in COMMANDS.names():
         COMMANDS.load(name)

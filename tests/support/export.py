@@ -13,10 +13,12 @@ from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
+import pytest
 
 from demorec.config import VideoConfig
 from demorec.errors import ExportError
 from demorec.lerobot import ExportReport
+from demorec.lerobot import export as lerobot_export
 from demorec.tables import EXPORTERS
 from support.recording import write_episode
 
@@ -47,6 +49,11 @@ def export(sources: Path | Sequence[Path], out: Path, exporter: str = "lerobot",
     row = EXPORTERS.load(exporter)
     defaults = {"verify": False} if exporter == "lerobot" else {}
     return row.export(sources, out, row.options(**{**defaults, **options}), None)
+
+
+def without_verification(patch: pytest.MonkeyPatch) -> None:
+    """Let no export be verified: LeRobot takes seconds to load and does not matter where this is called."""
+    patch.setattr(lerobot_export, "lerobot_is_installed", lambda: False)
 
 
 def data_table(dataset: Path) -> pa.Table:

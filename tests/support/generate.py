@@ -1,6 +1,6 @@
 """Runs of stand-in recordings (`support.makers`), with the real machinery around them.
 
-As a program (`python -m support.generate OUT MAKER NUM_EPISODES WORKERS`) it is a driver that tests can kill.
+As a program (`python -m support.generate OUT MAKER NUM_EPISODES WORKERS GRACE_S`) it is a driver that tests can kill.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from pathlib import Path
 
 from demorec.config import GenerateConfig
 from demorec.errors import DemorecError
+from demorec.generate import run as running
 from demorec.generate.observer import NoProgress, RunResult
 from demorec.generate.options import RunOptions
 from demorec.generate.run import generate
@@ -65,6 +66,16 @@ def run_fake(
     )
 
 
+def attempts_of(result: RunResult) -> dict[tuple[int, int], bool]:
+    """(episode, attempt) -> whether it succeeded."""
+    return {(a.episode_index, a.attempt): a.success for a in result.run.attempts}
+
+
+def num_finished(out: Path) -> int:
+    """Recordings that lie in a run's episodes/ now."""
+    return len(list((out / "episodes").glob("*.mcap")))
+
+
 def expected_attempts(num_episodes: int, *, seed: int = 0, max_attempts: int = 3) -> dict[tuple[int, int], bool]:
     """What a run must come to, from the definition: attempts follow each other until one succeeds."""
     expected = {}
@@ -77,6 +88,8 @@ def expected_attempts(num_episodes: int, *, seed: int = 0, max_attempts: int = 3
 
 
 if __name__ == "__main__":
-    result = run_fake(Path(sys.argv[1]), maker=sys.argv[2], num_episodes=int(sys.argv[3]), workers=int(sys.argv[4]))
+    out, of_maker, number, processes, grace_s = sys.argv[1:]
+    running.GRACE_S = float(grace_s)
+    result = run_fake(Path(out), maker=of_maker, num_episodes=int(number), workers=int(processes))
     print(result.run.digest)
     sys.exit(130 if result.interrupted else 0)

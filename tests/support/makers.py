@@ -60,7 +60,8 @@ def make_quickly(plan: EpisodePlan, folder: Path) -> Attempt:
 
 
 def make_for_ever(plan: EpisodePlan, folder: Path) -> Attempt:
-    """Never ends by itself."""
+    """Never ends by itself; a file named after its process tells that it has begun."""
+    (folder / "unfinished" / f"busy-{os.getpid()}").touch()
     while True:
         time.sleep(0.05)
 

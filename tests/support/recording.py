@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +31,7 @@ from demorec.scene.episode import (
 from demorec.scene.robot import ParallelGripper, RobotSpec
 from demorec.scene.scene import Body, Camera, Goal, RobotPlacement, Scene, Shape
 
+Codec = Literal["h264", "av1", "jpeg"]
 PHASES = ("approach", "descend", "grasp", "lift", "transport", "place", "retreat")
 HOME = (0.0, -0.4, 0.0, -2.2, 0.0, 1.8, 0.785)
 

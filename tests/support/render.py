@@ -45,7 +45,8 @@ def camera(width: int = 224, height: int = 224, **changes: Any) -> Camera:
 def setup(client: Any, *cameras: Camera, textures: dict[int, Texture] | None = None, **changes: Any) -> RenderSetup:
     """A setup of a client's bodies, with depth and segmentation."""
     bodies = visual_bodies(client, shape_rows(client), names={}, textures=textures or {})
-    return RenderSetup(**({"bodies": bodies, "cameras": cameras, "depth": True, "segmentation": True} | changes))
+    fields: dict[str, Any] = {"bodies": bodies, "cameras": cameras, "depth": True, "segmentation": True, **changes}
+    return RenderSetup(**fields)
 
 
 class ClientWorld:
@@ -137,7 +138,7 @@ def cast_cylinder(radius: float, length: float, origin: Any, direction: Any) -> 
 def cast_capsule(radius: float, length: float, origin: Any, direction: Any) -> NDArray[np.float64]:
     """(H, W) depth of a capsule along z, `length` between the centres of its half spheres."""
     ends = [cast_sphere(radius, origin, direction, (0, 0, z)) for z in (-length / 2, length / 2)]
-    return np.minimum.reduce([cast_tube(radius, length, origin, direction), *ends])
+    return np.asarray(np.minimum.reduce([cast_tube(radius, length, origin, direction), *ends]))
 
 
 def project(cam: Camera, point: Any) -> NDArray[np.float64]:

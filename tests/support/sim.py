@@ -16,6 +16,12 @@ def episode(index: int = 0, **config: Any) -> Episode:
     return prepare(EpisodePlan(config=GenerateConfig(**config), episode_index=index))
 
 
+def first_frame(prepared: Episode) -> Frame:
+    """What is seen before anything has moved; its pictures need no episode around them."""
+    with make_world(prepared.info) as world, make_renderer(prepared.info) as renderer:
+        return next(Session.of_episode(world, prepared, renderer).run(ScriptAgent(prepared)))
+
+
 def run(prepared: Episode, world: World | None = None) -> tuple[list[Frame], Outcome]:
     """All frames and the outcome, in `world` or in a fresh one."""
     if world is None:

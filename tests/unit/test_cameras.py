@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from support.sim import episode
 from demorec.geometry import Pose
 from demorec.loop import make_world
 from demorec.scene.scene import Camera
+from demorec.sim.world import World
 from demorec.tables import CAMERAS, ROBOTS
 
 
@@ -29,25 +31,25 @@ def inside(camera: Camera, place: tuple[float, float], margin: float = 0.0) -> b
 
 
 @pytest.fixture(scope="module", params=ROBOTS.names())
-def world(request):
+def world(request: pytest.FixtureRequest) -> Iterator[World]:
     prepared = episode(0, robot=request.param, cameras=CAMERAS.names(), variation="none")
     with make_world(prepared.info) as made:
         made.reset(prepared.info.scene)
         yield made
 
 
-def cameras_of(world) -> dict[str, Camera]:
+def cameras_of(world: World) -> dict[str, Camera]:
     return {camera.name: camera for camera in world.scene.cameras}
 
 
-def test_front_sees_every_place_where_objects_go_and_the_hand_above(world):
+def test_front_sees_every_place_where_objects_go_and_the_hand_above(world: World) -> None:
     camera = cameras_of(world)["front"]
     for x, y, z in itertools.product((0.33, 0.67), (-0.30, 0.30), (0.0, 0.06)):
         assert inside(camera, pixel(camera, camera.mount_from_camera, (x, y, z)), margin=0.02), (x, y, z)
     assert inside(camera, pixel(camera, camera.mount_from_camera, tuple(world.arm.world_from_tcp().position)))
 
 
-def test_wrist_sees_the_space_between_the_fingers(world):
+def test_wrist_sees_the_space_between_the_fingers(world: World) -> None:
     camera = cameras_of(world)["wrist"]
     mount = world.mounts()[camera.mount]
     state = world.client.getLinkState(mount.body, mount.link, computeForwardKinematics=True)
@@ -62,7 +64,7 @@ def test_wrist_sees_the_space_between_the_fingers(world):
 
 
 @pytest.mark.parametrize("name", CAMERAS.names())
-def test_presets_are_usable(name):
+def test_presets_are_usable(name: str) -> None:
     preset = CAMERAS.load(name)
     assert preset.summary
     camera = preset.camera(name, ROBOTS.load("panda"), width=320, height=240)

@@ -22,7 +22,7 @@ FAILED = "failed/episode_000000.attempt_0.mcap"
 
 
 @pytest.fixture
-def run(tmp_path) -> Path:
+def run(tmp_path: Path) -> Path:
     """A run of one failed attempt, made up, so that checks of its physics fail."""
     folder = make_run(tmp_path / "run", [], failures=[0], cameras=())
     attempt = replace(inspect_recording(folder / FAILED).attempt, file=FAILED)
@@ -36,13 +36,15 @@ def report_of(path: Path, file: Path) -> SubjectReport:
     return report
 
 
-def check(capsys, *args: object) -> tuple[int, str]:
+def check(capsys: pytest.CaptureFixture[str], *args: object) -> tuple[int, str]:
     with pytest.raises(SystemExit) as ended:
         main(["check", *map(str, args)])
     return int(ended.value.code or 0), capsys.readouterr().out
 
 
-def test_what_a_failed_attempt_recorded_is_told_and_does_not_fail_the_run(capsys, run):
+def test_what_a_failed_attempt_recorded_is_told_and_does_not_fail_the_run(
+    capsys: pytest.CaptureFixture[str], run: Path
+) -> None:
     report = report_of(run, run / FAILED)
     assert report.level == "fail"
     assert not report.is_bad()
@@ -59,14 +61,16 @@ def test_what_a_failed_attempt_recorded_is_told_and_does_not_fail_the_run(capsys
 
 
 @pytest.mark.parametrize("of", ["file", "folder"])
-def test_named_directly_it_is_judged_as_any_recording(capsys, run, of):
+def test_named_directly_it_is_judged_as_any_recording(capsys: pytest.CaptureFixture[str], run: Path, of: str) -> None:
     path = run / FAILED if of == "file" else (run / FAILED).parent
     assert report_of(path, run / FAILED).is_bad()
     assert check(capsys, path)[0] == 1
 
 
 @pytest.mark.parametrize("damage", ["cut", "flipped"])
-def test_a_damaged_file_among_the_failed_attempts_fails(capsys, run, damage):
+def test_a_damaged_file_among_the_failed_attempts_fails(
+    capsys: pytest.CaptureFixture[str], run: Path, damage: str
+) -> None:
     path = run / FAILED
     good = path.read_bytes()
     if damage == "cut":
@@ -78,7 +82,7 @@ def test_a_damaged_file_among_the_failed_attempts_fails(capsys, run, damage):
     assert check(capsys, run)[0] == 1
 
 
-def test_a_recording_of_a_success_is_judged_in_full(tmp_path):
+def test_a_recording_of_a_success_is_judged_in_full(tmp_path: Path) -> None:
     folder = make_run(tmp_path / "run", [12], cameras=())
     path = folder / "episodes/episode_000000.mcap"
     attempt = replace(inspect_recording(path).attempt, file="episodes/episode_000000.mcap")
@@ -86,7 +90,7 @@ def test_a_recording_of_a_success_is_judged_in_full(tmp_path):
     assert report_of(folder, path).is_bad()
 
 
-def test_the_closing_table_counts_them_apart(run):
+def test_the_closing_table_counts_them_apart(run: Path) -> None:
     """What decides the exit code of generate-dataset."""
     attempt = replace(inspect_recording(run / FAILED).attempt, file=FAILED)
     known = RunFile(config=GenerateConfig(), versions={}, num_episodes=1, attempts=(attempt,))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import shutil
 from pathlib import Path
 
 import pytest
@@ -23,22 +24,22 @@ EXPORT = ExportRecord(run_digest="12", repo_id="me/cubes")
 
 
 @pytest.mark.parametrize("folder", ["/data/cubes", "/my data/it's; rm -rf $HOME `x`"])
-def test_a_shell_reads_them_as_they_are_meant(monkeypatch, folder):
-    monkeypatch.setattr(generate_report.shutil, "which", lambda name: f"/bin/{name}")
+def test_a_shell_reads_them_as_they_are_meant(monkeypatch: pytest.MonkeyPatch, folder: str) -> None:
+    monkeypatch.setattr(shutil, "which", lambda name: f"/bin/{name}")
     view, check, train = (shlex.split(line) for line in next_commands(result_of(Path(folder)), EXPORT))
     assert view == ["demorec", "view", folder]
     assert check == ["demorec", "check", folder]
     assert train[:3] == ["lerobot-train", "--dataset.repo_id=me/cubes", f"--dataset.root={folder}/dataset"]
 
 
-def test_a_program_that_is_not_on_the_path_is_given_by_its_own(monkeypatch):
-    monkeypatch.setattr(generate_report.shutil, "which", lambda name: None)
+def test_a_program_that_is_not_on_the_path_is_given_by_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shutil, "which", lambda name: None)
     for line in next_commands(result_of(Path("/data")), EXPORT):
         assert Path(shlex.split(line)[0]).is_file()
 
 
 @pytest.mark.parametrize("without", ["a dataset", "pictures", "torch"])
-def test_no_training_is_offered_that_would_not_start(monkeypatch, without):
+def test_no_training_is_offered_that_would_not_start(monkeypatch: pytest.MonkeyPatch, without: str) -> None:
     if without == "torch":
         monkeypatch.setattr(generate_report, "find_spec", lambda name: None)
     result = result_of(Path("/data"), cameras=() if without == "pictures" else ("front",))

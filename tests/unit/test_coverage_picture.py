@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from demorec.geometry import Pose
 
 
 @given(st.floats(-5, 5), st.floats(1e-3, 10))
-def test_ticks_are_round_numbers_within_the_range(low, width):
+def test_ticks_are_round_numbers_within_the_range(low: float, width: float) -> None:
     ticks = _ticks(low, low + width)
     assert 3 <= len(ticks) <= 9
     assert low - 1e-9 <= min(ticks) <= max(ticks) <= low + width + 1e-9
@@ -40,7 +41,7 @@ def test_every_axis_is_labelled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     written: list[str] = []
     write = ImageDraw.ImageDraw.text
 
-    def text(self, xy, text, *args, **options):
+    def text(self: ImageDraw.ImageDraw, xy: Any, text: str, *args: Any, **options: Any) -> None:
         written.append(text)
         write(self, xy, text, *args, **options)
 

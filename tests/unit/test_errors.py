@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import errno
 import pickle
+from pathlib import Path
 
 import pytest
+from support.present import present
 
 from demorec.errors import RecordingError, ResourceError, resource_error
 
@@ -23,7 +25,9 @@ from demorec.errors import RecordingError, ResourceError, resource_error
         (OSError(errno.EIO, "Input/output error"), "storage"),
     ],
 )
-def test_what_the_machine_lacks_is_told_as_such_however_it_is_wrapped(tmp_path, error, words):
+def test_what_the_machine_lacks_is_told_as_such_however_it_is_wrapped(
+    tmp_path: Path, error: Exception, words: str
+) -> None:
     def wrapped() -> RuntimeError:
         try:
             try:
@@ -37,7 +41,7 @@ def test_what_the_machine_lacks_is_told_as_such_however_it_is_wrapped(tmp_path, 
                 return outer
 
     for raised in (error, wrapped()):
-        found = resource_error(raised, tmp_path)
+        found = present(resource_error(raised, tmp_path))
         assert words in str(found)
         assert str(found).endswith(f"whether the file is sound is not known: {tmp_path}")
         assert resource_error(found) is found
@@ -48,10 +52,10 @@ def test_what_the_machine_lacks_is_told_as_such_however_it_is_wrapped(tmp_path, 
 @pytest.mark.parametrize(
     "error", [OSError(errno.ENOENT, "none"), OSError("?"), ValueError(), RecordingError("damaged"), ImportError("none")]
 )
-def test_every_other_error_is_left_alone(error):
+def test_every_other_error_is_left_alone(error: Exception) -> None:
     assert resource_error(error) is None
 
 
-def test_without_a_file_nothing_is_said_of_one():
+def test_without_a_file_nothing_is_said_of_one() -> None:
     assert str(resource_error(MemoryError())).endswith("(ulimit -v).")
     assert ResourceError("x").exit_code == 1

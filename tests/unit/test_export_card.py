@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -40,13 +41,19 @@ def commands_of(dataset: Path) -> list[str]:
         ),
     ],
 )
-def test_the_flags_of_a_config_are_parsed_to_it(config):
+def test_the_flags_of_a_config_are_parsed_to_it(config: GenerateConfig) -> None:
     words = shlex.split(" ".join(flags(config, GenerateConfig())))
     assert parse(Generate, words, prog="generate-dataset", defaults=None).episodes == config
 
 
-def test_the_commands_of_a_card_make_the_dataset(tmp_path):
-    options = {"repo_id": "me/cubes", "action": "ee", "privileged": True, "episodes": "0:2", "license": "it's mine"}
+def test_the_commands_of_a_card_make_the_dataset(tmp_path: Path) -> None:
+    options: dict[str, Any] = {
+        "repo_id": "me/cubes",
+        "action": "ee",
+        "privileged": True,
+        "episodes": "0:2",
+        "license": "it's mine",
+    }
     export(make_run(tmp_path / "run", (6, 5, 7)), tmp_path / "d", **options)
     generating, exporting = (shlex.split(command) for command in commands_of(tmp_path / "d"))
     assert generating[0] == "generate-dataset"
@@ -60,14 +67,14 @@ def test_the_commands_of_a_card_make_the_dataset(tmp_path):
     assert "demorec reproduce path/of/this/folder --out copy" in (tmp_path / "d" / "README.md").read_text()
 
 
-def test_an_appended_dataset_has_no_such_commands(tmp_path):
+def test_an_appended_dataset_has_no_such_commands(tmp_path: Path) -> None:
     run = make_run(tmp_path / "run", (6, 5))
     export(run, tmp_path / "d", episodes="0")
     export(run, tmp_path / "d", episodes="1", append=True)
     assert "Made by these commands" not in (tmp_path / "d" / "README.md").read_text()
 
 
-def test_thumbnails_are_labelled(tmp_path):
+def test_thumbnails_are_labelled(tmp_path: Path) -> None:
     export(make_run(tmp_path / "run", (31, 16)), tmp_path / "d")
     sheet = np.asarray(Image.open(tmp_path / "d" / "demorec" / "thumbnails.jpg")).astype(int)
     assert sheet.shape == (2 * (18 + 120), 5 * 160, 3)

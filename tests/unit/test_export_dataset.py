@@ -6,6 +6,7 @@ import json
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -28,7 +29,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_run(tmp_path_factory.mktemp("run") / "run", (20, 15, 17, 9), failures=(2,))
 
 
-def video_frames(dataset: Path, camera: str) -> Iterator[np.ndarray]:
+def video_frames(dataset: Path, camera: str) -> Iterator[np.ndarray[Any, Any]]:
     for path in sorted((dataset / "videos" / f"observation.images.{camera}").glob("*/*.mp4")):
         with av.open(str(path)) as container:
             for frame in container.decode(video=0):
@@ -39,7 +40,7 @@ def recordings(run: Path) -> list[Path]:
     return sorted((run / "episodes").glob("*.mcap"))
 
 
-def vectors(dataset: Path, name: str) -> np.ndarray:
+def vectors(dataset: Path, name: str) -> np.ndarray[Any, Any]:
     return np.array(data_table(dataset).column(name).to_pylist())
 
 
@@ -58,10 +59,12 @@ def test_a_dataset_holds_what_was_recorded(run: Path, tmp_path: Path) -> None:
     for row, frame in enumerate(frames):
         observation = frame.observation
         assert np.array_equal(
-            state[row].astype(np.float32), np.float32([*observation.joint_position[:7], observation.gripper_width])
+            state[row].astype(np.float32),
+            np.array([*observation.joint_position[:7], observation.gripper_width], np.float32),
         )
         assert np.array_equal(
-            action[row].astype(np.float32), np.float32([*frame.action.joint_target, frame.action.gripper_target])
+            action[row].astype(np.float32),
+            np.array([*frame.action.joint_target, frame.action.gripper_target], np.float32),
         )
     assert table.column("index").to_pylist() == list(range(61))
     assert table.column("episode_index").to_pylist() == [0] * 20 + [1] * 15 + [2] * 17 + [3] * 9
@@ -331,7 +334,7 @@ def test_append_goes_on_where_the_dataset_ends(run: Path, tmp_path: Path) -> Non
         if not name.startswith("observation.images"):  # of pictures LeRobot's own rule is used, an average
             assert all(a[name][q] == b[name][q] for q in ("q01", "q10", "q50", "q90", "q99"))
     summary = dataset_info(grown)
-    assert (summary.num_successes, summary.num_attempts) == (4, dataset_info(whole).num_attempts + 0)
+    assert (summary.num_successes, summary.num_attempts) == (4, dataset_info(whole).num_attempts)
     rows = episode_rows(grown)
     assert [row["data/file_index"] for row in rows] == [0, 0, 1, 1]
     assert [row["meta/episodes/file_index"] for row in rows] == [0, 0, 1, 1]

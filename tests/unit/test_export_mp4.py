@@ -5,10 +5,12 @@ from __future__ import annotations
 import io
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
 import pytest
+from support.present import present
 
 from demorec.config import VideoConfig
 from demorec.errors import ExportError
@@ -21,7 +23,7 @@ from demorec.recording.video import decode, is_keyframe, make_encoder
 WIDTH, HEIGHT = 64, 48
 
 
-def pictures(count: int, seed: int = 0) -> list[np.ndarray]:
+def pictures(count: int, seed: int = 0) -> list[np.ndarray[Any, Any]]:
     rng = np.random.default_rng(seed)
     base = rng.integers(0, 255, (HEIGHT // 8, WIDTH // 8, 3)).astype(np.uint8).repeat(8, axis=0).repeat(8, axis=1)
     return [np.roll(base, 3 * index, axis=1) for index in range(count)]
@@ -37,7 +39,7 @@ def encoded(
 
 def coded(
     codec: str, count: int, *, fps: int = 30, seed: int = 0, crf: int | None = None
-) -> tuple[CodedVideo, list[np.ndarray]]:
+) -> tuple[CodedVideo, list[np.ndarray[Any, Any]]]:
     """A video and what a decoder makes of its packets."""
     settings, packets = encoded(codec, count, fps=fps, seed=seed, crf=crf)
     video_packets = [
@@ -66,10 +68,11 @@ def test_every_picture_and_time_comes_back(tmp_path: Path, codec: str, fps: int)
     assert [path.name for path in tmp_path.iterdir()] == ["a.mp4"]
     with av.open(str(tmp_path / "a.mp4")) as container:
         stream = container.streams.video[0]
-        assert (stream.average_rate, stream.base_rate, stream.frames) == (fps, fps, 13)
-        assert stream.duration * stream.time_base == Fraction(13, fps)
+        assert stream.average_rate == stream.base_rate == fps
+        assert stream.frames == 13
+        assert present(stream.duration) * present(stream.time_base) == Fraction(13, fps)
         frames = list(container.decode(stream))
-    assert [frame.pts * frame.time_base for frame in frames] == [Fraction(n, fps) for n in range(13)]
+    assert [present(frame.pts) * present(frame.time_base) for frame in frames] == [Fraction(n, fps) for n in range(13)]
     for frame, expected in zip(frames, first_pictures + second_pictures, strict=True):
         assert np.array_equal(frame.to_ndarray(format="rgb24"), expected)
 
@@ -83,7 +86,7 @@ def test_the_index_is_in_front_and_seeking_finds_keyframes(tmp_path: Path) -> No
     assert data.index(b"moov") < data.index(b"mdat")
     with av.open(str(tmp_path / "a.mp4")) as container:
         stream = container.streams.video[0]
-        container.seek(round(13 / 30 / stream.time_base), stream=stream)
+        container.seek(round(13 / 30 / present(stream.time_base)), stream=stream)
         frame = next(container.decode(stream))
         assert frame.key_frame
         number = round(frame.time * 30)
@@ -172,15 +175,16 @@ def test_the_packets_are_what_ffmpeg_would_write(codec: str) -> None:
             packet.duration, packet.time_base, packet.stream = 1, Fraction(1, 30), stream
             target.mux_one(packet)
     buffer.seek(0)
-    expected = [bytes(packet) for packet in av.open(buffer).demux(video=0) if packet.size]
+    expected = [bytes(packet) for packet in av.open(buffer, "r").demux(video=0) if packet.size]
     assert samples_of(video) == expected
     if codec == "h264":
-        parsed = av.open(io.BytesIO(b"".join(units)), format=demuxer).demux(video=0)
+        parsed = av.open(io.BytesIO(b"".join(units)), "r", format=demuxer).demux(video=0)
         assert video.is_keyframe.tolist() == [packet.is_keyframe for packet in parsed if packet.size]
 
 
 def hevc_units(count: int) -> list[bytes]:
     context = av.CodecContext.create("libx265", "w")
+    assert isinstance(context, av.VideoCodecContext)
     context.width, context.height, context.pix_fmt = WIDTH, HEIGHT, "yuv420p"
     context.time_base, context.framerate = Fraction(1, 30), Fraction(30)
     context.options = {"x265-params": "bframes=0:repeat-headers=1:log-level=none"}
@@ -207,7 +211,7 @@ def test_every_way_to_put_start_codes(
     units: list[tuple[str | bytes, ...]], expected: list[tuple[str, ...]], keyframes: list[int]
 ) -> None:
     """By hand, from ITU-T H.264 annex B: byte_stream_nal_unit with leading_zero_8bits and trailing_zero_8bits."""
-    coded_units = [b"".join(NAL.get(part, part) for part in unit) for unit in units]  # type: ignore[call-overload]
+    coded_units = [b"".join(NAL[part] if isinstance(part, str) else part for part in unit) for unit in units]
     video = video_of("h264", coded_units)
     wanted = [b"".join(len(NAL[name]).to_bytes(4, "big") + NAL[name] for name in names) for names in expected]
     assert samples_of(video) == wanted

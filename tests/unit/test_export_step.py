@@ -8,13 +8,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from support.export import export, files_of, make_run
+from support.export import export, files_of, make_run, without_verification
 
 from demorec.config import GenerateConfig, deciding_versions
 from demorec.errors import ConfigError
-from demorec.generate import export_step
 from demorec.generate.export_step import export_run
-from demorec.lerobot import ExportOptions, dataset_digest
+from demorec.lerobot import dataset_digest
 from demorec.runs.run_file import RunFile, load_run_file, save_run_file
 
 
@@ -24,19 +23,14 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = make_run(tmp_path_factory.mktemp("run") / "run", (5, 4))
     save_run_file(RunFile(config=GenerateConfig(), versions=deciding_versions(), num_episodes=2), folder)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(export_step, "ExportOptions", unverified)
+        without_verification(patch)
         export_run(folder, repo_id="me/cubes")
     return folder
 
 
-def unverified(**options: object) -> ExportOptions:
-    """LeRobot takes seconds to load and does not matter here."""
-    return ExportOptions(**{**options, "verify": False})  # type: ignore[arg-type]
-
-
 @pytest.fixture
 def run(exported: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr(export_step, "ExportOptions", unverified)
+    without_verification(monkeypatch)
     return shutil.copytree(exported, tmp_path / "run")
 
 

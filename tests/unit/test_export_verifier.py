@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from demorec.lerobot import ExportOptions, verify
 from demorec.lerobot.verify import Verifier
 
 
-def test_an_export_that_fails_does_not_wait_for_it(monkeypatch):
+def test_an_export_that_fails_does_not_wait_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(verify, "_serve", never_end)
     with suppress(KeyError), Verifier() as verifier:
         process = verifier._process
@@ -23,7 +24,7 @@ def test_an_export_that_fails_does_not_wait_for_it(monkeypatch):
     assert process.exitcode == -signal.SIGTERM
 
 
-def test_not_even_for_one_that_does_not_listen(monkeypatch):
+def test_not_even_for_one_that_does_not_listen(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(verify, "_GRACE_S", 0.1)
     monkeypatch.setattr(verify, "_serve", never_listen)
     with suppress(KeyError), Verifier() as verifier:
@@ -40,7 +41,9 @@ def test_not_even_for_one_that_does_not_listen(monkeypatch):
         (lack_memory, ResourceError, "too little memory"),
     ],
 )
-def test_its_end_and_its_lack_of_memory_are_told(tmp_path: Path, monkeypatch, serve, error, words):
+def test_its_end_and_its_lack_of_memory_are_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, serve: Callable[..., None], error: type[Exception], words: str
+) -> None:
     monkeypatch.setattr(verify, "_serve", serve)
     with Verifier() as verifier, pytest.raises(error, match=words):
         verifier.verify(tmp_path, [], ExportOptions())

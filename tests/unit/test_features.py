@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -115,13 +116,13 @@ def test_environment_state_against_scipy() -> None:
     names = observation_names(PANDA, scene, privileged=True)[ENVIRONMENT_STATE]
     assert len(names) == values.shape[1] == len(set(names))
 
-    def matrix(vector: np.ndarray) -> np.ndarray:
+    def matrix(vector: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
         result = np.eye(4)
         result[:3, :3] = Rotation.from_quat(vector[3:]).as_matrix()
         result[:3, 3] = vector[:3]
         return result
 
-    def yaw(pose: np.ndarray) -> float:
+    def yaw(pose: np.ndarray[Any, Any]) -> float:
         vertical = int(np.argmax(np.abs(pose[2, :3])))
         axis = pose[:3, (vertical + 1) % 3]
         return math.atan2(axis[1], axis[0])
@@ -198,7 +199,7 @@ def test_the_tcp_quaternion_keeps_its_sign_through_a_turn_of_the_hand() -> None:
 
 
 def columns_of(rng: np.random.Generator, count: int) -> EpisodeColumns:
-    def poses() -> np.ndarray:
+    def poses() -> np.ndarray[Any, Any]:
         return np.array([random_pose(rng).vector() for _ in range(count)])
 
     return EpisodeColumns(
@@ -213,7 +214,7 @@ def columns_of(rng: np.random.Generator, count: int) -> EpisodeColumns:
 
 
 @pytest.mark.parametrize("rows", [slice(None), np.arange(2, 50, 3)])
-def test_increments_sum_up_to_the_absolute_targets(rows: slice | np.ndarray) -> None:
+def test_increments_sum_up_to_the_absolute_targets(rows: slice | np.ndarray[Any, Any]) -> None:
     rng = np.random.default_rng(5)
     scene, columns = make_scene(rng), columns_of(rng, 50)
     target = np.array(scene.robot.joint_position)
@@ -228,7 +229,7 @@ def test_increments_sum_up_to_the_absolute_targets(rows: slice | np.ndarray) -> 
 
 
 @pytest.mark.parametrize("rows", [slice(None), np.arange(2, 50, 3)])
-def test_pose_deltas_compose_to_the_absolute_poses(rows: slice | np.ndarray) -> None:
+def test_pose_deltas_compose_to_the_absolute_poses(rows: slice | np.ndarray[Any, Any]) -> None:
     rng = np.random.default_rng(6)
     scene, columns = make_scene(rng), columns_of(rng, 50)
     pose = Pose(position=columns.base_from_tcp[0, :3], quat_xyzw=columns.base_from_tcp[0, 3:])
@@ -275,7 +276,7 @@ def test_increments_lead_back_from_noise_as_the_noise_lets_go(fps: int) -> None:
     assert np.allclose(deltas[:, 3:6], turns, atol=1e-6)
 
 
-def frame_times(frames: np.ndarray, fps: int) -> np.ndarray:
+def frame_times(frames: np.ndarray[Any, Any], fps: int) -> np.ndarray[Any, Any]:
     return np.array([frame_time_ns(int(frame), fps) for frame in frames])
 
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import pytest
 from support.export import export, info, make_run
 
 from demorec.check.report import CheckOptions, check_subjects, find_subjects
@@ -16,7 +17,7 @@ from demorec.runs.recordings import inspect_recording
 from demorec.runs.run_file import RunFile, save_run_file
 
 
-def test_the_dataset_has_what_was_asked_for_last(tmp_path, monkeypatch):
+def test_the_dataset_has_what_was_asked_for_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(export_step, "ExportOptions", partial(ExportOptions, verify=False))
     folder = make_run(tmp_path / "run", [9, 11, 10, 12], failures=[1, 3], cameras=())
     lines = []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -26,24 +27,24 @@ from demorec.generate.options import RunOptions, available_cores, default_out, d
         ({"repo_id": "me/cubes", "export": False}, "--no-export leaves it out"),
     ],
 )
-def test_impossible_values_are_refused(values, message):
+def test_impossible_values_are_refused(values: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError) as error:
         RunOptions(**values).validate()
     assert message in str(error.value)
 
 
-def test_possible_values_are_not():
+def test_possible_values_are_not() -> None:
     RunOptions(num_episodes=1, workers=3, repo_id="me/cubes").validate()
     RunOptions(executor="ray", address="auto", gpus_per_worker=0.5, cpus_per_worker=2).validate()
 
 
-def test_default_names_come_from_the_task():
+def test_default_names_come_from_the_task() -> None:
     assert default_out("pick_place") == Path("recordings/pick_place")
     assert default_out("my.module:MyTask").name == "MyTask"
     assert default_repo_id("my.module:MyTask") == "local/MyTask"
 
 
-def test_cores_are_those_that_this_process_may_use():
+def test_cores_are_those_that_this_process_may_use() -> None:
     before = os.sched_getaffinity(0)
     try:
         os.sched_setaffinity(0, {min(before)})

@@ -3,23 +3,30 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from demorec.geometry import Pose
 from demorec.scene.assets import asset_path
 from demorec.scene.kinematics import ArmKinematics
+from demorec.scene.robot import RobotSpec
 from demorec.scene.urdf import Urdf, quat_from_rpy
 from demorec.sim.arm import arm_kinematics
 from demorec.sim.client import connect
 from demorec.sim.urdf_file import urdf_file
 from demorec.tables import ROBOTS
 
+SimulatedRobot = tuple[RobotSpec, Any, int, dict[str, int], dict[str, int]]
+"""Specification, client, body, indices of links and of joints by name."""
+
 
 @pytest.fixture(params=ROBOTS.names())
-def robot(request):
+def robot(request: pytest.FixtureRequest) -> Iterator[SimulatedRobot]:
     spec = ROBOTS.load(request.param)
     client = connect()
     with urdf_file(spec.urdf) as path:
@@ -30,17 +37,17 @@ def robot(request):
     client.disconnect()
 
 
-def random_positions(spec, count, seed=0):
+def random_positions(spec: RobotSpec, count: int, seed: int = 0) -> NDArray[np.float64]:
     low, high = np.array(spec.position_lower), np.array(spec.position_upper)
     return np.random.default_rng(seed).uniform(low, high, (count, len(low)))
 
 
-def link_pose(client, body, link):
+def link_pose(client: Any, body: int, link: int) -> tuple[NDArray[np.float64], Rotation]:
     state = client.getLinkState(body, link, computeForwardKinematics=True)
     return np.array(state[4]), Rotation.from_quat(state[5])
 
 
-def test_forward_kinematics_equals_the_simulators(robot):
+def test_forward_kinematics_equals_the_simulators(robot: SimulatedRobot) -> None:
     spec, client, body, links, joints = robot
     arm = arm_kinematics(spec)
     for q in random_positions(spec, 50):
@@ -52,7 +59,7 @@ def test_forward_kinematics_equals_the_simulators(robot):
         assert (Rotation.from_quat(pose.quat_xyzw) * rotation.inv()).magnitude() < 1e-5
 
 
-def test_every_link_of_the_urdf_is_where_the_simulator_has_it(robot):
+def test_every_link_of_the_urdf_is_where_the_simulator_has_it(robot: SimulatedRobot) -> None:
     spec, client, body, links, joints = robot
     urdf = Urdf.load(asset_path(spec.urdf))
     q = dict(zip(spec.arm_joints, random_positions(spec, 1, seed=3)[0].tolist(), strict=True))
@@ -67,7 +74,7 @@ def test_every_link_of_the_urdf_is_where_the_simulator_has_it(robot):
         assert (Rotation.from_quat(poses[name].quat_xyzw) * rotation.inv()).magnitude() < 1e-5, name
 
 
-def test_jacobian_equals_finite_differences(robot):
+def test_jacobian_equals_finite_differences(robot: SimulatedRobot) -> None:
     spec, *_ = robot
     arm = arm_kinematics(spec)
     step = 1e-6
@@ -83,7 +90,7 @@ def test_jacobian_equals_finite_differences(robot):
             assert np.abs(jacobian[:, joint] - expected).max() < 1e-6
 
 
-def test_inverse_kinematics_reaches_the_pose_in_the_simulator(robot):
+def test_inverse_kinematics_reaches_the_pose_in_the_simulator(robot: SimulatedRobot) -> None:
     spec, client, body, links, joints = robot
     arm = arm_kinematics(spec)
     home = np.array(spec.home_q)
@@ -105,7 +112,7 @@ def test_inverse_kinematics_reaches_the_pose_in_the_simulator(robot):
     assert solved >= 38
 
 
-def test_the_null_space_pull_changes_the_elbow_and_not_the_hand(robot):
+def test_the_null_space_pull_changes_the_elbow_and_not_the_hand(robot: SimulatedRobot) -> None:
     spec, *_ = robot
     arm = arm_kinematics(spec)
     home = np.array(spec.home_q)
@@ -119,7 +126,7 @@ def test_the_null_space_pull_changes_the_elbow_and_not_the_hand(robot):
     assert np.linalg.norm(pulled - home) < np.linalg.norm(still - home)
 
 
-def test_out_of_reach_is_none_and_not_a_wrong_answer(robot):
+def test_out_of_reach_is_none_and_not_a_wrong_answer(robot: SimulatedRobot) -> None:
     spec, *_ = robot
     arm = arm_kinematics(spec)
     home = np.array(spec.home_q)
@@ -127,7 +134,7 @@ def test_out_of_reach_is_none_and_not_a_wrong_answer(robot):
     assert arm.inverse(pose, start=home, rest=home) is None
 
 
-def test_a_straight_path_is_straight_and_turns_evenly(robot):
+def test_a_straight_path_is_straight_and_turns_evenly(robot: SimulatedRobot) -> None:
     spec, *_ = robot
     arm = arm_kinematics(spec)
     start = np.array(spec.home_q)
@@ -139,7 +146,7 @@ def test_a_straight_path_is_straight_and_turns_evenly(robot):
     )
     goal = arm.inverse(base_from_goal, start=start, rest=start)
     assert goal is not None
-    fractions = np.linspace(0, 1, 9)
+    fractions = np.linspace(0, 1, 9, dtype=np.float64)
     path = arm.straight_path(
         start=start, goal=goal, base_from_start=base_from_start, base_from_goal=base_from_goal, fractions=fractions
     )
@@ -152,14 +159,14 @@ def test_a_straight_path_is_straight_and_turns_evenly(robot):
         assert (Rotation.from_quat(pose.quat_xyzw) * slerp(u).inv()).magnitude() < 2e-3
 
 
-def test_roll_pitch_yaw_as_urdf_means_them():
+def test_roll_pitch_yaw_as_urdf_means_them() -> None:
     rpy = [0.3, -1.1, 2.4]
     expected = Rotation.from_euler("xyz", rpy).as_quat()
     found = quat_from_rpy(rpy)
     assert min(np.abs(found - expected).max(), np.abs(found + expected).max()) < 1e-12
 
 
-def test_a_chain_with_other_joints_is_refused():
+def test_a_chain_with_other_joints_is_refused() -> None:
     spec = ROBOTS.load("panda")
     with pytest.raises(ValueError, match="panda_joint7"):
         ArmKinematics.from_urdf(
@@ -171,7 +178,7 @@ def test_a_chain_with_other_joints_is_refused():
         )
 
 
-def test_scale_multiplies_lengths():
+def test_scale_multiplies_lengths() -> None:
     spec = ROBOTS.load("panda")
     q = np.array(spec.home_q)
     small, large = arm_kinematics(spec), arm_kinematics(spec, scale=1.3)

@@ -16,20 +16,20 @@ from support.sim import episode, run
 
 import demorec.loop
 from demorec.config import EpisodePlan, GenerateConfig
-from demorec.loop import ScriptAgent, Session, make_world, prepare
+from demorec.loop import Episode, ScriptAgent, Session, make_world, prepare
 from demorec.plain import from_json, to_json
-from demorec.scene.episode import EpisodeInfo
+from demorec.scene.episode import EpisodeInfo, Frame, Outcome
 from demorec.scene.features import NOISE_DECAY
 
 
 @pytest.fixture(scope="module")
-def ran():
+def ran() -> tuple[Episode, list[Frame], Outcome]:
     prepared = episode(4)
     frames, outcome = run(prepared)
     return prepared, frames, outcome
 
 
-def test_an_episode_succeeds_strictly(ran):
+def test_an_episode_succeeds_strictly(ran: tuple[Episode, list[Frame], Outcome]) -> None:
     prepared, frames, outcome = ran
     assert outcome.success
     assert outcome.failure_phase == outcome.failure_reason == ""
@@ -42,20 +42,20 @@ def test_an_episode_succeeds_strictly(ran):
     assert frames[-1].observation.contact_force == 0
 
 
-def test_phases_run_in_order(ran):
+def test_phases_run_in_order(ran: tuple[Episode, list[Frame], Outcome]) -> None:
     _, frames, _ = ran
     phases = list(dict.fromkeys(frame.phase for frame in frames))
     assert phases == ["approach", "descend", "close", "lift", "transport", "lower", "release", "retreat"]
     assert [event.name for frame in frames for event in frame.events] == ["grasp", "place"]
 
 
-def test_time_stamps_are_exact_integers(ran):
+def test_time_stamps_are_exact_integers(ran: tuple[Episode, list[Frame], Outcome]) -> None:
     _, frames, _ = ran
     assert [frame.frame_index for frame in frames] == list(range(len(frames)))
     assert [frame.time_ns for frame in frames[:4]] == [0, 33_333_333, 66_666_667, 100_000_000]
 
 
-def test_observation_comes_before_the_action(ran):
+def test_observation_comes_before_the_action(ran: tuple[Episode, list[Frame], Outcome]) -> None:
     """The joints follow the command of frame t only at frame t + 1."""
     _, frames, _ = ran
     commands = np.array([frame.command.joint_target for frame in frames])
@@ -65,7 +65,7 @@ def test_observation_comes_before_the_action(ran):
     assert follows < 0.5 * equal
 
 
-def test_replaying_the_commands_gives_the_same_bits(ran):
+def test_replaying_the_commands_gives_the_same_bits(ran: tuple[Episode, list[Frame], Outcome]) -> None:
     prepared, frames, outcome = ran
     info = from_json(to_json(prepared.info), EpisodeInfo)  # as a recording would hold it
     with make_world(info) as world:
@@ -79,9 +79,9 @@ def test_replaying_the_commands_gives_the_same_bits(ran):
         assert world.state_digest() == outcome.final_state_digest
 
 
-def test_noise_is_on_the_command_only_and_only_in_free_motion(ran):
+def test_noise_is_on_the_command_only_and_only_in_free_motion(ran: tuple[Episode, list[Frame], Outcome]) -> None:
     _, frames, _ = ran
-    noise = {phase: [] for phase in {frame.phase for frame in frames}}
+    noise: dict[str, list[float]] = {phase: [] for phase in {frame.phase for frame in frames}}
     for frame in frames:
         noise[frame.phase].append(np.abs(frame.command.joint_target - frame.action.joint_target).max())
     assert np.mean(noise["approach"]) > 0.005
@@ -91,7 +91,7 @@ def test_noise_is_on_the_command_only_and_only_in_free_motion(ran):
         assert max(noise[phase]) < 0.001, phase
 
 
-def test_labels_are_smooth(ran):
+def test_labels_are_smooth(ran: tuple[Episode, list[Frame], Outcome]) -> None:
     """The clean action keeps to the velocity limits; noise never enters it."""
     prepared, frames, _ = ran
     labels = np.array([frame.action.joint_target for frame in frames])
@@ -102,7 +102,7 @@ def test_labels_are_smooth(ran):
     assert (np.abs(np.diff(commands, axis=0)) * prepared.info.fps <= limit * (1 + 1e-9)).all()
 
 
-def test_no_frame_is_idle(ran):
+def test_no_frame_is_idle(ran: tuple[Episode, list[Frame], Outcome]) -> None:
     _, frames, _ = ran
     # Neither the label nor what is executed moves.
     labels = np.array([[*f.action.joint_target, *f.command.joint_target, f.action.gripper_target] for f in frames])
@@ -113,7 +113,7 @@ def test_no_frame_is_idle(ran):
     assert sum(outside_of_gripping) <= 0.06 * len(frames)
 
 
-def test_the_expert_goes_on_only_where_it_wanted_to_be(ran):
+def test_the_expert_goes_on_only_where_it_wanted_to_be(ran: tuple[Episode, list[Frame], Outcome]) -> None:
     """Noise fades before the hand is lowered: a policy must not learn that nearly there is there."""
     _, frames, _ = ran
     for before, after in itertools.pairwise(frames):
@@ -123,7 +123,7 @@ def test_the_expert_goes_on_only_where_it_wanted_to_be(ran):
             assert np.abs(before.command.joint_target - before.action.joint_target).max() < 0.006
 
 
-def test_noise_lets_go_at_the_rate_that_increments_expect(ran):
+def test_noise_lets_go_at_the_rate_that_increments_expect(ran: tuple[Episode, list[Frame], Outcome]) -> None:
     """Once no noise is added, the exported increments are the executed ones."""
     prepared, frames, _ = ran
     actions = np.array([frame.action.joint_target for frame in frames])
@@ -138,7 +138,7 @@ def test_noise_lets_go_at_the_rate_that_increments_expect(ran):
     assert prepared.behaviour.action_noise == 0.02
 
 
-def test_an_episode_depends_on_its_plan_alone():
+def test_an_episode_depends_on_its_plan_alone() -> None:
     """Alone, after others, in reverse order: the same digest."""
     plans = [episode(index) for index in (0, 1, 2)]
     alone = [run(prepared)[1].final_state_digest for prepared in plans]
@@ -149,7 +149,7 @@ def test_an_episode_depends_on_its_plan_alone():
     assert len(set(alone)) == 3
 
 
-def test_pictures_do_not_disturb_the_physics():
+def test_pictures_do_not_disturb_the_physics() -> None:
     _, without = run(episode(4, max_episode_seconds=2.0))
     frames, outcome = run(episode(4, max_episode_seconds=2.0, cameras=("front",), width=32, height=32, renderer="tiny"))
     assert outcome.final_state_digest == without.final_state_digest
@@ -167,7 +167,9 @@ print(json.dumps([outcome.final_state_digest, to_json(prepared.info)]))
 
 
 @pytest.mark.parametrize("coretype", ["Haswell", "Nehalem"])
-def test_another_process_and_another_blas_kernel_give_the_same_bits(ran, coretype):
+def test_another_process_and_another_blas_kernel_give_the_same_bits(
+    ran: tuple[Episode, list[Frame], Outcome], coretype: str
+) -> None:
     prepared, _, outcome = ran
     path = str(Path(__file__).parents[1])
     env = {**os.environ, "PYTHONPATH": path, "PYTHONHASHSEED": "7", "OPENBLAS_CORETYPE": coretype}
@@ -182,7 +184,7 @@ def test_another_process_and_another_blas_kernel_give_the_same_bits(ran, coretyp
     assert info == to_json(prepared.info)
 
 
-def test_a_stuck_episode_ends_as_a_failure_with_its_phase():
+def test_a_stuck_episode_ends_as_a_failure_with_its_phase() -> None:
     frames, outcome = run(episode(4, max_episode_seconds=2.0))
     assert len(frames) == 60
     assert not outcome.success
@@ -190,7 +192,7 @@ def test_a_stuck_episode_ends_as_a_failure_with_its_phase():
     assert outcome.failure_phase == frames[-1].phase
 
 
-def test_joint_samples_at_the_physics_rate():
+def test_joint_samples_at_the_physics_rate() -> None:
     frames, _ = run(episode(4, joint_rate="physics", max_episode_seconds=1.0))
     assert frames[0].joint_samples == ()
     assert all(len(frame.joint_samples) == 7 for frame in frames[1:])
@@ -199,13 +201,13 @@ def test_joint_samples_at_the_physics_rate():
 
 
 @pytest.mark.parametrize("fps", [10, 60])
-def test_other_frame_rates_work_too(fps):
+def test_other_frame_rates_work_too(fps: int) -> None:
     frames, outcome = run(episode(0, fps=fps))
     assert outcome.success
     assert abs(frames[-1].time_ns / 1e9 - (len(frames) - 1) / fps) < 1e-9
 
 
-def test_info_is_plain_and_complete(ran):
+def test_info_is_plain_and_complete(ran: tuple[Episode, list[Frame], Outcome]) -> None:
     prepared, _, _ = ran
     info = prepared.info
     assert from_json(to_json(info), EpisodeInfo) == info
@@ -215,13 +217,13 @@ def test_info_is_plain_and_complete(ran):
     assert "cube" in info.instruction
 
 
-def test_attempts_draw_other_scenes():
+def test_attempts_draw_other_scenes() -> None:
     config = GenerateConfig(cameras=())
     first, second = (prepare(EpisodePlan(config=config, episode_index=0, attempt=a)).info.scene for a in (0, 1))
     assert first != second
 
 
-def test_breaking_off_leaves_the_world_usable(ran):
+def test_breaking_off_leaves_the_world_usable(ran: tuple[Episode, list[Frame], Outcome]) -> None:
     prepared, _, outcome = ran
     with make_world(prepared.info) as world:
         session = Session.of_episode(world, prepared)

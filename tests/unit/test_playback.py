@@ -55,7 +55,7 @@ def _chunks(path: Path) -> dict[str, list[Any]]:
 
 def _column(chunks: list[Any], component: str) -> list[Any]:
     """(seconds in ns, value) of every row, in order of time."""
-    rows = []
+    rows: list[tuple[int, Any]] = []
     for chunk in chunks:
         batch = chunk.to_record_batch()
         if component in batch.schema.names and not chunk.is_static:
@@ -151,7 +151,7 @@ def test_links_move_as_scipy_says() -> None:
     urdf = Urdf.load(asset_path("franka_panda/panda.urdf"))
     for name in ("panda_joint2", "panda_finger_joint1"):
         joint = next(joint for joint in urdf.joints if joint.name == name)
-        position = np.linspace(-1.0, 1.0, 7)
+        position = np.linspace(-1.0, 1.0, 7, dtype=np.float64)
         translation, quaternion = joint_columns(joint, position)
         fixed = Rotation.from_quat(joint.parent_from_joint.quat_xyzw)
         for row, q in enumerate(position):
@@ -225,7 +225,7 @@ def _drawn(path: Path, tmp_path: Path) -> dict[str, list[Any]]:
     return _chunks(tmp_path / "x.rrd")
 
 
-def _mesh_of(chunks: list[Any]) -> tuple[np.ndarray, set[int]]:
+def _mesh_of(chunks: list[Any]) -> tuple[np.ndarray[Any, Any], set[int]]:
     """Vertices (N, 3) and the colours, 0xRRGGBBAA."""
     (batch,) = [b for c in chunks if "Mesh3D:vertex_positions" in (b := c.to_record_batch()).schema.names]
     vertices = np.array(batch.column("Mesh3D:vertex_positions").to_pylist()[0])

@@ -33,14 +33,14 @@ def told(*command: str, cwd: Path) -> list[str]:
     return done.stdout.splitlines()
 
 
-def test_a_script_needs_no_main_guard(tmp_path):
+def test_a_script_needs_no_main_guard(tmp_path: Path) -> None:
     (tmp_path / "script.py").write_text(SCRIPT)
     expected = ["[2.0, 3.0]", "child", "end", "script"]
     assert sorted(told("script.py", cwd=tmp_path)) == expected
     assert sorted(told("-m", "script", cwd=tmp_path)) == expected
 
 
-def test_python_itself_would_run_the_script_again(tmp_path):
+def test_python_itself_would_run_the_script_again(tmp_path: Path) -> None:
     """Else the test above would prove nothing."""
     plain = "from multiprocessing import get_context; SPAWN = get_context('spawn')"
     (tmp_path / "script.py").write_text(SCRIPT.replace("from demorec.processes import SPAWN", plain))
@@ -63,7 +63,7 @@ with ProcessPoolExecutor(max_workers=2, mp_context=SPAWN) as pool:
 """
 
 
-def test_workers_of_a_pool_end_with_their_parent_busy_or_idle(tmp_path):
+def test_workers_of_a_pool_end_with_their_parent_busy_or_idle(tmp_path: Path) -> None:
     (tmp_path / "script.py").write_text(PARENT)
     parent = subprocess.Popen([sys.executable, "script.py"], cwd=tmp_path, stdout=subprocess.PIPE, text=True)
     assert parent.stdout is not None

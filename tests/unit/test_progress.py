@@ -19,7 +19,9 @@ class Clock:
         return self.now
 
 
-def lines_of(capsys, *, total: int, seconds_each: float, done: int = 0, note: str = "") -> list[str]:
+def lines_of(
+    capsys: pytest.CaptureFixture[str], *, total: int, seconds_each: float, done: int = 0, note: str = ""
+) -> list[str]:
     """What a job prints whose things take so long each."""
     clock = Clock()
     with ProgressBar("generating", total=total, done=done, is_terminal=False, clock=clock) as bar:
@@ -34,17 +36,17 @@ def lines_of(capsys, *, total: int, seconds_each: float, done: int = 0, note: st
 
 
 @pytest.mark.parametrize(("total", "seconds_each"), [(3, 3.0), (9000, 0.001), (1, 500.0)])
-def test_what_is_over_soon_prints_nothing(capsys, total, seconds_each):
+def test_what_is_over_soon_prints_nothing(capsys: pytest.CaptureFixture[str], total: int, seconds_each: float) -> None:
     assert lines_of(capsys, total=total, seconds_each=seconds_each) == []
 
 
-def test_a_line_says_how_far_it_is_and_how_long_it_will_take(capsys):
+def test_a_line_says_how_far_it_is_and_how_long_it_will_take(capsys: pytest.CaptureFixture[str]) -> None:
     lines = lines_of(capsys, total=40, seconds_each=5.0, note="2 failed attempts")
     assert lines[0] == "generating: 2 of 40 episodes (5 %), 10 s passed, about 3.2 min left, 2 failed attempts"
     assert lines[1].startswith("generating: 4 of 40 episodes (10 %), 20 s passed, about 3.0 min left")
 
 
-def test_what_was_done_before_does_not_count_for_the_time_that_is_left(capsys):
+def test_what_was_done_before_does_not_count_for_the_time_that_is_left(capsys: pytest.CaptureFixture[str]) -> None:
     assert lines_of(capsys, total=104, done=100, seconds_each=10.0)[0] == (
         "generating: 101 of 104 episodes (97 %), 10 s passed, about 30 s left"
     )
@@ -58,11 +60,13 @@ def test_what_was_done_before_does_not_count_for_the_time_that_is_left(capsys):
         (8640, 10.0, 287, 289),  # a day: every five minutes, and not every 10 s
     ],
 )
-def test_there_is_neither_a_flood_nor_a_silence(capsys, total, seconds_each, fewest, most):
+def test_there_is_neither_a_flood_nor_a_silence(
+    capsys: pytest.CaptureFixture[str], total: int, seconds_each: float, fewest: int, most: int
+) -> None:
     assert fewest <= len(lines_of(capsys, total=total, seconds_each=seconds_each)) <= most
 
 
-def test_a_total_that_is_not_known_is_not_told(capsys):
+def test_a_total_that_is_not_known_is_not_told(capsys: pytest.CaptureFixture[str]) -> None:
     clock = Clock()
     with ProgressBar("replaying", is_terminal=False, clock=clock) as bar:
         clock.now += 10
@@ -70,7 +74,7 @@ def test_a_total_that_is_not_known_is_not_told(capsys):
     assert capsys.readouterr().err == "replaying: 1, 10 s passed\n"
 
 
-def test_a_total_may_be_known_only_later(capsys):
+def test_a_total_may_be_known_only_later(capsys: pytest.CaptureFixture[str]) -> None:
     clock = Clock()
     with ProgressBar("exporting", is_terminal=False, clock=clock) as bar:
         clock.now += 20
@@ -78,7 +82,7 @@ def test_a_total_may_be_known_only_later(capsys):
     assert capsys.readouterr().err == "exporting: 1 of 3 episodes (33 %), 20 s passed, about 40 s left\n"
 
 
-def test_a_terminal_gets_a_bar_and_no_lines(capsys):
+def test_a_terminal_gets_a_bar_and_no_lines(capsys: pytest.CaptureFixture[str]) -> None:
     clock = Clock()
     with ProgressBar("generating", total=3, is_terminal=True, clock=clock) as bar:
         clock.now += 400
@@ -91,7 +95,9 @@ def test_a_terminal_gets_a_bar_and_no_lines(capsys):
     assert "passed" not in told
 
 
-def test_one_job_after_another_has_its_own_bar(capsys, monkeypatch):
+def test_one_job_after_another_has_its_own_bar(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("sys.stderr.isatty", lambda: True)
     with RunProgress() as progress:
         progress.verifying(7, 7)

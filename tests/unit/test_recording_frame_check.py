@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.present import present
 from support.recording import make_episode
 
 from demorec.errors import RecordingError
@@ -69,7 +70,7 @@ FAULTS: dict[str, tuple[Callable[[Frame], Frame], str]] = {
     ),
     "a force without a torque": (lambda f: observed(f, wrench=np.zeros(3)), r"a wrench of shape \(3,\); recordings"),
     "a NaN in the wrench": (
-        lambda f: observed(f, wrench=with_nan(f.observation.wrench)),
+        lambda f: observed(f, wrench=with_nan(present(f.observation.wrench))),
         "wrench in its observation that is not finite",
     ),
     "a NaN in a joint": (

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import tracemalloc
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,7 @@ from support.recording import make_episode
 from demorec.recording import EpisodeWriter, Recording
 from demorec.scene.episode import frame_time_ns
 
-READERS: dict[str, Callable[[Recording], object]] = {
+READERS: dict[str, Callable[[Recording], Iterable[object]]] = {
     "packets": lambda recording: recording.packets("front"),
     "images": lambda recording: recording.images("front"),
     "depth": lambda recording: recording.depth("front"),
@@ -35,6 +36,10 @@ def write_long(path: Path, num_frames: int) -> None:
         writer.finish(replace(outcome, num_frames=num_frames))
 
 
+def read_through(read: Callable[[Recording], Iterable[object]], recording: Recording) -> None:
+    deque(read(recording), maxlen=1)
+
+
 def peak_bytes(work: Callable[[], object]) -> int:
     tracemalloc.start()
     try:
@@ -53,11 +58,11 @@ def test_memory_does_not_grow_with_length(
     peaks: dict[str, list[int]] = {"writing": [], **{name: [] for name in READERS}}
     for count in (10, *num_frames):  # the first loads and compiles what is loaded and compiled once
         path = tmp_path / f"{count}.mcap"
-        peaks["writing"].append(peak_bytes(lambda path=path, count=count: write_long(path, count)))
+        peaks["writing"].append(peak_bytes(partial(write_long, path, count)))
         with Recording(path) as recording:
             assert recording.num_frames == count
             for name, read in READERS.items():
-                peaks[name].append(peak_bytes(lambda read=read, recording=recording: deque(read(recording), maxlen=1)))
+                peaks[name].append(peak_bytes(partial(read_through, read, recording)))
     with capsys.disabled():
         print(f"\npeak memory of {num_frames[0]} and {num_frames[1]} frames:", end=" ")
         print(", ".join(f"{name} {short >> 10} and {long >> 10} kB" for name, (_, short, long) in peaks.items()))

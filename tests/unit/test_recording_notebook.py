@@ -5,18 +5,23 @@ from __future__ import annotations
 import base64
 import io
 import sys
+from collections.abc import Iterable, Iterator
 from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from PIL import Image
 from support.docs import run_examples
-from support.recording import frame_number, make_episode, write_episode
+from support.present import present
+from support.recording import Codec, frame_number, make_episode, write_episode
 
 from demorec.config import VideoConfig
 from demorec.errors import MissingDependencyError, RecordingError
-from demorec.recording import Recording, reader
+from demorec.recording import Recording, reader, video
+from demorec.recording.video import VideoPacket, VideoSettings
+from demorec.scene.episode import Frame
 
 NUM_FRAMES = 47
 
@@ -28,12 +33,12 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def truth():
+def truth() -> list[Frame]:
     _, frames, _ = make_episode(num_frames=NUM_FRAMES, depth=True, segmentation=True)
     return frames
 
 
-def same_frame(found, true) -> None:
+def same_frame(found: Frame, true: Frame) -> None:
     assert found.frame_index == true.frame_index
     assert found.time_ns == true.time_ns
     assert found.phase == true.phase
@@ -44,12 +49,12 @@ def same_frame(found, true) -> None:
     for camera, images in found.images.items():
         assert frame_number(images.color) == true.frame_index
         assert np.abs(images.color.astype(int) - true.images[camera].color).mean() < 12
-        assert np.allclose(images.depth, true.images[camera].depth, atol=5.1e-4)
-        assert np.array_equal(images.segmentation, true.images[camera].segmentation)
+        assert np.allclose(present(images.depth), present(true.images[camera].depth), atol=5.1e-4)
+        assert np.array_equal(present(images.segmentation), present(true.images[camera].segmentation))
         assert np.allclose(images.world_from_camera.position, true.images[camera].world_from_camera.position)
 
 
-def test_frames_come_with_numbers_and_pictures(path, truth):
+def test_frames_come_with_numbers_and_pictures(path: Path, truth: list[Frame]) -> None:
     with Recording(path) as recording:
         assert len(recording) == NUM_FRAMES
         count = 0
@@ -60,12 +65,12 @@ def test_frames_come_with_numbers_and_pictures(path, truth):
 
 
 @pytest.mark.parametrize("index", [0, 1, 9, 10, 33, NUM_FRAMES - 1, -1, -NUM_FRAMES])
-def test_any_frame_can_be_picked(path, truth, index):
+def test_any_frame_can_be_picked(path: Path, truth: list[Frame], index: int) -> None:
     with Recording(path) as recording:
         same_frame(recording[index], truth[index])
 
 
-def test_slices_are_those_of_a_list(path, truth):
+def test_slices_are_those_of_a_list(path: Path, truth: list[Frame]) -> None:
     with Recording(str(path)) as recording:
         for part in (slice(3, 9, 2), slice(None, None, -20), slice(-2, None), slice(40, 400), slice(9, 3)):
             found = recording[part]
@@ -74,7 +79,7 @@ def test_slices_are_those_of_a_list(path, truth):
 
 
 @pytest.mark.parametrize("index", [NUM_FRAMES, -NUM_FRAMES - 1])
-def test_there_are_no_frames_beyond_the_ends(path, index):
+def test_there_are_no_frames_beyond_the_ends(path: Path, index: int) -> None:
     with Recording(path) as recording:
         with pytest.raises(IndexError):
             recording[index]
@@ -83,7 +88,7 @@ def test_there_are_no_frames_beyond_the_ends(path, index):
 
 
 @pytest.mark.parametrize("codec", ["h264", "av1", "jpeg"])
-def test_a_picked_picture_is_that_of_the_whole_stream(tmp_path, codec):
+def test_a_picked_picture_is_that_of_the_whole_stream(tmp_path: Path, codec: Codec) -> None:
     file = write_episode(tmp_path / "a.mcap", num_frames=12, video=VideoConfig(codec=codec, gop=5))
     with Recording(file) as recording:
         whole = list(recording.images("wrist"))
@@ -91,28 +96,28 @@ def test_a_picked_picture_is_that_of_the_whole_stream(tmp_path, codec):
             assert np.array_equal(recording.image("wrist", index), whole[index])
 
 
-def test_only_pictures_from_the_keyframe_on_are_decoded(path, monkeypatch):
-    given = []
+def test_only_pictures_from_the_keyframe_on_are_decoded(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    given: list[VideoPacket] = []
 
-    def decode(settings, packets):
+    def decode(settings: VideoSettings, packets: Iterable[VideoPacket]) -> Iterator[NDArray[np.uint8]]:
         given.extend(packets)
         return real(settings, iter(given))
 
-    real = reader.decode
+    real = video.decode
     monkeypatch.setattr(reader, "decode", decode)
     with Recording(path) as recording:
         recording.image("front", 33)
     assert [packet.frame_index for packet in given] == [30, 31, 32, 33]  # a keyframe every ten
 
 
-def test_a_closed_recording_says_so(path):
+def test_a_closed_recording_says_so(path: Path) -> None:
     with Recording(path) as recording:
         pass
     with pytest.raises(RecordingError, match="closed before it was read"):
         recording[3]
 
 
-def test_the_table_holds_every_number(path, truth):
+def test_the_table_holds_every_number(path: Path, truth: list[Frame]) -> None:
     with Recording(path) as recording:
         table = recording.to_pandas()
     assert table.index.name == "frame_index"
@@ -124,8 +129,8 @@ def test_the_table_holds_every_number(path, truth):
         assert row["is_deliberate_miss"] == frame.is_deliberate_miss
         assert row["joint_position.panda_joint3"] == seen.joint_position[2]
         assert row["joint_effort.panda_finger_joint2"] == seen.joint_effort[8]
-        assert row["wrench.fz"] == seen.wrench[2]
-        assert row["wrench.tx"] == seen.wrench[3]
+        assert row["wrench.fz"] == present(seen.wrench)[2]
+        assert row["wrench.tx"] == present(seen.wrench)[3]
         assert row["base_from_tcp.z"] == seen.base_from_tcp.position[2]
         assert row["object_poses.cube.qw"] == seen.object_poses["cube"].quat_xyzw[3]
         assert row["command_joint_target.panda_joint7"] == command.joint_target[6]
@@ -135,7 +140,7 @@ def test_the_table_holds_every_number(path, truth):
     assert table.shape == (NUM_FRAMES, numbers)
 
 
-def test_without_pandas_a_sentence_says_how_to_get_it(path, monkeypatch):
+def test_without_pandas_a_sentence_says_how_to_get_it(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pandas", None)
     with Recording(path) as recording, pytest.raises(MissingDependencyError, match="pip install pandas"):
         recording.to_pandas()
@@ -151,16 +156,16 @@ class Page(HTMLParser):
         self.tags: set[str] = set()
         self.feed(text)
 
-    def handle_starttag(self, tag, attrs):
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.tags.add(tag)
         if tag == "img":
-            self.pictures.append(base64.b64decode(dict(attrs)["src"].partition("base64,")[2]))
+            self.pictures.append(base64.b64decode(present(dict(attrs)["src"]).partition("base64,")[2]))
 
-    def handle_data(self, data):
+    def handle_data(self, data: str) -> None:
         self.texts.append(data)
 
 
-def test_the_page_of_a_notebook(path):
+def test_the_page_of_a_notebook(path: Path) -> None:
     with Recording(path) as recording:
         page = Page(recording._repr_html_())
         line = repr(recording)
@@ -173,7 +178,7 @@ def test_the_page_of_a_notebook(path):
     assert [frame_number(picture) for picture in pictures] == 2 * [0, 12, 23, 34, 46]
 
 
-def test_foreign_text_does_nothing_in_a_page_or_a_line(tmp_path, path):
+def test_foreign_text_does_nothing_in_a_page_or_a_line(tmp_path: Path, path: Path) -> None:
     evil = tmp_path / "<script>alert(1)<\\script>\x1b[2J.mcap"
     evil.write_bytes(path.read_bytes())
     with Recording(evil) as recording:
@@ -181,7 +186,7 @@ def test_foreign_text_does_nothing_in_a_page_or_a_line(tmp_path, path):
         assert "\x1b" not in repr(recording) + recording._repr_html_()
 
 
-def test_recordings_without_pictures_or_frames_have_a_page_too(tmp_path):
+def test_recordings_without_pictures_or_frames_have_a_page_too(tmp_path: Path) -> None:
     with Recording(write_episode(tmp_path / "a.mcap", num_frames=3, cameras=())) as recording:
         assert "cameras" in recording._repr_html_()
         assert recording[2].images == {}
@@ -189,7 +194,9 @@ def test_recordings_without_pictures_or_frames_have_a_page_too(tmp_path):
 
 
 @pytest.mark.parametrize(("document", "number"), [("docs/recording.md", 2), ("README.md", 1)])
-def test_the_examples_of_the_documents_run(path, capsys, document, number):
+def test_the_examples_of_the_documents_run(
+    path: Path, capsys: pytest.CaptureFixture[str], document: str, number: int
+) -> None:
     recording = {"recordings/demo/episodes/episode_000000.mcap": path}
     assert run_examples(document, "from demorec.recording import Recording", recording) == number
     assert capsys.readouterr().out

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.check import checked, level_of, rewrite_messages
+from support.present import present
 from support.recording import make_episode, write_episode
 
 from demorec.errors import RecordingError
@@ -98,7 +99,7 @@ def test_a_stream_that_the_version_must_have_is_missed(topic: str, tmp_path: Pat
 
 def test_one_bit_of_the_wrench_is_another_digest(tmp_path: Path) -> None:
     info, frames, outcome = make_episode(num_frames=5, cameras=())
-    wrench = frames[3].observation.wrench.copy()
+    wrench = present(frames[3].observation.wrench).copy()
     wrench[4] = np.nextafter(wrench[4], 99.0)
     changed = replace(frames[3], observation=replace(frames[3].observation, wrench=wrench))
     with (

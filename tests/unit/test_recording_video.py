@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.recording import make_episode
+from support.recording import Codec, make_episode
 
 from demorec.config import VideoConfig
 from demorec.errors import RecordingError
@@ -46,7 +46,7 @@ def test_packets_do_not_depend_on_what_was_in_the_memory() -> None:
 
 
 @pytest.mark.parametrize("codec", ["h264", "av1", "jpeg"])
-def test_the_delay_is_short(codec: str) -> None:
+def test_the_delay_is_short(codec: Codec) -> None:
     """What an encoder holds back is lost in a crash."""
     _, frames, _ = make_episode(num_frames=40, cameras=("front",))
     encoder = make_encoder(video=VideoConfig(codec=codec, gop=30), width=64, height=48, fps=30)
@@ -59,7 +59,8 @@ def test_the_delay_is_short(codec: str) -> None:
 
 def test_broken_video_is_told_in_one_sentence() -> None:
     _, frames, _ = make_episode(num_frames=4, cameras=("front",))
-    for codec, junk in (("h264", b"\0\0\0\1\x65junk"), ("av1", b"\x12\0junk"), ("jpeg", b"\xff\xd8\xffjunk")):
+    broken: dict[Codec, bytes] = {"h264": b"\0\0\0\1\x65junk", "av1": b"\x12\0junk", "jpeg": b"\xff\xd8\xffjunk"}
+    for codec, junk in broken.items():
         encoder = make_encoder(video=VideoConfig(codec=codec), width=64, height=48, fps=30)
         data = [packet for frame in frames for packet in encoder.encode(frame.images["front"].color)]
         data += encoder.finish()
@@ -82,7 +83,7 @@ def test_another_size_than_the_settings_say() -> None:
         list(decode(encoder.settings, [packet]))
 
 
-def test_packets_do_not_depend_on_the_instructions_of_the_cpu():
+def test_packets_do_not_depend_on_the_instructions_of_the_cpu() -> None:
     """x264 without any vector instruction codes the same bits as with all that this machine has."""
     from fractions import Fraction
 
@@ -97,6 +98,7 @@ def test_packets_do_not_depend_on_the_instructions_of_the_cpu():
 
     def plain(parameters: str) -> list[bytes]:
         context = av.CodecContext.create(encoder.settings.encoder, "w")
+        assert isinstance(context, av.VideoCodecContext)
         context.width, context.height, context.pix_fmt = 224, 224, "yuv420p"
         context.time_base, context.framerate, context.gop_size = Fraction(1, 30), Fraction(30, 1), encoder.settings.gop
         context.color_range, context.color_primaries, context.color_trc, context.colorspace = 1, 1, 13, 6
@@ -122,7 +124,7 @@ def test_packets_do_not_depend_on_the_instructions_of_the_cpu():
 
 
 @pytest.mark.parametrize(("codec", "decoder"), [("h264", "h264"), ("av1", "libdav1d")])
-def test_a_stream_says_how_its_colours_are_meant(codec: str, decoder: str) -> None:
+def test_a_stream_says_how_its_colours_are_meant(codec: Codec, decoder: str) -> None:
     """And it is true: the luma and chroma in it give the picture back by the matrix and range that it names."""
     import av
 
@@ -131,6 +133,7 @@ def test_a_stream_says_how_its_colours_are_meant(codec: str, decoder: str) -> No
     encoder = make_encoder(video=VideoConfig(codec=codec, crf=5), width=128, height=64, fps=30)
     packets = [*encoder.encode(picture), *encoder.finish()]
     context = av.CodecContext.create(decoder, "r")
+    assert isinstance(context, av.VideoCodecContext)
     frames = [frame for packet in packets for frame in context.decode(av.Packet(packet))] + context.decode(None)
     # Code points of ITU-T H.273: limited range, primaries of BT.709, transfer of sRGB, matrix of BT.601.
     assert (context.color_range, context.color_primaries, context.color_trc, context.colorspace) == (1, 1, 13, 6)
@@ -144,7 +147,7 @@ def test_a_stream_says_how_its_colours_are_meant(codec: str, decoder: str) -> No
 
 
 @pytest.mark.parametrize("codec", ["h264", "av1"])
-def test_an_encoder_leaves_the_scheduling_alone(codec: str) -> None:
+def test_an_encoder_leaves_the_scheduling_alone(codec: Codec) -> None:
     policy = os.sched_getscheduler(0)
     encoder = make_encoder(video=VideoConfig(codec=codec), width=96, height=64, fps=30)
     threads = [int(task.name) for task in Path("/proc/self/task").iterdir()]

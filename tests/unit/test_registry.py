@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from fractions import Fraction
+from pathlib import Path
 
 import pytest
 
@@ -55,7 +56,7 @@ def test_somebody_elses_mistake_is_one_sentence(name: str) -> None:
     [("def (", "SyntaxError"), ("1 / 0", "ZeroDivisionError"), ("raise SystemExit(3)", "SystemExit: 3")],
 )
 def test_whatever_a_module_raises_is_one_sentence(
-    source: str, reason: str, tmp_path, monkeypatch: pytest.MonkeyPatch
+    source: str, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "breaks_on_import.py").write_text(source)
     monkeypatch.syspath_prepend(str(tmp_path))

@@ -5,7 +5,10 @@ from __future__ import annotations
 import errno
 import json
 import os
+from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import pytest
 from support.generate import expected_attempts
@@ -50,14 +53,14 @@ def a_run() -> RunFile:
     ).with_attempts(attempts)
 
 
-def test_a_run_survives_the_file(tmp_path):
+def test_a_run_survives_the_file(tmp_path: Path) -> None:
     run = a_run()
     save_run_file(run, tmp_path)
     assert load_run_file(tmp_path) == run
     assert [p.name for p in tmp_path.iterdir()] == ["run.json"]
 
 
-def test_there_is_one_line_an_attempt_and_one_for_each_episode_to_come(tmp_path):
+def test_there_is_one_line_an_attempt_and_one_for_each_episode_to_come(tmp_path: Path) -> None:
     run = a_run()
     save_run_file(run, tmp_path)
     text = (tmp_path / "run.json").read_text()
@@ -80,7 +83,7 @@ def test_there_is_one_line_an_attempt_and_one_for_each_episode_to_come(tmp_path)
         lambda text: "\x00" * 100,
     ],
 )
-def test_every_damage_is_told_as_such(tmp_path, damage):
+def test_every_damage_is_told_as_such(tmp_path: Path, damage: Callable[[str], str]) -> None:
     save_run_file(a_run(), tmp_path)
     path = tmp_path / "run.json"
     before = path.read_text()
@@ -90,7 +93,7 @@ def test_every_damage_is_told_as_such(tmp_path, damage):
         load_run_file(tmp_path)
 
 
-def edit(path, change) -> None:
+def edit(path: Path, change: Callable[[Any], object]) -> None:
     """Change run.json as JSON, and be sure that it is another one then."""
     plain = json.loads(path.read_text())
     before = json.dumps(plain)
@@ -115,7 +118,7 @@ def edit(path, change) -> None:
         (lambda run: run["episodes"].append(run["episodes"][0]), "two lines are of episode 0, attempt 0"),
     ],
 )
-def test_numbers_that_no_run_has_are_damage(tmp_path, change, words):
+def test_numbers_that_no_run_has_are_damage(tmp_path: Path, change: Callable[[Any], object], words: str) -> None:
     run = a_run()
     assert run.attempts[0].success, "the first line must be that of a recording in episodes/"
     save_run_file(run, tmp_path)
@@ -125,7 +128,7 @@ def test_numbers_that_no_run_has_are_damage(tmp_path, change, words):
     assert words in str(error.value)
 
 
-def test_a_failed_attempt_may_have_no_recording(tmp_path):
+def test_a_failed_attempt_may_have_no_recording(tmp_path: Path) -> None:
     run = a_run()
     failed = next(line for line in run.attempts if not line.success)
     run = run.with_attempts([replace(line, file="") if line is failed else line for line in run.attempts])
@@ -133,11 +136,11 @@ def test_a_failed_attempt_may_have_no_recording(tmp_path):
     assert load_run_file(tmp_path) == run
 
 
-def make_nested(path):
+def make_nested(path: Path) -> None:
     path.write_text("[" * 100_000)
 
 
-def make_huge(path):
+def make_huge(path: Path) -> None:
     with path.open("wb") as file:
         file.truncate(1 << 40)
 
@@ -151,14 +154,14 @@ def make_huge(path):
         (lambda path: path.mkdir(), "a folder"),
     ],
 )
-def test_whatever_lies_in_its_place_is_told_at_once(tmp_path, make, words):
+def test_whatever_lies_in_its_place_is_told_at_once(tmp_path: Path, make: Callable[[Path], object], words: str) -> None:
     make(tmp_path / "run.json")
     with pytest.raises(DamagedRunFileError, match=words):
         load_run_file(tmp_path)
 
 
 @pytest.mark.parametrize("number", [errno.EMFILE, errno.EIO, errno.ENOMEM])
-def test_what_the_machine_lacks_is_no_damage(tmp_path, monkeypatch, number):
+def test_what_the_machine_lacks_is_no_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
     save_run_file(a_run(), tmp_path)
 
     def fail(*_: object) -> str:
@@ -169,7 +172,7 @@ def test_what_the_machine_lacks_is_no_damage(tmp_path, monkeypatch, number):
         load_run_file(tmp_path)
 
 
-def test_it_is_never_written_through_what_lies_in_the_way(tmp_path):
+def test_it_is_never_written_through_what_lies_in_the_way(tmp_path: Path) -> None:
     (tmp_path / "mine").write_text("mine")
     (tmp_path / "run.json.part").symlink_to("mine")
     save_run_file(a_run(), tmp_path)
@@ -179,7 +182,7 @@ def test_it_is_never_written_through_what_lies_in_the_way(tmp_path):
     assert load_run_file(tmp_path) == a_run()
 
 
-def test_fewer_episodes_are_the_run_that_they_would_have_been_alone(tmp_path):
+def test_fewer_episodes_are_the_run_that_they_would_have_been_alone(tmp_path: Path) -> None:
     run = a_run()
     fewer = replace(run, num_episodes=2).with_attempts(run.known)
     alone = replace(run, num_episodes=2, attempts=tuple(line for line in run.attempts if line.episode_index < 2))
@@ -192,7 +195,7 @@ def test_fewer_episodes_are_the_run_that_they_would_have_been_alone(tmp_path):
     assert replace(fewer, num_episodes=8).with_attempts(fewer.known) == run
 
 
-def test_a_newer_format_is_no_damage(tmp_path):
+def test_a_newer_format_is_no_damage(tmp_path: Path) -> None:
     save_run_file(a_run(), tmp_path)
     path = tmp_path / "run.json"
     path.write_text(path.read_text().replace('"format": 1', '"format": 2'))
@@ -201,12 +204,12 @@ def test_a_newer_format_is_no_damage(tmp_path):
     assert not isinstance(error.value, DamagedRunFileError)
 
 
-def test_a_folder_without_a_run_is_told(tmp_path):
+def test_a_folder_without_a_run_is_told(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no run of generate-dataset"):
         load_run_file(tmp_path)
 
 
-def test_the_digest_depends_on_content_and_on_nothing_else():
+def test_the_digest_depends_on_content_and_on_nothing_else() -> None:
     run = a_run()
     same = [
         replace(run, sessions=(), export=None, versions={}, num_episodes=9),

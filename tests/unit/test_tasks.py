@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from support.sim import body_index, episode, run
 
 from demorec.errors import SceneError
 from demorec.geometry import Pose, wrap_angle
 from demorec.loop import Episode, make_world
-from demorec.scene.scene import Body, Shape
+from demorec.scene.episode import Frame
+from demorec.scene.scene import Body, Shape, ShapeKind
 from demorec.sim.robots.panda import PANDA
+from demorec.sim.world import World
 from demorec.tasks import skills
 from demorec.tasks.conditions import lasting
 from demorec.tasks.grasping import grasp_yaws, grasps_beside, hand_down, hand_yaw, raised, symmetric_yaws
@@ -25,7 +29,7 @@ def sampler(seed: int = 0) -> Sampler:
     return Sampler(np.random.default_rng(seed))
 
 
-def test_points_keep_their_distance_and_stay_inside():
+def test_points_keep_their_distance_and_stay_inside() -> None:
     draw = sampler()
     for _ in range(300):
         first = draw.point(WORKSPACE)
@@ -35,20 +39,20 @@ def test_points_keep_their_distance_and_stay_inside():
         assert math.dist(first, second) >= 0.2
 
 
-def test_a_full_table_is_a_scene_error():
+def test_a_full_table_is_a_scene_error() -> None:
     with pytest.raises(SceneError, match=r"the tenth cube.*1000 tries"):
         sampler().point(
             Region(x=(0.4, 0.5), y=(0.0, 0.1)), away_from=[(0.45, 0.05)], min_distance=0.2, what="the tenth cube"
         )
 
 
-def test_placements_follow_the_stratified_point_first():
+def test_placements_follow_the_stratified_point_first() -> None:
     draw = Sampler(np.random.default_rng(0), unit_point=(0.5, 0.25))
     assert draw.point(WORKSPACE) == (0.5, -0.125)
     assert draw.point(WORKSPACE) != (0.5, -0.125)
 
 
-def test_layouts_cover_the_promised_ranges():
+def test_layouts_cover_the_promised_ranges() -> None:
     scenes = [episode(index).info.scene for index in range(200)]
     cubes = [scene.body("red_cube") for scene in scenes]
     positions = np.array([cube.world_from_body.position for cube in cubes])
@@ -66,22 +70,22 @@ def test_layouts_cover_the_promised_ranges():
     assert np.hypot(*(targets - positions)[:, :2].T).min() >= 0.12
 
 
-def body(size, symmetry=1, kind="box"):
+def body(size: tuple[float, ...], symmetry: int = 1, kind: ShapeKind = "box") -> Body:
     shape = Shape(kind=kind, size=size)
     return Body(name="b", role="object", shape=shape, world_from_body=Pose(), mass=0.1, yaw_symmetry=symmetry)
 
 
-def rolled(degrees):
+def rolled(degrees: float) -> Pose:
     """A turn about x."""
     half = math.radians(degrees) / 2
     return Pose(quat_xyzw=np.array([math.sin(half), 0, 0, math.cos(half)]))
 
 
-def shifted(pose, x=0.0, z=0.0):
+def shifted(pose: Pose, x: float = 0.0, z: float = 0.0) -> Pose:
     return Pose(position=pose.position + np.array([x, 0.0, z]), quat_xyzw=pose.quat_xyzw)
 
 
-def test_fingers_close_over_faces_that_fit():
+def test_fingers_close_over_faces_that_fit() -> None:
     flat = body((0.12, 0.03, 0.04))
     yaws = grasp_yaws(flat, Pose.from_yaw([0.5, 0, 0.02], 0.3), 0.0, 0.08)
     # The fingers move along the hand's y axis: over the 3 cm side (y of the box) the hand's x axis is the box's.
@@ -91,13 +95,13 @@ def test_fingers_close_over_faces_that_fit():
     assert wrap_angle(grasp_yaws(body((0.02, 0.06), 0, "cylinder"), Pose(), 0.7, 0.08)[0]) == pytest.approx(0.7)
 
 
-def test_a_cube_on_its_side_is_grasped_squarely_too():
+def test_a_cube_on_its_side_is_grasped_squarely_too() -> None:
     tipped = Pose.from_yaw([0.5, 0, 0.02], 0.4) @ rolled(90)
     yaws = grasp_yaws(body((0.04, 0.04, 0.04)), tipped, 0.0, 0.08)
     assert [math.remainder(yaw - 0.4, math.pi / 2) for yaw in yaws] == pytest.approx([0.0] * 4, abs=1e-9)
 
 
-def test_hand_poses():
+def test_hand_poses() -> None:
     pose = hand_down((0.4, 0.1, 0.2), 0.6)
     assert hand_yaw(pose) == pytest.approx(0.6)
     assert pose.rotation[:, 2] == pytest.approx([0, 0, -1])
@@ -106,7 +110,7 @@ def test_hand_poses():
 
 
 @pytest.fixture(scope="module")
-def finished():
+def finished() -> Iterator[tuple[Episode, World]]:
     """A world in which the episode has just ended well."""
     prepared = episode(0)
     with make_world(prepared.info) as world:
@@ -115,19 +119,19 @@ def finished():
         yield prepared, world
 
 
-BREAKAGES = {
+BREAKAGES: dict[str, Callable[[Pose], Pose]] = {
     "distance_to_goal": lambda pose: shifted(pose, x=0.021),
     "height_error": lambda pose: shifted(pose, z=0.0041),
     "tilt": lambda pose: pose @ rolled(5.2),
 }
 
 
-def failed(prepared: Episode, world) -> set[str]:
+def failed(prepared: Episode, world: World) -> set[str]:
     return {check.name for check in prepared.task.evaluate(world) if not check.passed}
 
 
 @pytest.mark.parametrize("name", BREAKAGES)
-def test_a_cube_that_lies_wrong_fails_its_check(finished, name):
+def test_a_cube_that_lies_wrong_fails_its_check(finished: tuple[Episode, World], name: str) -> None:
     prepared, world = finished
     good = world.pose("red_cube")
     world.set_state(object_poses={"red_cube": good})
@@ -139,7 +143,7 @@ def test_a_cube_that_lies_wrong_fails_its_check(finished, name):
     world.set_state(object_poses={"red_cube": good})
 
 
-def test_a_cube_that_floats_moves_or_is_held_fails(finished):
+def test_a_cube_that_floats_moves_or_is_held_fails(finished: tuple[Episode, World]) -> None:
     prepared, world = finished
     cube, good = body_index(world, "red_cube"), world.pose("red_cube")
     world.set_state(object_poses={"red_cube": raised(good, 0.003)})
@@ -165,7 +169,7 @@ def behave(prepared: Episode, **values: float) -> Episode:
     return dataclasses.replace(prepared, behaviour=Behaviour(**values))
 
 
-def test_a_deliberate_miss_is_flagged_and_mended():
+def test_a_deliberate_miss_is_flagged_and_mended() -> None:
     frames, outcome = run(behave(episode(5), miss_x=0.03, miss_y=0.03))
     assert outcome.success
     assert outcome.num_retries == 1
@@ -188,7 +192,7 @@ def test_a_deliberate_miss_is_flagged_and_mended():
         (6, "pick_from_clutter", -0.005),
     ],
 )
-def test_a_deliberate_miss_touches_nothing(robot, task, index, offset):
+def test_a_deliberate_miss_touches_nothing(robot: str, task: str, index: int, offset: float) -> None:
     """Fast, with bodies of all sizes: no finger lands on one, and no opening finger pushes one."""
     prepared = episode(index, robot=robot, task=task)
     side = 1.0 if index % 2 == 0 else -1.0
@@ -203,14 +207,14 @@ def test_a_deliberate_miss_touches_nothing(robot, task, index, offset):
         assert np.abs(opened.observation.object_poses[name].position - start.position).max() < 3e-4, name
 
 
-def test_several_objects_are_missed_once():
+def test_several_objects_are_missed_once() -> None:
     frames, outcome = run(behave(episode(1, task="sort_by_color"), miss_x=0.03))
     assert outcome.success
     assert [event.name for frame in frames for event in frame.events].count("miss") == 1
     assert len({event.message for frame in frames for event in frame.events if event.name == "place"}) >= 2
 
 
-def test_where_there_is_no_free_side_nothing_is_missed(monkeypatch):
+def test_where_there_is_no_free_side_nothing_is_missed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(skills, "grasps_beside", lambda *_, **__: [])
     frames, outcome = run(behave(episode(5), miss_x=0.03))
     assert outcome.success
@@ -218,21 +222,21 @@ def test_where_there_is_no_free_side_nothing_is_missed(monkeypatch):
     assert not any(frame.is_deliberate_miss for frame in frames)
 
 
-def test_lasting_asks_for_a_row_without_a_gap():
+def test_lasting_asks_for_a_row_without_a_gap() -> None:
     answers = iter([True, True, False, True, True, True, True])
     done = lasting(lambda: next(answers), steps=3)
     assert [done() for _ in range(7)] == [False, False, False, False, False, True, True]
 
 
-def cube_at(x, y, *, side=0.04, yaw=0.0):
+def cube_at(x: float, y: float, *, side: float = 0.04, yaw: float = 0.0) -> tuple[Body, Pose]:
     return body((side, side, side)), Pose.from_yaw([x, y, side / 2], yaw)
 
 
-def test_a_miss_goes_to_the_free_side():
+def test_a_miss_goes_to_the_free_side() -> None:
     cube, pose = cube_at(0.5, 0.1)
     grasp = hand_down((0.503, 0.1, 0.02), 0.0)  # shifted: the miss is counted from the cube
 
-    def sides(*others):
+    def sides(*others: tuple[Body, Pose]) -> list[float]:
         found = grasps_beside(grasp, cube, pose, x=-0.05, y=0.0, others=others, robot=PANDA)
         return [round(float(miss.position[0]) - 0.5, 6) for miss in found]
 
@@ -248,7 +252,7 @@ def test_a_miss_goes_to_the_free_side():
 
 
 @pytest.mark.parametrize(("side", "yaw", "half"), [(0.06, 0.0, 0.030), (0.03, 0.0, 0.015), (0.04, 0.6, 0.0278)])
-def test_a_miss_is_as_far_as_the_fingers_need(side, yaw, half):
+def test_a_miss_is_as_far_as_the_fingers_need(side: float, yaw: float, half: float) -> None:
     """`half` is that of the cube along the hand's x axis: side / 2 (cos yaw + sin yaw); half a finger is 12 mm."""
     cube, pose = cube_at(0.5, 0.1, side=side, yaw=yaw)
     grasp = hand_down((0.49, 0.1, side / 2), 0.0)
@@ -260,23 +264,23 @@ def test_a_miss_is_as_far_as_the_fingers_need(side, yaw, half):
             assert miss.position[1:].tolist() == pytest.approx([0.096, side / 2])  # the hand's y axis points to -y
 
 
-def test_without_a_miss_nothing_is_flagged():
+def test_without_a_miss_nothing_is_flagged() -> None:
     frames, _ = run(episode(5))
     assert not any(frame.is_deliberate_miss for frame in frames)
 
 
-def test_perception_error_shifts_the_grasp():
+def test_perception_error_shifts_the_grasp() -> None:
     clean, _ = run(behave(episode(5), action_noise=0.0))
     wrong, outcome = run(behave(episode(5), action_noise=0.0, perception_x=0.005))
     assert outcome.success
 
-    def grasp(frames):
+    def grasp(frames: list[Frame]) -> NDArray[np.float64]:
         return next(frame for frame in frames if frame.phase == "close").action.base_from_tcp_target.position
 
     assert (grasp(wrong) - grasp(clean))[0] == pytest.approx(0.005, abs=5e-4)
 
 
-def test_an_object_out_of_reach_gives_up_with_its_phase():
+def test_an_object_out_of_reach_gives_up_with_its_phase() -> None:
     prepared = episode(0)
     far = dataclasses.replace(
         prepared.info.scene.body("red_cube"), world_from_body=Pose(position=np.array([0.8, 0.6, 0.025]))
@@ -289,7 +293,7 @@ def test_an_object_out_of_reach_gives_up_with_its_phase():
     assert [event.name for frame in frames for event in frame.events] == ["unreachable"]
 
 
-def test_a_cube_that_slips_is_dropped_and_fails_after_three_tries():
+def test_a_cube_that_slips_is_dropped_and_fails_after_three_tries() -> None:
     prepared = episode(0)
     slippery = dataclasses.replace(prepared.info.scene.body("red_cube"), lateral_friction=0.0, mass=2.0)
     bodies = tuple(slippery if b.name == "red_cube" else b for b in prepared.info.scene.bodies)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 import pytest
 
 from demorec.generate import worker
@@ -19,7 +21,7 @@ from demorec.runs.run_file import STARTING
 )
 def test_every_second_counts_once(first: str, expected: dict[str, float], monkeypatch: pytest.MonkeyPatch) -> None:
     now = 1000.0
-    monkeypatch.setattr(worker.time, "process_time", lambda: now)
+    monkeypatch.setattr(time, "process_time", lambda: now)
     clock = worker._Stopwatch(first)
     now += 1.0
     with clock.stage(RENDERING):

@@ -5,9 +5,12 @@ from __future__ import annotations
 import dataclasses
 import subprocess
 import sys
+from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
+from support.present import present
 from support.sim import body_index, episode, run
 
 from demorec.errors import ConfigError, SceneError
@@ -21,13 +24,13 @@ from demorec.sim.world import World
 
 
 @pytest.fixture(scope="module")
-def world():
+def world() -> Iterator[World]:
     with World(PANDA) as made:
         yield made
 
 
 @pytest.fixture(scope="module")
-def scene():
+def scene() -> Scene:
     return episode(0).info.scene
 
 
@@ -41,14 +44,14 @@ def with_bodies(scene: Scene, *bodies: Body) -> Scene:
     return dataclasses.replace(scene, bodies=(*scene.bodies, *bodies), goals=())
 
 
-def test_the_scene_alone_is_enough(world, scene):
+def test_the_scene_alone_is_enough(world: World, scene: Scene) -> None:
     world.reset(scene)
     first = world.state_digest()
     world.reset(from_json(to_json(scene), Scene))
     assert world.state_digest() == first
 
 
-def test_observation_agrees_with_the_simulator(world, scene):
+def test_observation_agrees_with_the_simulator(world: World, scene: Scene) -> None:
     world.reset(scene)
     hold(world, 3)
     seen = world.observe()
@@ -67,10 +70,10 @@ def test_observation_agrees_with_the_simulator(world, scene):
     assert np.abs(at_rest[:7]).max() > 10
 
 
-def test_one_command_is_one_frame_of_physics(scene):
+def test_one_command_is_one_frame_of_physics(scene: Scene) -> None:
     with World(PANDA, fps=30, sample_joints=True) as world:
         world.reset(scene)
-        assert world.joint_samples == ()
+        assert not world.joint_samples
         q = world.arm.target + 0.02
         command = Action(joint_target=q, gripper_target=0.08, base_from_tcp_target=world.arm.kinematics.forward(q))
         before = world.observe().joint_position
@@ -84,7 +87,7 @@ def test_one_command_is_one_frame_of_physics(scene):
         assert world.joint_samples[0].time_ns == round(1e9 * 9 / 240)
 
 
-def test_the_force_torque_sensor_does_not_touch_the_physics(world, scene):
+def test_the_force_torque_sensor_does_not_touch_the_physics(world: World, scene: Scene) -> None:
     def digest_after(sensor: bool) -> tuple[str, bool]:
         world.reset(scene)
         hand = world.arm.links[PANDA.hand_link]
@@ -94,24 +97,24 @@ def test_the_force_torque_sensor_does_not_touch_the_physics(world, scene):
             world.apply(
                 Action(joint_target=q, gripper_target=0.01, base_from_tcp_target=world.arm.kinematics.forward(q))
             )
-        return world.state_digest(), bool(world.observe().wrench.any())
+        return world.state_digest(), bool(present(world.observe().wrench).any())
 
     with_sensor, without = digest_after(True), digest_after(False)
     assert with_sensor[0] == without[0]
     assert (with_sensor[1], without[1]) == (True, False)
 
 
-def test_the_wrench_grows_by_the_weight_of_what_is_lifted():
+def test_the_wrench_grows_by_the_weight_of_what_is_lifted() -> None:
     prepared = episode(0, variation="none")
     frames, outcome = run(prepared)
     assert outcome.success
     lift = next(i for i, f in enumerate(frames) if f.observation.object_poses["red_cube"].position[2] > 0.06)
-    free = np.mean([f.observation.wrench[2] for f in frames[: lift // 2]])
-    held = np.mean([f.observation.wrench[2] for f in frames[lift + 10 : lift + 60]])
+    free = np.mean([present(f.observation.wrench)[2] for f in frames[: lift // 2]])
+    held = np.mean([present(f.observation.wrench)[2] for f in frames[lift + 10 : lift + 60]])
     assert abs((free - held) - 9.81 * prepared.info.scene.body("red_cube").mass) < 0.15
 
 
-def test_set_state_places_everything_exactly(world, scene):
+def test_set_state_places_everything_exactly(world: World, scene: Scene) -> None:
     world.reset(scene)
     q = np.concatenate([np.array(PANDA.home_q) + 0.1, [0.01, 0.01]])
     pose = Pose.from_yaw([0.5, 0.1, 0.3], 0.4)
@@ -122,7 +125,7 @@ def test_set_state_places_everything_exactly(world, scene):
     assert not seen.joint_velocity.any()
 
 
-def test_set_state_takes_the_speed_away(world, scene):
+def test_set_state_takes_the_speed_away(world: World, scene: Scene) -> None:
     world.reset(scene)
     lifted = Pose(position=np.array([0.5, 0.1, 0.5]))
     world.set_state(object_poses={"red_cube": lifted})
@@ -132,7 +135,7 @@ def test_set_state_takes_the_speed_away(world, scene):
     assert not world.velocity("red_cube")[0].any()
 
 
-def test_a_body_whose_centre_of_mass_is_off_its_origin_is_where_the_scene_says(world, scene):
+def test_a_body_whose_centre_of_mass_is_off_its_origin_is_where_the_scene_says(world: World, scene: Scene) -> None:
     pose = Pose.from_yaw([0.5, 0.3, 0.4], 0.8)
     duck = Body(
         name="duck",
@@ -158,7 +161,7 @@ def test_a_body_whose_centre_of_mass_is_off_its_origin_is_where_the_scene_says(w
         (Shape(kind="capsule", size=(0.02, 0.05)), 0.09),
     ],
 )
-def test_shapes_have_the_size_that_they_say(world, scene, shape, height):
+def test_shapes_have_the_size_that_they_say(world: World, scene: Scene, shape: Shape, height: float) -> None:
     body = Body(
         name="thing", role="object", shape=shape, world_from_body=Pose(position=np.array([0.5, 0.4, 1.0])), mass=0.1
     )
@@ -168,7 +171,7 @@ def test_shapes_have_the_size_that_they_say(world, scene, shape, height):
     assert abs(shape.extents[2] - height) < 1e-12
 
 
-def test_a_mark_is_seen_but_not_felt(world, scene):
+def test_a_mark_is_seen_but_not_felt(world: World, scene: Scene) -> None:
     world.reset(scene)
     mark = scene.body("green_target")
     above = Pose(position=mark.world_from_body.position + np.array([0.0, 0.0, 0.1]))
@@ -178,7 +181,7 @@ def test_a_mark_is_seen_but_not_felt(world, scene):
     assert abs(world.pose("red_cube").position[2] - side / 2) < 5e-4
 
 
-def test_digest_tells_one_bit(world, scene):
+def test_digest_tells_one_bit(world: World, scene: Scene) -> None:
     world.reset(scene)
     first = world.state_digest()
     pose = world.pose("red_cube")
@@ -187,7 +190,7 @@ def test_digest_tells_one_bit(world, scene):
     assert world.state_digest() != first
 
 
-def test_parameters_of_another_client_do_not_leak():
+def test_parameters_of_another_client_do_not_leak() -> None:
     prepared = episode(1)
     _, expected = run(prepared)
     vandal = connect()
@@ -199,7 +202,7 @@ def test_parameters_of_another_client_do_not_leak():
     assert found.final_state_digest == expected.final_state_digest
 
 
-def test_wrong_scenes_are_refused_in_one_sentence(world, scene):
+def test_wrong_scenes_are_refused_in_one_sentence(world: World, scene: Scene) -> None:
     with pytest.raises(SceneError, match="no_such"):
         world.reset(
             with_bodies(
@@ -220,7 +223,9 @@ def test_wrong_scenes_are_refused_in_one_sentence(world, scene):
         odd.reset(scene)
 
 
-def test_broken_model_file_is_a_scene_error(world, scene, tmp_path, monkeypatch):
+def test_broken_model_file_is_a_scene_error(
+    world: World, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     broken = tmp_path / "broken.urdf"
     broken.write_text("<robot name='x'><link")
     monkeypatch.setattr("demorec.sim.urdf_file.asset_path", lambda name: broken)
@@ -231,13 +236,13 @@ def test_broken_model_file_is_a_scene_error(world, scene, tmp_path, monkeypatch)
         world.reset(with_bodies(scene, body))
 
 
-def test_close_twice_is_harmless():
+def test_close_twice_is_harmless() -> None:
     world = World(PANDA)
     world.close()
     world.close()
 
 
-def test_a_client_that_nobody_refers_to_is_freed():
+def test_a_client_that_nobody_refers_to_is_freed() -> None:
     client = connect()
     is_connected = client.isConnected
     assert is_connected()
@@ -245,7 +250,7 @@ def test_a_client_that_nobody_refers_to_is_freed():
     assert not is_connected()
 
 
-def test_a_disconnected_client_does_not_reach_the_next_one():
+def test_a_disconnected_client_does_not_reach_the_next_one() -> None:
     """PyBullet gives the number of a client to the next one."""
     client = connect()
     assert client.isConnected()
@@ -257,7 +262,7 @@ def test_a_disconnected_client_does_not_reach_the_next_one():
     other.disconnect()
 
 
-def test_a_world_that_nobody_closed_is_silent_at_the_end():
+def test_a_world_that_nobody_closed_is_silent_at_the_end() -> None:
     """The later a module is cleared away, the longer it keeps what it holds: this one longer than PyBullet."""
     program = """
 import os
@@ -269,13 +274,13 @@ os.kept = World(PANDA)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
-def test_connecting_prints_nothing(capfd):
+def test_connecting_prints_nothing(capfd: pytest.CaptureFixture[str]) -> None:
     connect().disconnect()
     captured = capfd.readouterr()
     assert captured.out == captured.err == ""
 
 
-def test_visuals_are_read_anew_when_a_colour_is_changed(world, scene):
+def test_visuals_are_read_anew_when_a_colour_is_changed(world: World, scene: Scene) -> None:
     world.reset(scene)
     before = world.visuals()
     assert world.visuals() is before
@@ -287,7 +292,7 @@ def test_visuals_are_read_anew_when_a_colour_is_changed(world, scene):
     assert world.visuals() == before
 
 
-def test_textures_are_told_whether_or_not_the_scene_has_cameras(world, scene):
+def test_textures_are_told_whether_or_not_the_scene_has_cameras(world: World, scene: Scene) -> None:
     texture = Texture(pattern="checker", colors=((1.0, 1.0, 1.0), (0.0, 0.0, 0.0)))
     covered = tuple(dataclasses.replace(body, texture=texture) for body in scene.bodies)
     world.reset(dataclasses.replace(scene, bodies=covered, cameras=()))
