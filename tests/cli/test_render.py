@@ -10,18 +10,13 @@ import time
 from pathlib import Path
 
 import pytest
+from support.commands import exit_code
 from support.export import files_of, make_run
 
-from demorec.cli import main
-from demorec.replay import rerender as rerendering
+from demorec.recording import EpisodeWriter
+from demorec.scene.episode import Outcome
 
 DEMOREC = [sys.executable, "-c", "from demorec.cli import main; main()"]
-
-
-def demorec(*arguments: object) -> int:
-    with pytest.raises(SystemExit) as done:
-        main([str(argument) for argument in arguments])
-    return int(done.value.code or 0)
 
 
 @pytest.fixture(scope="module")
@@ -40,9 +35,9 @@ def test_the_same_command_keeps_what_is_drawn(
     out = tmp_path / "out"
     command = ("render", run, "--out", out, "--width", 32, "--height", 32, "--looks", 1, "--workers", 1)
     drawn: list[Path] = []
-    write = rerendering.EpisodeWriter.finish
+    write = EpisodeWriter.finish
 
-    def until_the_second(writer: rerendering.EpisodeWriter, outcome: rerendering.Outcome) -> object:
+    def until_the_second(writer: EpisodeWriter, outcome: Outcome) -> object:
         if drawn:
             raise KeyboardInterrupt
         stats = write(writer, outcome)
@@ -50,13 +45,13 @@ def test_the_same_command_keeps_what_is_drawn(
         return stats
 
     with monkeypatch.context() as patch:
-        patch.setattr(rerendering.EpisodeWriter, "finish", until_the_second)
-        assert demorec(*command) == 130
+        patch.setattr(EpisodeWriter, "finish", until_the_second)
+        assert exit_code(*command) == 130
     assert "Interrupted: 1 of 3 recordings are drawn; the same command goes on" in capsys.readouterr().err
     before = recordings(out)
     assert len(before) == 1
     assert list((out / "episodes").glob("*.part"))  # the half file
-    assert demorec(*command) == 0
+    assert exit_code(*command) == 0
     said = capsys.readouterr().out
     assert "1 of 3 had been drawn before and are kept" in said
     assert "3 recordings, 12 pictures" in said
@@ -64,7 +59,7 @@ def test_the_same_command_keeps_what_is_drawn(
     assert before.items() <= after.items()
     assert len(after) == 3
     assert not list((out / "episodes").glob("*.part"))
-    assert demorec("render", run, "--out", tmp_path / "once", *command[4:]) == 0
+    assert exit_code("render", run, "--out", tmp_path / "once", *command[4:]) == 0
     assert files_of(tmp_path / "once") == files_of(out)
 
 
@@ -84,27 +79,27 @@ def test_another_request_is_refused(
 ) -> None:
     source, out = run / "episodes" / "episode_000000.mcap", tmp_path / "out"
     same = ("render", source, "--out", out, "--looks", 1)
-    assert demorec(*same) == 0
+    assert exit_code(*same) == 0
     before = files_of(out)
     capsys.readouterr()
-    assert demorec(*same, *other) == 2
+    assert exit_code(*same, *other) == 2
     assert "is there already" in capsys.readouterr().err
     another = run / "episodes" / "episode_000001.mcap"
-    assert demorec("render", another, "--out", out / source.name, "--looks", 1) == 2
+    assert exit_code("render", another, "--out", out / source.name, "--looks", 1) == 2
     assert files_of(out) == before
-    assert demorec(*same, *other, "--overwrite") == 0
+    assert exit_code(*same, *other, "--overwrite") == 0
     assert files_of(out) != before
 
 
 def test_a_damaged_one_is_not_taken_for_drawn(run: Path, tmp_path: Path) -> None:
     source, target = run / "episodes" / "episode_000000.mcap", tmp_path / "new.mcap"
     command = ("render", source, "--out", target, "--looks", 1)
-    assert demorec(*command) == 0
+    assert exit_code(*command) == 0
     whole = target.read_bytes()
     middle = len(whole) // 2
     target.write_bytes(whole[:middle] + bytes([whole[middle] ^ 255]) + whole[middle + 1 :])
-    assert demorec(*command) == 2
-    assert demorec(*command, "--overwrite") == 0
+    assert exit_code(*command) == 2
+    assert exit_code(*command, "--overwrite") == 0
     assert target.read_bytes() == whole
 
 
@@ -132,5 +127,5 @@ def test_ended_from_outside_it_is_quiet_and_goes_on(run: Path, tmp_path: Path, n
         assert "the same command goes on" in lines[0]
     else:
         assert lines == []
-    assert demorec(*command[3:]) == 0
+    assert exit_code(*command[3:]) == 0
     assert len(recordings(out)) == 3

@@ -19,8 +19,9 @@ from demorec.cli import main
 from demorec.config import GenerateConfig
 from demorec.errors import ConfigError, GenerationError, MissingDependencyError, ResourceError
 from demorec.generate import survey
+from demorec.generate.observer import RunResult
 from demorec.generate.options import RunOptions
-from demorec.generate.run import RunResult, generate
+from demorec.generate.run import generate
 from demorec.runs.run_file import load_run_file
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from support.recording import PANDA, make_episode
 
+from demorec.check.base import Measurement
 from demorec.check.dataset_motion import dataset_joint_limits
 from demorec.scene.features import STATE
 
@@ -21,5 +22,5 @@ def test_the_opening_of_a_scaled_gripper_is_scaled_once(width: float, beyond: fl
     info = replace(info, robot=PANDA.scaled(1.3), scene=replace(info.scene, robot=placement))
     state = np.array([[*PANDA.home_q, width]], dtype=np.float32)
     found = dataset_joint_limits.measure(SimpleNamespace(described=lambda: [({STATE: state}, info)]))
-    assert found is not None
+    assert isinstance(found, Measurement)
     assert found.value == pytest.approx(beyond, abs=1e-6)
