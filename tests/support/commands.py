@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import os
 import subprocess
 import sys
 import traceback
@@ -32,8 +33,13 @@ class Commands:
     """Context manager over the process."""
 
     def __enter__(self) -> Self:
+        # As a module: as a script its folder would come first, and `support/mcap.py` would be what `import mcap` finds.
         self._process = subprocess.Popen(
-            [sys.executable, __file__], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+            [sys.executable, "-m", "support.commands"],
+            env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])},
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
         )
         return self
 
@@ -69,7 +75,6 @@ class Commands:
 
 
 def _serve() -> None:
-    import os
     import time
 
     from demorec.cli import COMMANDS, main
