@@ -9,7 +9,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from demorec.errors import ExportError
+from demorec.errors import ExportError, in_words
 from demorec.lerobot.files import read_table
 from demorec.lerobot.layout import DatasetInfo
 from demorec.lerobot.paths import SIDECAR_DIR
@@ -68,7 +68,7 @@ class Dataset:
         try:
             return [read_episode_info(row["episode_info"]) for row in self.sidecar]
         except (ValueError, KeyError, TypeError) as error:
-            raise ExportError(f"The sidecar's episode_info cannot be used ({error}): {self.path}") from error
+            raise ExportError(f"The sidecar's episode_info cannot be used ({in_words(error)}): {self.path}") from error
 
     def described(self) -> list[tuple[Rows, EpisodeInfo]]:
         """(rows, info) of each episode that the sidecar describes."""

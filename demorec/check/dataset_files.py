@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -14,7 +15,7 @@ import numpy as np
 
 from demorec.check.base import Measurement, check, worst
 from demorec.check.dataset import Dataset
-from demorec.errors import ExportError, MissingDependencyError
+from demorec.errors import ExportError, MissingDependencyError, in_words
 from demorec.geometry import Array
 from demorec.lerobot.files import check_video, read_json
 from demorec.lerobot.inspect import episode_digests
@@ -81,7 +82,7 @@ def dataset_videos(dataset: Dataset) -> Measurement | None:
                 for _ in reader.read(place):
                     pass
         except ExportError as error:
-            wrong.append(f"{key}: {error}")
+            wrong.append(str(error))
         finally:
             reader.close()
     return Measurement(value=len(wrong), detail="; ".join(wrong[:2]) or f"{len(dataset.info.video_keys)} cameras")
@@ -124,7 +125,7 @@ def _stats(dataset: Dataset) -> dict[str, Any]:
         if not isinstance(found, dict) or not all(isinstance(entry, dict) for entry in found.values()):
             raise ValueError("it holds no object of objects")
     except (OSError, ValueError) as error:
-        raise ExportError(f"The statistics cannot be read ({error}): {path}") from error
+        raise ExportError(f"The statistics cannot be read ({in_words(error)}): {path}") from error
     return found
 
 
@@ -162,7 +163,7 @@ def dataset_picture_statistics(dataset: Dataset) -> Measurement | None:
                         if number % 10 == 0:
                             means.append(frame.to_ndarray(format="rgb24").mean(axis=(0, 1)) / 255)
             except (OSError, av.FFmpegError) as error:
-                raise ExportError(f"The video cannot be decoded ({error}): {path}") from error
+                raise ExportError(f"The video cannot be decoded ({in_words(error)}): {path}") from error
         said = _numbers(stats.get(key, {}).get("mean", np.full(3, np.inf)))
         if means:
             value = float(np.abs(np.mean(means, axis=0) - said).max()) if said.shape == (3,) else math.inf
@@ -231,7 +232,8 @@ def dataset_opens(dataset: Dataset) -> Measurement:
         )
     if done.returncode != 0:
         lines = [line for line in done.stderr.splitlines() if line.strip()]
-        return Measurement(value=1, detail=lines[-1][:200] if lines else f"exit status {done.returncode}")
+        said = re.sub(r"^[\w.]+: ", "", lines[-1])[:200] if lines else f"it ends with the exit status {done.returncode}"
+        return Measurement(value=1, detail=f"LeRobot cannot open it ({said})")
     told = json.loads(done.stdout.splitlines()[-1])
     same = (told["episodes"], told["frames"]) == (dataset.info.total_episodes, dataset.info.total_frames)
     return Measurement(value=int(not same), detail=f"{told['episodes']} episodes, {told['frames']} frames")

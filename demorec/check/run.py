@@ -12,7 +12,7 @@ import numpy as np
 
 from demorec.check.base import Measurement, check, worst
 from demorec.check.coverage import infos_by_task, largest_gap, start_vector, twins
-from demorec.errors import ConfigError, RecordingError, resource_error
+from demorec.errors import ConfigError, RecordingError, in_words, resource_error
 from demorec.lerobot.files import read_json
 from demorec.lerobot.paths import INFO_PATH
 from demorec.recording import Recording
@@ -51,7 +51,7 @@ class CheckedRun:
             unusable = ConfigError(f"{RUN_NAME} cannot be used ({error.strerror}): {self.path}")
             raise resource_error(error) or unusable from error
         except (ValueError, KeyError, TypeError) as error:
-            raise ConfigError(f"{RUN_NAME} cannot be used ({error}): {self.path}") from error
+            raise ConfigError(f"{RUN_NAME} cannot be used ({in_words(error)}): {self.path}") from error
         return dict(run)
 
     @property
@@ -175,6 +175,6 @@ def run_dataset(run: CheckedRun) -> Measurement | None:
     try:
         episodes = int(read_json(path)["total_episodes"])
     except (OSError, ValueError, KeyError, TypeError, OverflowError) as error:
-        raise ConfigError(f"info.json of the dataset cannot be used ({error}): {path}") from error
+        raise ConfigError(f"info.json of the dataset cannot be used ({in_words(error)}): {path}") from error
     successes = sum(1 for line in run.lines if line["success"] and line["episode_index"] < run.run["num_episodes"])
     return Measurement(value=abs(episodes - successes), detail=f"{episodes} in the dataset, {successes} successes")

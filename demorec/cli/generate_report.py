@@ -13,6 +13,7 @@ from pathlib import Path
 
 from demorec.cli.output import say, tell
 from demorec.cli.progress import duration
+from demorec.generate.contents import set_aside
 from demorec.generate.estimate import Estimate
 from demorec.generate.observer import RunResult
 from demorec.generate.options import RunOptions, available_cores
@@ -88,14 +89,8 @@ def print_result(result: RunResult, export: ExportRecord | None, checked: CheckS
         rows.append(
             ("wall time", f"{wall:.1f} s with {_workers(result.session.workers)}, {rate:.1f} episodes a minute")
         )
-    leftovers = sum(1 for path in (folder / UNFINISHED).rglob("*") if path.is_file())
-    if leftovers:
-        rows.append(
-            (
-                "set aside",
-                f"{leftovers} files in {folder / UNFINISHED} (demorec recover reads recordings that a crash cut off)",
-            )
-        )
+    if aside := set_aside(folder):
+        rows.append(("set aside", f"{', '.join(aside)}: {folder / UNFINISHED}"))
     rows.append(("run digest", run.digest))
     if export is not None:
         rows.append(("dataset digest", export.dataset_digest))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from tyro.conf import Positional
 
 from demorec.cli.output import say, say_json
-from demorec.errors import ConfigError, ExportError, RecordingError, in_words
+from demorec.errors import ConfigError, ExportError, RecordingError, in_words, resource_error, without_path
 from demorec.lerobot.paths import INFO_PATH
 from demorec.runs.find import Found, expect
 from demorec.safety.text import display_width, printable
@@ -21,6 +20,9 @@ if TYPE_CHECKING:
     from demorec.config import GenerateConfig
     from demorec.recording.summary import RecordingSummary
     from demorec.runs.run_file import RunFile
+
+_MOST_PROBLEMS = 5
+"""Of a dataset that are told one by one."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -178,30 +180,45 @@ def _dataset(path: Path) -> tuple[dict[str, Any], list[str]]:
             ("robot", str(info["robot_type"])),
             ("size", _size(sum(part.stat().st_size for part in path.rglob("*") if part.is_file()))),
         ]
-        facts += _dataset_content(path)
+        more, problems = _dataset_content(path)
+        facts += [*more, *(("problem", problem) for problem in problems[:_MOST_PROBLEMS])]
+        if len(problems) > _MOST_PROBLEMS:
+            facts.append(("problems", f"{len(problems)} in all; demorec check says more"))
         rows = [("feature", "dtype", "shape", "names")]
         for name, feature in info["features"].items():
             shape = "x".join(map(str, feature["shape"]))
             rows.append((name, str(feature["dtype"]), shape, _names(feature.get("names"))))
     except (OSError, ValueError, KeyError, TypeError, AttributeError, ArithmeticError) as error:
         raise RecordingError(f"The dataset's info.json is damaged ({in_words(error)}): {file}") from error
-    return {"kind": "dataset", "path": str(path), "info": info}, [*_aligned(facts), "", *_aligned(rows)]
+    plain = {"kind": "dataset", "path": str(path), "info": info, "problems": problems}
+    return plain, [*_aligned(facts), "", *_aligned(rows)]
 
 
-def _dataset_content(path: Path) -> list[tuple[str, str]]:
-    """What the tables say beyond info.json, where demorec understands them."""
+def _dataset_content(path: Path) -> tuple[list[tuple[str, str]], list[str]]:
+    """What the tables say beyond info.json, where demorec understands them, and what is wrong with the dataset."""
     from demorec.lerobot import dataset_digest, dataset_info
+    from demorec.lerobot.inspect import dataset_problems, has_digest
+    from demorec.lerobot.layout import DatasetInfo
 
     facts: list[tuple[str, str]] = []
-    # Incomplete datasets and kinds of features that demorec does not write: demorec check says what is wrong.
-    with contextlib.suppress(ExportError):
+    problems: list[str] = []
+    try:
+        info = DatasetInfo.load(path)
+        problems += dataset_problems(path, info)
+        if problems:
+            return facts, problems
         summary = dataset_info(path)
         if summary.num_attempts is not None:
             facts.append(("successes", f"{summary.num_successes}, of {summary.num_attempts} attempts"))
         for name, width, height, codec in summary.cameras:
             facts.append(("camera", f"{name.removeprefix(IMAGE_PREFIX)} {width}x{height} {codec}"))
-        facts.append(("digest", dataset_digest(path)))
-    return facts
+        if has_digest(info):
+            facts.append(("digest", dataset_digest(path)))
+    except ExportError as error:
+        if (lack := resource_error(error)) is not None:
+            raise lack from error
+        problems.append(without_path(error, path))
+    return facts, problems
 
 
 def _names(names: object) -> str:

@@ -60,14 +60,6 @@ def goes_in(source: ExportSource, recording: Recording, options: CommonOptions) 
     return source.is_chosen and (success or options.include_failures)
 
 
-def nothing_to_export(num_recordings: int, num_failures: int) -> ConfigError:
-    """What to raise when not one recording goes in."""
-    return ConfigError(
-        f"Nothing to export: of {num_recordings} recordings, {num_failures} are failed attempts and the "
-        "others are not among the wanted episodes (--include-failures, --episodes)."
-    )
-
-
 def places_of(sources: Iterable[ExportSource]) -> list[Path]:
     """What an export must not write over: the recordings, and a run's folders of them with all that is in there.
 
@@ -119,7 +111,48 @@ class Profile:
         )
 
 
-def refuse_differences(profile: Profile, reference: Path, paths: Iterable[Path], options: CommonOptions) -> None:
+class Intake:
+    """What goes into one dataset: recordings that go together, and the count of failed attempts that are left out.
+
+    Args:
+        found: All recordings of the export.
+        options: Its options.
+
+    Attributes:
+        skipped_failures: Failed attempts that were left out so far.
+    """
+
+    def __init__(self, found: Sequence[ExportSource], options: CommonOptions) -> None:
+        self.skipped_failures = 0
+        self._found = found
+        self._options = options
+        self._first: tuple[Profile, Path] | None = None
+
+    def take(self, path: Path, profile: Profile) -> None:
+        """Note a recording that goes in.
+
+        Raises:
+            ExportError: It does not go together with the first one.
+        """
+        if self._first is None:
+            self._first = profile, path
+        elif profile != self._first[0]:
+            _refuse_differences(*self._first, (source.path for source in self._found), self._options)
+
+    def leave_out(self) -> None:
+        """Note a failed attempt that only counts for the success rate."""
+        self.skipped_failures += 1
+
+    def check(self) -> None:
+        """Raise ConfigError when not one recording has gone in."""
+        if self._first is None:
+            raise ConfigError(
+                f"Nothing to export: of {len(self._found)} recordings, {self.skipped_failures} are failed attempts and "
+                "the others are not among the wanted episodes (--include-failures, --episodes)."
+            )
+
+
+def _refuse_differences(profile: Profile, reference: Path, paths: Iterable[Path], options: CommonOptions) -> None:
     """Raise ExportError with every difference between the reference and any of the recordings.
 
     Called only when one is known to differ: then all headers are read, so that the user hears of everything at once.

@@ -24,7 +24,25 @@ _UNFINISHED = re.compile(
     rf"|{_NAME}(\.\d+)?"  # set aside, since it was damaged or of another run
     r"|error_episode_\d+\.txt"
 )
-_SET_ASIDE_DATASET = re.compile(rf"{DATASET_FOLDER}(\.\d+)?/(.*)")
+_SET_ASIDE_DATASET = re.compile(rf"({DATASET_FOLDER}(?:\.\d+)?)/(.*)")
+
+
+def set_aside(folder: Path) -> list[str]:
+    """What lies in a run's unfinished/, in words: how many of each kind."""
+    names = list(files_below(folder / UNFINISHED))
+    datasets = {match[1] for name in names if (match := _SET_ASIDE_DATASET.fullmatch(name))}
+    others = [name for name in names if not _SET_ASIDE_DATASET.fullmatch(name)]
+    cut = sum(name.endswith(".part") for name in others)
+    whole = sum(name.startswith("episode_") for name in others)
+    reports = sum(name.startswith("error_") for name in others)
+    counted = (
+        (len(datasets), "dataset", " that the run did not leave like this"),
+        (whole, "recording", " not of this run, or damaged"),
+        (cut, "unfinished recording", " (demorec recover reads what is whole)"),
+        (reports, "error report", ""),
+        (len(others) - cut - whole - reports, "other file", ""),
+    )
+    return [f"{count} {noun}{'' if count == 1 else 's'}{more}" for count, noun, more in counted if count]
 
 
 def foreign_recordings(folder: Path, place: str, *, known: frozenset[str] = frozenset()) -> Iterator[str]:

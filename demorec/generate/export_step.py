@@ -68,6 +68,8 @@ def export_run(
                 says(f"{DATASET}/ is not as the run made it (damaged, or changed since); it was moved to {aside}.")
             elif (present.run_digest, present.repo_id) == (run.digest, repo_id) and present.dataset_digest:
                 return present, None
+        elif present is not None and present.dataset_digest:
+            says(f"{DATASET}/ is no longer there; it is made again.")
         record = ExportRecord(run_digest=run.digest, repo_id=repo_id)
         # Written down before: after a crash in between, what is there is known to be ours.
         save_run_file(replace(run, export=record), folder)

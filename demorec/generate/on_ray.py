@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from demorec.config import EpisodePlan
-from demorec.errors import ConfigError, GenerationError, MissingDependencyError
+from demorec.errors import ConfigError, GenerationError, MissingDependencyError, in_words
 from demorec.generate.executor import SINGLE_THREADED, Lost, Report, attempt_episode
 from demorec.generate.options import available_cores
 from demorec.runs.run_file import RUN_NAME
@@ -190,8 +190,8 @@ def _knock(address: str) -> None:
             pass
     except (OSError, OverflowError) as error:
         raise ConfigError(
-            f"The Ray cluster at {address!r} cannot be reached ({error}): give the address that `ray start --head` "
-            "has printed, or --address auto on a machine of the cluster."
+            f"The Ray cluster at {address!r} cannot be reached ({in_words(error)}): give the address that "
+            "`ray start --head` has printed, or --address auto on a machine of the cluster."
         ) from error
 
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from demorec.errors import DemorecError, resource_error
+from demorec.errors import DemorecError, in_words, resource_error, without_path
 from demorec.generate.plan import plain_differences
 from demorec.plain import to_plain
 from demorec.runs.recordings import Inspected, inspect_recording
@@ -79,7 +79,7 @@ def survey(
         except (DemorecError, OSError, MemoryError) as error:
             if (lack := resource_error(error, path)) is not None:
                 raise lack from error
-            set_aside[file] = (error.strerror if isinstance(error, OSError) else None) or str(error)
+            set_aside[file] = without_path(error, path) if isinstance(error, DemorecError) else in_words(error)
             _set_aside(path, folder)
         progress(number + 1, len(files))
     return Survey(attempts=tuple(kept), set_aside=set_aside, num_adopted=num_adopted)

@@ -9,13 +9,12 @@ from demorec.errors import ExportError
 from demorec.export.options import ExportReport, ProgressCallback
 from demorec.export.sources import (
     ExportSource,
+    Intake,
     Profile,
     find_recordings,
     goes_in,
     is_among_episodes,
-    nothing_to_export,
     places_of,
-    refuse_differences,
 )
 from demorec.hdf5.file import DATASET, UNFINISHED, NewFile
 from demorec.hdf5.options import Hdf5Options
@@ -36,8 +35,8 @@ def export_hdf5(
         progress: Called after every recording.
 
     Raises:
-        ConfigError: Impossible options, or a file in the way.
-        ExportError: Nothing to export, recordings that differ, a full disk. What was at `out` is still there then.
+        ConfigError: Impossible options, nothing to export, or a file in the way.
+        ExportError: Recordings that differ, a full disk. What was at `out` is still there then.
         RecordingError: A recording is damaged, or lacks pictures that were asked for.
     """
     options.validate()
@@ -63,23 +62,18 @@ def _write(
     writer: RobomimicWriter, found: Sequence[ExportSource], out: Path, progress: ProgressCallback | None
 ) -> ExportReport:
     options = writer.options
-    first: tuple[Profile, Path] | None = None
-    skipped_failures = 0
+    intake = Intake(found, options)
     for done, source in enumerate(found, start=1):
         with Recording(source.path) as recording:
             if is_among_episodes(recording, options):
                 if goes_in(source, recording, options):
-                    profile = Profile.of(recording, options)
-                    first = first or (profile, source.path)
-                    if profile != first[0]:
-                        refuse_differences(*first, (other.path for other in found), options)
+                    intake.take(source.path, Profile.of(recording, options))
                     writer.add(recording)
                 else:
-                    skipped_failures += 1
+                    intake.leave_out()
         if progress is not None:
             progress(done, len(found))
-    if first is None:
-        raise nothing_to_export(len(found), skipped_failures)
+    intake.check()
     writer.finish()
     return ExportReport(
         path=out,
@@ -87,5 +81,5 @@ def _write(
         num_frames=writer.num_frames,
         new_episodes=writer.num_episodes,
         new_frames=writer.num_frames,
-        skipped_failures=skipped_failures,
+        skipped_failures=intake.skipped_failures,
     )

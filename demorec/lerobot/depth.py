@@ -17,7 +17,7 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.errors import ExportError
+from demorec.errors import ExportError, in_words
 from demorec.geometry import Array
 from demorec.lerobot.mp4 import CodedVideo
 from demorec.lerobot.stats import PixelHistogram
@@ -82,7 +82,9 @@ def _encoder(width: int, height: int, fps: int) -> av.VideoCodecContext:
         }
         context.open()
     except (av.FFmpegError, ValueError) as error:
-        raise ExportError(f"Depth video cannot be coded, this build of PyAV has no 12-bit HEVC ({error}).") from error
+        raise ExportError(
+            f"Depth video cannot be coded, this build of PyAV has no 12-bit HEVC ({in_words(error)})."
+        ) from error
     return context
 
 

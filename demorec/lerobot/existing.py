@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from demorec.errors import ExportError
+from demorec.errors import ExportError, in_words
 from demorec.lerobot.files import open_table, read_json, read_table
 from demorec.lerobot.layout import AUTOMATIC_FEATURES, STATS_PATH, TASKS_PATH, DatasetInfo, Feature, FilePosition
 from demorec.lerobot.paths import INFO_PATH, SIDECAR_DIR
@@ -66,7 +66,7 @@ def open_existing(root: Path) -> Existing:
         if not isinstance(configs, dict) or not all(isinstance(config, dict) for config in configs.values()):
             raise ValueError(f"{CONFIGS_PATH} holds no configurations")
     except (OSError, ValueError, TypeError, AttributeError) as error:
-        raise ExportError(f"The dataset cannot be read ({error}): {root}") from error
+        raise ExportError(f"The dataset cannot be read ({in_words(error)}): {root}") from error
     if (episodes, frames, rows) != (info.total_episodes, info.total_frames, info.total_frames):
         raise ExportError(
             f"The dataset is not whole: {INFO_PATH} counts {info.total_episodes} episodes of {info.total_frames} "

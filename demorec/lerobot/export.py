@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from importlib.metadata import version
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import numpy as np
 
 from demorec.errors import ConfigError
 from demorec.export.options import ExportReport, ProgressCallback
-from demorec.export.sources import ExportSource, find_recordings, nothing_to_export, places_of, refuse_differences
+from demorec.export.sources import ExportSource, Intake, find_recordings, places_of
 from demorec.export.staging import CODED, staged_folder
 from demorec.lerobot.card import CardFacts, write_card
 from demorec.lerobot.digest import combined_digest
@@ -24,7 +25,7 @@ from demorec.lerobot.kind import DATASET, GROWING_DATASET
 from demorec.lerobot.layout import DatasetInfo
 from demorec.lerobot.options import ExportOptions
 from demorec.lerobot.readings import Reading, readings
-from demorec.lerobot.sidecar import AttemptRecord, SidecarStart, SidecarWriter
+from demorec.lerobot.sidecar import SidecarStart, SidecarWriter
 from demorec.lerobot.verify import LEROBOT, MAX_EPISODES, Sample, Verifier, lerobot_is_installed
 from demorec.lerobot.writer import DatasetWriter, WriterStart
 from demorec.safety.replacing import shown
@@ -42,10 +43,10 @@ def export_lerobot(
         progress: Called after every recording.
 
     Raises:
-        ConfigError: Options that contradict each other, something at `out` that is never replaced, or episodes to be
-            appended that the dataset has already.
-        ExportError: Nothing to export, recordings that differ, a dataset in the way, a full disk, a failed
-            verification. What was at `out` is still there then.
+        ConfigError: Options that contradict each other, nothing to export, something in the way at `out`, or episodes
+            to be appended that the dataset has already.
+        ExportError: Recordings that differ, a full disk, a failed verification. What was at `out` is still there
+            then.
         RecordingError: A recording is damaged.
     """
     options.validate()
@@ -85,21 +86,19 @@ class _Export:
         self._transcoded: dict[str, None] = {}
         self._digests: list[str] = []
         self._recordings: list[Path] = []
-        self._skipped_failures = 0
+        self._intake = Intake(found, options)
 
     def run(self, progress: ProgressCallback | None) -> ExportReport:
         aside = self._folder.with_name(CODED)  # is removed with everything beside the new folder
         aside.mkdir(exist_ok=True)
-        found = readings(self._found, self._options, progress, aside=aside)
-        waiting: list[AttemptRecord] = []  # failed attempts before the first episode
-        first = None
-        for first in found:
-            if first.prepared is not None:
+        found = self._noted(readings(self._found, self._options, progress, aside=aside))
+        begun: list[Reading] = []  # up to the first episode, which decides what features there are
+        for reading in found:
+            begun.append(reading)
+            if reading.prepared is not None:
                 break
-            waiting.append(first.attempt)
-        if first is None or first.prepared is None:
-            raise nothing_to_export(len(self._found), len(waiting))
-        info = self._dataset_info(first)
+        self._intake.check()
+        info = self._dataset_info(begun[-1])
         start = self._existing.writer if self._existing else WriterStart()
         sidecar_start = self._existing.sidecar if self._existing else SidecarStart()
         limits: dict[str, Any] = {"limit_mb": info.data_files_size_in_mb, "chunks_size": info.chunks_size}
@@ -107,17 +106,7 @@ class _Export:
             DatasetWriter(self._folder, info, start) as writer,
             SidecarWriter(self._folder, sidecar_start, **limits) as sidecar,
         ):
-            for attempt in waiting:
-                self._add_failure(sidecar, attempt)
-            self._add(writer, sidecar, first)
-            for reading in found:
-                if reading.prepared is None:
-                    self._add_failure(sidecar, reading.attempt)
-                    continue
-                if reading.profile != first.profile:
-                    refuse_differences(
-                        first.profile, first.path, (source.path for source in self._found), self._options
-                    )
+            for reading in chain(begun, found):
                 self._add(writer, sidecar, reading)
             self._refuse_duplicates()
             finished = writer.finish()
@@ -130,7 +119,7 @@ class _Export:
             num_frames=finished.total_frames,
             new_episodes=finished.total_episodes - start.num_episodes,
             new_frames=finished.total_frames - start.num_frames,
-            skipped_failures=self._skipped_failures,
+            skipped_failures=self._intake.skipped_failures,
             transcoded=tuple(self._transcoded),
             left_out=self._left_out,
             digest=combined_digest(finished, [*self._before, *self._digests]),
@@ -156,8 +145,19 @@ class _Export:
             video_files_size_in_mb=self._options.video_files_mb,
         )
 
+    def _noted(self, found: Iterable[Reading]) -> Iterator[Reading]:
+        """The same, each counted and held against the others before it is written."""
+        for reading in found:
+            if reading.prepared is None:
+                self._intake.leave_out()
+            else:
+                self._intake.take(reading.path, reading.profile)
+            yield reading
+
     def _add(self, writer: DatasetWriter, sidecar: SidecarWriter, reading: Reading) -> None:
-        assert reading.prepared is not None
+        if reading.prepared is None:
+            sidecar.add_attempt(reading.attempt, in_dataset=False)
+            return
         written = writer.add(reading.prepared.data)
         sidecar.add(written, reading.prepared.record)
         self._digests.append(written.digest)
@@ -174,10 +174,6 @@ class _Export:
                 f"The dataset has {len(twice)} of these episodes already: {shown(twice)}. Leave them out with "
                 "--episodes, or give --allow-duplicates to have them twice."
             )
-
-    def _add_failure(self, sidecar: SidecarWriter, attempt: AttemptRecord) -> None:
-        sidecar.add_attempt(attempt, in_dataset=False)
-        self._skipped_failures += 1
 
     def _about_this_export(self) -> dict[str, Any]:
         options = self._options

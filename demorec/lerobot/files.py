@@ -15,7 +15,7 @@ from typing import Any, BinaryIO
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from demorec.errors import ExportError
+from demorec.errors import ExportError, in_words
 from demorec.plain import parse_json
 from demorec.safety.files import open_regular, read_text_limited
 
@@ -53,7 +53,7 @@ def open_table(path: Path, columns: Sequence[str] | None = None) -> pq.ParquetFi
         groups = [table.metadata.row_group(number) for number in range(table.metadata.num_row_groups)]
         values = sum(group.column(number).num_values for group in groups for number in range(group.num_columns))
     except (OSError, ValueError, pa.ArrowException) as error:
-        raise ExportError(f"The table cannot be read ({_words(error)}): {path}") from error
+        raise ExportError(f"The table cannot be read ({in_words(error)}): {path}") from error
     if _BYTES_PER_VALUE * max(values, table.metadata.num_rows) > _most_bytes(size):
         raise ExportError(f"The table claims {values:,} values in {size / 1000:,.0f} kB, so it is not read: {path}")
     missing = set(columns or ()) - set(table.schema_arrow.names)
@@ -89,17 +89,11 @@ def read_table(path: Path, columns: Sequence[str] | None = None, *, schema: pa.S
                 raise ExportError(f"The table would unpack to more than {allowed / 1e6:,.0f} MB: {path}")
         return pa.Table.from_batches(batches, schema=batches[0].schema if batches else table.schema_arrow)
     except (OSError, ValueError, pa.ArrowException) as error:
-        raise ExportError(f"The table cannot be read ({_words(error)}): {path}") from error
+        raise ExportError(f"The table cannot be read ({in_words(error)}): {path}") from error
 
 
 def _most_bytes(size: int) -> int:
     return max(_FLOOR_BYTES, _RATIO * size)
-
-
-def _words(error: BaseException) -> str:
-    if isinstance(error, OSError) and error.strerror:
-        return error.strerror
-    return (str(error).splitlines() or [type(error).__name__])[0][:200]
 
 
 def check_video(path: Path) -> None:
@@ -113,7 +107,7 @@ def check_video(path: Path) -> None:
             size = os.fstat(file.fileno()).st_size
             claimed = sum(_samples(file, 0, size, size, [_MAX_BOXES]))
     except (OSError, ValueError, struct.error) as error:
-        raise ExportError(f"The video cannot be opened ({_words(error)}): {path}") from error
+        raise ExportError(f"The video cannot be opened ({in_words(error)}): {path}") from error
     if claimed > size:
         raise ExportError(f"The video claims {claimed:,} bytes or pictures, but has {size:,} bytes: {path}")
 

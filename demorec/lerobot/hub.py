@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from demorec.errors import ExportError, MissingDependencyError
+from demorec.errors import ExportError, MissingDependencyError, in_words
 from demorec.lerobot.layout import CODEBASE_VERSION
 
 
@@ -41,7 +41,6 @@ def push_to_hub(folder: Path, repo_id: str, *, private: bool) -> str:
         hub.create_tag(repo_id, tag=CODEBASE_VERSION, repo_type="dataset", exist_ok=True)
     except Exception as error:  # the hub's client raises errors of several HTTP libraries
         raise ExportError(
-            f"The dataset was not uploaded to {repo_id} ({type(error).__name__}: {str(error).splitlines()[0]}); "
-            f"it is kept: {folder}"
+            f"The dataset was not uploaded to {repo_id} ({in_words(error)}); it is kept: {folder}"
         ) from error
     return str(url)

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from demorec.errors import ExportError
+from demorec.errors import ExportError, in_words, resource_error, without_path
 from demorec.lerobot.digest import combined_digest, episode_digest
-from demorec.lerobot.files import open_table, read_json, read_table
-from demorec.lerobot.layout import DatasetInfo
-from demorec.lerobot.paths import SIDECAR_DIR
+from demorec.lerobot.files import check_video, open_table, read_json, read_table
+from demorec.lerobot.layout import STATS_PATH, VIDEO_PATH, DatasetInfo
+from demorec.lerobot.paths import INFO_PATH, SIDECAR_DIR
 from demorec.lerobot.reader import PacketReader, RowReader, episode_places, read_tasks
 
 
@@ -75,6 +77,60 @@ def dataset_info(path: Path) -> DatasetSummary:
     )
 
 
+def dataset_problems(path: Path, info: DatasetInfo) -> list[str]:
+    """What of a dataset is missing, emptied or cut off, one sentence each; by the ends of its files, which is quick.
+
+    `demorec check` reads all that is in them.
+    """
+    problems: list[str] = []
+    rows: dict[str, int] = {}
+    for place in ("data", "meta/episodes"):
+        rows[place] = 0
+        for file in sorted((path / place).glob("*/*.parquet")):
+            with _noted(problems, path):
+                rows[place] += open_table(file).metadata.num_rows
+    if not problems:
+        for place, said in (("data", info.total_frames), ("meta/episodes", info.total_episodes)):
+            if rows[place] != said:
+                problems.append(f"The tables in {place} have {rows[place]} rows, {INFO_PATH} counts {said}")
+    with _noted(problems, path):
+        read_tasks(path)
+    if not (path / STATS_PATH).exists():
+        problems.append(f"The statistics are missing: {STATS_PATH}")
+    with _noted(problems, path):
+        check_tables(path)
+    with _noted(problems, path):
+        videos = {
+            position.path(info.video_path or VIDEO_PATH, key)
+            for place in episode_places(path, info)
+            for key, (position, _) in place.videos.items()
+        }
+        for name in sorted(videos):
+            with _noted(problems, path):
+                check_video(path / name)
+    return list(dict.fromkeys(problems))
+
+
+@contextmanager
+def _noted(problems: list[str], path: Path) -> Iterator[None]:
+    """Turn an ExportError into one more problem, told without the dataset's own path."""
+    try:
+        yield
+    except ExportError as error:
+        if (lack := resource_error(error)) is not None:
+            raise lack from error
+        problems.append(without_path(error, path).replace(f"{path}/", ""))
+
+
+def has_digest(info: DatasetInfo) -> bool:
+    """Whether the content has a digest: all of it is video, numbers or text."""
+    return not _without_digest(info)
+
+
+def _without_digest(info: DatasetInfo) -> list[str]:
+    return [name for name, feature in info.features.items() if feature.dtype in ("image", "language")]
+
+
 def check_tables(path: Path) -> None:
     """Read the ends of all tables and the JSON files: whether any was emptied or cut off.
 
@@ -88,7 +144,7 @@ def check_tables(path: Path) -> None:
             elif file.suffix == ".json":
                 read_json(file)
         except (OSError, ValueError) as error:
-            raise ExportError(f"The dataset is damaged ({error}): {file}") from error
+            raise ExportError(f"The dataset is damaged ({in_words(error)}): {file}") from error
 
 
 def dataset_digest(path: Path) -> str:
@@ -103,8 +159,7 @@ def dataset_digest(path: Path) -> str:
 
 def episode_digests(path: Path, info: DatasetInfo) -> list[str]:
     """The digest of every episode, in order, read back from all files."""
-    unknown = [name for name, feature in info.features.items() if feature.dtype in ("image", "language")]
-    if unknown:
+    if unknown := _without_digest(info):
         raise ExportError(f"The content of {', '.join(unknown)} has no digest, it is neither video nor numbers: {path}")
     tasks = read_tasks(path)
     rows = RowReader(path, info)

@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import pyarrow as pa
 
-from demorec.errors import ExportError
+from demorec.errors import ExportError, in_words
 from demorec.lerobot.files import read_json
 from demorec.lerobot.paths import INFO_PATH, SIDECAR_DIR
 
@@ -194,7 +194,7 @@ class DatasetInfo:
         except OSError as error:
             raise ExportError(f"No LeRobot dataset, {INFO_PATH} cannot be read ({error.strerror}): {root}") from error
         except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise ExportError(f"{INFO_PATH} of the dataset is damaged ({_words(error)}): {root}") from error
+            raise ExportError(f"{INFO_PATH} of the dataset is damaged ({in_words(error)}): {root}") from error
         return info
 
     def _check(self) -> None:
@@ -238,10 +238,6 @@ def _check_template(template: object) -> None:
     for _, name, kind, conversion in string.Formatter().parse(template):
         if name is not None and (name not in _PLACEHOLDERS or conversion or not re.fullmatch(r"(0?\dd)?", kind or "")):
             raise ValueError(f"the path {template[:80]!r} has an unknown placeholder")
-
-
-def _words(error: BaseException) -> str:
-    return f"{error} is missing" if isinstance(error, KeyError) else str(error)[:300]
 
 
 _PLACEHOLDERS = ("chunk_index", "file_index", "video_key")

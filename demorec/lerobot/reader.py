@@ -14,7 +14,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from demorec.errors import ExportError
+from demorec.errors import ExportError, in_words
 from demorec.lerobot.data_stats import column_numbers
 from demorec.lerobot.files import check_video, open_table, read_table
 from demorec.lerobot.layout import TASKS_PATH, VIDEO_PATH, DatasetInfo, FilePosition
@@ -188,7 +188,7 @@ class PacketReader:
             try:
                 self._container = av.open(str(path), format="mp4")
             except (OSError, av.FFmpegError) as error:
-                raise ExportError(f"The video cannot be opened ({error}): {path}") from error
+                raise ExportError(f"The video cannot be opened ({in_words(error)}): {path}") from error
             self._packets = _samples(self._container)
             self._position, self._next = position, 0
         if first < self._next:

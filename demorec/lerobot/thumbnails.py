@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from demorec.errors import ExportError
+from demorec.errors import ExportError, in_words
 from demorec.export.staging import sync_file
 from demorec.lerobot.layout import DatasetInfo
 from demorec.lerobot.paths import SIDECAR_DIR
@@ -73,4 +73,4 @@ def _pictures(
                         yield np.asarray(frame.to_ndarray(format="rgb24"), dtype=np.uint8)
                         break
     except (OSError, av.FFmpegError) as error:
-        raise ExportError(f"The finished video cannot be read back ({error}): {path}") from error
+        raise ExportError(f"The finished video cannot be read back ({in_words(error)}): {path}") from error

@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from demorec.errors import DemorecError, ExportError, resource_error
+from demorec.errors import DemorecError, ExportError, in_words, resource_error
 from demorec.export.columns import frame_stride
 from demorec.lerobot.depth import code_values, quantised
 from demorec.lerobot.options import ExportOptions
@@ -123,7 +123,7 @@ def _serve(pipe: Connection[Any, Any], cache: str) -> None:
         answer = error
     except Exception as error:
         answer = resource_error(error) or ExportError(
-            f"The new dataset was dropped, it cannot be verified ({type(error).__name__}: {error})."
+            f"The new dataset was dropped, it cannot be verified ({in_words(error)})."
         )
     with suppress(OSError):
         pipe.send(answer)
@@ -136,7 +136,7 @@ def _verify(root: Path, samples: tuple[Sample, ...], options: ExportOptions) -> 
         dataset = LeRobotDataset(options.repo_id, root=root, video_backend="pyav", return_uint8=True)
     except Exception as error:  # whatever LeRobot says, the dataset must not be handed out
         raise resource_error(error) or ExportError(
-            f"The new dataset was dropped, LeRobot cannot open it ({type(error).__name__}: {error})."
+            f"The new dataset was dropped, LeRobot cannot open it ({in_words(error)})."
         ) from error
     frames = 0
     for number, sample in enumerate(samples):
@@ -157,7 +157,7 @@ def _compare_episode(dataset: Any, sample: Sample, recording: Recording, options
         except Exception as error:
             raise ExportError(
                 f"The new dataset was dropped, LeRobot cannot read frame {moment} of episode {sample.episode_index} "
-                f"({type(error).__name__}: {error})."
+                f"({in_words(error)})."
             ) from error
         wrong = [
             name for name, values in expected.columns.items() if name in item and not _equal(item[name], values[moment])

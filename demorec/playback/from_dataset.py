@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rerun.experimental import LeRobotReader
 
-from demorec.errors import RecordingError, resource_error
+from demorec.errors import RecordingError, in_words, resource_error
 from demorec.geometry import Array, Pose
 from demorec.lerobot.files import check_video, read_json, read_table
 from demorec.lerobot.layout import DatasetInfo, Feature
@@ -48,7 +48,8 @@ def open_dataset_episode(root: Path, episode_index: int) -> Iterator[PlayedEpiso
     try:
         episode = _read_episode(root, episode_index)
     except (OSError, ValueError, TypeError, KeyError, IndexError) as error:  # nulls and odd values in its tables
-        raise resource_error(error) or RecordingError(f"The dataset cannot be read ({error}): {root}") from error
+        unreadable = RecordingError(f"The dataset cannot be read ({in_words(error)}): {root}")
+        raise resource_error(error) or unreadable from error
     yield episode
 
 

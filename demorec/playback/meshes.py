@@ -19,7 +19,7 @@ import platformdirs
 import trimesh
 from numpy.typing import NDArray
 
-from demorec.errors import DemorecError, RecordingError
+from demorec.errors import DemorecError, RecordingError, in_words
 from demorec.geometry import Pose
 from demorec.scene.assets import mesh_path
 from demorec.scene.scene import Rgba
@@ -140,7 +140,7 @@ def mesh_file(path: Path) -> SurfaceMesh:
                 return SurfaceMesh(**{name: arrays[name] for name in ("vertices", "normals", "triangles", "colors")})
         mesh = _read_mesh_file(path)
     except (OSError, ValueError, KeyError) as error:
-        raise RecordingError(f"The mesh cannot be read ({error}): {path}") from error
+        raise RecordingError(f"The mesh cannot be read ({in_words(error)}): {path}") from error
     _keep(cached, mesh)
     return mesh
 

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 import numpy as np
 import rerun as rr
 
-from demorec.errors import DemorecError
+from demorec.errors import DemorecError, in_words
 from demorec.geometry import Array, quat_multiply
 from demorec.playback.episode import PlayedEpisode
 from demorec.playback.meshes import SurfaceMesh, urdf_meshes
@@ -102,7 +102,7 @@ def robot_model(urdf: str, scale: float, description: str | None) -> tuple[Urdf,
     except (DemorecError, OSError, ValueError) as error:
         if recorded is None:
             raise
-        reason = f"its model is not installed here ({error})"
+        reason = f"its model is not installed here ({in_words(error)})"
     else:
         if recorded is None or _same_joints(installed, recorded):
             return installed, meshes

@@ -31,7 +31,7 @@ from mcap.records import (
     Statistics,
 )
 
-from demorec.errors import DemorecError, RecordingError, ResourceError, resource_error
+from demorec.errors import DemorecError, RecordingError, ResourceError, in_words, resource_error
 from demorec.recording.chunks import MAX_RECORD_BYTES, RECORD_HEAD, Block, ChunkPlace, blocks_of, chunk_content
 from demorec.recording.limits import LimitError, Limits
 from demorec.safety.files import open_regular
@@ -72,12 +72,7 @@ def damage_as_recording_error(path: Path) -> Iterator[None]:
 def _damage(error: BaseException, path: Path) -> DemorecError:
     if "not enough memory" in str(error):  # zstandard has no error of its own for that
         error = MemoryError()
-    return resource_error(error, path) or RecordingError(f"The recording is damaged ({_short(error)}): {path}")
-
-
-def _short(error: BaseException) -> str:
-    text = str(error).splitlines()
-    return text[0][:120] if text and text[0] else type(error).__name__
+    return resource_error(error, path) or RecordingError(f"The recording is damaged ({in_words(error)}): {path}")
 
 
 class Container:

@@ -6,16 +6,16 @@ import functools
 import math
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Sequence
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.errors import SceneError
+from demorec.errors import SceneError, in_words
 from demorec.geometry import Array, Pose
 from demorec.recording.shapes import Primitive, fit_primitives
 from demorec.scene.assets import asset_path, mesh_path
+from demorec.scene.obj import read_obj
 from demorec.scene.scene import Body, Rgba
 from demorec.scene.urdf import quat_from_rpy
 from demorec.scene.urdf_shapes import UrdfShape, read_links
@@ -97,30 +97,19 @@ def _primitives(shape: UrdfShape, folder: Path) -> Iterator[Primitive]:
 @functools.lru_cache(maxsize=256)
 def _mesh_primitives(path: Path, scale: tuple[float, ...]) -> list[Primitive]:
     try:
-        vertices, faces = _load_obj(path) if path.suffix.lower() == ".obj" else _load_mesh(path)
+        vertices, faces = _load_mesh(path)
     except (OSError, ValueError, IndexError) as error:
-        raise SceneError(f"A mesh of the scene cannot be read ({error}): {path}") from error
+        raise SceneError(f"A mesh of the scene cannot be read ({in_words(error)}): {path}") from error
     return fit_primitives(vertices * np.array(scale), faces)
 
 
-def _load_obj(path: Path) -> tuple[Array, NDArray[np.int64]]:
-    """Vertices (V, 3) and triangles (F, 3) of a Wavefront OBJ file, polygons cut into fans."""
-    vertices: list[list[float]] = []
-    faces: list[tuple[int, int, int]] = []
-    for line in path.read_text(errors="replace").splitlines():
-        words = line.split()
-        if line.startswith("v "):
-            vertices.append([float(word) for word in words[1:4]])
-        elif line.startswith("f "):
-            corners = [int(word.split("/")[0]) for word in words[1:]]
-            corners = [corner - 1 if corner > 0 else len(vertices) + corner for corner in corners]
-            faces += [(corners[0], second, third) for second, third in pairwise(corners[1:])]
-    if not faces:
-        raise ValueError("no triangles")
-    return np.array(vertices), np.array(faces, dtype=np.int64)
-
-
 def _load_mesh(path: Path) -> tuple[Array, NDArray[np.int64]]:
+    """Vertices (V, 3) and triangles (F, 3) of a mesh file."""
+    if path.suffix.lower() == ".obj":
+        found = read_obj(path)
+        if not len(found.faces):
+            raise ValueError("no triangles")
+        return found.points, found.faces
     import trimesh  # takes a second to load, and the usual robot needs it for nothing
 
     mesh = trimesh.load(path, force="mesh", process=False)

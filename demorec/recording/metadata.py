@@ -10,7 +10,7 @@ import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from demorec.errors import RecordingError
+from demorec.errors import RecordingError, in_words
 from demorec.plain import to_json
 from demorec.recording.video import VideoSettings
 from demorec.scene.episode import FORMAT_VERSION, EpisodeInfo, Outcome
@@ -70,7 +70,7 @@ def read_episode_metadata(metadata: Mapping[str, str]) -> tuple[EpisodeInfo, dic
     if version not in _KNOWN_VERSIONS:
         raise RecordingError(
             f"The recording has format version {version[:20] or 'none'}, this demorec reads 1 to {FORMAT_VERSION}: "
-            "use the demorec that wrote it, or a newer one."
+            "use the demorec that wrote it, or a newer one"
         )
     try:
         info = read_episode_info(metadata["info"])
@@ -79,7 +79,9 @@ def read_episode_metadata(metadata: Mapping[str, str]) -> tuple[EpisodeInfo, dic
         cameras = from_description(metadata["cameras"], dict[str, CameraStreams])
         _check_cameras(info, cameras)
     except (KeyError, ValueError) as error:
-        raise RecordingError(f"The recording's metadata is not that of format version {version} ({error}).") from error
+        raise RecordingError(
+            f"The recording's metadata is not that of format version {version} ({in_words(error)})"
+        ) from error
     return info, cameras
 
 
@@ -103,7 +105,7 @@ def read_outcome_metadata(metadata: Mapping[str, str]) -> Outcome:
         if min(outcome.num_frames, outcome.num_retries) < 0:
             raise ValueError("a number of frames or retries below 0")
     except (KeyError, ValueError) as error:
-        raise RecordingError(f"The recording's outcome cannot be read ({error}).") from error
+        raise RecordingError(f"The recording's outcome cannot be read ({in_words(error)})") from error
     return outcome
 
 
@@ -114,7 +116,7 @@ def _sealed(metadata: dict[str, str]) -> dict[str, str]:
 def check_seal(name: str, metadata: Mapping[str, str]) -> None:
     """Raise RecordingError unless the metadata are as they were written."""
     if metadata.get(_CHECKSUM) != _checksum(metadata):
-        raise RecordingError(f"The recording is damaged: the checksum of its metadata {name} does not match.")
+        raise RecordingError(f"The recording is damaged: the checksum of its metadata {name} does not match")
 
 
 def _checksum(metadata: Mapping[str, str]) -> str:

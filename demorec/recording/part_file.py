@@ -11,7 +11,7 @@ import foxglove
 from foxglove.mcap import MCAPCompression, MCAPWriteOptions
 from foxglove.messages import CompressedVideo
 
-from demorec.errors import ConfigError, RecordingError
+from demorec.errors import ConfigError, RecordingError, in_words
 from demorec.recording import messages
 from demorec.recording.ros2 import DEFINITIONS
 from demorec.safety.replacing import RECORDING, check_replaceable, lock_part
@@ -135,8 +135,7 @@ class PartFile:
         check_replaceable(self.path, RECORDING, overwrite=self._overwrite)
 
     def _unwritable(self, error: Exception) -> RecordingError:
-        reason = error.strerror if isinstance(error, OSError) else str(error)
-        return RecordingError(f"The recording cannot be written ({reason}): {self.path}")
+        return RecordingError(f"The recording cannot be written ({in_words(error)}): {self.path}")
 
     def log(self, topic: str, schema: str, data: bytes, time_ns: int, *, latched: bool = False) -> None:
         """Add a message; every topic has one type."""

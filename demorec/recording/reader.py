@@ -74,7 +74,7 @@ class RecordingReader:
             if recovered is not None:
                 metadata.check_seal(metadata.RECOVERED, recovered)
         except RecordingError as error:
-            raise RecordingError(f"{error} {self.path}") from error
+            raise RecordingError(f"{error}: {self.path}") from error
         self.is_recovered = recovered is not None
         self.num_frames = self._container.counts.get(channels.GRIPPER, 0)
         if self.outcome is None and not self.is_recovered:

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from demorec.errors import ConfigError, RecordingError, resource_error
+from demorec.errors import ConfigError, RecordingError, resource_error, without_path
 from demorec.recording import channels, messages, metadata
 from demorec.recording.container import SalvagedMessage, SalvagedMetadata, salvage
 from demorec.recording.part_file import PartFile
@@ -52,9 +52,7 @@ def recover(source: Path, target: Path, *, overwrite: bool = False) -> Recovered
     try:
         survey = _survey(source)
     except RecordingError as error:
-        if str(error).endswith(str(source)):
-            raise
-        raise RecordingError(f"{error} {source}") from error
+        raise RecordingError(f"{without_path(error, source)}: {source}") from error
     if survey.episode is None or survey.num_frames == 0:
         raise RecordingError(f"Nothing can be recovered, the file holds no whole frame ({survey.reason}): {source}")
     info, _ = metadata.read_episode_metadata(survey.episode)

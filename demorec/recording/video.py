@@ -17,10 +17,10 @@ from typing import Literal, Protocol, cast
 import av
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from demorec.config import VideoConfig
-from demorec.errors import ConfigError, RecordingError
+from demorec.errors import ConfigError, RecordingError, in_words
 from demorec.recording.scheduling import ordinary_scheduling
 
 Rgb = NDArray[np.uint8]
@@ -147,7 +147,7 @@ class _StreamEncoder:
         except (av.FFmpegError, ValueError) as error:
             raise ConfigError(
                 f"The video encoder {encoder} does not start with {width}x{height} pixels, crf {self.settings.crf}, "
-                f"preset {self.settings.preset} ({error}): choose another preset, or --codec jpeg."
+                f"preset {self.settings.preset} ({in_words(error)}): choose another preset, or --codec jpeg."
             ) from error
         self._context = context
         self._num_pictures = 0
@@ -220,8 +220,11 @@ def _decode_jpeg(settings: VideoSettings, packets: Iterable[VideoPacket]) -> Ite
                 if image.width * image.height > settings.width * settings.height:  # before anything is unpacked
                     raise OSError(f"{image.width}x{image.height} pixels")
                 yield np.asarray(image.convert("RGB"))
+        except UnidentifiedImageError as error:
+            raise RecordingError(f"The picture of frame {packet.frame_index} is no JPEG.") from error
         except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-            raise RecordingError(f"The picture of frame {packet.frame_index} is no valid JPEG ({error}).") from error
+            reason = in_words(error)
+            raise RecordingError(f"The picture of frame {packet.frame_index} is no valid JPEG ({reason}).") from error
 
 
 def _decode_stream(settings: VideoSettings, packets: Iterable[VideoPacket]) -> Iterator[Rgb]:

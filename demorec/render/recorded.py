@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from demorec.errors import SceneError
+from demorec.errors import SceneError, in_words
 from demorec.geometry import Array, Pose
 from demorec.render import Mount, Visual, VisualBody
 from demorec.scene.assets import asset_path, mesh_path
@@ -128,7 +128,7 @@ def _load_urdf(urdf: str, scale: float, *, name: str, is_fixed: bool) -> tuple[V
         model = BulletBody(text, scale=scale)
         links = {link.name: link for link in read_links(text, scale=scale)}
     except (OSError, ValueError) as error:
-        raise SceneError(f"The model of {name!r} cannot be read from {urdf!r} ({error}).") from error
+        raise SceneError(f"The model of {name!r} cannot be read from {urdf!r} ({in_words(error)}).") from error
     visuals = []
     for number, link in enumerate(model.link_names, start=-1):
         for shape in links[link].seen:

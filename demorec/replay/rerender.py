@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from demorec.config import EpisodePlan, GenerateConfig, VideoConfig, read_toml
-from demorec.errors import ConfigError, DemorecError, NotAllowedError, RecordingError
+from demorec.errors import ConfigError, DemorecError, NotAllowedError, RecordingError, in_words
 from demorec.geometry import Pose, look_at
 from demorec.loop import prepare
 from demorec.plain import digest, from_plain, to_json
@@ -93,7 +93,7 @@ def read_cameras(path: Path) -> dict[str, FreeCamera]:
         try:
             cameras[name] = from_plain(_tuples(table), FreeCamera)
         except (ValueError, TypeError, AttributeError) as error:
-            raise ConfigError(f"{path}, camera {name!r}: {error}.") from error
+            raise ConfigError(f"The camera {name!r} of the file cannot be used ({in_words(error)}): {path}") from error
     if not cameras:
         raise ConfigError(f"The file describes no camera; write a table, e.g. [side] with position and look_at: {path}")
     return cameras

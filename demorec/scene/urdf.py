@@ -127,8 +127,10 @@ class Urdf:
         try:
             joints = tuple(_joint(element, scale) for element in elements)
             links = [link.attrib["name"] for link in robot.findall("link")]
-        except (KeyError, AttributeError) as error:
-            raise ValueError(f"a joint or link of the URDF lacks something ({error})") from error
+        except KeyError as error:
+            raise ValueError(f"a joint or link of the URDF lacks something, its {error}") from error
+        except AttributeError as error:
+            raise ValueError("a joint of the URDF lacks something, its parent or its child") from error
         children = {joint.child for joint in joints}
         roots = [link for link in links if link not in children]
         if len(roots) != 1:

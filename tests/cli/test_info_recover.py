@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import resource
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from support.export import export, files_of
 from support.recording import make_episode, write_episode
 
 from demorec.cli import COMMANDS, main, run_command
@@ -30,6 +32,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     part = folder / "c.mcap.part"
     part.write_bytes(part.read_bytes()[:-3000])
     return folder
+
+
+@pytest.fixture(scope="module")
+def dataset(folder: Path) -> Path:
+    export(folder / "a.mcap", folder / "exported" / "dataset")
+    return folder / "exported" / "dataset"
 
 
 def test_info_of_a_recording(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -94,6 +102,71 @@ def test_info_of_a_dataset(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     (tmp_path / "meta" / "info.json").write_text("{}")
     assert run("info", tmp_path) == 1
     assert "info.json is damaged" in capsys.readouterr().err
+
+
+def empty_table(dataset: Path) -> None:
+    next((dataset / "data").glob("*/*.parquet")).write_bytes(b"")
+
+
+def drop_table(dataset: Path) -> None:
+    next((dataset / "data").glob("*/*.parquet")).unlink()
+
+
+def drop_statistics(dataset: Path) -> None:
+    (dataset / "meta" / "stats.json").unlink()
+
+
+def drop_video(dataset: Path) -> None:
+    next((dataset / "videos/observation.images.front").glob("*/*.mp4")).unlink()
+
+
+def cut_video(dataset: Path) -> None:
+    video = next((dataset / "videos/observation.images.front").glob("*/*.mp4"))
+    video.write_bytes(video.read_bytes()[:100])
+
+
+def drop_tasks(dataset: Path) -> None:
+    (dataset / "meta" / "tasks.parquet").unlink()
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (empty_table, "data/chunk-000/file-000.parquet"),
+        (drop_table, "The tables in data have 0 rows, meta/info.json counts 45"),
+        (drop_statistics, "The statistics are missing: meta/stats.json"),
+        (drop_video, "videos/observation.images.front/chunk-000/file-000.mp4"),
+        (cut_video, "videos/observation.images.front/chunk-000/file-000.mp4"),
+        (drop_tasks, "meta/tasks.parquet"),
+    ],
+)
+def test_info_says_what_a_dataset_lacks(
+    dataset: Path, tmp_path: Path, spoil: Callable[[Path], None], words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("info", dataset) == 0
+    good = capsys.readouterr().out
+    assert "problem" not in good
+    assert "digest" in good
+    spoilt = tmp_path / "d"
+    shutil.copytree(dataset, spoilt)
+    spoil(spoilt)
+    assert files_of(spoilt) != files_of(dataset)
+    assert run("info", spoilt) == 0
+    (line,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("problem"))
+    assert words in line
+    assert str(spoilt) not in line, "the first row names it"
+    assert run("info", spoilt, "--json") == 0
+    assert len(json.loads(capsys.readouterr().out)["problems"]) == 1
+
+
+def test_info_of_a_dataset_of_an_older_format_says_so(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(dataset, tmp_path / "d")
+    info = tmp_path / "d" / "meta" / "info.json"
+    info.write_text(info.read_text().replace("v3.0", "v2.1"))
+    assert run("info", tmp_path / "d") == 0
+    assert "The dataset has format v2.1, expected v3.0; LeRobot can convert it" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import os
 import subprocess
 import sys
 import traceback
@@ -56,6 +57,7 @@ class Commands:
     """Context manager over the process."""
 
     def __enter__(self) -> Self:
+        # As a module: as a script its folder would come first, and `support/mcap.py` would be what `import mcap` finds.
         self._process = subprocess.Popen(
             # -P: the modules beside this file (mcap, docs ...) must not stand before the libraries of their names.
             [sys.executable, "-P", __file__],
@@ -97,7 +99,6 @@ class Commands:
 
 
 def _serve() -> None:
-    import os
     import time
 
     for name in COMMANDS.names():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ import pytest
 from demorec.cli import generate_report
 from demorec.cli.generate_report import next_commands
 from demorec.config import GenerateConfig
+from demorec.generate.contents import set_aside
 from demorec.generate.observer import RunResult
 from demorec.runs.run_file import ExportRecord, RunFile, Session
 
@@ -46,3 +48,30 @@ def test_no_training_is_offered_that_would_not_start(monkeypatch: pytest.MonkeyP
     lines = next_commands(result, None if without == "a dataset" else EXPORT)
     assert len(lines) == 2
     assert "lerobot-train" not in " ".join(lines)
+
+
+@pytest.mark.parametrize(
+    ("names", "words"),
+    [
+        ((), []),
+        (
+            ("dataset/meta/info.json", "dataset/README.md", "dataset.1/meta/info.json"),
+            ["2 datasets that the run did not leave like this"],
+        ),
+        (
+            ("episode_000003.mcap", "host-12-0/episode_000004.mcap.part", "error_episode_000004.txt"),
+            [
+                "1 recording not of this run, or damaged",
+                "1 unfinished recording (demorec recover reads what is whole)",
+                "1 error report",
+            ],
+        ),
+        (("notes.txt",), ["1 other file"]),
+    ],
+)
+def test_what_was_set_aside_is_told_by_what_it_is(tmp_path: Path, names: Sequence[str], words: list[str]) -> None:
+    for name in names:
+        file = tmp_path / "unfinished" / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.touch()
+    assert set_aside(tmp_path) == words

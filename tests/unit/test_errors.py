@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import errno
+import json
 import pickle
+import struct
 from pathlib import Path
 
+import av
 import pytest
 from support.present import present
 
-from demorec.errors import RecordingError, ResourceError, resource_error
+from demorec.errors import RecordingError, ResourceError, in_words, resource_error
 
 
 @pytest.mark.parametrize(
@@ -59,3 +62,36 @@ def test_every_other_error_is_left_alone(error: Exception) -> None:
 def test_without_a_file_nothing_is_said_of_one() -> None:
     assert str(resource_error(MemoryError())).endswith("(ulimit -v).")
     assert ResourceError("x").exit_code == 1
+
+
+def _raised(code: str) -> Exception:
+    scope = {"json": json, "struct": struct, "av": av, "Path": Path}
+    try:
+        exec(code, scope)
+    except Exception as error:
+        return error
+    raise AssertionError(f"nothing was raised by {code}")
+
+
+@pytest.mark.parametrize(
+    ("code", "words"),
+    [
+        ("{}['fps']", "it has no 'fps'"),
+        ("json.loads('{')", "it is no JSON, line 1"),
+        ("b'\\xff'.decode()", "it is no UTF-8 text"),
+        ("struct.unpack('<Q', b'ab')", "it ends within a value"),
+        ("len(5)", "a value is of another kind than expected"),
+        ("None.items()", "a value is of another kind than expected"),
+        ("[][3]", "it has fewer values than it should"),
+        ("1 / 0", "a number is out of range"),
+        ("Path('/nothing/at/all').read_text()", "No such file or directory"),
+        ("av.open('/nothing/at/all')", "No such file or directory"),
+        ("raise ValueError('two lines are of episode 3.\\nAnd more.')", "two lines are of episode 3"),
+        ("raise ValueError", "no reason is given"),
+        ("raise EOFError", "it ends too early"),
+    ],
+)
+def test_errors_of_python_are_told_in_words(code: str, words: str) -> None:
+    error = _raised(code)
+    assert in_words(error) == words
+    assert in_words(RecordingError("The recording is damaged: a.mcap")) == "The recording is damaged: a.mcap"

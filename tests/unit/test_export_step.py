@@ -133,3 +133,13 @@ def test_a_dataset_of_other_episodes_is_left_alone_when_the_run_file_was_lost(ru
     with pytest.raises(ConfigError, match="in the way"):
         export_run(run, repo_id="me/cubes")
     assert files_of(run / "dataset") == before
+
+
+def test_a_dataset_that_was_moved_away_is_made_again_and_that_is_said(run: Path, tmp_path: Path) -> None:
+    (run / "dataset").rename(tmp_path / "mine")
+    before = files_of(tmp_path / "mine")
+    said: list[str] = []
+    assert export_run(run, repo_id="me/cubes", says=said.append)[1] is not None
+    assert said == ["dataset/ is no longer there; it is made again."]
+    assert files_of(tmp_path / "mine") == before
+    assert not (run / "unfinished" / "dataset").exists()

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -75,3 +79,27 @@ def test_an_end_is_drawn_where_the_object_ended(dataset: Path, recorded: Array, 
 )
 def test_closing_fingers_that_stop_hold_something(opening: list[int], target: list[int], expected: list[int]) -> None:
     assert held(np.array(opening) / 1000, np.array(target) / 1000, 30).astype(int).tolist() == expected
+
+
+_READ = """
+import sys
+import av
+from rerun.experimental import LeRobotReader
+assert av.logging.get_level() is None  # nothing of FFmpeg's reaches the terminal
+list(LeRobotReader(sys.argv[1]).stream(0))
+"""
+
+
+@pytest.mark.slow
+def test_what_reruns_reader_says_of_a_dataset_cannot_act_on_a_terminal(dataset: Path, tmp_path: Path) -> None:
+    """It writes to the terminal by itself, past our own output: foreign words must be spelt out in there already."""
+    spoilt = tmp_path / "d"
+    shutil.copytree(dataset, spoilt)
+    info = spoilt / "meta" / "info.json"
+    text = info.read_text().replace('"float32"', '"odd\\u001b[2Jtype"')
+    assert text != info.read_text()
+    info.write_text(text)
+    environment = {**os.environ, "RUST_LOG": "warn"}
+    done = subprocess.run([sys.executable, "-c", _READ, spoilt], env=environment, capture_output=True, check=False)
+    assert b"odd" in done.stderr
+    assert b"\x1b[2J" not in done.stderr

@@ -9,8 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from demorec.cli.info import _aligned
 from demorec.cli.output import OutputError, say, tell
-from demorec.safety.text import printable
+from demorec.safety.text import display_width, printable
 
 
 @given(st.text())
@@ -61,3 +62,18 @@ def test_a_full_disk_behind_the_output_is_told(monkeypatch: pytest.MonkeyPatch) 
         monkeypatch.setattr(sys, "stdout", full)
         with pytest.raises(OutputError, match="No space left"):
             say("x" * 10)
+
+
+@pytest.mark.parametrize(
+    ("text", "width"),
+    [("abc", 3), ("把红色", 6), ("ｆ", 2), ("e\u0301", 1), ("Ωß", 2), ("", 0), ("✓", 1)],
+)
+def test_a_text_takes_the_columns_that_a_terminal_gives_it(text: str, width: int) -> None:
+    assert display_width(text) == width
+
+
+@given(st.lists(st.tuples(st.text(), st.text(min_size=1)), min_size=1))
+def test_columns_stand_below_each_other_whatever_is_in_them(cells: list[tuple[str, str]]) -> None:
+    rows = _aligned([("name", "|"), *((name, "|") for name, _ in cells)])
+    assert len({display_width(row.rpartition("|")[0]) for row in rows}) == 1
+    assert all(printable(row) == row for row in rows)

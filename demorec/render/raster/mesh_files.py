@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.errors import RenderError
+from demorec.errors import RenderError, in_words
 from demorec.render.raster.mesh import Floats, RasterMesh, make_mesh
+from demorec.scene.obj import Material, read_obj
 
 FORMATS = (".obj", ".stl", ".dae")
 
@@ -32,7 +32,7 @@ def load_mesh(path: Path) -> RasterMesh:
     except OSError as error:
         raise RenderError(f"The mesh file cannot be read ({error.strerror}): {path}") from error
     except (ValueError, IndexError, KeyError, ElementTree.ParseError, UnicodeDecodeError) as error:
-        raise RenderError(f"The mesh file is broken ({error}): {path}") from error
+        raise RenderError(f"The mesh file is broken ({in_words(error)}): {path}") from error
     if mesh.num_faces == 0:
         raise RenderError(f"The mesh file holds no triangles: {path}")
     if not np.isfinite(mesh.points).all():
@@ -40,119 +40,31 @@ def load_mesh(path: Path) -> RasterMesh:
     return mesh
 
 
-def _materials(path: Path) -> dict[str, tuple[Floats, Path | None]]:
-    """Material name -> diffuse colour and texture, of an MTL file; a missing file means no materials."""
-    found: dict[str, tuple[Floats, Path | None]] = {}
-    name = None
-    if not path.is_file():
-        return found
-    for line in path.read_text(errors="replace").splitlines():
-        words = line.split()
-        if not words:
-            continue
-        if words[0] == "newmtl":
-            name = " ".join(words[1:])
-            found[name] = (np.ones(3), None)
-        elif name is not None and words[0] == "Kd" and len(words) >= 4:
-            found[name] = (np.array([float(v) for v in words[1:4]]), found[name][1])
-        elif name is not None and words[0] == "map_Kd" and len(words) >= 2:
-            # Options (-s 1 1 1, ...) stand before the name.
-            texture = path.parent / words[-1]
-            found[name] = (found[name][0], texture if texture.is_file() else None)
-    return found
-
-
-@dataclass
-class _ObjText:
-    """What the lines of an OBJ file say.
-
-    Attributes:
-        points, uvs, normals: Three, two and three numbers each.
-        corners: Numbers of point, texture coordinate and normal, from 1, of each corner of each triangle; 0: none.
-        face_material: Name of the material of each triangle.
-        materials: Name -> diffuse colour and texture.
-    """
-
-    points: list[list[float]] = field(default_factory=list)
-    uvs: list[list[float]] = field(default_factory=list)
-    normals: list[list[float]] = field(default_factory=list)
-    corners: list[tuple[int, int, int]] = field(default_factory=list)
-    face_material: list[str] = field(default_factory=list)
-    materials: dict[str, tuple[Floats, Path | None]] = field(default_factory=dict)
-
-    @classmethod
-    def read(cls, path: Path) -> _ObjText:
-        """Of a file and the material libraries that it names."""
-        found, material = cls(), ""
-        for line in path.read_text(errors="replace").splitlines():
-            words = line.split()
-            if not words:
-                continue
-            key = words[0]
-            if key == "v":
-                found.points.append([float(words[1]), float(words[2]), float(words[3])])
-            elif key == "vt":
-                found.uvs.append([float(words[1]), float(words[2]) if len(words) > 2 else 0.0])
-            elif key == "vn":
-                found.normals.append([float(words[1]), float(words[2]), float(words[3])])
-            elif key == "f":
-                polygon = [found._corner(word) for word in words[1:]]
-                for i in range(1, len(polygon) - 1):
-                    found.corners += [polygon[0], polygon[i], polygon[i + 1]]
-                    found.face_material.append(material)
-            elif key == "mtllib":
-                found.materials |= _materials(path.parent / " ".join(words[1:]))
-            elif key == "usemtl":
-                material = " ".join(words[1:])
-        return found
-
-    def _corner(self, word: str) -> tuple[int, int, int]:
-        parts = (word + "//").split("/")[:3]
-        # Negative numbers count back from the latest; 0 stands for "none".
-        counts = (len(self.points), len(self.uvs), len(self.normals))
-        a, b, c = (
-            0 if not part else int(part) + (count + 1 if part[0] == "-" else 0)
-            for part, count in zip(parts, counts, strict=True)
-        )
-        return a, b, c
-
-
 def load_obj(path: Path) -> RasterMesh:
-    """An OBJ file with its materials; polygons are cut into fans.
+    """An OBJ file with its materials.
 
     As in PyBullet the first texture of the file covers all of it. The materials' colours count where there are
     several and no texture; PyBullet ignores them unless told otherwise.
     """
-    text = _ObjText.read(path)
-    points, uvs, normals, materials = text.points, text.uvs, text.normals, text.materials
-    index = np.array(text.corners, dtype=np.int64).reshape(-1, 3, 3)
-    faces = index[:, :, 0] - 1
-    if len(faces) and (faces.min() < 0 or faces.max() >= len(points)):
-        raise ValueError(f"a face names vertex {int(faces.max()) + 1} of {len(points)}")
-    texture = next((texture for _, texture in materials.values() if texture is not None), None)
+    found = read_obj(path)
+    index, faces, materials = found.corners, found.faces, found.materials
+    texture = next((material.texture for material in materials.values() if material.texture is not None), None)
     uv = None
-    if uvs and len(faces):
-        if index[:, :, 1].max() > len(uvs):
-            raise ValueError(f"a face names texture coordinate {int(index[:, :, 1].max())} of {len(uvs)}")
+    if len(found.uvs) and len(faces):
+        if index[:, :, 1].max() > len(found.uvs):
+            raise ValueError(f"a face names texture coordinate {int(index[:, :, 1].max())} of {len(found.uvs)}")
         # Corners without a coordinate get the middle of the texture, as in Bullet's loader.
-        uv = np.concatenate([[[0.5, 0.5]], np.array(uvs)])[index[:, :, 1]]
+        uv = np.concatenate([[[0.5, 0.5]], found.uvs])[index[:, :, 1]]
     colors = None
-    if texture is None and len({tuple(kd) for kd, _ in materials.values()}) > 1:
-        white = (np.ones(3), None)
-        colors = np.array([materials.get(name, white)[0] for name in text.face_material])
+    if texture is None and len({tuple(material.color) for material in materials.values()}) > 1:
+        white = Material(color=np.ones(3), texture=None)
+        colors = np.array([materials.get(name, white).color for name in found.face_materials])
     corner_normals = None
-    if normals and len(faces) and index[:, :, 2].min() > 0:
-        if index[:, :, 2].max() > len(normals):
-            raise ValueError(f"a face names normal {int(index[:, :, 2].max())} of {len(normals)}")
-        corner_normals = np.array(normals)[index[:, :, 2] - 1]
-    return make_mesh(
-        np.array(points, dtype=np.float64).reshape(-1, 3),
-        faces,
-        normals=corner_normals,
-        uv=uv,
-        colors=colors,
-        texture=texture,
-    )
+    if len(found.normals) and len(faces) and index[:, :, 2].min() > 0:
+        if index[:, :, 2].max() > len(found.normals):
+            raise ValueError(f"a face names normal {int(index[:, :, 2].max())} of {len(found.normals)}")
+        corner_normals = found.normals[index[:, :, 2] - 1]
+    return make_mesh(found.points, faces, normals=corner_normals, uv=uv, colors=colors, texture=texture)
 
 
 def load_stl(path: Path) -> RasterMesh:

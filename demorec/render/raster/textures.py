@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
-from demorec.errors import RenderError
+from demorec.errors import RenderError, in_words
 from demorec.render.raster.kernels.layout import MIP_LEVELS
 from demorec.render.raster.mesh import Floats, RasterMesh, face_normals
 
@@ -23,8 +23,10 @@ def load_picture(path: Path) -> Picture:
     try:
         with Image.open(path) as image:
             return np.asarray(image.convert("RGB"))
-    except (OSError, UnidentifiedImageError) as error:
-        raise RenderError(f"The texture cannot be read ({error}): {path}") from error
+    except UnidentifiedImageError as error:
+        raise RenderError(f"The texture is no picture that can be read: {path}") from error
+    except OSError as error:
+        raise RenderError(f"The texture cannot be read ({in_words(error)}): {path}") from error
 
 
 _pyramids: OrderedDict[int, tuple[Picture, list[NDArray[np.uint32]], int]] = OrderedDict()

@@ -1,0 +1,134 @@
+"""Wavefront OBJ files, read once for all who need a mesh: those who draw it and those who describe it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.geometry import Array
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Material:
+    """What colours a face.
+
+    Attributes:
+        color: (3,) diffuse RGB, 0..1.
+        texture: Picture, if it is there.
+    """
+
+    color: Array
+    texture: Path | None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ObjFile:
+    """The triangles of a file, polygons cut into fans.
+
+    Attributes:
+        points: (V, 3) in the file's unit.
+        uvs: (U, 2) texture coordinates.
+        normals: (N, 3) as the file has them, of any length.
+        corners: (F, 3, 3) of each corner of each triangle: the numbers of its point, texture coordinate and normal,
+            counted from 1; 0 for none. The points are there, the others are as the file has them.
+        face_materials: (F,) name of each triangle's material, "" without one.
+        materials: Name -> material, of the MTL files that it names and that are there.
+    """
+
+    points: Array
+    uvs: Array
+    normals: Array
+    corners: NDArray[np.int64]
+    face_materials: tuple[str, ...]
+    materials: Mapping[str, Material]
+
+    @property
+    def faces(self) -> NDArray[np.int64]:
+        """(F, 3) rows of `points`."""
+        return self.corners[:, :, 0] - 1
+
+
+def read_obj(path: Path) -> ObjFile:
+    """Read a file.
+
+    Raises:
+        OSError: It cannot be read.
+        ValueError, IndexError: It is no OBJ file, or a face names a point that the file does not have.
+    """
+    points: list[list[float]] = []
+    uvs: list[list[float]] = []
+    normals: list[list[float]] = []
+    corners: list[tuple[int, int, int]] = []
+    face_materials: list[str] = []
+    materials: dict[str, Material] = {}
+    material = ""
+
+    def parse(corner: str) -> tuple[int, int, int]:
+        parts = (corner + "//").split("/")[:3]
+        # Negative numbers count back from the latest; 0 stands for "none".
+        counts = (len(points), len(uvs), len(normals))
+        a, b, c = (
+            0 if not part else int(part) + (count + 1 if part[0] == "-" else 0)
+            for part, count in zip(parts, counts, strict=True)
+        )
+        return a, b, c
+
+    for line in path.read_text(errors="replace").splitlines():
+        words = line.split()
+        if not words:
+            continue
+        key = words[0]
+        if key == "v":
+            points.append([float(words[1]), float(words[2]), float(words[3])])
+        elif key == "vt":
+            uvs.append([float(words[1]), float(words[2]) if len(words) > 2 else 0.0])
+        elif key == "vn":
+            normals.append([float(words[1]), float(words[2]), float(words[3])])
+        elif key == "f":
+            polygon = [parse(word) for word in words[1:]]
+            for i in range(1, len(polygon) - 1):
+                corners += [polygon[0], polygon[i], polygon[i + 1]]
+                face_materials.append(material)
+        elif key == "mtllib":
+            materials |= _materials(path.parent / " ".join(words[1:]))
+        elif key == "usemtl":
+            material = " ".join(words[1:])
+    found = ObjFile(
+        points=np.array(points, dtype=np.float64).reshape(-1, 3),
+        uvs=np.array(uvs, dtype=np.float64).reshape(-1, 2),
+        normals=np.array(normals, dtype=np.float64).reshape(-1, 3),
+        corners=np.array(corners, dtype=np.int64).reshape(-1, 3, 3),
+        face_materials=tuple(face_materials),
+        materials=materials,
+    )
+    faces = found.faces
+    if len(faces) and (faces.min() < 0 or faces.max() >= len(points)):
+        raise ValueError(f"a face names vertex {int(faces.max()) + 1} of {len(points)}")
+    return found
+
+
+def _materials(path: Path) -> dict[str, Material]:
+    """Material name -> material, of an MTL file; a missing file means no materials."""
+    found: dict[str, Material] = {}
+    name = None
+    if not path.is_file():
+        return found
+    for line in path.read_text(errors="replace").splitlines():
+        words = line.split()
+        if not words:
+            continue
+        if words[0] == "newmtl":
+            name = " ".join(words[1:])
+            found[name] = Material(color=np.ones(3), texture=None)
+        elif name is not None and words[0] == "Kd" and len(words) >= 4:
+            color = np.array([float(word) for word in words[1:4]])
+            found[name] = Material(color=color, texture=found[name].texture)
+        elif name is not None and words[0] == "map_Kd" and len(words) >= 2:
+            # Options (-s 1 1 1, ...) stand before the name.
+            texture = path.parent / words[-1]
+            found[name] = Material(color=found[name].color, texture=texture if texture.is_file() else None)
+    return found

@@ -1,0 +1,55 @@
+"""OBJ files, judged by trimesh and by what the format's description says."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pybullet_data
+import pytest
+import trimesh
+
+from demorec.errors import SceneError
+from demorec.recording.description import _mesh_primitives
+from demorec.scene.obj import read_obj
+
+SQUARE = "v 0 0 0\nv 2 0 0\nv 2 3 0\nv 0 3 0\n"
+
+
+@pytest.mark.parametrize("name", ["duck.obj", "cube.obj"])
+def test_trimesh_finds_the_same_triangles(name: str) -> None:
+    path = Path(pybullet_data.getDataPath()) / name
+    expected = trimesh.load(path, force="mesh", process=False)
+    found = read_obj(path)
+    assert len(found.faces) == len(expected.faces)
+    ours = found.points[found.faces]
+    theirs = np.asarray(expected.vertices)[np.asarray(expected.faces)]
+    assert np.abs(np.sort(ours.reshape(-1, 9), axis=0) - np.sort(theirs.reshape(-1, 9), axis=0)).max() < 1e-6
+
+
+@pytest.mark.parametrize("face", ["f 1 2 3 4", "f -4 -3 -2 -1", "f 1//7 2/5 3/5/6 4", "f\t1 2 3 4"])
+def test_polygons_become_fans_however_their_corners_are_named(tmp_path: Path, face: str) -> None:
+    (tmp_path / "x.obj").write_text(f"{SQUARE}{face}\n")
+    found = read_obj(tmp_path / "x.obj")
+    assert found.faces.tolist() == [[0, 1, 2], [0, 2, 3]]
+    assert found.face_materials == ("", "")
+
+
+def test_materials_are_those_that_are_there(tmp_path: Path) -> None:
+    (tmp_path / "m.mtl").write_text("newmtl red\nKd 1 0 0\nmap_Kd gone.png\nnewmtl plain\n")
+    (tmp_path / "x.obj").write_text(f"mtllib m.mtl\nmtllib missing.mtl\n{SQUARE}usemtl red\nf 1 2 3\n")
+    found = read_obj(tmp_path / "x.obj")
+    assert found.face_materials == ("red",)
+    assert {name: (m.color.tolist(), m.texture) for name, m in found.materials.items()} == {
+        "red": ([1, 0, 0], None),
+        "plain": ([1, 1, 1], None),
+    }
+
+
+@pytest.mark.parametrize("face", ["f 1 2 5", "f 1 2 -9", "f 1 2 0"])
+def test_a_face_of_points_that_are_not_there_is_refused(tmp_path: Path, face: str) -> None:
+    (tmp_path / "x.obj").write_text(f"{SQUARE}{face}\n")
+    with pytest.raises(ValueError, match=r"a face names vertex \d+ of 4"):
+        read_obj(tmp_path / "x.obj")
+    with pytest.raises(SceneError, match="A mesh of the scene cannot be read"):  # what describes it says so, too
+        _mesh_primitives(tmp_path / "x.obj", (1.0, 1.0, 1.0))
