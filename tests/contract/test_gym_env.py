@@ -44,7 +44,7 @@ def make(task: str = "pick_place", **options: Any) -> DemorecEnv:
     return env
 
 
-@pytest.mark.parametrize("task", TASKS.names())
+@pytest.mark.parametrize("task", tasks_with_long_ones_slow())
 @pytest.mark.filterwarnings("ignore:.*(action space|observation space|Box).*:UserWarning")
 def test_gymnasium_accepts_the_environment(task: str) -> None:
     env = make(task)
