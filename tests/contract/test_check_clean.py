@@ -7,12 +7,13 @@ from pathlib import Path
 
 import pytest
 from support.check import checked, simulate
+from support.tasks import tasks_with_long_ones_slow
 
 from demorec.cli import main
 from demorec.tables import CHECKS, ROBOTS, TASKS
 
 
-@pytest.mark.parametrize("task", TASKS.names())
+@pytest.mark.parametrize("task", tasks_with_long_ones_slow())
 def test_every_task(task: str, tmp_path: Path) -> None:
     report = checked(simulate(tmp_path / "e.mcap", task=task, seed=21))
     assert [r for r in report.results if r.level in ("warn", "fail")] == []

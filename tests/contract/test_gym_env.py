@@ -11,17 +11,20 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
+from support.check import simulate
 from support.docs import run_examples
 from support.present import present
 from support.sim import episode
+from support.tasks import tasks_with_long_ones_slow
 
 import demorec.gym_env
 from demorec.errors import ConfigError, SceneError
 from demorec.gym_env import DemorecEnv, env_id
 from demorec.loop import ScriptAgent, Session, make_renderer, make_world
 from demorec.loop.actions import ACTION_KINDS
-from demorec.recording import EpisodeWriter, Recording
+from demorec.recording import Recording
 from demorec.scene import features
+from demorec.scene.episode import EpisodeColumns, EpisodeInfo
 from demorec.tables import TASKS
 
 FRAMES = 45
@@ -41,7 +44,7 @@ def make(task: str = "pick_place", **options: Any) -> DemorecEnv:
     return env
 
 
-@pytest.mark.parametrize("task", TASKS.names())
+@pytest.mark.parametrize("task", tasks_with_long_ones_slow())
 @pytest.mark.filterwarnings("ignore:.*(action space|observation space|Box).*:UserWarning")
 def test_gymnasium_accepts_the_environment(task: str) -> None:
     env = make(task)
@@ -51,17 +54,10 @@ def test_gymnasium_accepts_the_environment(task: str) -> None:
     env.close()
 
 
-@pytest.mark.parametrize("task", TASKS.names())
+@pytest.mark.parametrize("task", tasks_with_long_ones_slow())
 def test_a_recordings_commands_give_its_observations_to_the_bit(task: str, tmp_path: Path) -> None:
     """The numbers of the exported features of a file on disk, against those that a policy would see."""
-    prepared = episode(3, task=task)
-    path = tmp_path / "episode.mcap"
-    with make_world(prepared.info) as world, EpisodeWriter(path, prepared.info) as writer:
-        session = Session.of_episode(world, prepared)
-        for frame in session.run(ScriptAgent(prepared)):
-            writer.write(frame)
-        writer.finish(session.outcome)
-    with Recording(path) as recording:
+    with Recording(simulate(tmp_path / "e.mcap", episode_index=3, task=task)) as recording:
         info, columns = recording.info, recording.columns()
     rows = features.ObservationRows.of_columns(columns)
     expected = features.observation_vectors(rows, info.robot, info.scene, privileged=True)
@@ -81,46 +77,34 @@ def test_a_recordings_commands_give_its_observations_to_the_bit(task: str, tmp_p
     env.close()
 
 
+@pytest.fixture(scope="module")
+def expert(tmp_path_factory: pytest.TempPathFactory) -> tuple[EpisodeInfo, EpisodeColumns]:
+    """What the expert did in an episode without noise, read from a file."""
+    path = simulate(tmp_path_factory.mktemp("expert") / "e.mcap", episode_index=2, variation="none")
+    with Recording(path) as recording:
+        return recording.info, recording.columns()
+
+
 @pytest.mark.parametrize("kind", ACTION_KINDS)
-def test_exported_actions_solve_the_task(kind: features.ActionKind) -> None:
+def test_exported_actions_solve_the_task(expert: tuple[EpisodeInfo, EpisodeColumns], kind: features.ActionKind) -> None:
     """float32 actions of each kind, executed one after the other, do what the expert did (without noise)."""
-    prepared = episode(2, variation="none")
-    with make_world(prepared.info) as world:
-        frames = list(Session.of_episode(world, prepared).run(ScriptAgent(prepared)))
-    columns = columns_of(frames)
-    actions = features.action_vectors(columns, prepared.info.scene, kind)
+    info, columns = expert
+    actions = features.action_vectors(columns, info.scene, kind)
     assert actions.dtype == np.float32
     env = make(split="all", variation="none", action=kind)
     env.reset(seed=2)
-    assert env.info.scene == prepared.info.scene
+    assert env.info.scene == info.scene
     rewards = []
     for action in actions:
         assert env.action_space.contains(action)
-        _, reward, terminated, truncated, info = env.step(action)
-        assert info["is_success"] == terminated == (reward == 1.0)
+        _, reward, terminated, truncated, told = env.step(action)
+        assert told["is_success"] == terminated == (reward == 1.0)
         assert not truncated
         rewards.append(reward)
         if terminated:
             break
     assert sum(rewards) == rewards[-1] == 1.0
     env.close()
-
-
-def columns_of(frames: list[Any]) -> Any:
-    """The columns of frames, through a file."""
-    import tempfile
-
-    from demorec.scene.episode import Outcome
-
-    prepared = episode(2, variation="none")
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "e.mcap"
-        with EpisodeWriter(path, prepared.info) as writer:
-            for frame in frames:
-                writer.write(frame)
-            writer.finish(Outcome(success=True, checks=(), num_frames=len(frames)))
-        with Recording(path) as recording:
-            return recording.columns()
 
 
 def test_pictures_are_those_of_the_rollout() -> None:
@@ -220,7 +204,7 @@ def test_render_shows_the_world() -> None:
     env.close()
 
 
-@pytest.mark.parametrize("vector", [SyncVectorEnv, AsyncVectorEnv])
+@pytest.mark.parametrize("vector", [SyncVectorEnv, pytest.param(AsyncVectorEnv, marks=pytest.mark.slow)])
 def test_vectors_of_environments_give_what_single_ones_give(vector: type) -> None:
     fns = [functools.partial(gymnasium.make, "demorec.gym_env:demorec/PickPlace-v0", split="all")] * 2
     options = {} if vector is SyncVectorEnv else {"context": "spawn"}

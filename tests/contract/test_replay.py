@@ -13,13 +13,13 @@ import pytest
 from support.check import Spoilt, simulate, simulate_run
 from support.commands import exit_code
 from support.recording import make_episode
+from support.tasks import tasks_with_long_ones_slow
 
 from demorec.errors import ConfigError
 from demorec.lerobot.export import export_lerobot
 from demorec.lerobot.options import ExportOptions
 from demorec.recording import EpisodeWriter, Recording
 from demorec.replay import ReplayOptions, ReplayReport, open_file, replay_all
-from demorec.tables import TASKS
 
 
 @pytest.fixture(scope="session")
@@ -32,7 +32,7 @@ def _replay(path: Path, **options: object) -> ReplayReport:
     return next(iter(replay_all([open_file(path, chosen)], chosen)))[0]
 
 
-@pytest.mark.parametrize("task", TASKS.names())
+@pytest.mark.parametrize("task", tasks_with_long_ones_slow())
 def test_every_task_replays_to_the_bit(task: str, tmp_path: Path) -> None:
     path = simulate(tmp_path / "e.mcap", task=task, seed=5)
     report = _replay(path)
@@ -143,11 +143,15 @@ def test_the_command(recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixtu
     assert exit_code("replay", path, "--tolerance", "0.001") == 0
 
 
+@pytest.fixture(scope="module")
+def quiet_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Without exploration noise, actions are what was executed, rounded to float32."""
+    return simulate_run(tmp_path_factory.mktemp("quiet") / "run", 2, seed=3, variation="none")
+
+
 @pytest.mark.parametrize("action", ["joint", "joint_increment", "ee", "ee_delta"])
-def test_datasets_of_every_kind_of_action(action: str, tmp_path: Path) -> None:
-    # Without exploration noise, actions are what was executed, rounded to float32.
-    run = simulate_run(tmp_path / "run", 2, seed=3, variation="none")
-    export_lerobot([run], tmp_path / "ds", ExportOptions(verify=False, action=action))  # type: ignore[arg-type]
+def test_datasets_of_every_kind_of_action(action: str, quiet_run: Path, tmp_path: Path) -> None:
+    export_lerobot([quiet_run], tmp_path / "ds", ExportOptions(verify=False, action=action))  # type: ignore[arg-type]
     from demorec.cli.replay import demonstrations
 
     found = [report for report, _ in replay_all(demonstrations([tmp_path / "ds"], ReplayOptions()), ReplayOptions())]

@@ -149,7 +149,7 @@ def test_the_recording_alone_is_drawn_without_a_simulator(robot: str, task: str,
         "task": task,
         "variation": "full",
         "segmentation": True,
-        "max_episode_seconds": 2.0,
+        "max_episode_seconds": 1.0,
     }
     source = simulate(tmp_path / "e.mcap", seed=4, cameras=("front", "wrist"), width=64, height=64, **config)
     command = ("render", source, "--out", tmp_path / "again.mcap")

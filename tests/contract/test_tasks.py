@@ -20,17 +20,14 @@ def plan(task: str, index: int = 0, **options: object) -> EpisodePlan:
 
 
 @pytest.mark.parametrize("task", TASKS.names())
-def test_an_episode_succeeds_and_repeats_to_the_bit(task: str) -> None:
+def test_an_episode_succeeds(task: str) -> None:
+    """That it repeats to the bit is shown in test_determinism.py for every row, and by replays in test_replay.py."""
     episode = prepare(plan(task))
-    digests = set()
     with make_world(episode.info) as world:
-        for _ in range(2):
-            session = Session.of_episode(world, episode)
-            frames = list(session.run(ScriptAgent(episode)))
-            assert session.outcome.success, (session.outcome, episode.info.instruction)
-            assert session.outcome.num_frames == len(frames)
-            digests.add(session.outcome.final_state_digest)
-    assert len(digests) == 1
+        session = Session.of_episode(world, episode)
+        frames = list(session.run(ScriptAgent(episode)))
+    assert session.outcome.success, (session.outcome, episode.info.instruction)
+    assert session.outcome.num_frames == len(frames)
 
 
 @pytest.mark.parametrize("task", TASKS.names())

@@ -41,6 +41,13 @@ class Remembers(NoProgress):
         self.said.append(message)
 
 
+class Tells(NoProgress):
+    """Prints what it is told."""
+
+    def says(self, message: str) -> None:
+        print(message, flush=True)
+
+
 def run_fake(
     out: Path,
     *,
@@ -90,6 +97,6 @@ def expected_attempts(num_episodes: int, *, seed: int = 0, max_attempts: int = 3
 if __name__ == "__main__":
     out, of_maker, number, processes, grace_s = sys.argv[1:]
     running.GRACE_S = float(grace_s)
-    result = run_fake(Path(out), maker=of_maker, num_episodes=int(number), workers=int(processes))
+    result = run_fake(Path(out), maker=of_maker, num_episodes=int(number), workers=int(processes), progress=Tells())
     print(result.run.digest)
     sys.exit(130 if result.interrupted else 0)

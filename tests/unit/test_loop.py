@@ -140,18 +140,18 @@ def test_noise_lets_go_at_the_rate_that_increments_expect(ran: tuple[Episode, li
 
 def test_an_episode_depends_on_its_plan_alone() -> None:
     """Alone, after others, in reverse order: the same digest."""
-    plans = [episode(index) for index in (0, 1, 2)]
+    plans = [episode(index) for index in (0, 1)]
     alone = [run(prepared)[1].final_state_digest for prepared in plans]
     with make_world(plans[0].info) as world:
         in_order = [run(prepared, world)[1].final_state_digest for prepared in plans]
         reverse = [run(prepared, world)[1].final_state_digest for prepared in reversed(plans)]
     assert alone == in_order == reverse[::-1]
-    assert len(set(alone)) == 3
+    assert len(set(alone)) == 2
 
 
 def test_pictures_do_not_disturb_the_physics() -> None:
-    _, without = run(episode(4, max_episode_seconds=2.0))
-    frames, outcome = run(episode(4, max_episode_seconds=2.0, cameras=("front",), width=32, height=32, renderer="tiny"))
+    _, without = run(episode(4, max_episode_seconds=1.0))
+    frames, outcome = run(episode(4, max_episode_seconds=1.0, cameras=("front",), width=32, height=32, renderer="tiny"))
     assert outcome.final_state_digest == without.final_state_digest
     assert frames[0].images["front"].color.shape == (32, 32, 3)
 
@@ -166,7 +166,7 @@ print(json.dumps([outcome.final_state_digest, to_json(prepared.info)]))
 """
 
 
-@pytest.mark.parametrize("coretype", ["Haswell", "Nehalem"])
+@pytest.mark.parametrize("coretype", ["Haswell", pytest.param("Nehalem", marks=pytest.mark.slow)])
 def test_another_process_and_another_blas_kernel_give_the_same_bits(
     ran: tuple[Episode, list[Frame], Outcome], coretype: str
 ) -> None:

@@ -85,6 +85,7 @@ def test_drawable_text_is_left_alone() -> None:
     assert text.missing == set()
 
 
+@pytest.mark.slow
 @pytest.mark.viewer
 def test_the_viewer_draws_every_drawable_character(tmp_path: Path) -> None:
     need_vulkan()

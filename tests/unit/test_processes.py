@@ -73,5 +73,5 @@ def test_workers_of_a_pool_end_with_their_parent_busy_or_idle(tmp_path: Path) ->
     assert len(workers) == 2
     parent.kill()
     parent.wait()
-    _, alive = psutil.wait_procs(descendants, timeout=20)
+    _, alive = psutil.wait_procs(descendants, timeout=120)
     assert not alive
