@@ -18,8 +18,9 @@ from demorec.safety.replacing import PICTURE, check_replaceable
 
 if TYPE_CHECKING:
     from demorec.check.base import Level, Result
-    from demorec.check.report import SubjectReport
+    from demorec.check.report import Subject, SubjectReport
     from demorec.replay import ReplayReport
+    from demorec.replay.deep import DeepReport
     from demorec.scene.episode import EpisodeInfo
 
 
@@ -36,6 +37,7 @@ class Check:
       demorec check recordings/cubes --no-pictures --strict
       demorec check datasets/cubes --json
       demorec check recordings/cubes --replay 5
+      demorec check recordings/cubes/episodes/episode_000007.mcap --deep
     """
 
     paths: Positional[tuple[Path, ...]]
@@ -48,6 +50,9 @@ class Check:
     """Warnings count as failures."""
     replay: int = 0
     """Also replay this many episodes of each run or dataset, spread evenly, and every recording given by itself."""
+    deep: bool = False
+    """Also make every recording again, from its config and seed, and compare every number and picture with it; takes
+    about as long as generating it."""
     coverage_picture: Path | None = None
     """Draw start places, goals and ranges of all episodes into this PNG file."""
     overwrite: bool = False
@@ -89,15 +94,33 @@ class Check:
                     from demorec.cli.replay import told
 
                     say(told(replayed))
+        remade = list(self._remade(subjects, allowed)) if self.deep else []
         if self.coverage_picture is not None:
             self._draw(self.coverage_picture)
         failed = [report for report in reports if report.is_bad(strict=self.strict)]
         diverged = [replayed for replayed in replays if not _as_recorded(replayed)]
+        different = [report for report in remade if report.level == "fail" or (self.strict and report.level == "warn")]
         if self.json:
-            say_json([_plain(report) for report in reports] + [_plain_replay(r) for r in replays])
+            from demorec.cli.deep import plain_deep
+
+            plain = [_plain(report) for report in reports] + [_plain_replay(r) for r in replays]
+            say_json(plain + [plain_deep(report) for report in remade])
         else:
-            say(_summary(reports, len(failed), len(replays), len(diverged)))
-        return 1 if failed or diverged else 0
+            summary = _summary(reports, len(failed), len(replays), len(diverged))
+            say(summary + (f" {len(remade)} made again, {len(different)} not as recorded." if remade else ""))
+        return 1 if failed or diverged or different else 0
+
+    def _remade(self, subjects: Sequence[Subject], allowed: tuple[str, ...]) -> Iterator[DeepReport]:
+        from demorec.cli.deep import deep_lines
+        from demorec.replay.deep import deep_checks
+
+        paths = [subject.path for subject in subjects if subject.kind == "recording"]
+        with ProgressBar("making again", total=len(paths)) as bar:
+            for report in deep_checks(paths, workers=self.workers, allowed=allowed):
+                bar.advance()
+                if not self.json:
+                    say(*deep_lines(report, verbose=self.verbose))
+                yield report
 
     def _check_picture(self, path: Path) -> None:
         if path.suffix.lower() != ".png":

@@ -11,21 +11,20 @@ import os
 import platform
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
 from demorec.config import EpisodePlan
 from demorec.errors import ConfigError, SceneError
 from demorec.geometry import Array
-from demorec.loop import ScriptAgent, Session, make_renderer, make_world, prepare
+from demorec.loop import ScriptAgent, Session, Workshop, prepare
 from demorec.recording import EpisodeWriter
 from demorec.render import Renderer, RenderSetup
 from demorec.runs.recordings import inspect_recording
 from demorec.runs.run_file import EPISODES, FAILED, STARTING, UNFINISHED, Attempt, recording_name, sync_folder
 from demorec.safety.own_versions import version_differences
-from demorec.scene.episode import CameraImages, EpisodeInfo, Frame, Outcome
-from demorec.sim.world import World
+from demorec.scene.episode import CameraImages, Frame, Outcome
 
 SIMULATION, RENDERING, RECORDING = "simulation", "rendering", "recording"
 STAGES = (SIMULATION, RENDERING, RECORDING)
@@ -79,40 +78,8 @@ def _check_versions(plan: EpisodePlan, here: Mapping[str, str]) -> None:
         raise ConfigError(f"What decides the run's episodes is not what it was at its start: {'; '.join(different)}")
 
 
-class _Workshop:
-    """The world and the renderer of this process, kept warm from one episode to the next."""
-
-    def __init__(self) -> None:
-        self._world: World | None = None
-        self._renderer: AbstractContextManager[Renderer | None] | None = None
-        self._entered: Renderer | None = None
-        self._key: object = None
-
-    @property
-    def is_warm(self) -> bool:
-        """Whether this process has made an episode before."""
-        return self._world is not None
-
-    def equip(self, info: EpisodeInfo) -> tuple[World, Renderer | None]:
-        """A world and a renderer for episodes like this one; the present ones where they fit."""
-        config = info.config
-        key = (info.robot, info.fps, config.get("joint_rate"), config.get("renderer"), bool(info.scene.cameras))
-        if self._world is None or key != self._key:
-            self.close()
-            self._world, self._renderer, self._key = make_world(info), make_renderer(info), key
-            self._entered = self._renderer.__enter__()
-        return self._world, self._entered
-
-    def close(self) -> None:
-        """Free both; harmless when called twice."""
-        if self._renderer is not None:
-            self._renderer.__exit__(None, None, None)
-        if self._world is not None:
-            self._world.close()
-        self._world = self._renderer = self._entered = self._key = None
-
-
-_workshop = _Workshop()
+_workshop = Workshop()
+"""Of this process."""
 
 
 class _Stopwatch:

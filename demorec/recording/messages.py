@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -178,7 +178,18 @@ def protobuf_video(time_ns: int, frame_id: str, video_format: str, data: bytes) 
 
 
 def read_protobuf_video(data: bytes) -> bytes:
-    """The coded picture: field 3 of foxglove.CompressedVideo (all its fields are length-delimited)."""
+    """The coded picture of a `protobuf_video`."""
+    for name, value in protobuf_fields(data):
+        if name == "data":
+            return value
+    raise ValueError("a video message without a picture")
+
+
+_VIDEO_FIELDS = {1: "timestamp", 2: "frame_id", 3: "data", 4: "format"}
+
+
+def protobuf_fields(data: bytes) -> Iterator[tuple[str, bytes]]:
+    """(name, bytes) of the fields of a foxglove.CompressedVideo, all of which are length-delimited."""
     position = 0
     while position < len(data):
         tag, position = _varint(data, position)
@@ -186,11 +197,9 @@ def read_protobuf_video(data: bytes) -> bytes:
             raise ValueError(f"a video message with a field of wire type {tag & 7}")
         length, position = _varint(data, position)
         if position + length > len(data):
-            break
-        if tag >> 3 == 3:
-            return data[position : position + length]
+            raise ValueError("a video message that ends within a field")
+        yield _VIDEO_FIELDS.get(tag >> 3, f"field {tag >> 3}"), data[position : position + length]
         position += length
-    raise ValueError("a video message without a picture")
 
 
 def _varint(data: bytes, position: int) -> tuple[int, int]:

@@ -1,0 +1,46 @@
+"""What a person and a program read of recordings that were made again."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from demorec.replay.deep import DeepReport
+
+_SHOWN = 12
+"""Differences of one recording that are printed: the first ones tell the most."""
+
+
+def deep_lines(report: DeepReport, *, verbose: bool = False) -> list[str]:
+    """One line about a recording, below it the versions that differ, then what differs, the first frames first."""
+    lines = [f"{report.level:<4}  made again {report.path}: {_verdict(report)}"]
+    details = [*report.versions]
+    if report.error:
+        details.append(f"It cannot be made again: {report.error}")
+    shown = report.differences if verbose else report.differences[:_SHOWN]
+    details += [str(difference) for difference in shown]
+    if len(report.differences) > len(shown):
+        details.append(f"and {len(report.differences) - len(shown)} fields more (--verbose shows all)")
+    if report.replay:
+        details.append(f"Replayed: {report.replay}")
+    return lines + [f"      {detail}" for detail in details]
+
+
+def _verdict(report: DeepReport) -> str:
+    if report.error:
+        return "not possible"
+    if not report.differences:
+        aside = "; labels, phases and events are taken over in a derived recording" if report.is_derived else ""
+        return f"the same to the bit in all {report.num_frames} frames{aside}"
+    frames = {frame for difference in report.differences for frame in difference.frames}
+    return f"{len(report.differences)} fields differ, in {len(frames)} of {report.num_frames} frames"
+
+
+def plain_deep(report: DeepReport) -> dict[str, Any]:
+    """The same as plain data for JSON, with every frame that differs."""
+    from demorec.plain import to_plain
+
+    plain = to_plain(report)
+    return {"path": str(report.path), "kind": "deep", "level": report.level, "results": [
+        {name: value for name, value in plain.items() if name != "path"}
+    ]}  # fmt: skip

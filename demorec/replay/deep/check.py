@@ -1,0 +1,149 @@
+"""The deep check: a recording is made again, and everything in it must come out as it is recorded."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from demorec.config import deciding_versions
+from demorec.errors import DemorecError, resource_error
+from demorec.loop import Workshop
+from demorec.processes import SPAWN
+from demorec.recording import Recording
+from demorec.replay.deep.contents import Contents, coded_topics, content_differences
+from demorec.replay.deep.difference import Difference
+from demorec.replay.deep.pictures import picture_differences
+from demorec.replay.deep.remake import recorded_config, recorded_painter, remake
+from demorec.replay.demonstration import ReplayOptions, open_demonstration
+from demorec.replay.drive import replay
+from demorec.safety.own_versions import version_differences
+from demorec.scene.episode import EpisodeInfo
+
+
+@dataclass(frozen=True, kw_only=True)
+class DeepReport:
+    """How a recording compares with itself made again.
+
+    Attributes:
+        path: The recording.
+        versions: One line for each version in which what made it differs from what is here.
+        differences: Everything that differs, ordered by the first frame.
+        error: Why it could not be made again; "" where it could.
+        replay: How its own commands fare in its own scene, in words; "" unless numbers differ.
+        is_derived: Whether it is a replay or rendering, of which labels, phases and events are taken over.
+        num_frames: Of the recording.
+    """
+
+    path: Path
+    versions: tuple[str, ...] = ()
+    differences: tuple[Difference, ...] = ()
+    error: str = ""
+    replay: str = ""
+    is_derived: bool = False
+    num_frames: int = 0
+
+    @property
+    def level(self) -> Literal["pass", "warn", "fail"]:
+        """Other versions, and other codings of the same pictures, are warnings."""
+        if self.error or any(not difference.is_coding for difference in self.differences):
+            return "fail"
+        return "warn" if self.versions or self.differences else "pass"
+
+
+def deep_check(path: Path, workshop: Workshop, allowed: Sequence[str] = ()) -> DeepReport:
+    """Make a recording again and compare everything.
+
+    Args:
+        path: The recording.
+        workshop: Gives world and renderer.
+        allowed: The user's own modules that may be imported for what the recording names.
+
+    Raises:
+        ResourceError: This machine cannot do it, which says nothing about the recording.
+    """
+    versions: tuple[str, ...] = ()
+    num_frames, is_derived = 0, False
+    try:
+        with tempfile.TemporaryDirectory(prefix="demorec-deep-") as folder, Recording(path) as recording:
+            info, num_frames, is_derived = recording.info, recording.num_frames, bool(recording.info.origin)
+            versions = version_differences(info.versions, _versions_here(info, allowed))
+            again = Path(folder) / "again.mcap"
+            remake(recording, again, workshop, allowed)
+            differences = tuple(_differences(recording, again, workshop, allowed))
+            replayed = ""
+            if not is_derived and any(not d.is_coding and d.field != "picture" for d in differences):
+                replayed = _replayed(recording, workshop, allowed)
+    except DemorecError as error:
+        if (lack := resource_error(error)) is not None:
+            raise lack from error
+        return DeepReport(path=path, versions=versions, error=str(error), num_frames=num_frames, is_derived=is_derived)
+    return DeepReport(
+        path=path,
+        versions=versions,
+        differences=differences,
+        replay=replayed,
+        num_frames=num_frames,
+        is_derived=is_derived,
+    )
+
+
+def _versions_here(info: EpisodeInfo, allowed: Sequence[str]) -> Mapping[str, str]:
+    with suppress(DemorecError):
+        return deciding_versions(recorded_config(info, allowed))
+    return deciding_versions()
+
+
+def _differences(recording: Recording, again: Path, workshop: Workshop, allowed: Sequence[str]) -> Iterator[Difference]:
+    """Ordered by the first frame."""
+    found, made = Contents.of(recording.path), Contents.of(again)
+    with Recording(again) as remade:
+        if recording.is_recovered:
+            made.cut_off(found)
+        differences, pictures = content_differences(found, made, remade.info, recording.info.fps)
+        if pictures:
+            painter = recorded_painter(remade.info, workshop.equip(remade.info)[1], allowed)
+            assert painter is not None, "pictures were drawn"
+            cameras = coded_topics(remade.info)
+            differences += picture_differences(found, made, remade, painter, cameras, pictures)
+    yield from sorted(differences, key=lambda difference: difference.first_frame)
+
+
+def _replayed(recording: Recording, workshop: Workshop, allowed: Sequence[str]) -> str:
+    """Whether the fault is in what was recorded, or in how it is made again: the commands alone, in the scene alone."""
+    options = ReplayOptions(allowed=tuple(allowed))
+    try:
+        demonstration = open_demonstration(recording, options)
+        report, _ = replay(demonstration, workshop.equip(recording.info)[0], options)
+    except DemorecError as error:
+        return f"cannot be replayed ({error})"
+    if report.first_difference is None:
+        return "its commands, sent again in its recorded scene, give its recorded states to the bit"
+    step, what = report.first_difference
+    return f"its commands, sent again in its recorded scene, give other states from frame {step} on ({what})"
+
+
+def deep_checks(paths: Sequence[Path], *, workers: int = 1, allowed: Sequence[str] = ()) -> Iterator[DeepReport]:
+    """One report for each recording, in order."""
+    if workers == 1 or len(paths) < 2:
+        workshop = Workshop()
+        try:
+            for path in paths:
+                yield deep_check(path, workshop, allowed)
+        finally:
+            workshop.close()
+        return
+    with ProcessPoolExecutor(max_workers=min(workers, len(paths)), mp_context=SPAWN) as pool:
+        yield from pool.map(_deep_check_here, paths, [tuple(allowed)] * len(paths))
+
+
+_workshop = Workshop()
+"""Of a process of the pool."""
+
+
+def _deep_check_here(path: Path, allowed: tuple[str, ...]) -> DeepReport:
+    return deep_check(path, _workshop, allowed)

@@ -1,0 +1,109 @@
+"""A recording made again: the script run again from config and seed, or the commands of a derived one sent again."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from demorec.config import EpisodePlan, GenerateConfig, VideoConfig
+from demorec.errors import ConfigError
+from demorec.loop import ScriptAgent, Session, Workshop, prepare
+from demorec.plain import digest, from_plain
+from demorec.recording import EpisodeWriter, Recording
+from demorec.render import Renderer
+from demorec.render.painter import Painter
+from demorec.replay.demonstration import ReplayOptions, open_demonstration
+from demorec.replay.drive import DemonstrationAgent
+from demorec.replay.rerender import recorded_view, view_painter
+from demorec.scene.assets import allow_models
+from demorec.scene.episode import EpisodeInfo
+from demorec.tables import RENDERERS, TASKS
+
+
+def recorded_config(info: EpisodeInfo, allowed: Collection[str]) -> GenerateConfig:
+    """The config that an episode says it was made with.
+
+    Raises:
+        ConfigError: It is none.
+        NotAllowedError: It names something of a module that is not among those `allowed`.
+    """
+    try:
+        config = from_plain(info.config, GenerateConfig)
+    except ValueError as error:
+        raise ConfigError(f"The recorded config is none of this version ({error}).") from error
+    config.check_names(allowed)
+    config.validate()
+    return config
+
+
+def remake(recording: Recording, path: Path, workshop: Workshop, allowed: Sequence[str] = ()) -> None:
+    """Make the episode of a recording again, as a recording of the same format version.
+
+    A generated one needs nothing but its config, its number and its attempt. A derived one (`origin`) has no script:
+    its commands are sent again in its recorded scene, and labels, phases and events are taken over.
+
+    Args:
+        recording: The original.
+        path: The file to be made.
+        workshop: Gives world and renderer.
+        allowed: The user's own modules that may be imported for what the recording names.
+
+    Raises:
+        ConfigError: Its config cannot be used.
+        DemorecError: It cannot be simulated, drawn or written here.
+    """
+    if recording.info.origin:
+        _send_again(recording, path, workshop, allowed)
+        return
+    config = recorded_config(recording.info, allowed)
+    episode = prepare(
+        EpisodePlan(config=config, episode_index=recording.info.episode_index, attempt=recording.info.attempt)
+    )
+    info = replace(episode.info, format_version=recording.info.format_version)
+    world, renderer = workshop.equip(info)
+    session = Session.of_episode(world, episode, renderer)
+    with EpisodeWriter(path, info, video=config.video) as writer:
+        for frame in session.run(ScriptAgent(episode)):
+            writer.write(frame)
+        writer.finish(session.outcome)
+
+
+def _send_again(recording: Recording, path: Path, workshop: Workshop, allowed: Sequence[str]) -> None:
+    allow_models(allowed)
+    options = ReplayOptions(allowed=tuple(allowed))
+    demonstration = open_demonstration(recording, options)
+    info = replace(recording.info, config_digest=digest(recording.info.config))
+    RENDERERS.check_name(str(info.config.get("renderer", "raster")))
+    task = TASKS.load(info.task, allowed)()
+    world, renderer = workshop.equip(info)
+    session = Session(world, info.scene, task, painter=recorded_painter(info, renderer, allowed))
+    agent = DemonstrationAgent(demonstration, options)
+    with EpisodeWriter(path, info, video=_video(info)) as writer:
+        for frame in session.run(agent):
+            writer.write(frame)
+        outcome = session.outcome
+        if recording.outcome is not None:  # why it failed, and after how many tries, no replay can tell
+            told = recording.outcome
+            outcome = replace(
+                outcome,
+                failure_phase=told.failure_phase,
+                failure_reason=told.failure_reason,
+                num_retries=told.num_retries,
+                success=all(check.passed for check in outcome.checks) and not told.failure_reason,
+            )
+        writer.finish(outcome)
+
+
+def _video(info: EpisodeInfo) -> VideoConfig:
+    try:
+        return from_plain(info.config.get("video", {}), VideoConfig)
+    except ValueError as error:
+        raise ConfigError(f"The recorded config is none of this version ({error}).") from error
+
+
+def recorded_painter(info: EpisodeInfo, renderer: Renderer | None, allowed: Collection[str]) -> Painter | None:
+    """Draws what the recording shows, from where its cameras really were; None without cameras."""
+    if renderer is None:
+        return None
+    return view_painter(renderer, recorded_view(info, allowed), info.config)

@@ -1,0 +1,399 @@
+"""`check --deep` names whatever differs from the recording made again: every field of every topic, every picture."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from copy import deepcopy
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap_ros2._dynamic import generate_dynamic, serialize_dynamic
+from support.check import Spoilt, rewrite_messages, simulate
+from support.mcap import rewritten
+
+from demorec.cli import main
+from demorec.loop import Workshop
+from demorec.plain import to_plain
+from demorec.recording import Recording
+from demorec.recording.metadata import EPISODE, OUTCOME
+from demorec.recording.ros2 import DEFINITIONS
+from demorec.replay.deep import DeepReport, deep_check, deep_checks
+from demorec.replay.deep.contents import CODED, Contents, content_differences
+from demorec.replay.rerender import RerenderOptions, rerender
+
+FPS = 10
+
+
+@pytest.fixture(scope="module")
+def workshop() -> Iterator[Workshop]:
+    made = Workshop()
+    yield made
+    made.close()
+
+
+@pytest.fixture(scope="module")
+def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Every stream that there is: two cameras, depth, segmentation, joint states at the physics rate, noise."""
+    path = tmp_path_factory.mktemp("deep") / "filmed.mcap"
+    return simulate(
+        path, seed=7, fps=FPS, cameras=("front", "wrist"), width=96, height=96, depth=True, segmentation=True,
+        joint_rate="physics", variation="full",
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def blind(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Without pictures, which makes it again in no time."""
+    return simulate(tmp_path_factory.mktemp("deep") / "blind.mcap", seed=7, fps=FPS)
+
+
+def found(report: DeepReport) -> set[tuple[str, str, tuple[int, ...]]]:
+    return {(d.stream, d.field, d.frames) for d in report.differences}
+
+
+def test_good_recordings_come_out_the_same(filmed: Path, blind: Path, workshop: Workshop) -> None:
+    for path in (filmed, blind):
+        report = deep_check(path, workshop)
+        assert (report.level, report.differences, report.versions, report.error) == ("pass", (), (), "")
+        assert report.num_frames > 40
+
+
+def test_a_failed_attempt_comes_out_the_same(tmp_path: Path, workshop: Workshop) -> None:
+    path = simulate(tmp_path / "failed.mcap", seed=7, fps=FPS, max_episode_seconds=2.0)
+    with Recording(path) as recording:
+        assert recording.outcome is not None
+        assert recording.outcome.failure_reason == "time_limit"
+    assert deep_check(path, workshop).level == "pass"
+
+
+def test_a_rendering_comes_out_the_same(blind: Path, tmp_path: Path, workshop: Workshop) -> None:
+    path = tmp_path / "rendered.mcap"
+    rerender(blind, path, RerenderOptions(cameras=("front",), width=64, height=64, looks=3))
+    report = deep_check(path, workshop)
+    assert (report.level, report.differences, report.is_derived) == ("pass", (), True)
+
+
+# --------------------------------------------------------------------------------------- every field of every topic
+
+
+def single_values(message: Any, path: str = "") -> Iterator[tuple[str, Callable[[], None]]]:
+    """(name, what changes it) of every single value of a decoded message, the last of each array standing for it."""
+    for name in message.__slots__:
+        value, where = getattr(message, name), f"{path}.{name}".lstrip(".")
+        if hasattr(value, "__slots__"):
+            yield from single_values(value, where)
+        elif isinstance(value, list) and value and not isinstance(value[-1], bool | int | float | str):
+            yield from single_values(value[-1], f"{where}[{len(value) - 1}]")
+        elif isinstance(value, bytes | bytearray | memoryview):
+            continue  # a coded picture
+        elif hasattr(value, "__len__") and not isinstance(value, str):
+            if len(value):
+                yield f"{where}[{len(value) - 1}]", lambda v=value: v.__setitem__(len(v) - 1, other(v[len(v) - 1]))
+        else:
+            yield where, lambda m=message, n=name, v=value: setattr(m, n, other(v))
+
+
+def other(value: Any) -> Any:
+    """Another value of the same type, the nearest one for numbers."""
+    if isinstance(value, bool):
+        return not value
+    if isinstance(value, str):
+        return value + "x"
+    if isinstance(value, float):
+        return float(np.nextafter(np.float32(value), np.float32(np.inf)))
+    return value + 1
+
+
+def test_every_field_of_every_topic(filmed: Path, tmp_path: Path, workshop: Workshop) -> None:
+    """One value of one message each, all in one file: every one is named with its frame, and nothing else is."""
+    with Recording(filmed) as recording:
+        topics = recording.topics
+    kinds = {kind for kind, _ in topics.values()}
+    decoders = {kind: generate_dynamic(kind, DEFINITIONS[kind])[kind] for kind in kinds}
+    encoders = {kind: serialize_dynamic(kind, DEFINITIONS[kind])[kind] for kind in kinds}
+    expected: set[tuple[str, str, int]] = set()
+    turn: dict[str, int] = {}
+    fields: dict[str, list[str]] = {}
+
+    def spoil(topic: str, data: bytes) -> bytes:
+        kind = topics[topic][0]
+        number = turn[topic] = turn.get(topic, -1) + 1
+        message = decoders[kind](data)
+        changes = dict(single_values(message))
+        known = fields.setdefault(topic, list(changes))
+        per_frame = 1 if topics[topic][1] > 1 else len(known)  # what is said once has all its faults in one message
+        for name in known[number * per_frame : (number + 1) * per_frame]:
+            if name in changes:
+                changes[name]()
+                expected.add((topic, name, number))
+        return bytes(encoders[kind](message))
+
+    spoilt = tmp_path / "spoilt.mcap"
+    spoilt.write_bytes(rewritten(filmed, messages=spoil))
+    report = deep_check(spoilt, workshop)
+    named = {(d.stream, d.field) for d in report.differences}
+    assert {(topic, name) for topic, name, _ in expected} == named
+    assert {topic for topic, _, _ in expected} == topics.keys()
+    assert len(expected) > 200
+    frames = {(d.stream, d.field): d.frames for d in report.differences}
+    sampled = {"/joint_states", "/events", "/phase", "/deliberate_miss"}  # not one message a frame
+    for topic, name, number in expected:
+        if topic in sampled:
+            assert len(frames[topic, name]) == 1
+        elif topics[topic][1] > 1:
+            assert frames[topic, name] == (number,), (topic, name)
+    firsts = [d.first_frame for d in report.differences]
+    assert firsts == sorted(firsts)
+
+
+def test_one_bit_of_one_number(blind: Path, tmp_path: Path, workshop: Workshop) -> None:
+    seen = 0
+
+    def spoil(topic: str, data: bytes) -> bytes:
+        nonlocal seen
+        seen += topic == "/ee_pose"
+        if topic != "/ee_pose" or seen != 6:
+            return data
+        place = len(data) - 7 * 8  # the last bit of position.x
+        return data[:place] + bytes([data[place] ^ 1]) + data[place + 1 :]
+
+    spoilt = tmp_path / "spoilt.mcap"
+    spoilt.write_bytes(rewritten(blind, messages=spoil))
+    report = deep_check(spoilt, workshop)
+    assert found(report) == {("/ee_pose", "pose.position.x", (5,))}
+    assert report.level == "fail"
+    assert "to the bit" in report.replay  # the commands and joint states are sound
+
+
+def test_messages_that_are_missing_or_too_many(blind: Path, tmp_path: Path, workshop: Workshop) -> None:
+    spoilt = tmp_path / "spoilt.mcap"
+    gone = iter(range(10_000))
+    rewrite_messages(
+        blind, spoilt, lambda m: () if m[0] == "/action" and next(gone) == 7 else (m, m) if m[0] == "/phase" else (m,)
+    )
+    named = found(deep_check(spoilt, workshop))
+    assert ("/action", "messages", (7,)) in named
+    assert {field for stream, field, _ in named if stream == "/phase"} == {"messages"}
+
+
+def test_a_topic_that_no_recording_has(blind: Path, tmp_path: Path, workshop: Workshop) -> None:
+    spoilt = tmp_path / "spoilt.mcap"
+    rewrite_messages(blind, spoilt, lambda m: (m, ("/mine", *m[1:])) if m[0] == "/wrench" else (m,))
+    assert ("/mine", "messages", ()) in found(deep_check(spoilt, workshop))
+
+
+# ----------------------------------------------------------------------------------------------------- the metadata
+
+
+def leaves(value: Any, path: str) -> Iterator[tuple[str, Any, Any]]:
+    """(name, container, key) of every single value in JSON data."""
+    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, child in items:
+        where = f"{path}.{key}" if isinstance(key, str) else f"{path}[{key}]"
+        if isinstance(child, dict | list) and child:
+            yield from leaves(child, where)
+        else:
+            yield where, value, key
+
+
+@pytest.mark.parametrize("record", [EPISODE, OUTCOME])
+def test_every_field_of_the_metadata(record: str, filmed: Path) -> None:
+    """One value each, in turn: it is named, and nothing else is."""
+    again = Contents.of(filmed)
+    with Recording(filmed) as recording:
+        info = recording.info
+    count = 0
+    for key, text in again.metadata[record].items():
+        if key == "crc32":  # is made anew with each change
+            continue
+        data = json.loads(text) if text[:1] in "{[" else text
+        places = list(leaves(data, key)) if isinstance(data, dict | list) else [(key, None, None)]
+        for number, (name, _, _) in enumerate(places):
+            spoilt = deepcopy(data)
+            if places[0][1] is None:
+                spoilt = other(data)
+            else:
+                _, container, place = list(leaves(spoilt, key))[number]
+                value = container[place]
+                container[place] = "x" if value is None or isinstance(value, dict | list) else other(value)
+            metadata = {**again.metadata[record], key: spoilt if isinstance(spoilt, str) else json.dumps(spoilt)}
+            recorded = replace(again, metadata={**again.metadata, record: metadata})
+            differences, pictures = content_differences(recorded, again, info, info.fps)
+            if name.startswith("info.versions"):  # told by themselves
+                assert not differences
+                continue
+            assert [(d.stream, d.field) for d in differences] == [(f"metadata {record}", name)]
+            assert not pictures
+            count += 1
+    assert count > (300 if record == EPISODE else 20)
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "named"),
+    [
+        (("root_seed",), 8, "info.root_seed"),
+        (("attempt",), 1, "info.scene"),
+        (("instruction",), "Do something else.", "info.instruction"),
+        (("scene", "bodies", 1, "mass"), 0.9, "info.scene.bodies[1].mass"),
+        (("config", "seed"), 8, "info.root_seed"),
+        (("config", "sampling_block"), 51, "info.config_digest"),
+        (("config_digest",), "0123456789abcdef", "info.config_digest"),
+        (("behaviour", "speed"), 0.77, "info.behaviour.speed"),
+    ],
+)
+def test_a_changed_description(
+    place: tuple[Any, ...], value: Any, named: str, blind: Path, tmp_path: Path, workshop: Workshop
+) -> None:
+    with Recording(blind) as recording:
+        info = to_plain(recording.info)
+    target = info
+    for key in place[:-1]:
+        target = target[key]
+    assert target[place[-1]] != value
+    target[place[-1]] = value
+    spoilt = tmp_path / "spoilt.mcap"
+    spoilt.write_bytes(rewritten(blind, change={EPISODE: {"info": json.dumps(info)}}))
+    report = deep_check(spoilt, workshop)
+    assert report.level == "fail"
+    assert any(d.stream == f"metadata {EPISODE}" and d.field.startswith(named) for d in report.differences)
+
+
+def test_other_versions_are_said_first(
+    blind: Path, tmp_path: Path, workshop: Workshop, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with Recording(blind) as recording:
+        info = to_plain(recording.info)
+    info["versions"]["pybullet"] = "3.2.5"
+    spoilt = tmp_path / "spoilt.mcap"
+    spoilt.write_bytes(rewritten(blind, change={EPISODE: {"info": json.dumps(info)}}))
+    report = deep_check(spoilt, workshop)
+    assert report.level == "warn"
+    assert any("pybullet is 3.2.5 there" in line for line in report.versions)
+    with pytest.raises(SystemExit) as ended:
+        main(["check", str(spoilt), "--deep", "--only", "opens"])
+    assert ended.value.code in (0, None)
+    lines = capsys.readouterr().out.splitlines()
+    assert "made again" in lines[1]
+    assert "pybullet is 3.2.5 there" in lines[2]
+
+
+# ----------------------------------------------------------------------------------------------------- the pictures
+
+
+def torn(picture: Any) -> Any:
+    half = len(picture) // 2
+    return np.concatenate([picture[:half], np.roll(picture[half:], 7, axis=1)])
+
+
+def blurred(picture: Any) -> Any:
+    padded = np.pad(picture.astype(np.float64), ((1, 1), (1, 1), (0, 0)), mode="edge")
+    rows, columns = picture.shape[:2]
+    near = [padded[i : i + rows, j : j + columns] for i in range(3) for j in range(3)]
+    return np.mean(near, axis=0).astype(np.uint8)
+
+
+def shifted(picture: Any) -> Any:
+    return np.roll(picture, 1, axis=1)
+
+
+def green(picture: Any) -> Any:
+    return np.stack([picture[..., 0] // 2, np.maximum(picture[..., 1], 200), picture[..., 2] // 2], axis=-1)
+
+
+def patched(picture: Any) -> Any:
+    changed = picture.copy()
+    changed[40:52, 40:52] = 255 - changed[40:52, 40:52]
+    return changed
+
+
+def brighter(picture: Any) -> Any:
+    return np.clip(picture.astype(np.int16) + 6, 0, 255).astype(np.uint8)
+
+
+def channels_swapped(picture: Any) -> Any:
+    return picture[..., ::-1]
+
+
+def test_a_few_pictures_among_many(filmed: Path, tmp_path: Path, workshop: Workshop) -> None:
+    """All are coded a second time, as by a program that edits videos: only the spoilt ones show something else."""
+    faults = {6: brighter, 11: torn, 16: blurred, 21: shifted, 26: green, 31: patched, 36: channels_swapped}
+    swapped = {20: 24, 24: 20}
+    spoilt = Spoilt(filmed)
+    before = [images["front"].color for images in spoilt.pictures]
+    spoilt.picture("wrist", lambda frame, picture: faults[frame](picture) if frame in faults else picture)
+    spoilt.picture("front", lambda frame, picture: before[swapped.get(frame, frame)])
+    depth = spoilt.pictures[9]["front"].depth
+    labels = spoilt.pictures[12]["wrist"].segmentation
+    assert depth is not None
+    assert labels is not None
+    depth[30, 30] += 0.001
+    labels[40, 40] = labels[40, 40] + 1
+    report = deep_check(spoilt.write(tmp_path / "spoilt.mcap"), workshop)
+    shown = {d.stream: d.frames for d in report.differences if d.field == "picture"}
+    assert shown == {
+        "/camera/wrist/h264": tuple(faults),
+        "/camera/wrist/video": tuple(faults),
+        "/camera/front/h264": tuple(swapped),
+        "/camera/front/video": tuple(swapped),
+        "/camera/front/depth": (9,),
+        "/camera/wrist/segmentation": (12,),
+    }
+    (of_depth,) = (d for d in report.differences if d.stream == "/camera/front/depth")
+    assert "1 of 9216 pixels" in of_depth.recorded
+    assert all(d.is_coding or d.field == "picture" or d.stream.endswith("/histogram") for d in report.differences)
+
+
+@pytest.mark.parametrize("stream", [stream for stream in CODED if "image" not in stream])
+def test_a_coded_picture_of_another_frame(stream: str, filmed: Path, tmp_path: Path, workshop: Workshop) -> None:
+    """The stamp is right, the bytes are whole, the picture is that of five frames before."""
+    topic, pictures = f"/camera/front/{stream}", []
+
+    def spoil(name: str, data: bytes) -> bytes:
+        if name != topic:
+            return data
+        pictures.append(data)
+        return data[:12] + pictures[10][12:] if len(pictures) == 25 else data
+
+    spoilt = tmp_path / "spoilt.mcap"
+    spoilt.write_bytes(rewritten(filmed, messages=spoil))
+    report = deep_check(spoilt, workshop)
+    assert report.level == "fail"
+    (difference,) = (d for d in report.differences if d.field == "picture")
+    assert (difference.stream, difference.frames[0]) == (topic, 24)
+
+
+# ---------------------------------------------------------------------------------------------------- the command
+
+
+def test_the_command(blind: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "recordings"
+    folder.mkdir()
+    shutil.copy(blind, folder / "a.mcap")
+    rewrite_messages(blind, folder / "b.mcap", lambda m: () if m[0] == "/wrench" and m[3] == 0 else (m,))
+    for flags in ((), ("--json",)):
+        with pytest.raises(SystemExit) as ended:
+            main(["check", str(folder), "--deep", "--only", "opens", *flags])
+        assert ended.value.code == 1
+        told = capsys.readouterr().out
+        if flags:
+            deep = [entry for entry in json.loads(told) if entry["kind"] == "deep"]
+            assert [entry["level"] for entry in deep] == ["pass", "fail"]
+            streams = [difference["stream"] for difference in deep[1]["results"][0]["differences"]]
+            assert "/wrench" in streams
+        else:
+            assert "the same to the bit" in told
+            assert "/wrench messages at frame 0" in told
+            assert told.splitlines()[-1].endswith("2 made again, 1 not as recorded.")
+
+
+def test_a_damaged_file_among_good_ones(blind: Path, tmp_path: Path, workshop: Workshop) -> None:
+    damaged = tmp_path / "damaged.mcap"
+    damaged.write_bytes(blind.read_bytes()[:-200])
+    reports = list(deep_checks([damaged, blind]))
+    assert [report.level for report in reports] == ["fail", "pass"]
+    assert "cut off" in reports[0].error
