@@ -151,7 +151,7 @@ def _lines(report: SubjectReport, *, verbose: bool) -> list[str]:
         ("pass", "passed"),
         ("warn", "warnings"),
         ("fail", "failed"),
-        ("skip", "not applicable"),
+        ("skip", "not measured"),
     )
     counts = ", ".join(f"{report.count(level)} {word}" for level, word in words if report.count(level))
     kind = "failed attempt" if report.is_failed_attempt else report.kind
