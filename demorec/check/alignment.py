@@ -67,7 +67,15 @@ def lag_error(before: Array, after: Array, *, what: str) -> Measurement | None:
     return Measurement(value=abs(lag), detail=f"{what}: {lag:+.2f} frames off")
 
 
-@check(group="alignment", measures="lag between states and what the commands ask for, frames", warn=0.3, fail=0.6)
+@check(
+    group="alignment",
+    measures="lag between states and what the commands ask for, frames",
+    reads=(
+        "/command",
+        "/joint_states",
+        "info.physics_hz",
+    ),
+)
 def command_lag(episode: RecordedEpisode) -> Measurement | None:
     """Command t is sent after observation t and reached, but for the servo's lag, at observation t + 1."""
     c, info = episode.columns, episode.info
@@ -79,7 +87,15 @@ def command_lag(episode: RecordedEpisode) -> Measurement | None:
     return lag_error(expected, c.joint_position[:, : episode.num_arm], what="states")
 
 
-@check(group="alignment", measures="lag between action and executed command, frames", warn=0)
+@check(
+    group="alignment",
+    measures="lag between action and executed command, frames",
+    warn=0,
+    reads=(
+        "/action",
+        "/command",
+    ),
+)
 def action_lag(episode: RecordedEpisode) -> Measurement | None:
     """The action of a frame is the wish behind that frame's command.
 
@@ -103,7 +119,14 @@ def action_lag(episode: RecordedEpisode) -> Measurement | None:
     return Measurement(value=abs(lags[best]), detail=f"commands run {lags[best]:+d} frames behind the actions")
 
 
-@check(group="alignment", measures="lag between gripper command and opening, frames beyond the motor's", warn=2, fail=4)
+@check(
+    group="alignment",
+    measures="lag between gripper command and opening, frames beyond the motor's",
+    reads=(
+        "/command",
+        "/gripper",
+    ),
+)
 def gripper_lag(episode: RecordedEpisode) -> Measurement | None:
     """The opening starts to follow within a few frames of each command to close or open, and never before it."""
     c, fps = episode.columns, episode.info.fps

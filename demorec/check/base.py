@@ -7,11 +7,13 @@ says it beforehand. Larger values are worse, everywhere.
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Literal, overload
 
+from demorec.check.limits import limit_table
 from demorec.errors import DemorecError, MissingDependencyError, resource_error
 
 Level = Literal["pass", "warn", "fail", "skip"]
@@ -63,6 +65,7 @@ class Check:
         unit: Of the value and the limits; "" for counts and ratios.
         warn, fail: The value passes up to `warn`, is a warning up to `fail`, and a failure above.
         needs_pictures: Whether pictures have to be decoded.
+        reads: What it looks at, of all that `demorec.check.reads` lists: topics, fields, columns.
         measure: The function.
     """
 
@@ -74,6 +77,7 @@ class Check:
     warn: float
     fail: float
     needs_pictures: bool
+    reads: tuple[str, ...]
     measure: Callable[[Any], Found]
 
     @property
@@ -84,7 +88,7 @@ class Check:
         return f"{self.scope}, {self.group}: {self.measures}; {warn}fails above {self.fail:g}{unit}"
 
     def run(self, subject: object) -> Result:
-        """Measure and judge; an error of ours while reading is a failure of this check, a missing package is none.
+        """Measure and judge; an error while reading or computing is a failure of this check, a missing package is none.
 
         Raises:
             ResourceError: This machine cannot measure it, which says nothing about the subject.
@@ -97,6 +101,13 @@ class Check:
             if (lack := resource_error(error)) is not None:
                 raise lack from error
             return self._result("fail", Measurement(value=math.nan, detail=str(error)))
+        except Exception as error:
+            if (lack := resource_error(error)) is not None:
+                raise lack from error
+            # What is broken in a way that nobody foresaw must not take the other checks' findings with it.
+            logging.getLogger(__name__).debug("check %s", self.name, exc_info=True)
+            odd = Measurement(value=math.nan, detail="the data are such that this check cannot be computed on them")
+            return self._result("fail", odd)
         if found is None:
             return self.skipped("nothing to measure")
         if isinstance(found, NotMeasured):
@@ -162,24 +173,35 @@ def check(
     *,
     group: Group,
     measures: str,
-    warn: float,
+    warn: float | None = None,
     fail: float | None = None,
     unit: str = "",
     scope: Scope = "recording",
     needs_pictures: bool = False,
+    reads: tuple[str, ...] = (),
 ) -> Callable[[Callable[[Any], Found]], Check]:
-    """Make a `Check` of a function; its name is the function's. Without `fail` there is no range for warnings."""
+    """Make a `Check` of a function; its name is the function's.
+
+    Without `warn` its limits are those of `demorec.check.limits`; without `fail` there is no range for warnings.
+    """
 
     def wrap(function: Callable[[Any], Found]) -> Check:
+        name = function.__name__
+        if warn is None:
+            limits = limit_table().checks[name]
+            lower, upper = limits.warn, limits.fail
+        else:
+            lower, upper = warn, warn if fail is None else fail
         return Check(
-            name=function.__name__,
+            name=name,
             group=group,
             scope=scope,
             measures=measures,
             unit=unit,
-            warn=warn,
-            fail=warn if fail is None else fail,
+            warn=lower,
+            fail=upper,
             needs_pictures=needs_pictures,
+            reads=reads,
             measure=function,
         )
 

@@ -27,6 +27,12 @@ UNRELATED = 14.0
     unit="px",
     warn=0.01,
     fail=0.5,
+    reads=(
+        "/camera/{camera}/camera_info",
+        "info.scene.cameras.fov_y",
+        "info.scene.cameras.width",
+        "info.scene.cameras.height",
+    ),
 )
 def intrinsics(episode: RecordedEpisode) -> Found:
     """The calibration message agrees with the scene's camera and the pictures' size."""
@@ -45,7 +51,17 @@ def intrinsics(episode: RecordedEpisode) -> Found:
 
 
 @check(
-    group="calibration", measures="extrinsics against the camera's mount on the robot", unit="m", warn=1e-5, fail=1e-3
+    group="calibration",
+    measures="extrinsics against the camera's mount on the robot",
+    unit="m",
+    warn=1e-5,
+    fail=1e-3,
+    reads=(
+        "/camera/{camera}/pose",
+        "info.scene.cameras.mount",
+        "info.scene.cameras.mount_from_camera",
+        "info.scene.robot.world_from_base",
+    ),
 )
 def extrinsics(episode: RecordedEpisode) -> Found:
     """Recorded camera poses are those of the mount, by forward kinematics (0.1 m per rad of rotation)."""
@@ -83,9 +99,15 @@ def _allowance(episode: RecordedEpisode, camera: Camera) -> float:
     group="calibration",
     measures="shift of the pictures against what the recorded numbers make of them, of the height",
     unit="%",
-    warn=0.6,
-    fail=1.2,
     needs_pictures=True,
+    reads=(
+        "/camera/{camera}/h264",
+        "/camera/{camera}/video",
+        "/camera/{camera}/image/compressed",
+        "/camera/{camera}/camera_info",
+        "info.scene.cameras",
+        "info.behaviour",
+    ),
 )
 def projection(episode: RecordedEpisode) -> Found:
     """Recorded poses, projected with K and extrinsics, fall where the picture has them.
@@ -115,9 +137,14 @@ def projection(episode: RecordedEpisode) -> Found:
 @check(
     group="calibration",
     measures="size of what the pictures show against what the recorded numbers make of it, off 1",
-    warn=0.03,
-    fail=0.06,
     needs_pictures=True,
+    reads=(
+        "/camera/{camera}/h264",
+        "/camera/{camera}/video",
+        "/camera/{camera}/image/compressed",
+        "/camera/{camera}/camera_info",
+        "info.scene.cameras.fov_y",
+    ),
 )
 def projected_size(episode: RecordedEpisode) -> Found:
     """Things are as large in the picture as their distance and K make them: catches a wrong focal length or scale."""
@@ -134,7 +161,20 @@ def projected_size(episode: RecordedEpisode) -> Found:
     return worst(*found)
 
 
-@check(group="alignment", measures="lag between pictures and numbers, frames", warn=0.4, fail=0.7, needs_pictures=True)
+@check(
+    group="alignment",
+    measures="lag between pictures and numbers, frames",
+    needs_pictures=True,
+    reads=(
+        "/camera/{camera}/h264",
+        "/camera/{camera}/video",
+        "/camera/{camera}/image/compressed",
+        "/camera/{camera}/depth",
+        "/camera/{camera}/segmentation",
+        "/joint_states",
+        "/object/{body}/pose",
+    ),
+)
 def picture_lag(episode: RecordedEpisode) -> Found:
     """Picture t shows state t: robot and objects are where the numbers of the same frame put them.
 
@@ -158,9 +198,14 @@ def picture_lag(episode: RecordedEpisode) -> Found:
 @check(
     group="calibration",
     measures="difference of depth pictures from what the recorded numbers make of them, of 255 for 3 m",
-    warn=10.0,
-    fail=15.0,
     needs_pictures=True,
+    reads=(
+        "/camera/{camera}/depth",
+        "/joint_states",
+        "/object/{body}/pose",
+        "info.scene.bodies.shape",
+        "info.scene.cameras.far",
+    ),
 )
 def depth_matches_scene(episode: RecordedEpisode) -> Found:
     """Depth is metres along the optical axis, in every frame: catches other units, distances along the ray, flips."""
@@ -170,9 +215,13 @@ def depth_matches_scene(episode: RecordedEpisode) -> Found:
 @check(
     group="calibration",
     measures="difference of labels from what the recorded numbers make of them, of 255",
-    warn=10.0,
-    fail=15.0,
     needs_pictures=True,
+    reads=(
+        "/camera/{camera}/segmentation",
+        "/joint_states",
+        "/object/{body}/pose",
+        "info.scene.bodies.shape",
+    ),
 )
 def segmentation_matches_scene(episode: RecordedEpisode) -> Found:
     """Every pixel has the label of the body that geometry puts there, in every frame."""

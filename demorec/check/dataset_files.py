@@ -23,7 +23,16 @@ from demorec.lerobot.reader import PacketReader
 from demorec.lerobot.verify import LEROBOT, lerobot_is_installed
 
 
-@check(group="dataset", scope="dataset", measures="tables that cannot be read", warn=0)
+@check(
+    group="dataset",
+    scope="dataset",
+    measures="tables that cannot be read",
+    warn=0,
+    reads=(
+        "meta/info.json",
+        "meta/episodes",
+    ),
+)
 def dataset_readable(dataset: Dataset) -> Measurement:
     """info.json, the tables and every row can be read."""
     frames = sum(len(rows["index"]) for rows in dataset.rows)
@@ -31,7 +40,17 @@ def dataset_readable(dataset: Dataset) -> Measurement:
 
 
 @check(
-    group="dataset", scope="dataset", measures="counters, indices and timestamps that are not as they must be", warn=0
+    group="dataset",
+    scope="dataset",
+    measures="counters, indices and timestamps that are not as they must be",
+    warn=0,
+    reads=(
+        "timestamp",
+        "frame_index",
+        "episode_index",
+        "index",
+        "task_index",
+    ),
 )
 def dataset_counts(dataset: Dataset) -> Measurement:
     """Totals agree with the tables; indices count up without a gap; timestamps are frame_index / fps."""
@@ -64,7 +83,16 @@ def dataset_counts(dataset: Dataset) -> Measurement:
     return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{start} frames at {info.fps} fps")
 
 
-@check(group="dataset", scope="dataset", measures="episodes without a coded picture for every frame", warn=0)
+@check(
+    group="dataset",
+    scope="dataset",
+    measures="episodes without a coded picture for every frame",
+    warn=0,
+    reads=(
+        "observation.images.{camera}",
+        "observation.images.{camera}_depth",
+    ),
+)
 def dataset_videos(dataset: Dataset) -> Measurement | None:
     """Every episode has its pictures in every camera's file, one after the other."""
     if not dataset.info.video_keys:
@@ -94,6 +122,14 @@ def dataset_videos(dataset: Dataset) -> Measurement | None:
     measures="statistics against those recomputed from all rows, in standard deviations",
     warn=0.01,
     fail=0.05,
+    reads=(
+        "meta/stats.json",
+        "observation.state",
+        "observation.velocity",
+        "observation.ee_pose",
+        "observation.environment_state",
+        "action",
+    ),
 )
 def dataset_statistics(dataset: Dataset) -> Measurement | None:
     """meta/stats.json, by which training normalises, is that of the data."""
@@ -144,6 +180,10 @@ def _numbers(value: Any) -> Array:
     warn=0.06,
     fail=0.12,
     needs_pictures=True,
+    reads=(
+        "meta/stats.json",
+        "observation.images.{camera}",
+    ),
 )
 def dataset_picture_statistics(dataset: Dataset) -> Measurement | None:
     """The statistics of each camera are those of its pictures, by a sample of each file."""
@@ -178,7 +218,13 @@ def _bound_pictures(container: Any, shape: tuple[int, ...]) -> None:
         stream.codec_context.options = {"max_pixels": str((height + 128) * (width + 128))}
 
 
-@check(group="dataset", scope="dataset", measures="episodes on which dataset and sidecar disagree", warn=0)
+@check(
+    group="dataset",
+    scope="dataset",
+    measures="episodes on which dataset and sidecar disagree",
+    warn=0,
+    reads=("demorec/",),
+)
 def dataset_sidecar(dataset: Dataset) -> Measurement | None:
     """Task, success and content digest of each episode are those that the sidecar keeps."""
     if not dataset.sidecar:
@@ -214,7 +260,12 @@ print(json.dumps({"episodes": dataset.num_episodes, "frames": len(dataset)}))
 
 
 @check(
-    group="dataset", scope="dataset", measures="errors when the installed LeRobot opens it", warn=0, needs_pictures=True
+    group="dataset",
+    scope="dataset",
+    measures="errors when the installed LeRobot opens it",
+    warn=0,
+    needs_pictures=True,
+    reads=("meta/info.json",),
 )
 def dataset_opens(dataset: Dataset) -> Measurement:
     """LeRobot opens the dataset and reads first, middle and last frame, pictures included."""

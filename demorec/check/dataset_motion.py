@@ -19,7 +19,13 @@ from demorec.scene.features import ACTION, EE_POSE, STATE, VELOCITY
 from demorec.scene.urdf import Urdf
 
 
-@check(group="dataset", scope="dataset", measures="episodes that move like another", warn=0)
+@check(
+    group="dataset",
+    scope="dataset",
+    measures="episodes that move like another",
+    warn=0,
+    reads=("observation.state",),
+)
 def dataset_duplicates(dataset: Dataset) -> Measurement | None:
     """Every episode is there once: no two have the same motion (within 0.0001 rad)."""
     if len(dataset.rows) < 2 or STATE not in dataset.info.features:
@@ -35,6 +41,7 @@ def dataset_duplicates(dataset: Dataset) -> Measurement | None:
     measures="largest gap in the range of a randomised quantity, share",
     warn=0.35,
     fail=0.6,
+    reads=("demorec/",),
 )
 def dataset_coverage(dataset: Dataset) -> Measurement | None:
     """Start places, yaws, sizes and goals are spread over their ranges (judged from 50 episodes on)."""
@@ -48,6 +55,7 @@ def dataset_coverage(dataset: Dataset) -> Measurement | None:
     unit="rad, m",
     warn=0.005,
     fail=0.05,
+    reads=("observation.state",),
 )
 def dataset_joint_limits(dataset: Dataset) -> Measurement | None:
     """States are rad and metres within the robot's limits."""
@@ -63,7 +71,15 @@ def dataset_joint_limits(dataset: Dataset) -> Measurement | None:
 
 
 @check(
-    group="dataset", scope="dataset", measures="ratio of state differences to velocities, off 1", warn=0.1, fail=0.16
+    group="dataset",
+    scope="dataset",
+    measures="ratio of state differences to velocities, off 1",
+    warn=0.1,
+    fail=0.16,
+    reads=(
+        "observation.state",
+        "observation.velocity",
+    ),
 )
 def dataset_velocity(dataset: Dataset) -> Measurement | None:
     """States change by velocity over time: catches a wrong fps and other joints' velocities. All episodes together."""
@@ -89,6 +105,10 @@ def dataset_velocity(dataset: Dataset) -> Measurement | None:
     unit="m",
     warn=1e-4,
     fail=1e-3,
+    reads=(
+        "observation.state",
+        "observation.ee_pose",
+    ),
 )
 def dataset_forward_kinematics(dataset: Dataset) -> Measurement | None:
     """observation.ee_pose is that of observation.state (float32; 0.1 m per rad of rotation)."""
@@ -110,7 +130,16 @@ def dataset_forward_kinematics(dataset: Dataset) -> Measurement | None:
     return worst(*found)
 
 
-@check(group="dataset", scope="dataset", measures="lag between action and state, off the contract's, frames", warn=0)
+@check(
+    group="dataset",
+    scope="dataset",
+    measures="lag between action and state, off the contract's, frames",
+    warn=0,
+    reads=(
+        "action",
+        "observation.state",
+    ),
+)
 def dataset_action_lag(dataset: Dataset) -> Measurement | None:
     """Action t is what leads from observation t to t + 1, in every episode; catches shifted and made-up actions.
 

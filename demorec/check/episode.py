@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import struct
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -110,8 +111,7 @@ class RecordedEpisode:
     @cached_property
     def scan(self) -> dict[str, TopicScan]:
         """Every message of every topic, read once: every chunk's checksum is verified on the way."""
-        container = Container(self.path)
-        try:
+        with self.container() as container:
             schemas = {name: container.schemas[c.schema_id].name for name, c in container.channels.items()}
             times: dict[str, list[int]] = {topic: [] for topic in schemas}
             stamps: dict[str, list[int]] = {topic: [] for topic in schemas}
@@ -124,8 +124,6 @@ class RecordedEpisode:
                 first.setdefault(topic, data)
             for name in container.attachment_names:
                 container.attachment(name)
-        finally:
-            container.close()
         return {
             topic: TopicScan(
                 schema=schema,
@@ -135,6 +133,15 @@ class RecordedEpisode:
             )
             for topic, schema in schemas.items()
         }
+
+    @contextmanager
+    def container(self) -> Iterator[Container]:
+        """The file's messages and metadata as they are."""
+        container = Container(self.path)
+        try:
+            yield container
+        finally:
+            container.close()
 
     @cached_property
     def index_counts(self) -> dict[str, int]:

@@ -11,14 +11,24 @@ from demorec.recording.streams import frame_streams
 from demorec.scene.episode import FORMAT_VERSION
 
 
-@check(group="file", measures="recordings that cannot be opened (index, metadata, format version)", warn=0)
+@check(
+    group="file",
+    measures="recordings that cannot be opened (index, metadata, format version)",
+    warn=0,
+    reads=("info.format_version",),
+)
 def opens(episode: RecordedEpisode) -> Measurement:
     """The index and the metadata pass their checksums and are of a known format version."""
     version = episode.recording.info.format_version
     return Measurement(value=0, detail=f"format version {version} of {FORMAT_VERSION}")
 
 
-@check(group="file", measures="topics whose message count differs from the index; every chunk passes its CRC", warn=0)
+@check(
+    group="file",
+    measures="topics whose message count differs from the index; every chunk passes its CRC",
+    warn=0,
+    reads=("metadata demorec.episode",),
+)
 def checksums(episode: RecordedEpisode) -> Measurement:
     """Every byte that holds a message or an attachment passes its checksum, and the index counts them right."""
     counts = {topic: len(scan.time_ns) for topic, scan in episode.scan.items()}
@@ -30,7 +40,16 @@ def checksums(episode: RecordedEpisode) -> Measurement:
     return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{sum(counts.values())} messages")
 
 
-@check(group="file", measures="topics that are missing, of another type or not one message a frame", warn=0)
+@check(
+    group="file",
+    measures="topics that are missing, of another type or not one message a frame",
+    warn=0,
+    reads=(
+        "info.scene.cameras.name",
+        "info.scene.bodies.name",
+        "info.format_version",
+    ),
+)
 def topics(episode: RecordedEpisode) -> Measurement:
     """Every stream that the metadata promises is there, of its type, with one message for each frame."""
     expected: dict[str, tuple[str, int | None]] = {}
@@ -71,7 +90,16 @@ def _picture_streams(episode: RecordedEpisode, camera: str) -> Iterator[tuple[st
         yield channels.camera_topic(camera, "segmentation"), messages.COMPRESSED_IMAGE
 
 
-@check(group="file", measures="streams that do not decode into numbers", warn=0)
+@check(
+    group="file",
+    measures="streams that do not decode into numbers",
+    warn=0,
+    reads=(
+        "/events",
+        "/phase",
+        "/deliberate_miss",
+    ),
+)
 def readable(episode: RecordedEpisode) -> Measurement:
     """Every message has the layout that the metadata promises."""
     num_frames = episode.columns.num_frames
@@ -79,7 +107,13 @@ def readable(episode: RecordedEpisode) -> Measurement:
     return Measurement(value=0, detail=f"{num_frames} frames, {num_events} events")
 
 
-@check(group="file", measures="recordings that a crash cut off (recovered, without an outcome)", warn=0, fail=1)
+@check(
+    group="file",
+    measures="recordings that a crash cut off (recovered, without an outcome)",
+    warn=0,
+    fail=1,
+    reads=("metadata demorec.recovered",),
+)
 def complete(episode: RecordedEpisode) -> Measurement:
     """The episode was recorded to its end."""
     cut = episode.recording.outcome is None

@@ -72,7 +72,15 @@ def _held_for(flags: NDArray[np.bool_], count: int) -> NDArray[np.bool_]:
     return np.asarray(np.arange(len(flags)) - np.maximum.accumulate(last) <= count)
 
 
-@check(group="physics", measures="fastest motion of an object that nothing touches", unit="m/s", warn=0.03, fail=0.1)
+@check(
+    group="physics",
+    measures="fastest motion of an object that nothing touches",
+    unit="m/s",
+    reads=(
+        "/object/{body}/pose",
+        "/joint_states",
+    ),
+)
 def object_motion(episode: RecordedEpisode) -> Measurement | None:
     """An object moves only when touched, or for a moment after it (falling, rolling, tipping)."""
     found = []
@@ -85,7 +93,12 @@ def object_motion(episode: RecordedEpisode) -> Measurement | None:
     return worst(*found)
 
 
-@check(group="physics", measures="object speed beyond that of the hand and of falling", unit="m/s", warn=0.8, fail=1.5)
+@check(
+    group="physics",
+    measures="object speed beyond that of the hand and of falling",
+    unit="m/s",
+    reads=("/object/{body}/pose",),
+)
 def teleports(episode: RecordedEpisode) -> Measurement | None:
     """No object jumps."""
     c, fps = episode.columns, episode.info.fps
@@ -102,7 +115,19 @@ def teleports(episode: RecordedEpisode) -> Measurement | None:
     return worst(*found)
 
 
-@check(group="physics", measures="distance of the first frame from the scene's start", unit="m", warn=0.01, fail=0.03)
+@check(
+    group="physics",
+    measures="distance of the first frame from the scene's start",
+    unit="m",
+    reads=(
+        "/object/{body}/pose",
+        "/joint_states",
+        "/gripper",
+        "info.scene.bodies.world_from_body",
+        "info.scene.robot.joint_position",
+        "info.scene.robot.gripper_width",
+    ),
+)
 def starts_as_scene_says(episode: RecordedEpisode) -> Measurement | None:
     """Objects and joints begin where the scene put them (0.1 m per rad of rotation; 0.1 m per rad of a joint).
 
@@ -125,7 +150,16 @@ def starts_as_scene_says(episode: RecordedEpisode) -> Measurement | None:
     return worst(*found)
 
 
-@check(group="physics", measures="depth to which a body is inside another", unit="m", warn=0.003, fail=0.008)
+@check(
+    group="physics",
+    measures="depth to which a body is inside another",
+    unit="m",
+    reads=(
+        "/object/{body}/pose",
+        "info.scene.bodies.shape",
+        "info.scene.bodies.collides",
+    ),
+)
 def penetration(episode: RecordedEpisode) -> Measurement | None:
     """Nothing solid is inside anything solid (boxes, spheres, cylinders, capsules)."""
     scene = episode.info.scene
@@ -197,7 +231,14 @@ def _surface_points(shape: Shape) -> Array:
     return np.concatenate([*rows, poles])
 
 
-@check(group="physics", measures="frames in which an object moves through the air unheld", warn=2, fail=5)
+@check(
+    group="physics",
+    measures="frames in which an object moves through the air unheld",
+    reads=(
+        "/object/{body}/pose",
+        "/gripper",
+    ),
+)
 def carried_by_gripper(episode: RecordedEpisode) -> Measurement | None:
     """While an object travels above where it rests, fingers press on it and stand as far apart as it is wide."""
     c, fps = episode.columns, episode.info.fps

@@ -6,34 +6,113 @@ import math
 
 import numpy as np
 
-from demorec.check.base import Measurement, check, worst
+from demorec.check.base import Found, Measurement, check, worst
 from demorec.check.episode import RecordedEpisode
 from demorec.check.rows import matrices
+from demorec.scene.episode import SuccessCheck
+from demorec.tables import TASKS
+
+AT_LEAST = ("on_support", "on_table", "gripper_width")
+"""Conditions of demorec's own tasks that hold from their limit up; all others hold up to it."""
 
 
-@check(group="outcome", measures="contradictions within the outcome", warn=0)
+@check(
+    group="outcome",
+    measures="contradictions within the outcome",
+    warn=0,
+    reads=(
+        "outcome.success",
+        "outcome.checks.name",
+        "outcome.checks.value",
+        "outcome.checks.limit",
+        "outcome.checks.passed",
+        "outcome.failure_phase",
+        "outcome.failure_reason",
+        "outcome.num_frames",
+    ),
+)
 def outcome_consistent(episode: RecordedEpisode) -> Measurement | None:
-    """Success means that every condition passed; a failure has a phase and a reason; the length is that recorded."""
+    """Each condition passed as value and limit have it, success as the conditions; a failure has phase and reason."""
     outcome = episode.recording.outcome
     if outcome is None:
         return None
     failed = [condition.name for condition in outcome.checks if not condition.passed]
     wrong = []
+    for condition in outcome.checks:
+        if condition.passed not in _possible(episode, condition):
+            wrong.append(f"{condition.name} is {condition.value:.4g}, limit {condition.limit:.4g}: {condition.passed}?")
     if outcome.success and failed:
         wrong.append(f"success, but {failed[0]} did not pass")
-    if outcome.success and outcome.failure_reason:
+    if outcome.success and (outcome.failure_reason or outcome.failure_phase):
         wrong.append(f"success, but with the failure reason {outcome.failure_reason!r}")
     if not outcome.success and not outcome.failure_reason:
         wrong.append("a failure without a reason")
+    if outcome.failure_reason in {condition.name for condition in outcome.checks if condition.passed}:
+        wrong.append(f"failed by {outcome.failure_reason}, which passed")
     if outcome.num_frames != episode.num_frames:
         wrong.append(f"{outcome.num_frames} frames said, {episode.num_frames} recorded")
     if not outcome.checks:
         wrong.append("no conditions")
+    if len({condition.name for condition in outcome.checks}) != len(outcome.checks):
+        wrong.append("a condition twice")
     return Measurement(value=len(wrong), detail="; ".join(wrong) or f"{len(outcome.checks)} conditions")
 
 
+def _possible(episode: RecordedEpisode, condition: SuccessCheck) -> set[bool]:
+    """What `passed` can be, given value and limit; a task of somebody else's may mean either side of the limit."""
+    at_most, at_least = condition.value <= condition.limit, condition.value >= condition.limit
+    if episode.info.task not in TASKS.rows:
+        return {at_most, at_least}
+    return {at_least if condition.name.partition(":")[0] in AT_LEAST else at_most}
+
+
 @check(
-    group="outcome", measures="goal distance in the last frame against the outcome's", unit="m", warn=0.01, fail=0.02
+    group="outcome",
+    measures="values of the outcome against the last frame, in units of their limits",
+    reads=(
+        "outcome.checks.name",
+        "outcome.checks.value",
+        "outcome.checks.limit",
+        "/object/{body}/pose",
+        "/gripper",
+        "info.scene.goals.object",
+    ),
+)
+def end_values(episode: RecordedEpisode) -> Found:
+    """Height, tilt and opening that the outcome names are those of the last frame, in which all is at rest."""
+    outcome, scene, c = episode.recording.outcome, episode.info.scene, episode.columns
+    if outcome is None or not outcome.success or not c.num_frames:
+        return None
+    frame = c.num_frames - 1
+    found: list[Measurement | None] = []
+    for condition in outcome.checks:
+        name, _, body = condition.name.partition(":")
+        body = body or (scene.goals[0].object if len(scene.goals) == 1 else "")
+        value = None
+        if name == "gripper_width":
+            value = float(c.gripper_width[frame])
+        elif body in c.object_poses and name in ("tilt", "disturbed"):
+            pose = matrices(c.object_poses[body][-1:])[0]
+            upright = min(1.0, float(np.abs(pose[2, :3]).max()))
+            start = scene.body(body).world_from_body.position
+            value = math.acos(upright) if name == "tilt" else math.dist(pose[:2, 3], start[:2])
+        if value is not None and condition.limit > 0:
+            detail = f"{condition.name}: {value:.4g}, outcome says {condition.value:.4g}"
+            off = abs(value - condition.value) / condition.limit
+            found.append(Measurement(value=off, frame=frame, detail=detail))
+    return worst(*found)
+
+
+@check(
+    group="outcome",
+    measures="goal distance in the last frame against the outcome's",
+    unit="m",
+    reads=(
+        "/object/{body}/pose",
+        "outcome.checks.value",
+        "info.scene.goals.onto",
+        "info.scene.goals.onto_from_goal",
+    ),
 )
 def final_state(episode: RecordedEpisode) -> Measurement | None:
     """An object that is said to lie at its goal lies there in the last recorded frame."""
@@ -59,7 +138,15 @@ def final_state(episode: RecordedEpisode) -> Measurement | None:
     return worst(*found)
 
 
-@check(group="outcome", measures="speed of the goals' objects at the end", unit="m/s", warn=0.03, fail=0.06)
+@check(
+    group="outcome",
+    measures="speed of the goals' objects at the end",
+    unit="m/s",
+    reads=(
+        "/object/{body}/pose",
+        "info.scene.goals.object",
+    ),
+)
 def at_rest_in_the_end(episode: RecordedEpisode) -> Measurement | None:
     """After a success the objects lie still: the recording does not stop in mid-motion."""
     outcome, c = episode.recording.outcome, episode.columns

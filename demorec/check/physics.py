@@ -20,7 +20,23 @@ def _worst_joint(episode: RecordedEpisode, table: Array, *, frame_offset: int = 
     )
 
 
-@check(group="physics", measures="numbers that are NaN or infinite", warn=0)
+@check(
+    group="physics",
+    measures="numbers that are NaN or infinite",
+    warn=0,
+    reads=(
+        "/joint_states",
+        "/gripper",
+        "/action",
+        "/command",
+        "/ee_pose",
+        "/action/ee_pose",
+        "/command/ee_pose",
+        "/wrench",
+        "/object/{body}/pose",
+        "/camera/{camera}/pose",
+    ),
+)
 def finite_numbers(episode: RecordedEpisode) -> Measurement:
     """Every recorded number is one."""
     c = episode.columns
@@ -43,7 +59,20 @@ def finite_numbers(episode: RecordedEpisode) -> Measurement:
     return Measurement(value=total, frame=first[1], detail=first[0])
 
 
-@check(group="physics", measures="joint positions beyond the robot's limits", unit="rad", warn=0.005, fail=0.05)
+@check(
+    group="physics",
+    measures="joint positions beyond the robot's limits",
+    unit="rad",
+    warn=0.005,
+    fail=0.05,
+    reads=(
+        "/joint_states",
+        "/action",
+        "/command",
+        "info.robot.position_lower",
+        "info.robot.position_upper",
+    ),
+)
 def joint_position(episode: RecordedEpisode) -> Measurement | None:
     """Measured and commanded arm joints stay within the limits."""
     robot, c = episode.info.robot, episode.columns
@@ -54,7 +83,18 @@ def joint_position(episode: RecordedEpisode) -> Measurement | None:
     return worst(*found)
 
 
-@check(group="physics", measures="largest joint velocity in units of its limit", warn=1.1, fail=1.5)
+@check(
+    group="physics",
+    measures="largest joint velocity in units of its limit",
+    warn=1.1,
+    fail=1.5,
+    reads=(
+        "/joint_states",
+        "/action",
+        "/command",
+        "info.robot.velocity_limit",
+    ),
+)
 def joint_velocity(episode: RecordedEpisode) -> Measurement | None:
     """Velocities, as recorded and as differences of measured and commanded positions."""
     n, fps, c = episode.num_arm, episode.info.fps, episode.columns
@@ -65,16 +105,31 @@ def joint_velocity(episode: RecordedEpisode) -> Measurement | None:
     return worst(*found)
 
 
-@check(group="physics", measures="largest acceleration of the wanted motion in units of its limit", warn=1.5, fail=3.0)
+@check(
+    group="physics",
+    measures="largest acceleration of the wanted motion in units of its limit",
+    reads=(
+        "/action",
+        "info.robot.acceleration_limit",
+    ),
+)
 def action_acceleration(episode: RecordedEpisode) -> Measurement | None:
-    """The expert's joint targets (the labels) ask for no more than the motors give."""
+    """The expert's joint targets (the labels) ask for no more than the motors give.
+
+    A target that stops from one frame to the next is the harder the shorter a frame is; that of 1/30 s is the measure.
+    """
     targets, fps = episode.columns.action_joint_target, episode.info.fps
     limit = np.array(episode.info.robot.acceleration_limit)
-    return _worst_joint(episode, np.abs(np.diff(targets, 2, axis=0)) * fps**2 / limit, frame_offset=1)
+    return _worst_joint(episode, np.abs(np.diff(targets, 2, axis=0)) * fps * min(fps, 30) / limit, frame_offset=1)
 
 
 @check(
-    group="physics", measures="largest acceleration of the measured motion in units of its limit", warn=12.0, fail=20.0
+    group="physics",
+    measures="largest acceleration of the measured motion in units of its limit",
+    reads=(
+        "/joint_states",
+        "info.robot.acceleration_limit",
+    ),
 )
 def joint_acceleration(episode: RecordedEpisode) -> Measurement | None:
     """Steps of the recorded velocities.
@@ -86,7 +141,14 @@ def joint_acceleration(episode: RecordedEpisode) -> Measurement | None:
     return _worst_joint(episode, np.abs(np.diff(velocity, axis=0)) * fps / limit, frame_offset=1)
 
 
-@check(group="physics", measures="ratio of position differences to recorded velocities, off 1", warn=0.1, fail=0.16)
+@check(
+    group="physics",
+    measures="ratio of position differences to recorded velocities, off 1",
+    reads=(
+        "/joint_states",
+        "info.fps",
+    ),
+)
 def velocity_matches_position(episode: RecordedEpisode) -> Measurement | None:
     """Differences of joint positions over the frame's time equal the mean of the velocities at both ends.
 
@@ -106,7 +168,23 @@ def velocity_matches_position(episode: RecordedEpisode) -> Measurement | None:
     return Measurement(value=float(off[joint]), detail=f"{episode.info.robot.arm_joints[joint]}: {ratio[joint]:.3f}")
 
 
-@check(group="physics", measures="EE pose against forward kinematics of the joints", unit="m", warn=1e-6, fail=1e-4)
+@check(
+    group="physics",
+    measures="EE pose against forward kinematics of the joints",
+    unit="m",
+    warn=1e-6,
+    fail=1e-4,
+    reads=(
+        "/ee_pose",
+        "/action/ee_pose",
+        "/command/ee_pose",
+        "/joint_states",
+        "/action",
+        "/command",
+        "/robot_description",
+        "info.robot.tcp_link",
+    ),
+)
 def forward_kinematics(episode: RecordedEpisode) -> Measurement | None:
     """Observed, wanted and commanded TCP poses are those of their joints (0.1 m per rad of rotation added)."""
     c, link = episode.columns, episode.info.robot.tcp_link
@@ -124,7 +202,19 @@ def forward_kinematics(episode: RecordedEpisode) -> Measurement | None:
     return worst(*found)
 
 
-@check(group="physics", measures="deviation of a quaternion's length from 1", warn=1e-6, fail=1e-3)
+@check(
+    group="physics",
+    measures="deviation of a quaternion's length from 1",
+    warn=1e-6,
+    fail=1e-3,
+    reads=(
+        "/ee_pose",
+        "/action/ee_pose",
+        "/command/ee_pose",
+        "/object/{body}/pose",
+        "/camera/{camera}/pose",
+    ),
+)
 def unit_quaternions(episode: RecordedEpisode) -> Measurement | None:
     """Every rotation is one."""
     c = episode.columns
@@ -140,7 +230,20 @@ def unit_quaternions(episode: RecordedEpisode) -> Measurement | None:
     return worst(*found)
 
 
-@check(group="physics", measures="gripper opening against its fingers and its range", unit="m", warn=1e-6, fail=2e-3)
+@check(
+    group="physics",
+    measures="gripper opening against its fingers and its range",
+    unit="m",
+    warn=1e-6,
+    fail=2e-3,
+    reads=(
+        "/gripper",
+        "/joint_states",
+        "/action",
+        "/command",
+        "info.robot.gripper.max_width",
+    ),
+)
 def gripper_width(episode: RecordedEpisode) -> Measurement | None:
     """The opening is that of the finger joints and lies, as its target does, within 0 and the full opening.
 
@@ -163,7 +266,16 @@ def _widths(episode: RecordedEpisode) -> tuple[Array, Array, Array]:
     return c.gripper_width, c.action_gripper, c.command_gripper
 
 
-@check(group="physics", measures="force that holds the hand against the vertical", unit="rad", warn=0.1, fail=0.4)
+@check(
+    group="physics",
+    measures="force that holds the hand against the vertical",
+    unit="rad",
+    reads=(
+        "/wrench",
+        "info.robot.hand_link",
+        "info.scene.physics.gravity",
+    ),
+)
 def wrench_holds_the_hand(episode: RecordedEpisode) -> Measurement | None:
     """Where the hand hardly accelerates and touches nothing, the arm's force on it is the answer to gravity.
 
@@ -185,7 +297,15 @@ def wrench_holds_the_hand(episode: RecordedEpisode) -> Measurement | None:
     return Measurement(value=angle, detail=f"{int(steady.sum())} steady frames")
 
 
-@check(group="physics", measures="distance of the joints from the command before", unit="rad", warn=0.15, fail=0.3)
+@check(
+    group="physics",
+    measures="distance of the joints from the command before",
+    unit="rad",
+    reads=(
+        "/joint_states",
+        "/command",
+    ),
+)
 def command_tracking(episode: RecordedEpisode) -> Measurement | None:
     """The arm goes where it is sent, rad: catches commands of another episode, of another joint, or made up."""
     c = episode.columns
@@ -193,14 +313,29 @@ def command_tracking(episode: RecordedEpisode) -> Measurement | None:
     return _worst_joint(episode, off, frame_offset=1)
 
 
-@check(group="physics", measures="distance between action and executed command", unit="rad", warn=0.25, fail=0.4)
+@check(
+    group="physics",
+    measures="distance between action and executed command",
+    unit="rad",
+    reads=(
+        "/action",
+        "/command",
+    ),
+)
 def action_matches_command(episode: RecordedEpisode) -> Measurement | None:
     """The label differs from what was executed by exploration noise at most, rad."""
     c = episode.columns
     return _worst_joint(episode, np.abs(c.action_joint_target - c.command_joint_target))
 
 
-@check(group="physics", measures="share of frames in which nothing moves and nothing is asked", warn=0.2, fail=0.5)
+@check(
+    group="physics",
+    measures="share of frames in which nothing moves and nothing is asked",
+    reads=(
+        "/action",
+        "/joint_states",
+    ),
+)
 def idle_frames(episode: RecordedEpisode) -> Measurement | None:
     """A policy that learns from idle frames learns to stand still."""
     c, n = episode.columns, episode.num_arm

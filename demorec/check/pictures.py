@@ -19,7 +19,19 @@ STALE_SHARE, STALE_EXCESS = 0.3, 1.5
 picture by more than this, of 255: a predicted picture may leave a small motion to the next keyframe."""
 
 
-@check(group="pictures", measures="frames without a picture that decodes", warn=0, needs_pictures=True)
+@check(
+    group="pictures",
+    measures="frames without a picture that decodes",
+    warn=0,
+    needs_pictures=True,
+    reads=(
+        "/camera/{camera}/h264",
+        "/camera/{camera}/video",
+        "/camera/{camera}/image/compressed",
+        "/camera/{camera}/depth",
+        "/camera/{camera}/segmentation",
+    ),
+)
 def pictures_decode(episode: RecordedEpisode) -> Found:
     """Every camera's video decodes to its end, one picture a frame."""
     found = []
@@ -34,7 +46,17 @@ def pictures_decode(episode: RecordedEpisode) -> Found:
     return worst(*found)
 
 
-@check(group="pictures", measures="pictures that are nearly all black or nearly all white", warn=0, needs_pictures=True)
+@check(
+    group="pictures",
+    measures="pictures that are nearly all black or nearly all white",
+    warn=0,
+    needs_pictures=True,
+    reads=(
+        "/camera/{camera}/h264",
+        "/camera/{camera}/video",
+        "/camera/{camera}/image/compressed",
+    ),
+)
 def pictures_exposed(episode: RecordedEpisode) -> Found:
     """No picture is black or burnt out: 95 % of its pixels darker than 12 or brighter than 250 of 255."""
     found = []
@@ -49,9 +71,12 @@ def pictures_exposed(episode: RecordedEpisode) -> Found:
 @check(
     group="pictures",
     measures="largest share of a picture that is black or white",
-    warn=0.5,
-    fail=0.95,
     needs_pictures=True,
+    reads=(
+        "/camera/{camera}/h264",
+        "/camera/{camera}/video",
+        "/camera/{camera}/image/compressed",
+    ),
 )
 def exposure(episode: RecordedEpisode) -> Found:
     """Most of every picture is neither under- nor overexposed."""
@@ -68,9 +93,15 @@ def exposure(episode: RecordedEpisode) -> Found:
 @check(
     group="pictures",
     measures="difference of the pictures from what the recorded numbers make of them, median of 255",
-    warn=9.0,
-    fail=14.0,
     needs_pictures=True,
+    reads=(
+        "/camera/{camera}/h264",
+        "/camera/{camera}/video",
+        "/camera/{camera}/image/compressed",
+        "info.scene.bodies.rgba",
+        "info.scene.bodies.texture",
+        "info.scene.light",
+    ),
 )
 def pictures_as_drawn(episode: RecordedEpisode) -> Found:
     """The pictures show robot, objects, colours and light as recorded: drawn anew and compared in every frame."""
@@ -87,9 +118,14 @@ def pictures_as_drawn(episode: RecordedEpisode) -> Found:
 @check(
     group="pictures",
     measures="difference of a single picture from what was recorded at its frame, beyond the usual, of 255",
-    warn=3.5,
-    fail=5.0,
     needs_pictures=True,
+    reads=(
+        "/camera/{camera}/h264",
+        "/camera/{camera}/video",
+        "/camera/{camera}/image/compressed",
+        "/joint_states",
+        "/object/{body}/pose",
+    ),
 )
 def odd_pictures(episode: RecordedEpisode) -> Found:
     """No single picture is another one, torn, blurred, shifted or off in colour."""
@@ -119,9 +155,14 @@ def _stale(compared: Comparison) -> NDArray[np.bool_]:
 @check(
     group="pictures",
     measures="longest run of unchanged pictures while something moves before the camera, frames",
-    warn=2,
-    fail=4,
     needs_pictures=True,
+    reads=(
+        "/camera/{camera}/h264",
+        "/camera/{camera}/video",
+        "/camera/{camera}/image/compressed",
+        "/joint_states",
+        "/object/{body}/pose",
+    ),
 )
 def frozen(episode: RecordedEpisode) -> Found:
     """A camera does not stand still while something moves in its view."""
@@ -131,9 +172,14 @@ def frozen(episode: RecordedEpisode) -> Found:
 @check(
     group="pictures",
     measures="pictures that repeat the one before, in the midst of motion",
-    warn=0,
-    fail=2,
     needs_pictures=True,
+    reads=(
+        "/camera/{camera}/h264",
+        "/camera/{camera}/video",
+        "/camera/{camera}/image/compressed",
+        "/joint_states",
+        "/object/{body}/pose",
+    ),
 )
 def repeated_pictures(episode: RecordedEpisode) -> Found:
     """No picture was dropped and the one before shown in its place."""
@@ -157,8 +203,12 @@ def _stale_frames(episode: RecordedEpisode, camera: Camera, *, in_runs: bool) ->
 @check(
     group="pictures",
     measures="likeness of two cameras' pictures (correlation over time)",
-    warn=0.98,
     needs_pictures=True,
+    reads=(
+        "/camera/{camera}/h264",
+        "/camera/{camera}/video",
+        "/camera/{camera}/image/compressed",
+    ),
 )
 def distinct_cameras(episode: RecordedEpisode) -> Found:
     """Two cameras in different places do not show the same pictures."""
@@ -188,9 +238,13 @@ def _correlation(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
 @check(
     group="pictures",
     measures="mean colour of the decoded pictures against the recorded histogram, of 255",
-    warn=4.0,
-    fail=8.0,
     needs_pictures=True,
+    reads=(
+        "/camera/{camera}/h264",
+        "/camera/{camera}/video",
+        "/camera/{camera}/image/compressed",
+        "/camera/{camera}/histogram",
+    ),
 )
 def pixel_statistics(episode: RecordedEpisode) -> Found:
     """The histograms, counted before coding, are those of the pictures: catches swapped channels and other pictures."""

@@ -12,7 +12,7 @@ from demorec.check.base import Check, Group, Level, Result, Scope
 from demorec.check.dataset import Dataset
 from demorec.check.episode import RecordedEpisode
 from demorec.check.run import CheckedRun
-from demorec.errors import DemorecError, check_option, resource_error
+from demorec.errors import check_option, resource_error
 from demorec.processes import SPAWN
 from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings, find
 from demorec.runs.run_file import DATASET
@@ -180,10 +180,10 @@ def _run(
     if read is not None:
         try:
             read()
-        except DemorecError as error:
+        except Exception as error:
             if (lack := resource_error(error)) is not None:
                 raise lack from error
-            unreadable = str(error)
+            unreadable = str(error) or "the numbers cannot be read"
     for check in checks:
         if unreadable and check.group not in _OF_THE_FILE and check.name not in gates:
             results.append(check.blocked())

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.geometry import Array
-from demorec.scene.urdf import Urdf
+from demorec.scene.urdf import Urdf, UrdfJoint
 
 
 def matrices(poses: Array) -> Array:
@@ -41,18 +41,23 @@ def link_matrices(urdf: Urdf, link: str, joint_position: Mapping[str, Array], co
     """(T, 4, 4) base_from_link, given joint name -> (T,) positions (rad, m); KeyError when there is no such link."""
     total = np.broadcast_to(np.eye(4), (count, 4, 4)).copy()
     for joint in urdf.path_to(link):
-        total = total @ joint.parent_from_joint.matrix()
         position = joint_position.get(joint.name)
         if position is None or joint.kind == "fixed":
-            continue
-        motion = np.broadcast_to(np.eye(4), (count, 4, 4)).copy()
-        axis = np.array(joint.axis)
-        if joint.kind == "prismatic":
-            motion[:, :3, 3] = position[:, None] * axis
+            total = total @ joint.parent_from_joint.matrix()
         else:
-            motion[:, :3, :3] = _axis_rotations(axis, position)
-        total = total @ motion
+            total = total @ joint_matrices(joint, position)
     return total
+
+
+def joint_matrices(joint: UrdfJoint, position: Array) -> Array:
+    """(T, 4, 4) parent_from_child of a moving joint at (T,) positions (rad, m)."""
+    motion = np.broadcast_to(np.eye(4), (len(position), 4, 4)).copy()
+    axis = np.array(joint.axis)
+    if joint.kind == "prismatic":
+        motion[:, :3, 3] = position[:, None] * axis
+    else:
+        motion[:, :3, :3] = _axis_rotations(axis, position)
+    return np.asarray(joint.parent_from_joint.matrix() @ motion)
 
 
 def _axis_rotations(axis: Array, angle: Array) -> Array:

@@ -3,26 +3,46 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from demorec.check.base import Measurement, check, worst
+from demorec.check.base import Found, Measurement, NotMeasured, check, worst
 from demorec.check.coverage import infos_by_task, largest_gap, start_vector, twins
 from demorec.errors import ConfigError, RecordingError, in_words, resource_error
+from demorec.geometry import Array
 from demorec.lerobot.files import read_json
 from demorec.lerobot.paths import INFO_PATH
 from demorec.recording import Recording
 from demorec.safety.files import open_regular, read_json_limited
-from demorec.scene.episode import EpisodeInfo
+from demorec.scene.episode import EpisodeInfo, Outcome
 
 RUN_NAME = "run.json"
 _MAX_JSON_BYTES = 2 << 30
 _LINE = {"episode_index": int, "attempt": int, "seed": int, "success": bool, "file": str, "sha256": str}
 """What the line of an attempt says, as far as it is checked."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Told:
+    """What a recording tells of itself.
+
+    Attributes:
+        info, outcome: As recorded.
+        digest: Of its content.
+        num_bytes: Size of the file.
+        motion: `motion_vector` of its joints.
+    """
+
+    info: EpisodeInfo
+    outcome: Outcome | None
+    digest: str
+    num_bytes: int
+    motion: Array
 
 
 class CheckedRun:
@@ -65,16 +85,27 @@ class CheckedRun:
         return [*sorted((self.path / "episodes").glob("*.mcap")), *sorted((self.path / "failed").glob("*.mcap"))]
 
     @cached_property
-    def infos(self) -> dict[str, EpisodeInfo]:
-        """File (relative) -> its info, of the recordings that can be opened."""
+    def told(self) -> dict[str, Told]:
+        """File (relative) -> what it tells of itself, of the recordings that can be read."""
         found = {}
         for path in self.recordings:
             try:
                 with Recording(path) as recording:
-                    found[str(path.relative_to(self.path))] = recording.info
-            except RecordingError:
-                continue  # check `opens` of that recording says so
+                    found[str(path.relative_to(self.path))] = Told(
+                        info=recording.info,
+                        outcome=recording.outcome,
+                        digest=recording.digest(),
+                        num_bytes=path.stat().st_size,
+                        motion=motion_vector(recording.columns().joint_position),
+                    )
+            except (RecordingError, OSError):
+                continue  # check `opens` or `readable` of that recording says so
         return found
+
+    @property
+    def infos(self) -> dict[str, EpisodeInfo]:
+        """File (relative) -> its info, of the recordings that can be read."""
+        return {file: told.info for file, told in self.told.items()}
 
     @property
     def successes(self) -> list[EpisodeInfo]:
@@ -85,7 +116,16 @@ class CheckedRun:
         ]
 
 
-@check(group="run", scope="run", measures="files missing, changed since they were made, or not in run.json", warn=0)
+@check(
+    group="run",
+    scope="run",
+    measures="files missing, changed since they were made, or not in run.json",
+    warn=0,
+    reads=(
+        "run.attempts.file",
+        "run.attempts.sha256",
+    ),
+)
 def run_files(run: CheckedRun) -> Measurement:
     """The recordings are exactly those that run.json lists, with the same SHA-256."""
     wrong = []
@@ -105,38 +145,94 @@ def run_files(run: CheckedRun) -> Measurement:
     return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{len(there)} recordings")
 
 
-@check(group="run", scope="run", measures="recordings whose own account differs from run.json or the run", warn=0)
+@check(
+    group="run",
+    scope="run",
+    measures="recordings whose own account differs from run.json or the run",
+    warn=0,
+    reads=(
+        "run.attempts.episode_index",
+        "run.attempts.attempt",
+        "run.attempts.seed",
+        "run.attempts.success",
+        "run.attempts.num_frames",
+        "run.attempts.num_bytes",
+        "run.attempts.digest",
+        "run.attempts.phase",
+        "run.attempts.reason",
+        "run.config",
+        "run.versions",
+        "info.episode_index",
+        "info.attempt",
+        "info.root_seed",
+        "info.versions",
+        "outcome.success",
+    ),
+)
 def run_agrees(run: CheckedRun) -> Measurement:
     """Number, attempt, seed and config of each recording are those of its line and of the run."""
-    wrong = []
-    for line in run.lines:
-        info = run.infos.get(line["file"])
-        if info is None:
-            continue
-        said = (line["episode_index"], line["attempt"], line["seed"])
-        if (info.episode_index, info.attempt, info.root_seed) != said:
-            wrong.append(f"{line['file']} is episode {info.episode_index}, attempt {info.attempt}")
-        elif info.config_digest != run.run.get("config_digest"):
-            wrong.append(f"{line['file']} was made with another config")
-        elif line["success"] != line["file"].startswith("episodes/"):
-            wrong.append(f"{line['file']} lies in the wrong folder")
+    wrong = [text for line in run.lines for text in _contradictions(run, line)]
     return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{len(run.lines)} lines")
 
 
-@check(group="run", scope="run", measures="episodes that have the start or the motion of another", warn=0)
-def run_duplicates(run: CheckedRun) -> Measurement | None:
+def _contradictions(run: CheckedRun, line: dict[str, Any]) -> Iterator[str]:
+    """What a line of run.json says otherwise than its recording."""
+    file = line["file"]
+    told = run.told.get(file)
+    if told is None:
+        return
+    info = told.info
+    said = (line["episode_index"], line["attempt"], line["seed"])
+    if (info.episode_index, info.attempt, info.root_seed) != said:
+        yield f"{file} is episode {info.episode_index}, attempt {info.attempt}"
+    if info.config_digest != run.run.get("config_digest"):
+        yield f"{file} was made with another config"
+    if line["success"] != file.startswith("episodes/"):
+        yield f"{file} lies in the wrong folder"
+    versions = run.run.get("versions", {})
+    if versions and dict(info.versions) != versions:
+        yield f"{file} was made by other versions"
+    stem = Path(file).name.partition(".")[0]
+    if stem != f"episode_{info.episode_index:06d}":
+        yield f"{file} is episode {info.episode_index}"
+    outcome = told.outcome
+    if outcome is None:
+        return
+    found = {
+        "success": outcome.success,
+        "phase": outcome.failure_phase,
+        "reason": outcome.failure_reason,
+        "num_frames": outcome.num_frames,
+        "num_bytes": told.num_bytes,
+        "digest": told.digest,
+    }
+    for name, value in found.items():
+        if line.get(name, value) != value:
+            yield f"{name} of {file} is {str(value)[:40]!r}, run.json says {str(line[name])[:40]!r}"
+
+
+@check(
+    group="run",
+    scope="run",
+    measures="episodes that have the start or the motion of another",
+    warn=0,
+    reads=(
+        "info.scene.bodies.world_from_body",
+        "info.scene.bodies.shape",
+        "info.scene.robot.joint_position",
+        "/joint_states",
+    ),
+)
+def run_duplicates(run: CheckedRun) -> Found:
     """Every episode is there once: no two start alike (within a tenth of a millimetre) or move alike."""
     files = [file for file in run.infos if file.startswith("episodes/")]
     if len(files) < 2:
         return None
+    config = run.run.get("config", {})
+    if config.get("fixed"):
+        return NotMeasured(why="--fixed asks for one layout, every episode of which starts alike")
     starts = [start_vector(run.infos[file].scene) for file in files]
-    motions = []
-    for file in files:
-        try:
-            with Recording(run.path / file) as recording:
-                motions.append(motion_vector(recording.columns().joint_position))
-        except RecordingError:
-            motions.append(np.full(1, float(len(motions))))
+    motions = [run.told[file].motion for file in files]
     same_start, start_pair = twins(starts, files, tolerance=1e-4)
     same_motion, motion_pair = twins(motions, files, tolerance=1e-4)
     return worst(
@@ -145,7 +241,7 @@ def run_duplicates(run: CheckedRun) -> Measurement | None:
     )
 
 
-def motion_vector(joint_position: np.ndarray[Any, np.dtype[Any]]) -> np.ndarray[Any, np.dtype[np.float64]]:
+def motion_vector(joint_position: Array) -> Array:
     """A motion as one row of fixed length: joint positions at 32 moments, evenly spread."""
     if not len(joint_position):
         return np.zeros(32)
@@ -154,7 +250,17 @@ def motion_vector(joint_position: np.ndarray[Any, np.dtype[Any]]) -> np.ndarray[
 
 
 @check(
-    group="run", scope="run", measures="largest gap in the range of a randomised quantity, share", warn=0.35, fail=0.6
+    group="run",
+    scope="run",
+    measures="largest gap in the range of a randomised quantity, share",
+    warn=0.35,
+    fail=0.6,
+    reads=(
+        "info.scene.bodies.world_from_body",
+        "info.scene.bodies.shape",
+        "info.scene.goals.onto",
+        "info.scene.goals.onto_from_goal",
+    ),
 )
 def run_coverage(run: CheckedRun) -> Measurement | None:
     """Start places, yaws, sizes and goals are spread over their ranges (judged from 50 episodes on)."""
@@ -166,7 +272,16 @@ def worst_gap(infos: Sequence[EpisodeInfo]) -> Measurement | None:
     return worst(*(largest_gap(group) for group in infos_by_task(infos).values()))
 
 
-@check(group="run", scope="run", measures="episodes that the run's dataset lacks or has too many", warn=0)
+@check(
+    group="run",
+    scope="run",
+    measures="episodes that the run's dataset lacks or has too many",
+    warn=0,
+    reads=(
+        "run.num_episodes",
+        "run.attempts.success",
+    ),
+)
 def run_dataset(run: CheckedRun) -> Measurement | None:
     """The dataset that was made from the run has an episode for each success of those asked for last."""
     path = run.path / "dataset" / INFO_PATH

@@ -15,7 +15,13 @@ def _once_a_frame(episode: RecordedEpisode) -> list[str]:
     return [topic for topic in topics if topic in episode.scan]
 
 
-@check(group="time", measures="largest distance of a message from its frame's time", unit="ms", warn=0)
+@check(
+    group="time",
+    measures="largest distance of a message from its frame's time",
+    unit="ms",
+    warn=0,
+    reads=("info.fps",),
+)
 def frame_times(episode: RecordedEpisode) -> Measurement | None:
     """Times rise in equal steps of 1 / fps from 0, the same on every stream of numbers."""
     expected = episode.frame_times
@@ -33,7 +39,15 @@ def frame_times(episode: RecordedEpisode) -> Measurement | None:
     return worst(*found)
 
 
-@check(group="time", measures="joint states between frames that are out of order or off the physics clock", warn=0)
+@check(
+    group="time",
+    measures="joint states between frames that are out of order or off the physics clock",
+    warn=0,
+    reads=(
+        "/joint_states",
+        "info.physics_hz",
+    ),
+)
 def joint_sample_times(episode: RecordedEpisode) -> Measurement | None:
     """Recorded at the physics rate, joint states rise in equal steps of 1 / physics_hz."""
     times = episode.scan[channels.JOINT_STATES].time_ns
@@ -46,7 +60,24 @@ def joint_sample_times(episode: RecordedEpisode) -> Measurement | None:
     return Measurement(value=len(wrong), frame=frame, detail=f"{len(times)} joint states at {hz} Hz")
 
 
-@check(group="time", measures="largest difference between a message's own stamp and its time", unit="ms", warn=0)
+@check(
+    group="time",
+    measures="largest difference between a message's own stamp and its time",
+    unit="ms",
+    warn=0,
+    reads=(
+        "/joint_states",
+        "/gripper",
+        "/action",
+        "/command",
+        "/ee_pose",
+        "/events",
+        "/camera/{camera}/h264",
+        "/camera/{camera}/video",
+        "/camera/{camera}/depth",
+        "/camera/{camera}/segmentation",
+    ),
+)
 def stamps(episode: RecordedEpisode) -> Measurement | None:
     """The stamp in each message's header, which ROS tools go by, is the time at which it was logged."""
     found = []
@@ -60,7 +91,17 @@ def stamps(episode: RecordedEpisode) -> Measurement | None:
     return worst(*found)
 
 
-@check(group="time", measures="pictures missing, surplus, off their frame's time, or too far from a keyframe", warn=0)
+@check(
+    group="time",
+    measures="pictures missing, surplus, off their frame's time, or too far from a keyframe",
+    warn=0,
+    reads=(
+        "/camera/{camera}/h264",
+        "/camera/{camera}/video",
+        "/camera/{camera}/image/compressed",
+        "cameras.video.gop",
+    ),
+)
 def video_frames(episode: RecordedEpisode) -> Measurement | None:
     """Each camera has one coded picture a frame at the frame's time, and a keyframe at least every GOP."""
     found = []

@@ -174,7 +174,7 @@ def _lines(report: SubjectReport, *, verbose: bool) -> list[str]:
         ("pass", "passed"),
         ("warn", "warnings"),
         ("fail", "failed"),
-        ("skip", "not applicable"),
+        ("skip", "not measured"),
     )
     blocked = sum(result.is_blocked for result in report.results)
     numbers = {level: report.count(level) - (blocked if level == "skip" else 0) for level, _ in words}

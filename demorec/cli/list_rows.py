@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from tyro.conf import Positional
 
 from demorec.cli.output import say, say_json
+from demorec.errors import ConfigError
 
 if TYPE_CHECKING:
     from demorec.registry import Registry
@@ -22,15 +23,20 @@ class ListRows:
     Examples:
       demorec list tasks
       demorec list cameras --json
+      demorec list checks --coverage
     """
 
     what: Positional[Literal["tasks", "cameras", "robots", "renderers", "exporters", "checks"]]
     """Which table."""
+    coverage: bool = False
+    """Of checks: which of them read each topic, metadata field and dataset column, and what none reads."""
     json: bool = False
     """Print JSON: a list of names and what they are."""
 
     def run(self) -> int:
         """Print one line each."""
+        if self.coverage:
+            return self._print_coverage()
         registry, describe = _tables()[self.what]
         rows = [(name, describe(registry, name)) for name in registry.names()]
         if self.json:
@@ -39,6 +45,22 @@ class ListRows:
         width = max(len(name) for name, _ in rows)
         for name, summary in rows:
             say(f"{name:<{width}}  {summary}")
+        return 0
+
+    def _print_coverage(self) -> int:
+        if self.what != "checks":
+            raise ConfigError(f"--coverage is of checks alone, found {self.what}: demorec list checks --coverage.")
+        from demorec.check.reads import coverage
+        from demorec.plain import to_plain
+
+        rows = coverage()
+        if self.json:
+            say_json([to_plain(row) for row in rows])
+            return 0
+        width = max(len(row.name) for row in rows)
+        for row in rows:
+            told = ", ".join(row.checks) or f"no check: {row.why_not}"
+            say(f"{row.kind:<6}  {row.name:<{width}}  {told}")
         return 0
 
 

@@ -69,6 +69,8 @@ PHASE_EVENT = "phase"
 """Name of the events that the writer adds at each change of phase, so that a log shows them too."""
 
 _VIDEO_STREAMS = {"h264": "h264", "av1": "video", "jpeg": "image/compressed"}
+PICTURE_STREAMS = (*_VIDEO_STREAMS.values(), "depth", "segmentation", "histogram")
+"""Streams of a camera that come from its pictures."""
 
 
 def video_topic(camera: str, codec: str) -> str:

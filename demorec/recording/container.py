@@ -188,6 +188,11 @@ class Container:
     def _record_at[R: McapRecord](self, offset: int, length: int, opcode: Opcode, kind: type[R]) -> R:
         return _read(self._content_at(offset, length, opcode), kind)
 
+    @property
+    def metadata_names(self) -> tuple[str, ...]:
+        """Names of all metadata records."""
+        return tuple(self._metadata)
+
     def metadata(self, name: str) -> dict[str, str] | None:
         """A metadata record, or None; the caller checks its seal."""
         index = self._metadata.get(name)

@@ -130,20 +130,25 @@ def _every_stream(info: EpisodeInfo) -> Iterator[FrameStream]:
 
 def tf_stream(frames: FrameTree) -> FrameStream:
     """The moving coordinate frames; they follow from other streams, so they become no column."""
-    message = CdrWriter()
-    message.u32(len(frames.moving))
-    for parent, child in frames.moving:
-        message.header(parent)
-        message.text(child)
-        message.value_slot(7)
     return FrameStream(
         topic=TF,
         schema=messages.TRANSFORMS,
-        layout=message.layout(),
+        layout=transforms_layout(frames.moving),
         parts=lambda values: frames.parts(values.observation),
         columns=lambda values: {},
         arrange=frames.arrange,
     )
+
+
+def transforms_layout(frames: Sequence[tuple[str, str]]) -> Layout:
+    """Of tf2_msgs/TFMessage with these (parent, child): position and quaternion xyzw of each."""
+    message = CdrWriter()
+    message.u32(len(frames))
+    for parent, child in frames:
+        message.header(parent)
+        message.text(child)
+        message.value_slot(7)
+    return message.layout()
 
 
 def merged_columns(found: Iterable[Columns]) -> dict[str, Any]:

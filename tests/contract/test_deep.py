@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Callable, Iterator
 from copy import deepcopy
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -93,9 +94,9 @@ def single_values(message: Any, path: str = "") -> Iterator[tuple[str, Callable[
             continue  # a coded picture
         elif hasattr(value, "__len__") and not isinstance(value, str):
             if len(value):
-                yield f"{where}[{len(value) - 1}]", lambda v=value: v.__setitem__(len(v) - 1, other(v[len(v) - 1]))
+                yield f"{where}[{len(value) - 1}]", partial(value.__setitem__, len(value) - 1, other(value[-1]))
         else:
-            yield where, lambda m=message, n=name, v=value: setattr(m, n, other(v))
+            yield where, partial(setattr, message, name, other(value))
 
 
 def other(value: Any) -> Any:

@@ -1,0 +1,152 @@
+"""Calibrates the limits of `demorec check`: the largest value that each check finds in good recordings.
+
+    python benchmarks/check_limits.py                      # every setting once
+    python benchmarks/check_limits.py --part 2/5           # every fifth setting, from the second on
+
+Settings run over all tasks, robots and variations, and with each through sizes, frame rates, codecs and qualities,
+depth and segmentation. Successful episodes only. What is found is merged into demorec/check/limits.toml (the larger
+value stays; `--anew` forgets what is there), whose limits this program leaves alone: it lists those that are too near.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import itertools
+import tempfile
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from demorec.check.limits import TABLE, Calibration, LimitTable, limit_table
+from demorec.check.report import CheckOptions, Subject, check_subject
+from demorec.config import EpisodePlan, GenerateConfig, VideoConfig
+from demorec.errors import SceneError
+from demorec.loop import ScriptAgent, Session, make_renderer, make_world, prepare
+from demorec.recording import EpisodeWriter
+from demorec.tables import ROBOTS, TASKS
+
+SIZES = ((128, 128), (224, 224), (96, 96), (64, 64), (320, 240), (640, 480))
+RATES = (30, 30, 60, 10, 20)
+VIDEOS = (
+    VideoConfig(),
+    VideoConfig(codec="av1"),
+    VideoConfig(codec="jpeg"),
+    VideoConfig(crf=30),
+    VideoConfig(codec="av1", crf=35),
+    VideoConfig(gop=30),
+    VideoConfig(codec="jpeg", jpeg_quality=60),
+)
+VARIATIONS = ("none", "mild", "full")
+
+
+def settings(seed: int) -> Iterator[GenerateConfig]:
+    """Every task, robot and variation; the lists above turn beside them at rates of their own."""
+    for number, (variation, robot, task) in enumerate(itertools.product(VARIATIONS, ROBOTS.names(), TASKS.names())):
+        width, height = SIZES[number % len(SIZES)]
+        extra = number % 4 == 3
+        yield GenerateConfig(
+            task=task,
+            robot=robot,
+            variation=variation,  # type: ignore[arg-type]
+            seed=seed,
+            fps=RATES[number % len(RATES)],
+            width=width,
+            height=height,
+            video=VIDEOS[number % len(VIDEOS)],
+            depth=extra,
+            segmentation=extra,
+        )
+
+
+def record(config: GenerateConfig, index: int, path: Path) -> bool:
+    """Make one episode; whether it succeeded."""
+    try:
+        episode = prepare(EpisodePlan(config=config, episode_index=index))
+    except SceneError:
+        return False
+    with (
+        make_world(episode.info) as world,
+        make_renderer(episode.info) as renderer,
+        EpisodeWriter(path, episode.info, video=config.video, overwrite=True) as writer,
+    ):
+        session = Session.of_episode(world, episode, renderer)
+        for frame in session.run(ScriptAgent(episode)):
+            writer.write(frame)
+        writer.finish(session.outcome)
+    return session.outcome.success
+
+
+def written(table: LimitTable) -> str:
+    """The table as TOML."""
+    c = table.calibration
+    lines = [
+        "# Written by benchmarks/check_limits.py but for the limits, which are set by hand (demorec/check/limits.py).",
+        "",
+        "[calibration]",
+        f"seed = {c.seed}",
+        f'date = "{c.date}"',
+        f"episodes = {c.episodes}",
+        f'settings = "{c.settings}"',
+        f"margin = {c.margin}",
+    ]
+    for name, limit in table.checks.items():
+        lines += ["", f"[checks.{name}]", f"warn = {limit.warn}", f"fail = {limit.fail}", f"largest = {limit.largest}"]
+    return "\n".join(lines) + "\n"
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Measure, tell, write."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--seed", type=int, default=2026)
+    parser.add_argument("--part", default="1/1", help="K/N: every N-th setting from the K-th on")
+    parser.add_argument("--episodes", type=int, default=1, help="of each setting")
+    parser.add_argument("--first", type=int, default=0, help="index of the first episode")
+    parser.add_argument("--anew", action="store_true", help="forget the values in the table")
+    options = parser.parse_args(argv)
+    first, step = (int(word) for word in options.part.split("/"))
+    before = limit_table()
+    largest = {name: 0.0 if options.anew else limit.largest for name, limit in before.checks.items()}
+    count = 0 if options.anew else before.calibration.episodes
+    with tempfile.TemporaryDirectory() as folder:
+        for config in itertools.islice(settings(options.seed), first - 1, None, step):
+            for index in range(options.first, options.first + options.episodes):
+                count += measure(config, index, Path(folder) / "episode.mcap", largest)
+            # After each setting, so that one can stop at any time.
+            write_table(before, largest, seed=options.seed, episodes=count)
+    print(f"{count} episodes in all; limits that are too near:")
+    for name, limit in before.checks.items():
+        if largest[name] * before.calibration.margin > limit.warn:
+            print(f"  {name}: warns above {limit.warn:g}, the largest value is {largest[name]:g}")
+
+
+def write_table(before: LimitTable, largest: Mapping[str, float], *, seed: int, episodes: int) -> None:
+    """The same limits with what was measured."""
+    calibration = Calibration(
+        seed=seed,
+        date=datetime.datetime.now(datetime.UTC).date().isoformat(),
+        episodes=episodes,
+        settings="all tasks, robots and variations; 64 to 640 pixels, 10 to 60 fps, three codecs, depth and labels",
+        margin=before.calibration.margin,
+    )
+    checks = {name: replace(limit, largest=round(largest[name], 6)) for name, limit in before.checks.items()}
+    TABLE.write_text(written(LimitTable(calibration=calibration, checks=checks)))
+
+
+def measure(config: GenerateConfig, index: int, path: Path, largest: dict[str, float]) -> int:
+    """Check one good episode, keep the largest values; how many episodes that were (a failed one is none)."""
+    if not record(config, index, path):
+        return 0
+    said: Mapping[str, Any] = {"task": config.task, "robot": config.robot, "variation": config.variation}
+    for result in check_subject(Subject(path=path, kind="recording"), CheckOptions()).results:
+        if result.level in ("warn", "fail"):
+            size = f"{config.width}x{config.height} {config.fps} fps {config.video.codec} crf {config.video.crf}"
+            print(*said.values(), size, index, result.level, result.check, result.value, result.frame, result.detail)
+        if result.check in largest and result.value is not None:
+            largest[result.check] = max(largest[result.check], result.value)
+    return 1
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,153 @@
+"""Does what is said about the episode agree with itself: config, task, words, robot, scene, noise."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from demorec.check.base import Found, Measurement, NotMeasured, check
+from demorec.check.episode import RecordedEpisode
+from demorec.errors import ConfigError
+from demorec.plain import digest
+from demorec.scene.scene import Scene
+from demorec.tables import ROBOTS, camera_name, load_robot
+
+COLOR_WORDS = frozenset(("red", "green", "blue", "yellow", "orange", "purple", "black", "white", "grey"))
+"""Words for colours in instructions."""
+
+
+@check(
+    group="outcome",
+    measures="statements about the episode that its config contradicts",
+    warn=0,
+    reads=(
+        "info.config",
+        "info.config_digest",
+        "info.task",
+        "info.root_seed",
+        "info.attempt",
+        "info.scene.robot.name",
+        "info.fps",
+        "info.physics_hz",
+        "info.scene.physics.hz",
+        "info.scene.cameras.name",
+        "cameras.video",
+        "cameras.depth",
+        "cameras.segmentation",
+    ),
+)
+def config_agrees(episode: RecordedEpisode) -> Found:
+    """Task, robot, seed, rates, cameras, sizes and codec are those of the config, whose digest is recomputed."""
+    info = episode.info
+    if not info.config:
+        return NotMeasured(why="the recording has no config")
+    wrong = [f"{name} is {found!r}, the config says {said!r}" for name, found, said in _statements(episode)
+             if found != said]  # fmt: skip
+    if digest(dict(info.config)) != info.config_digest:
+        wrong.append(f"the config's digest is {digest(dict(info.config))}, not {info.config_digest!r}")
+    return Measurement(value=len(wrong), detail="; ".join(wrong[:3]))
+
+
+def _statements(episode: RecordedEpisode) -> Iterator[tuple[str, object, object]]:
+    """What is said, how it is, and how the config has it."""
+    info, config = episode.info, episode.info.config
+    found: dict[str, Any] = {"task": info.task, "seed": info.root_seed, "fps": info.fps, "physics_hz": info.physics_hz}
+    for name, value in found.items():
+        yield name, value, config.get(name, value)
+    yield "robot", info.robot.name, str(config.get("robot", info.robot.name)).rpartition(":")[2] and info.robot.name
+    yield "robot of the scene", info.scene.robot.name, info.robot.name
+    yield "physics rate of the scene", info.scene.physics.hz, info.physics_hz
+    if "max_attempts" in config:
+        yield "attempt within the allowed", info.attempt < int(config["max_attempts"]), True
+    if "robot" in config and config["robot"] in ROBOTS.rows:
+        yield "robot", info.robot.name, config["robot"]
+    if "cameras" not in config:
+        return
+    yield "cameras", [camera.name for camera in episode.cameras], [camera_name(str(n)) for n in config["cameras"]]
+    for camera in episode.cameras:
+        video = episode.recording.video_settings(camera.name)
+        yield f"codec of {camera.name}", video.codec, config.get("video", {}).get("codec", video.codec)
+        yield f"GOP of {camera.name}", video.gop, 1 if video.codec == "jpeg" else config.get("video", {}).get(
+            "gop", video.gop)  # fmt: skip
+        yield f"depth of {camera.name}", episode.recording.has_depth(camera.name), bool(config.get("depth"))
+        labels = episode.recording.has_segmentation(camera.name)
+        yield f"segmentation of {camera.name}", labels, bool(config.get("segmentation"))
+
+
+@check(
+    group="outcome",
+    measures="things of the robot that its table has otherwise",
+    warn=0,
+    reads=("info.robot", "info.scene.robot.scale"),
+)
+def robot_as_known(episode: RecordedEpisode) -> Found:
+    """Limits, joints and links of one of demorec's own robots are those of its table, scaled as the scene says."""
+    info = episode.info
+    if info.robot.name not in ROBOTS.rows:
+        return NotMeasured(why=f"the robot {info.robot.name!r} is none of demorec's own")
+    try:
+        known = load_robot(info.robot.name).scaled(info.scene.robot.scale)
+    except ConfigError as error:
+        return NotMeasured(why=str(error))
+    fields = type(known).__dataclass_fields__
+    wrong = [name for name in fields if getattr(known, name) != getattr(info.robot, name)]
+    return Measurement(value=len(wrong), detail=", ".join(wrong[:5]))
+
+
+@check(
+    group="outcome",
+    measures="colours that the instruction names and the scene lacks, or the other way round",
+    warn=0,
+    reads=(
+        "info.instruction",
+        "info.scene.bodies.color_name",
+        "info.scene.goals.object",
+    ),
+)
+def instruction_fits_scene(episode: RecordedEpisode) -> Found:
+    """The instruction speaks of colours that are in the scene, and of those of the objects that have a goal."""
+    scene = episode.info.scene
+    words = [word for word in re.findall(r"[a-z]+", episode.info.instruction.lower()) if word in COLOR_WORDS]
+    if not episode.info.instruction.strip():
+        return Measurement(value=1, detail="there is no instruction")
+    known = {body.color_name for body in scene.bodies if body.color_name}
+    if not words:
+        return NotMeasured(why="the instruction names no colour")
+    wrong = [f"nothing is {word}" for word in dict.fromkeys(words) if word not in known]
+    wrong += [f"{color} is not named" for color in _goal_colors(scene) if color not in words]
+    return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or episode.info.instruction)
+
+
+def _goal_colors(scene: Scene) -> list[str]:
+    """Colours of the objects that shall go somewhere, each once."""
+    return list(dict.fromkeys(name for goal in scene.goals if (name := scene.body(goal.object).color_name)))
+
+
+@check(
+    group="alignment",
+    measures="exploration noise on the commands against what the behaviour says, factor off 1",
+    reads=(
+        "/action",
+        "/command",
+        "info.behaviour",
+    ),
+)
+def noise_as_said(episode: RecordedEpisode) -> Found:
+    """Commands differ from labels by noise of the size that the behaviour names, and not at all where it names none."""
+    c, behaviour = episode.columns, episode.info.behaviour
+    if "action_noise" not in behaviour:
+        return NotMeasured(why="the behaviour names no exploration noise")
+    noise = c.command_joint_target - c.action_joint_target
+    sigma = behaviour["action_noise"]
+    loud = np.abs(noise).max(axis=1, initial=0.0)
+    if sigma == 0.0:
+        frame = int(np.argmax(loud)) if len(loud) else None
+        return Measurement(value=0.0 if loud.max(initial=0.0) < 1e-9 else 1.0, frame=frame, detail="none is said")
+    noisy = loud > 0.5 * sigma
+    if noisy.sum() < 15:
+        return NotMeasured(why=f"{int(noisy.sum())} frames have noise")
+    found = float(np.sqrt((noise[noisy] ** 2).mean()))
+    return Measurement(value=abs(found / sigma - 1), detail=f"{found:.4f} rad, {sigma:.4f} rad are said")

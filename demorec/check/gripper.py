@@ -1,0 +1,145 @@
+"""Does the gripper do what it is told, and is what it is told what the label says."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from demorec.check.base import Found, Measurement, NotMeasured, check, worst
+from demorec.check.episode import RecordedEpisode
+from demorec.geometry import Array
+
+SETTLE_SECONDS = 0.6
+"""After a new command the fingers need so long to arrive; they close at 0.2 m/s from an opening of 0.1 m."""
+CARRIED_HEIGHT = 0.03
+"""Metres above its start from which on an object counts as carried."""
+
+
+@check(
+    group="alignment",
+    measures="gripper opening of the label against that of the executed command",
+    unit="m",
+    warn=1e-6,
+    fail=2e-3,
+    reads=("/action", "/command"),
+)
+def gripper_label(episode: RecordedEpisode) -> Measurement | None:
+    """Exploration noise is on the arm alone: the label asks for the opening that was sent."""
+    c = episode.columns
+    if not c.num_frames:
+        return None
+    off = np.abs(c.action_gripper - c.command_gripper)
+    frame = int(np.argmax(off))
+    return Measurement(value=float(off[frame]), frame=frame, detail="")
+
+
+@check(
+    group="physics",
+    measures="gripper opening against a command that it has had the time to follow",
+    unit="m",
+    reads=("/gripper", "/command", "/joint_states"),
+)
+def gripper_follows(episode: RecordedEpisode) -> Found:
+    """The fingers stand where they were told to, or further apart where something is between them.
+
+    Catches openings and commands that are inverted, halved or frozen.
+    """
+    c, fps = episode.columns, episode.info.fps
+    wait = math.ceil(SETTLE_SECONDS * fps)
+    if c.num_frames <= wait:
+        return NotMeasured(why=f"the episode is shorter than {SETTLE_SECONDS} s")
+    steady = np.ones(c.num_frames, dtype=bool)
+    for back in range(1, wait + 1):
+        steady[back:] &= np.abs(c.command_gripper[back:] - c.command_gripper[:-back]) < 1e-6
+    steady[:wait] = False
+    if not steady.any():
+        return NotMeasured(why="the gripper's command never lasts")
+    gap = c.gripper_width - c.command_gripper
+    off = np.where(c.contact_force > 0, np.maximum(-gap, 0.0), np.abs(gap))
+    off = np.where(steady, off, 0.0)
+    frame = int(np.argmax(off))
+    return Measurement(value=float(off[frame]), frame=frame, detail=f"{int(steady.sum())} frames after the motion")
+
+
+@check(
+    group="physics",
+    measures="contact force on a carried object against that of the gripper's motors, off 1",
+    reads=("/gripper", "info.robot.gripper.force", "/object/{body}/pose"),
+)
+def grip_force(episode: RecordedEpisode) -> Found:
+    """Two fingers that hold something press on it with the force of their motors, each of them.
+
+    The median over the frames in which an object is carried: catches another unit, half the sum, a frozen value.
+    """
+    scene, robot = episode.info.scene, episode.info.robot
+    if not scene.movable:
+        return None
+    if scene.hold != "friction":
+        return NotMeasured(why="what is carried is held by a constraint")
+    carried = _carried(episode)
+    if carried.sum() < 10:
+        return NotMeasured(why="nothing is carried for ten frames")
+    expected = len(robot.gripper.joints) * robot.gripper.force
+    force = float(np.median(episode.columns.contact_force[carried]))
+    frame = int(np.argmax(carried))
+    return Measurement(
+        value=abs(force / expected - 1), frame=frame, detail=f"{force:.1f} N, the motors give {expected:g} N"
+    )
+
+
+def _carried(episode: RecordedEpisode) -> Array:
+    """(T,) whether a closed hand has some object in the air."""
+    c = episode.columns
+    closed = c.command_gripper < 0.5 * c.gripper_width
+    lifted = np.zeros(c.num_frames, dtype=bool)
+    for body in episode.info.scene.movable:
+        pose = c.object_poses[body.name]
+        near = np.linalg.norm(pose[:, :3] - episode.world_from_tcp[:, :3, 3], axis=1) < 0.05
+        lifted |= near & (pose[:, 2] > pose[0, 2] + CARRIED_HEIGHT)
+    return np.asarray(closed & lifted)
+
+
+@check(
+    group="physics",
+    measures="contact force while there is nothing within reach",
+    unit="N",
+    reads=("/gripper", "/object/{body}/pose"),
+)
+def touches_nothing(episode: RecordedEpisode) -> Measurement | None:
+    """Fingers far above all supports and away from all objects touch nothing but each other."""
+    c, scene = episode.columns, episode.info.scene
+    tcp = episode.world_from_tcp[:, :3, 3]
+    tops = [float(b.world_from_body.position[2]) + max(b.shape.extents) / 2 for b in scene.fixed if b.collides
+            and max(b.shape.extents) < 1.0]  # fmt: skip
+    surfaces = [float(b.world_from_body.position[2]) + b.shape.extents[2] / 2 for b in scene.fixed if b.collides]
+    alone = tcp[:, 2] > max([*tops, *surfaces], default=-math.inf) + 0.06
+    for body in scene.movable:
+        reach = math.hypot(*body.shape.extents) / 2 + 0.08
+        alone &= np.linalg.norm(c.object_poses[body.name][:, :3] - tcp, axis=1) > reach
+    # Closed fingers press on each other.
+    alone &= c.gripper_width > 0.005
+    if not alone.any():
+        return None
+    force = np.where(alone, np.abs(c.contact_force), 0.0)
+    frame = int(np.argmax(force))
+    return Measurement(value=float(force[frame]), frame=frame, detail=f"{int(alone.sum())} frames alone")
+
+
+@check(
+    group="physics",
+    measures="largest motor torque or finger force in units of its limit",
+    warn=1.001,
+    fail=1.05,
+    reads=("/joint_states", "info.robot.torque_limit", "info.robot.gripper.force"),
+)
+def joint_effort(episode: RecordedEpisode) -> Found:
+    """No motor gives more than it can; a gripper that presses gives all that it has."""
+    c, n, robot = episode.columns, episode.num_arm, episode.info.robot
+    limit = np.array([*robot.torque_limit, *[robot.gripper.force] * (len(robot.joint_names) - n)])
+    table = np.abs(c.joint_effort) / limit
+    if not table.size:
+        return None
+    frame, joint = (int(i) for i in np.unravel_index(int(np.argmax(table)), table.shape))
+    largest = Measurement(value=float(table[frame, joint]), frame=frame, detail=robot.joint_names[joint])
+    return worst(largest)

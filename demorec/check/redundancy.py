@@ -1,0 +1,243 @@
+"""Does what a recording says twice agree: for other programs' sake the same is there in several forms.
+
+Each form is made again from the other and compared, the moving coordinate frames by kinematics written apart.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+
+from demorec.check.base import Found, Measurement, NotMeasured, check, worst
+from demorec.check.episode import RecordedEpisode
+from demorec.check.rows import displacement, joint_matrices, matrices
+from demorec.errors import SceneError
+from demorec.geometry import Array
+from demorec.recording import channels, messages, metadata
+from demorec.recording.container import damage_as_recording_error
+from demorec.recording.depth import FORMAT as DEPTH_FORMAT
+from demorec.recording.labels import FORMAT as LABELS_FORMAT
+from demorec.recording.streams import frame_streams, transforms_layout
+from demorec.recording.transforms import WORLD, FrameTree, camera_frame
+from demorec.scene.episode import Event
+from demorec.scene.scene import Camera
+
+
+@check(
+    group="file",
+    measures="messages said once that are not what the metadata make of them",
+    warn=0,
+    reads=(
+        "/tf_static",
+        "/robot_description",
+        "/object/{body}/robot_description",
+        "/camera/{camera}/camera_info",
+        "/labels",
+        "info.robot.urdf",
+        "info.scene.cameras",
+        "info.scene.bodies.name",
+        "info.scene.bodies.world_from_body",
+        "info.scene.bodies.shape",
+        "info.scene.bodies.rgba",
+    ),
+)
+def latched_messages(episode: RecordedEpisode) -> Found:
+    """Standing frames, descriptions, calibration (K, D, R, P, frame) and the labels' names follow from the metadata."""
+    has_labels = any(episode.recording.has_segmentation(camera.name) for camera in episode.cameras)
+    try:
+        expected = list(channels.latched_messages(episode.info, FrameTree(episode.info), has_labels=has_labels))
+    except SceneError as error:
+        return NotMeasured(why=f"a model is not to be had here: {error}")
+    wrong = []
+    for topic, schema, data in expected:
+        found = episode.scan.get(topic)
+        if found is None or found.schema != schema or len(found.time_ns) != 1:
+            wrong.append(f"{topic} is not there once")
+        elif found.first != data:
+            wrong.append(f"{topic} says something else")
+    return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{len(expected)} messages")
+
+
+@check(
+    group="file",
+    measures="values of the metadata's summary that its description contradicts",
+    warn=0,
+    reads=("metadata demorec.episode", "metadata demorec.outcome"),
+)
+def metadata_agrees(episode: RecordedEpisode) -> Measurement:
+    """What the metadata say in short, for people and other tools, is what they say at length."""
+    info, outcome = episode.info, episode.recording.outcome
+    with episode.container() as container:
+        brief = container.metadata(metadata.EPISODE) or {}
+        brief_outcome = container.metadata(metadata.OUTCOME) or {}
+    said: dict[str, object] = {
+        "task": info.task,
+        "instruction": info.instruction,
+        "episode_index": info.episode_index,
+        "attempt": info.attempt,
+        "root_seed": info.root_seed,
+    }
+    wrong = [f"{name} is {brief.get(name)!r}, not {value!r}" for name, value in said.items()
+             if brief.get(name) != str(value)]  # fmt: skip
+    if outcome is not None and brief_outcome.get("success") != str(outcome.success).lower():
+        wrong.append(f"success is {brief_outcome.get('success')!r}, not {outcome.success}")
+    return Measurement(value=len(wrong), detail="; ".join(wrong[:3]))
+
+
+@check(
+    group="alignment",
+    measures="moving coordinate frames against joints and object poses",
+    unit="m",
+    warn=1e-6,
+    fail=1e-4,
+    reads=(
+        "/tf",
+        "/joint_states",
+        "/object/{body}/pose",
+        "/robot_description",
+    ),
+)
+def moving_frames(episode: RecordedEpisode) -> Found:
+    """Every frame of /tf is where forward kinematics of the joints, or the object's pose, puts it.
+
+    Distances in metres, with 0.1 m per rad of rotation.
+    """
+    robot, c = episode.info.robot, episode.columns
+    number = {name: index for index, name in enumerate(robot.joint_names)}
+    joints = [joint for joint in episode.urdf.joints if joint.kind != "fixed" and joint.name in number]
+    names = [body.name for body in episode.info.scene.movable]
+    layout = transforms_layout([*((j.parent, j.child) for j in joints), *((WORLD, name) for name in names)])
+    with episode.container() as container, damage_as_recording_error(episode.path):
+        block = container.blocks((channels.TF,))[channels.TF]
+        values = layout.decode_rows(block.rows(len(layout.constant))).reshape(len(block), -1, 7)
+    if len(values) != c.num_frames:
+        return Measurement(value=float("inf"), detail=f"{len(values)} messages for {c.num_frames} frames")
+    expected = [joint_matrices(joint, c.joint_position[:, number[joint.name]]) for joint in joints]
+    expected += [episode.world_from_object(name) for name in names]
+    found: list[Measurement | None] = []
+    for index, (name, poses) in enumerate(zip([*(j.child for j in joints), *names], expected, strict=True)):
+        off = displacement(matrices(values[:, index]), poses)
+        if len(off):
+            frame = int(np.argmax(off))
+            found.append(Measurement(value=float(off[frame]), frame=frame, detail=name))
+    return worst(*found)
+
+
+@check(
+    group="alignment",
+    measures="values that follow from others of the same frame, largest difference",
+    warn=1e-9,
+    fail=1e-6,
+    reads=(
+        "/gripper",
+        "/action",
+        "/command",
+        "/joint_states",
+    ),
+)
+def derived_values(episode: RecordedEpisode) -> Found:
+    """The velocity of the opening is the sum of the fingers'; nothing is commanded but positions (zeros elsewhere)."""
+    n, c = episode.num_arm, episode.columns
+    rows = _values(episode, (channels.GRIPPER, channels.ACTION, channels.COMMAND))
+    expected = {channels.GRIPPER: rows[channels.GRIPPER].copy()}
+    expected[channels.GRIPPER][:, 1] = c.joint_velocity[:, n:].sum(axis=1)
+    for topic in (channels.ACTION, channels.COMMAND):
+        expected[topic] = rows[topic].copy()
+        expected[topic][:, n + 1 :] = 0.0
+    found: list[Measurement | None] = []
+    for topic, values in rows.items():
+        if len(values):
+            off = np.abs(values - expected[topic]).max(axis=1)
+            frame = int(np.argmax(off))
+            found.append(Measurement(value=float(off[frame]), frame=frame, detail=topic))
+    return worst(*found)
+
+
+def _values(episode: RecordedEpisode, topics: tuple[str, ...]) -> dict[str, Array]:
+    """topic -> (T, K) all values of its messages, those that become no column too."""
+    with episode.container() as container:
+        blocks = container.blocks(topics)
+    rows = {}
+    for stream in frame_streams(episode.info):
+        if stream.topic in topics:
+            with damage_as_recording_error(episode.path):
+                rows[stream.topic] = stream.layout.decode_rows(blocks[stream.topic].rows(len(stream.layout.constant)))
+    return rows
+
+
+@check(
+    group="file",
+    measures="events that are no log of the changes of phase, or not as they are written",
+    warn=0,
+    reads=(
+        "/events",
+        "/phase",
+    ),
+)
+def phase_events(episode: RecordedEpisode) -> Measurement:
+    """Every change of /phase is in /events at the same time, and no other; every event reads and writes alike."""
+    changes, logged, wrong = [], [], 0
+    with episode.container() as container:
+        for topic, time_ns, data in container.messages((channels.PHASE, channels.EVENTS)):
+            with damage_as_recording_error(episode.path):
+                if topic == channels.PHASE:
+                    changes.append((time_ns, messages.read_string(data)))
+                    continue
+                event = messages.read_log(data)
+            wrong += data != messages.log(time_ns, event)
+            if event.name == channels.PHASE_EVENT:
+                logged.append((time_ns, event.message))
+                wrong += event != Event(name=event.name, message=event.message)
+    again = sum(before[1] == after[1] for before, after in pairwise(changes))
+    missing = sorted(set(changes) ^ set(logged))
+    frame = None if not missing else int(np.searchsorted(episode.frame_times, missing[0][0]))
+    detail = f"{missing[0][1]!r} is in one of the two" if missing else f"{len(changes)} phases"
+    return Measurement(value=len(missing) + wrong + again, frame=frame, detail=detail)
+
+
+@check(
+    group="file",
+    measures="picture messages that are not what their coded pictures make of them",
+    warn=0,
+    reads=(
+        "/camera/{camera}/h264",
+        "/camera/{camera}/video",
+        "/camera/{camera}/image/compressed",
+        "/camera/{camera}/depth",
+        "/camera/{camera}/segmentation",
+        "cameras.video.codec",
+    ),
+)
+def picture_messages(episode: RecordedEpisode) -> Measurement | None:
+    """/video has the pictures of /h264 byte for byte; every message has its camera's frame, its format and its time."""
+    found = [_picture_messages(episode, camera) for camera in episode.cameras]
+    return worst(*found)
+
+
+def _picture_messages(episode: RecordedEpisode, camera: Camera) -> Measurement:
+    name, frame_id = camera.name, camera_frame(camera.name)
+    codec = episode.recording.video_settings(name).codec
+    color = messages.PictureMessages(frame_id, codec)
+    topics = {channels.video_topic(name, codec): color, channels.camera_topic(name, "video"): color}
+    topics[channels.camera_topic(name, "depth")] = messages.PictureMessages(frame_id, DEPTH_FORMAT)
+    topics[channels.camera_topic(name, "segmentation")] = messages.PictureMessages(frame_id, LABELS_FORMAT)
+    copies: dict[int, bytes] = {}
+    wrong, first = 0, None
+    with episode.container() as container:
+        for topic, time_ns, data in container.messages(tuple(topics)):
+            with damage_as_recording_error(episode.path):
+                if codec == "av1" and topic == channels.video_topic(name, codec):
+                    same = data == messages.protobuf_video(time_ns, frame_id, codec, messages.read_protobuf_video(data))
+                elif topic == channels.camera_topic(name, "video"):
+                    same = data == color.compressed_video(time_ns, copies.pop(time_ns, b""))
+                else:
+                    picture = messages.read_compressed_image(data)
+                    same = data == topics[topic].compressed_image(time_ns, picture)
+                    if codec == "h264" and topic == channels.video_topic(name, codec):
+                        copies[time_ns] = picture
+            if not same:
+                wrong += 1
+                first = first if first is not None else int(np.searchsorted(episode.frame_times, time_ns))
+    wrong += len(copies)
+    return Measurement(value=wrong, frame=first, detail=f"camera {name}")

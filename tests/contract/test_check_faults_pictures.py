@@ -1,0 +1,222 @@
+"""Faults of pictures, depth and labels, each caught by the check that compares them with what the numbers make of them.
+
+The pictures of a good recording are decoded once and changed in memory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from PIL import Image, ImageFilter
+from support.check import simulate
+from support.faults import Good, Rows
+
+from demorec.check.drawn import Kind
+from demorec.tables import CHECKS
+
+Fault = Callable[[Rows], Rows]
+ONE = 100
+"""The frame of a single odd picture: the hand is closing in on the cube."""
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory: pytest.TempPathFactory) -> Good:
+    """One pick-and-place by an iiwa, whose orange is nearly the cube's red, with all kinds of pictures."""
+    path = tmp_path_factory.mktemp("good") / "good.mcap"
+    return Good.open(simulate(path, seed=5, robot="iiwa", cameras=("front", "wrist"), depth=True, segmentation=True))
+
+
+def one(change: Fault) -> Fault:
+    """The change at one frame."""
+
+    def fault(rows: Rows) -> Rows:
+        out = rows.copy()
+        out[ONE] = change(rows[ONE : ONE + 1])[0]
+        return out
+
+    return fault
+
+
+def late(frames: int) -> Fault:
+    return lambda rows: np.concatenate([np.repeat(rows[:1], frames, axis=0), rows[:-frames]])
+
+
+def early(rows: Rows) -> Rows:
+    return np.concatenate([rows[1:], rows[-1:]])
+
+
+def rolled(pixels: int, axis: int = 2) -> Fault:
+    return lambda rows: np.roll(rows, pixels, axis=axis)
+
+
+def blurred(rows: Rows) -> Rows:
+    return np.stack([np.asarray(Image.fromarray(row).filter(ImageFilter.GaussianBlur(3))) for row in rows])
+
+
+def greenish(rows: Rows) -> Rows:
+    out = rows.copy()
+    out[..., 1] = np.minimum(rows[..., 1].astype(int) + 60, 255)
+    return out
+
+
+def torn(rows: Rows) -> Rows:
+    out = rows.copy()
+    out[ONE, rows.shape[1] // 2 :] = rows[ONE - 60, rows.shape[1] // 2 :]
+    return out
+
+
+def of_frame(frame: int) -> Fault:
+    def fault(rows: Rows) -> Rows:
+        out = rows.copy()
+        out[ONE] = rows[frame]
+        return out
+
+    return fault
+
+
+def stuck(first: int, last: int) -> Fault:
+    def fault(rows: Rows) -> Rows:
+        out = rows.copy()
+        out[first:last] = rows[first]
+        return out
+
+    return fault
+
+
+def every_other_twice(rows: Rows) -> Rows:
+    return np.asarray(rows[(np.arange(len(rows)) // 2) * 2])
+
+
+def darker(rows: Rows) -> Rows:
+    return np.asarray(rows * 0.75, dtype=rows.dtype)
+
+
+def grey(rows: Rows) -> Rows:
+    return np.asarray(np.repeat(rows.mean(axis=3, keepdims=True), 3, axis=3), dtype=rows.dtype)
+
+
+def zoomed(rows: Rows) -> Rows:
+    height, width = rows.shape[1:3]
+    edge = height // 12
+    box = (edge, edge, width - edge, height - edge)
+    return np.stack([np.asarray(Image.fromarray(row).resize((width, height), box=box)) for row in rows])
+
+
+def swapped_labels(rows: Rows) -> Rows:
+    out = rows.copy()
+    values = [value for value in np.unique(rows) if value >= 0]
+    out[rows == values[0]], out[rows == values[-1]] = values[-1], values[0]
+    return out
+
+
+def along_the_ray(rows: Rows) -> Rows:
+    height, width = rows.shape[1:3]
+    y, x = np.meshgrid(np.linspace(-1, 1, height), np.linspace(-1, 1, width), indexing="ij")
+    return np.asarray(rows * np.sqrt(1 + 0.45 * (x * x + y * y)), dtype=rows.dtype)
+
+
+COLOR: list[tuple[str, Fault, str]] = [
+    ("one frame late", late(1), "picture_lag"),
+    ("two frames late", late(2), "picture_lag"),
+    ("three frames late", late(3), "picture_lag"),
+    ("one frame early", early, "picture_lag"),
+    ("backwards", lambda rows: rows[::-1], "odd_pictures"),
+    ("stuck for ten frames", stuck(20, 30), "frozen"),
+    ("stuck from the lift on", stuck(ONE + 10, 400), "frozen"),
+    ("every other one twice", every_other_twice, "repeated_pictures"),
+    ("one blurred", one(blurred), "odd_pictures"),
+    ("one greenish", one(greenish), "odd_pictures"),
+    ("one torn", torn, "odd_pictures"),
+    ("one of the beginning", of_frame(0), "odd_pictures"),
+    ("one of the end", of_frame(-1), "odd_pictures"),
+    ("one shifted", one(rolled(4)), "odd_pictures"),
+    ("one mirrored", one(lambda rows: rows[:, :, ::-1]), "odd_pictures"),
+    ("one upside down", one(lambda rows: rows[:, ::-1]), "odd_pictures"),
+    ("one inverted", one(lambda rows: 255 - rows), "odd_pictures"),
+    ("one black", one(lambda rows: rows * 0), "odd_pictures"),
+    ("one with red for blue", one(lambda rows: rows[..., ::-1]), "odd_pictures"),
+    ("all inverted", lambda rows: 255 - rows, "pictures_as_drawn"),
+    ("all darker", darker, "pictures_as_drawn"),
+    ("all greenish", greenish, "pictures_as_drawn"),
+    ("all with red for blue", lambda rows: rows[..., ::-1], "pictures_as_drawn"),
+    ("all grey", grey, "pictures_as_drawn"),
+    ("shifted to the right by two pixels", rolled(2), "projection"),
+    ("shifted up by two pixels", rolled(-2, axis=1), "projection"),
+    ("mirrored", lambda rows: rows[:, :, ::-1], "projection"),
+    ("upside down", lambda rows: rows[:, ::-1], "projection"),
+    ("turned by half", lambda rows: rows[:, ::-1, ::-1], "projection"),
+    ("zoomed in", zoomed, "projected_size"),
+]  # fmt: skip
+
+DEPTH: list[tuple[str, Fault, str]] = [
+    ("one frame late", late(1), "picture_lag"),
+    ("one frame early", early, "picture_lag"),
+    ("stuck from the lift on", stuck(ONE + 10, 400), "depth_matches_scene"),
+    ("one of the beginning", of_frame(0), "depth_matches_scene"),
+    ("half of it", lambda rows: rows * np.float32(0.5), "depth_matches_scene"),
+    ("twice as far", lambda rows: rows * np.float32(2), "depth_matches_scene"),
+    ("millimetres", lambda rows: np.minimum(rows * 1000, 60).astype(np.float32), "depth_matches_scene"),
+    ("one without hits", one(lambda rows: rows * 0), "depth_matches_scene"),
+    ("mirrored", lambda rows: rows[:, :, ::-1], "depth_matches_scene"),
+    ("upside down", lambda rows: rows[:, ::-1], "depth_matches_scene"),
+    ("along the ray", along_the_ray, "depth_matches_scene"),
+    ("inverted", lambda rows: rows.max() - rows, "depth_matches_scene"),
+]
+
+LABELS: list[tuple[str, Fault, str]] = [
+    ("one frame late", late(1), "picture_lag"),
+    ("one frame early", early, "picture_lag"),
+    ("stuck from the lift on", stuck(ONE + 10, 400), "segmentation_matches_scene"),
+    ("one of the beginning", of_frame(0), "segmentation_matches_scene"),
+    ("two labels swapped", swapped_labels, "segmentation_matches_scene"),
+    ("all numbers one larger", lambda rows: np.where(rows >= 0, rows + 1, rows), "segmentation_matches_scene"),
+    ("bodies without links", lambda rows: np.where(rows >= 0, rows & 0xFFFFFF, rows), "segmentation_matches_scene"),
+    ("one of nothing", one(lambda rows: rows * 0 - 1), "segmentation_matches_scene"),
+    ("mirrored", lambda rows: rows[:, :, ::-1], "segmentation_matches_scene"),
+    ("upside down", lambda rows: rows[:, ::-1], "segmentation_matches_scene"),
+]
+
+CASES: list[tuple[Kind, str, Fault, str]] = [
+    *(("color", *row) for row in COLOR),
+    *(("depth", *row) for row in DEPTH),
+    *(("labels", *row) for row in LABELS),
+]
+
+
+def test_the_good_one_passes(good: Good) -> None:
+    spoilt = good.with_pictures({})
+    for name in sorted({check for *_, check in CASES}):
+        result = CHECKS.load(name).run(spoilt)
+        assert result.level == "pass", (name, result.value, result.detail)
+
+
+@pytest.mark.parametrize(("kind", "name", "fault", "check"), CASES, ids=[f"{kind}: {name}" for kind, name, *_ in CASES])
+@pytest.mark.parametrize("camera", ["front", "wrist"])
+def test_a_fault(camera: str, kind: Kind, name: str, fault: Fault, check: str, good: Good) -> None:
+    rows = good.pictures[camera, kind]
+    changed = fault(rows)
+    assert not np.array_equal(changed, rows)
+    result = CHECKS.load(check).run(good.with_pictures({(camera, kind): changed}))
+    assert result.level == "fail", (result.value, result.detail)
+
+
+def test_what_does_not_move_is_not_measured(good: Good) -> None:
+    still = RecordedStill(good)
+    result = CHECKS.load("picture_lag").run(still.episode)
+    assert result.level == "skip"
+    assert "too little moves" in result.detail
+
+
+class RecordedStill:
+    """The good recording as if nothing had moved in it."""
+
+    def __init__(self, good: Good) -> None:
+        first = {key: np.repeat(rows[:1], len(rows), axis=0) for key, rows in good.pictures.items()}
+        self.episode = good.with_pictures(first)
+        drawn = good.episode._drawn
+        assert isinstance(drawn, dict)
+        self.episode.__dict__["_drawn"] = {
+            key: np.repeat(cells[:1], len(cells), axis=0) for key, cells in drawn.items()
+        }

@@ -1,0 +1,161 @@
+"""Faults of recordings that need no file: good numbers or pictures with one thing wrong, and what a check says."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.check.base import Result
+from demorec.check.drawn import CellGrid, Kind, planes_of
+from demorec.check.episode import RecordedEpisode
+from demorec.check.pictures_summary import PictureSummary
+from demorec.scene.episode import EpisodeColumns, EpisodeInfo, Outcome
+from demorec.scene.scene import Camera
+from demorec.tables import CHECKS
+
+Rows = NDArray[Any]
+
+
+@dataclass
+class Good:
+    """A good recording, kept open, with its decoded pictures.
+
+    Attributes:
+        episode: As the checks see it; drawn once.
+        pictures: (camera, kind) -> (T, H, W[, 3]).
+    """
+
+    episode: RecordedEpisode
+    pictures: Mapping[tuple[str, Kind], Rows] = field(default_factory=dict)
+
+    @classmethod
+    def open(cls, path: Path) -> Good:
+        """Read and decode everything."""
+        episode = RecordedEpisode(path)
+        recording, pictures = episode.recording, {}
+        for camera in episode.cameras:
+            for kind in episode.kinds(camera.name):
+                read: Callable[[str], Any] = {
+                    "color": recording.images, "depth": recording.depth, "labels": recording.segmentation,
+                }[kind]  # fmt: skip
+                pictures[camera.name, kind] = np.stack(list(read(camera.name)))
+        return cls(episode, pictures)
+
+    @property
+    def _cameras(self) -> dict[str, Camera]:
+        return {camera.name: camera for camera in self.episode.cameras}
+
+    def with_pictures(self, changed: Mapping[tuple[str, Kind], Rows]) -> RecordedEpisode:
+        """The episode with other pictures; what is drawn of it stays."""
+        spoilt = RecordedEpisode(self.episode.path)
+        spoilt._recording = self.episode.recording
+        spoilt.__dict__["columns"] = self.episode.columns
+        spoilt.__dict__["_drawn"] = self.episode._drawn
+        for key in self.pictures.keys() - changed.keys():
+            spoilt._pictures[key] = self.episode.pictures(self._cameras[key[0]], key[1])
+        for (name, kind), pictures in changed.items():
+            grid = CellGrid(pictures.shape[2], pictures.shape[1])
+            planes = planes_of(kind, pictures)
+            nothing = np.zeros(len(pictures))
+            spoilt._pictures[name, kind] = PictureSummary(
+                error="", mean=np.zeros((len(pictures), 3)), dark=nothing, bright=nothing, cells=grid.means(planes)
+            )
+        return spoilt
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Changed:
+    """What is put in a recording's place; None leaves it."""
+
+    columns: EpisodeColumns
+    info: EpisodeInfo
+    outcome: Outcome
+
+    def with_columns(self, **arrays: Any) -> Changed:
+        """With other columns, which must differ."""
+        for name, array in arrays.items():
+            before = getattr(self.columns, name)
+            assert not np.array_equal(np.asarray(before), np.asarray(array)), f"{name} was not changed"
+        return replace(self, columns=replace(self.columns, **arrays))
+
+    def with_info(self, **fields: Any) -> Changed:
+        """With another description, which must differ."""
+        info = replace(self.info, **fields)
+        assert info != self.info
+        return replace(self, info=info)
+
+    def with_outcome(self, **fields: Any) -> Changed:
+        """With another outcome, which must differ."""
+        outcome = replace(self.outcome, **fields)
+        assert outcome != self.outcome
+        return replace(self, outcome=outcome)
+
+
+def judged(path: Path, check: str, fault: Callable[[Changed], Changed]) -> Result:
+    """What a check says of a recording with a fault in its numbers or in what is said about it."""
+    with RecordedEpisode(path) as episode:
+        recording = episode.recording
+        assert recording.outcome is not None
+        before = Changed(columns=recording.columns(), info=recording.info, outcome=recording.outcome)
+        changed = fault(before)
+        assert changed is not before
+        episode.__dict__["columns"] = changed.columns
+        recording.info, recording.outcome = changed.info, changed.outcome
+        return CHECKS.load(check).run(episode)
+
+
+def late(rows: Rows) -> Rows:
+    """One frame late, the first one twice."""
+    return np.concatenate([rows[:1], rows[:-1]])
+
+
+def halved(rows: Rows) -> Rows:
+    """All values half as large."""
+    return rows * 0.5
+
+
+def inverted(rows: Rows) -> Rows:
+    """The other sign."""
+    return -rows
+
+
+def upside_down(rows: Rows) -> Rows:
+    """Large where it was small, within the same range."""
+    return np.asarray(rows.max(axis=0) + rows.min(axis=0) - rows)
+
+
+def backwards(rows: Rows) -> Rows:
+    """The last frame first."""
+    return rows[::-1].copy()
+
+
+def frozen(rows: Rows) -> Rows:
+    """As it was after a third, from then on."""
+    out = rows.copy()
+    out[len(out) // 3 :] = out[len(out) // 3]
+    return out
+
+
+def one_alien(rows: Rows) -> Rows:
+    """One value of another time."""
+    out = rows.copy()
+    frame = 2 * len(out) // 3
+    far = int(np.argmax(np.abs(rows - rows[frame]).reshape(len(rows), -1).max(axis=1)))
+    out[frame] = rows[far]
+    return out
+
+
+def noisy(rows: Rows) -> Rows:
+    """A tenth of the range of noise."""
+    rng = np.random.default_rng(1)
+    return np.asarray(rows + rng.normal(0.0, 0.1, rows.shape) * np.ptp(rows, axis=0))
+
+
+def thousandfold(rows: Rows) -> Rows:
+    """Another unit."""
+    return rows * 1000.0

@@ -1,0 +1,83 @@
+"""Everything that is recorded or exported is read by some check, or named as unchecked with a reason."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pytest
+
+from demorec.check import reads
+from demorec.cli import main
+from demorec.recording import Recording, channels
+from demorec.recording.streams import frame_streams
+from demorec.scene.episode import EpisodeInfo
+from demorec.tables import CHECKS
+
+SAMPLES = Path(__file__).parents[2] / "recordings" / "sample"
+
+
+def test_nothing_is_read_by_no_check_without_a_reason() -> None:
+    rows = reads.coverage()
+    assert [row.name for row in rows if not row.checks and not row.why_not] == []
+    assert [
+        row.name for row in rows if row.checks and any(reads._covers(part, row.name) for part in reads.UNCHECKED)
+    ] == []
+
+
+def test_what_is_declared_exists() -> None:
+    names = [name for _, name in reads.everything()]
+    declared = {read for check in CHECKS.names() for read in CHECKS.load(check).reads} | set(reads.UNCHECKED)
+    assert [read for read in sorted(declared) if not any(reads._covers(read, name) for name in names)] == []
+
+
+def test_every_check_says_what_it_reads() -> None:
+    assert [name for name in CHECKS.names() if not CHECKS.load(name).reads] == []
+
+
+@pytest.mark.parametrize("sample", sorted(SAMPLES.glob("*.mcap")), ids=lambda path: path.stem)
+def test_the_topics_are_those_of_recordings(sample: Path) -> None:
+    known = reads.topics()
+    with Recording(sample) as recording:
+        bodies = [body.name for body in recording.info.scene.bodies]
+        for topic in recording.topics:
+            general = topic
+            for camera in recording.cameras:
+                general = general.replace(f"/camera/{camera}/", "/camera/{camera}/")
+            for body in bodies:
+                general = general.replace(f"/object/{body}/", "/object/{body}/")
+            assert general in known
+
+
+def test_a_new_stream_or_field_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+    @dataclass(frozen=True, kw_only=True, eq=False)
+    class Longer(EpisodeInfo):
+        mood: str = ""
+
+    def one_more(info: EpisodeInfo) -> tuple[object, ...]:
+        found = frame_streams(info)
+        return (*found, replace(found[0], topic="/temperature"))
+
+    monkeypatch.setattr(reads, "frame_streams", one_more)
+    monkeypatch.setattr(reads, "EpisodeInfo", Longer)
+    monkeypatch.setattr(channels, "PICTURE_STREAMS", (*channels.PICTURE_STREAMS, "thermal"))
+    unread = [row.name for row in reads.coverage() if not row.checks and not row.why_not]
+    assert unread == ["/camera/{camera}/thermal", "/temperature", "info.mood"]
+
+
+def test_the_command_tells_it(capsys: pytest.CaptureFixture[str]) -> None:
+    def run(*args: str) -> tuple[int, str]:
+        with pytest.raises(SystemExit) as ended:
+            main(["list", *args])
+        return int(ended.value.code or 0), capsys.readouterr().out
+
+    code, told = run("checks", "--coverage")
+    assert code == 0
+    lines = {line.split()[1]: line for line in told.splitlines()}
+    assert "moving_frames" in lines["/tf"]
+    assert "dataset_statistics" in lines["observation.state"]
+    assert "no check: " in lines["outcome.final_state_digest"]
+    code, told = run("checks", "--coverage", "--json")
+    assert {row["kind"] for row in json.loads(told)} == {"topic", "field", "column"}
+    assert run("tasks", "--coverage")[0] == 2
