@@ -7,6 +7,9 @@ UV_MINIMUM := 0.8.4
 TEST_WORKERS ?= $(shell n=$$(getconf _NPROCESSORS_ONLN 2>/dev/null || echo 1); echo $$(( n > 4 ? 4 : n )))
 BIN := .venv/bin
 
+# Containers often set this; every process would then compile LeRobot's and PyTorch's modules again, for 10 s each.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: demo test test-slow setup lint constraints clean
 
 demo: .venv/.stamp
