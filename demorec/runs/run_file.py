@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from demorec.config import GenerateConfig
-from demorec.errors import ConfigError, DemorecError, resource_error
+from demorec.errors import ConfigError, DemorecError, in_words, resource_error
 from demorec.plain import digest, from_plain, to_plain
 from demorec.safety.files import open_regular, read_json_limited
 
@@ -29,10 +29,6 @@ STARTING = "starting"
 
 MAX_RUN_FILE_BYTES = 2 << 30
 """Above this run.json is not read: some million episodes, which take ten times as much memory."""
-
-
-_MAX_REASON = 1000
-"""Characters of a reason: it may name many keys, and quotes what the file holds."""
 
 
 class DamagedRunFileError(DemorecError):
@@ -221,7 +217,7 @@ def load_run_file(folder: Path) -> RunFile:
         damaged = DamagedRunFileError(f"run.json is damaged ({error.strerror}): {path}")
         raise resource_error(error, path) or damaged from error
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise DamagedRunFileError(f"run.json is damaged ({str(error)[:_MAX_REASON]}): {path}") from error
+        raise DamagedRunFileError(f"run.json is damaged ({in_words(error)}): {path}") from error
 
 
 def recording_name(episode_index: int, attempt: int, *, success: bool) -> str:
