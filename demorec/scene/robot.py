@@ -35,6 +35,8 @@ class ParallelGripper:
     finger_depth: float
     palm_clearance: float
 
+    joint_kind: ClassVar[str] = "prismatic"
+    """Of the joints in the URDF."""
     joint_speed: ClassVar[float] = 0.1
     """With which the motor of each joint moves it, m/s."""
     gear_ratios: ClassVar[tuple[float, ...]] = (1.0,)

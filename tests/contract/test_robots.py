@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import xml.etree.ElementTree as ET
 from contextlib import nullcontext
 from dataclasses import replace
@@ -16,39 +15,28 @@ from support.sim import episode, run
 
 from demorec.errors import SceneError
 from demorec.loop import make_world
-from demorec.plain import from_json, to_json
 from demorec.scene.assets import asset_path, mesh_path
 from demorec.scene.episode import Action
 from demorec.scene.robot import RobotSpec
-from demorec.scene.urdf import Urdf
 from demorec.sim.arm import arm_kinematics
 from demorec.sim.world import World
 from demorec.tables import ROBOTS
 from demorec.tasks import grasping
 from demorec.tasks.grasping import hand_down
+from demorec.testing import RobotContract
+
+
+@pytest.mark.parametrize("robot", ROBOTS.names(), scope="class")
+class TestEveryRobot(RobotContract):
+    @pytest.fixture(autouse=True, scope="class")
+    @classmethod
+    def _row(cls, robot: str) -> None:
+        cls.robot = robot
 
 
 @pytest.fixture(params=ROBOTS.names())
 def spec(request: pytest.FixtureRequest) -> RobotSpec:
     return ROBOTS.load(request.param)
-
-
-def test_the_spec_names_what_the_urdf_has(spec: RobotSpec) -> None:
-    urdf = Urdf.load(asset_path(spec.urdf))
-    joints = {joint.name: joint for joint in urdf.joints}
-    links = {joint.child for joint in urdf.joints} | {urdf.root}
-    assert urdf.root == spec.base_link
-    assert {spec.tcp_link, spec.hand_link, *spec.gripper.finger_links} <= links
-    for name, low, high in zip(spec.arm_joints, spec.position_lower, spec.position_upper, strict=True):
-        assert joints[name].kind == "revolute"
-        assert joints[name].lower - 1e-4 <= low < high <= joints[name].upper + 1e-4
-    for name in spec.gripper.joints:
-        assert joints[name].kind == "prismatic"
-        assert math.isclose(joints[name].upper, spec.gripper.max_width / 2)
-    numbers = len(spec.arm_joints)
-    for values in (spec.home_q, spec.velocity_limit, spec.acceleration_limit, spec.torque_limit):
-        assert len(values) == numbers
-    assert from_json(to_json(spec), RobotSpec) == spec
 
 
 def test_the_wrench_holds_the_weight_of_the_hand(
@@ -113,44 +101,6 @@ def test_a_hand_that_no_joint_carries_is_refused(spec: RobotSpec, hand: str) -> 
         pytest.raises(SceneError, match=f"hand_link '{name}'; its links"),
     ):
         world.reset(scene)
-
-
-def test_home_points_the_hand_down_with_the_fingers_across(spec: RobotSpec) -> None:
-    pose = arm_kinematics(spec).forward(np.array(spec.home_q))
-    assert np.abs(pose.rotation - hand_down((0, 0, 0), 0.0).rotation).max() < 0.01
-    assert 0.2 < pose.position[0] < 0.6
-    assert abs(pose.position[1]) < 0.01
-
-
-def test_the_fingers_move_along_y_of_the_tcp_and_reach_as_far_as_the_spec_says(spec: RobotSpec) -> None:
-    scene = episode(0, robot=spec.name, variation="none").info.scene
-    with World(spec) as world:
-        world.reset(scene)
-        tcp = world.arm.world_from_tcp()
-        opened = np.array(scene.robot.joint_position)
-        width = spec.gripper.max_width
-        world.set_state(joint_position=np.array([*opened, width / 2, width / 2]))
-        tips = []
-        for link in world.arm.finger_links:
-            low, high = world.client.getAABB(world.arm.body, link)
-            tips.append(low[2])
-            centre = tcp.inverse().apply((np.array(low) + np.array(high)) / 2)
-            assert abs(centre[0]) < 0.01
-            assert width / 2 - 0.005 < abs(centre[1]) < width / 2 + 0.025
-        # PyBullet's boxes are some millimetres too large.
-        assert abs(tcp.position[2] - min(tips) - spec.gripper.finger_depth) < 0.005
-
-
-def test_the_whole_workspace_is_within_reach(spec: RobotSpec) -> None:
-    arm = arm_kinematics(spec)
-    home = np.array(spec.home_q)
-    for x in (0.35, 0.5, 0.65):
-        for y in (-0.25, 0.0, 0.25):
-            rest = home.copy()
-            rest[0] = math.atan2(y - arm.origins[0, 1], x - arm.origins[0, 0])
-            for z in (0.02, 0.15, 0.22):
-                for yaw in (-0.8, 0.0, 0.8):
-                    assert arm.inverse(hand_down((x, y, z), yaw), start=rest, rest=rest) is not None, (x, y, z, yaw)
 
 
 def test_it_picks_and_places(spec: RobotSpec) -> None:

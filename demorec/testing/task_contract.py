@@ -1,0 +1,184 @@
+"""What every task must hold, as tests for pytest."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+
+from demorec.check.report import CheckOptions, Subject, check_subject
+from demorec.config import EpisodePlan, GenerateConfig
+from demorec.loop import Episode, ScriptAgent, Session, make_world, prepare
+from demorec.plain import to_json
+from demorec.recording import EpisodeWriter
+from demorec.replay import ReplayOptions, open_file, replay_all
+from demorec.safety.user_modules import modules_of
+from demorec.scene.episode import EpisodeInfo, Frame, Outcome
+from demorec.scene.validity import read_episode_info
+from demorec.sim.arm import arm_kinematics
+from demorec.tasks.grasping import hand_down, symmetric_yaws
+
+
+class TaskContract:
+    """Layouts, words, success and recordings of one task with one robot, without pictures.
+
+    Attributes:
+        task: Name of a row of `demorec list tasks`, or "package.module:Name".
+        robot: The same of a robot.
+        seed: Root of all episodes.
+        num_layouts: How many are drawn and looked at.
+        num_episodes: How many the expert tries.
+        min_success: Least share of them that must succeed at the first try.
+    """
+
+    task: ClassVar[str]
+    robot: ClassVar[str] = "panda"
+    seed: ClassVar[int] = 0
+    num_layouts: ClassVar[int] = 30
+    num_episodes: ClassVar[int] = 10
+    min_success: ClassVar[float] = 0.9
+
+    def test_scenes_and_words_follow_from_the_plan_alone(self) -> None:
+        """The same plan gives the same description, another episode or attempt gives another scene."""
+        infos = [self._episode(index).info for index in range(4)]
+        for index, info in enumerate(infos):
+            again = self._episode(index).info
+            assert again == info, f"episode {index} is another when it is drawn again: is everything drawn from rng?"
+        for first, second in itertools.combinations(infos, 2):
+            assert first.scene != second.scene, "two episodes have the same scene"
+        assert self._episode(2, attempt=1).info.scene != infos[2].scene, "another attempt has the same scene"
+
+    def test_scenes_come_back_from_their_description(self) -> None:
+        """A recording's metadata rebuild the scene; it has goals, all for movable bodies, and an instruction."""
+        for index in range(self.num_layouts):
+            info = self._episode(index).info
+            assert read_episode_info(to_json(info)) == info, f"episode {index} is another when it is read back"
+            assert info.scene.goals, f"episode {index} has no goal"
+            assert info.instruction.strip(), f"episode {index} has no instruction"
+            assert info.instruction.isprintable(), f"the instruction of episode {index} is not one line of text"
+
+    def test_objects_stand_apart(self) -> None:
+        """No two movable bodies that stand on the table are in each other."""
+        for index in range(self.num_layouts):
+            movable = self._episode(index).info.scene.movable
+            standing = [body for body in movable if body.world_from_body.position[2] < 0.05]
+            for a, b in itertools.combinations(standing, 2):
+                gap = math.dist(a.world_from_body.position[:2], b.world_from_body.position[:2])
+                reach = (max(a.shape.extents[:2]) + max(b.shape.extents[:2])) / 2
+                assert gap > reach, f"{a.name} and {b.name} of episode {index} are {gap:.3f} m apart"
+
+    def test_objects_and_goals_are_within_reach(self) -> None:
+        """The hand, pointing down, gets to where each object is and to where it shall be, at one yaw at least."""
+        for index in range(self.num_layouts):
+            info = self._episode(index).info
+            for goal in info.scene.goals:
+                start = info.scene.body(goal.object).world_from_body
+                for what, pose in (("start", start), ("goal", info.scene.world_from_goal(goal))):
+                    at = pose.position.round(3).tolist()
+                    assert _is_within_reach(info, at), f"the {what} of {goal.object} of episode {index}, {at}"
+
+    def test_doing_nothing_is_a_failure(self) -> None:
+        """The conditions of success do not hold at the start, so they cannot hold by chance."""
+        episode = self._episode(0)
+        with make_world(episode.info) as world:
+            world.reset(episode.info.scene)
+            checks = episode.task.evaluate(world)
+        assert checks, "the task has no conditions of success"
+        assert not all(check.passed for check in checks), "the task is done before anything has moved"
+
+    def test_the_expert_succeeds(self) -> None:
+        """Strictly, at the first try, in most episodes."""
+        outcomes = [_run(self.task, self.robot, self.seed, index)[1] for index in range(self.num_episodes)]
+        failed = [
+            f"{index}: {outcome.failure_reason} in phase {outcome.failure_phase}"
+            for index, outcome in enumerate(outcomes)
+            if not outcome.success
+        ]
+        share = 1 - len(failed) / self.num_episodes
+        assert share >= self.min_success, f"{share:.0%} of {self.num_episodes} episodes succeed; {'; '.join(failed)}"
+
+    def test_commands_stay_within_the_limits_of_the_robot(self) -> None:
+        """Joint positions and velocities that the expert asks for, and the opening of the gripper."""
+        robot = self._episode(0).info.robot
+        frames, _ = _run(self.task, self.robot, self.seed, 0)
+        targets = np.array([frame.action.joint_target for frame in frames])
+        widths = np.array([frame.action.gripper_target for frame in frames])
+        speeds = np.abs(np.diff(targets, axis=0)) * self._episode(0).info.fps
+        for joint, name in enumerate(robot.arm_joints):
+            low, high = robot.position_lower[joint], robot.position_upper[joint]
+            assert low - 1e-9 <= targets[:, joint].min(), f"{name} is sent below its limit"
+            assert targets[:, joint].max() <= high + 1e-9, f"{name} is sent above its limit"
+            assert speeds[:, joint].max() <= robot.velocity_limit[joint] * (1 + 1e-9), f"{name} is sent too fast"
+        assert widths.min() >= 0, "the gripper is told a negative opening"
+        assert widths.max() <= robot.gripper.max_width + 1e-9, "the gripper is told to open wider than it can"
+
+    def test_an_episode_repeats_to_the_bit(self) -> None:
+        """The script draws nothing of its own and leaves nothing behind: in a used world all is as in a fresh one."""
+        frames, outcome = _run(self.task, self.robot, self.seed, 0)
+        episode = self._episode(0)
+        with make_world(episode.info) as world:
+            session = Session.of_episode(world, episode)
+            list(itertools.islice(session.run(ScriptAgent(episode)), 20))
+            again = list(session.run(ScriptAgent(episode)))
+        assert session.outcome == outcome, "the outcome differs when the episode is run again"
+        for old, new in zip(frames, again, strict=True):
+            assert np.array_equal(old.command.joint_target, new.command.joint_target), (
+                f"another command at frame {old.frame_index} when the episode is run again"
+            )
+            assert np.array_equal(old.observation.joint_position, new.observation.joint_position), (
+                f"the arm is elsewhere at frame {old.frame_index} when the episode is run again"
+            )
+
+    def test_its_recording_passes_every_check_and_replays_to_the_bit(self, tmp_path: Path) -> None:
+        """`demorec check` finds no fault, and the recorded commands do the task again."""
+        frames, outcome = _run(self.task, self.robot, self.seed, 0)
+        path, allowed = tmp_path / "episode_000000.mcap", modules_of([self.task, self.robot])
+        with EpisodeWriter(path, self._episode(0).info) as writer:
+            for frame in frames:
+                writer.write(frame)
+            writer.finish(outcome)
+        report = check_subject(Subject(path=path, kind="recording"), CheckOptions(allowed=allowed))
+        failed = [f"{result.check}: {result.detail}" for result in report.results if result.level == "fail"]
+        assert not failed, "; ".join(failed)
+        options = ReplayOptions(allowed=allowed)
+        ((replayed, _),) = replay_all([open_file(path, options)], options)
+        assert replayed.is_identical, f"the replay differs: {replayed.first_difference}"
+        assert replayed.success == outcome.success, "the replay ends otherwise"
+
+    def _episode(self, index: int, *, attempt: int = 0) -> Episode:
+        return prepare(replace(_plan(self.task, self.robot, self.seed, index), attempt=attempt))
+
+
+def _plan(task: str, robot: str, seed: int, index: int) -> EpisodePlan:
+    config = GenerateConfig(task=task, robot=robot, seed=seed, cameras=())
+    config.validate()
+    return EpisodePlan(config=config, episode_index=index)
+
+
+# The tests of a class come one after the other: what one has simulated, the next ones need not.
+@lru_cache(maxsize=16)
+def _run(task: str, robot: str, seed: int, index: int) -> tuple[tuple[Frame, ...], Outcome]:
+    """All frames of an episode, and its outcome."""
+    episode = prepare(_plan(task, robot, seed, index))
+    with make_world(episode.info) as world:
+        session = Session.of_episode(world, episode)
+        frames = tuple(session.run(ScriptAgent(episode)))
+    return frames, session.outcome
+
+
+def _is_within_reach(info: EpisodeInfo, point: list[float]) -> bool:
+    """Whether the TCP gets to a point of the world (3,), metres, with the hand pointing down."""
+    base_from_world = info.scene.robot.world_from_base.inverse()
+    arm = arm_kinematics(info.robot, scale=info.scene.robot.scale)
+    start = np.array(info.robot.home_q)
+    ahead = base_from_world.apply(np.array(point)) - arm.origins[0]
+    start[0] = math.atan2(ahead[1], ahead[0])
+    return any(
+        arm.inverse(base_from_world @ hand_down(point, yaw), start=start, rest=start) is not None
+        for yaw in symmetric_yaws(0.0, 8)
+    )

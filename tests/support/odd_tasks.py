@@ -1,0 +1,88 @@
+"""Tasks with one fault each, for the tests of `demorec.testing`; pick_place where nothing else is said."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from demorec.geometry import Pose
+from demorec.scene.robot import RobotSpec
+from demorec.scene.scene import Scene
+from demorec.tasks.grasping import raised
+from demorec.tasks.pick_place import PickPlace
+from demorec.tasks.sampling import Sampler
+from demorec.tasks.script import Step
+from demorec.tasks.skills import Expert
+
+_CALLS = itertools.count()
+
+
+class NeverTheSame(PickPlace):
+    def sample_scene(self, robot: RobotSpec, sampler: Sampler) -> Scene:
+        scene = super().sample_scene(robot, sampler)
+        return replace(scene, robot=replace(scene.robot, gripper_width=0.07 + 1e-6 * next(_CALLS)))
+
+
+class AlwaysTheSame(PickPlace):
+    def sample_scene(self, robot: RobotSpec, sampler: Sampler) -> Scene:
+        return super().sample_scene(robot, Sampler(np.random.default_rng(0), ranges=sampler.ranges))
+
+
+class Wordless(PickPlace):
+    def instruction(self, scene: Scene, rng: np.random.Generator) -> str:
+        return " "
+
+
+class Aimless(PickPlace):
+    def sample_scene(self, robot: RobotSpec, sampler: Sampler) -> Scene:
+        return replace(super().sample_scene(robot, sampler), goals=())
+
+    def instruction(self, scene: Scene, rng: np.random.Generator) -> str:
+        return "enjoy the day"
+
+
+class Crowded(PickPlace):
+    def sample_scene(self, robot: RobotSpec, sampler: Sampler) -> Scene:
+        scene = super().sample_scene(robot, sampler)
+        (cube,) = scene.movable
+        return replace(scene, bodies=(*scene.bodies, replace(cube, name="another_cube")))
+
+
+class OutOfReach(PickPlace):
+    def sample_scene(self, robot: RobotSpec, sampler: Sampler) -> Scene:
+        scene = super().sample_scene(robot, sampler)
+        return replace(scene, goals=(replace(scene.goals[0], onto_from_goal=Pose.from_yaw((1.4, 0.0, 0.02))),))
+
+
+class DoneAlready(PickPlace):
+    def sample_scene(self, robot: RobotSpec, sampler: Sampler) -> Scene:
+        scene = super().sample_scene(robot, sampler)
+        (cube,) = scene.movable
+        return replace(scene, goals=(replace(scene.goals[0], onto_from_goal=cube.world_from_body),))
+
+
+class Idle(PickPlace):
+    """Rises a little and calls it a day."""
+
+    def script(self, expert: Expert) -> Iterator[Step]:
+        yield from expert.move(raised(expert.tcp(), 0.02), speed=0.3)
+
+
+class Moody(PickPlace):
+    """Rises by another height each time."""
+
+    def script(self, expert: Expert) -> Iterator[Step]:
+        yield from expert.move(raised(expert.tcp(), 0.02 + 0.01 * next(_CALLS)), speed=0.3)
+
+
+class Hasty(PickPlace):
+    """Turns the first joint by a radian in one step."""
+
+    def script(self, expert: Expert) -> Iterator[Step]:
+        for step in expert.move(raised(expert.tcp(), 0.02), speed=0.3):
+            turned = step.action.joint_target + np.array([1.0, *[0.0] * 6])
+            yield step
+            yield replace(step, action=replace(step.action, joint_target=turned))
