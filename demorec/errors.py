@@ -117,6 +117,12 @@ def resource_error(error: BaseException, path: Path | None = None) -> ResourceEr
     return None
 
 
+def as_reason(error: BaseException) -> str:
+    """The message of an error as the rest of a sentence, behind "since"."""
+    text = (error.strerror if isinstance(error, OSError) else None) or str(error)
+    return text[:1].lower() + text[1:].rstrip(".")
+
+
 def error_chain(error: BaseException) -> Iterator[BaseException]:
     """An error, what it was raised from, and so on."""
     cause: BaseException | None = error

@@ -64,8 +64,8 @@ def _describe(path: Path) -> tuple[dict[str, Any], list[str]]:
     if recordings:
         return _folder(path, recordings)
     parts = sorted(path.glob("*.mcap.part"))
-    hint = f" It has unfinished recordings; demorec recover {parts[0].name} reads one." if parts else ""
-    raise ConfigError(f"The folder holds no run (run.json), dataset ({INFO_PATH}) or recording (*.mcap).{hint} {path}")
+    hint = f"; it has unfinished recordings, of which demorec recover {parts[0].name} reads one" if parts else ""
+    raise ConfigError(f"The folder holds no run (run.json), dataset ({INFO_PATH}) or recording (*.mcap){hint}: {path}")
 
 
 def _recording(path: Path) -> tuple[dict[str, Any], list[str]]:

@@ -68,10 +68,10 @@ def _sources(path: Path, include_failures: bool) -> list[PlaybackSource]:
         return [_recording(file) for file in files]
     hint = ""
     if any((path / "failed").glob("*.mcap")):
-        hint = " Its failures are shown with --include-failures."
+        hint = "; its failures are shown with --include-failures"
     elif below := sorted(folder.parent.name for folder in path.glob("*/episodes")):
-        hint = f" It holds runs, name one: {', '.join(below[:5])}{', ...' if below[5:] else ''}."
-    raise ConfigError(f"The folder holds no recording (*.mcap), run (episodes/) or dataset ({INFO_PATH}).{hint} {path}")
+        hint = f"; it holds runs, name one ({', '.join(below[:5])}{', ...' if below[5:] else ''})"
+    raise ConfigError(f"The folder holds no recording (*.mcap), run (episodes/) or dataset ({INFO_PATH}){hint}: {path}")
 
 
 def _is_mcap(path: Path) -> bool:

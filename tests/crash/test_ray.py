@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
@@ -26,7 +27,7 @@ REAL = GenerateConfig(seed=5, cameras=("wrist",), width=32, height=32)
 NUM_REAL = 20
 
 
-def run_on_ray(out: Path, *, maker: str, progress: NoProgress | None = None, **options: float) -> RunResult:
+def run_on_ray(out: Path, *, maker: str, progress: NoProgress | None = None, **options: Any) -> RunResult:
     return generate(
         GenerateConfig(cameras=()),
         RunOptions(out=out, num_episodes=NUM_EPISODES, executor="ray", **options),
@@ -205,3 +206,10 @@ def test_too_large_workers_are_refused(tmp_path, cluster):
 def test_an_unreachable_cluster_is_told_at_once(tmp_path, address):
     with pytest.raises(ConfigError, match=r"cannot be reached .* give the address that `ray start --head` has printed"):
         on_ray._connect(address, 1)
+
+
+def test_an_unreachable_cluster_leaves_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(on_ray.ray, "is_initialized", lambda: False)  # whatever the tests before have begun
+    with pytest.raises(ConfigError, match="cannot be reached"):
+        run_on_ray(tmp_path / "run", maker="make", address="127.0.0.1:1")
+    assert list(tmp_path.iterdir()) == []

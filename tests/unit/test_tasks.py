@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from demorec.geometry import Pose, wrap_angle
 from demorec.loop import Episode, make_world
 from demorec.scene.scene import Body, Shape
 from demorec.sim.robots.panda import PANDA
+from demorec.tables import TASKS
 from demorec.tasks import skills
 from demorec.tasks.base import Behaviour
 from demorec.tasks.conditions import lasting
@@ -299,3 +302,9 @@ def test_a_cube_that_slips_is_dropped_and_fails_after_three_tries():
     assert outcome.num_retries == 2
     assert outcome.failure_phase in ("lift", "close", "transport")
     assert outcome.failure_reason
+
+
+def test_the_documented_table_has_every_task_in_its_own_words() -> None:
+    text = (Path(__file__).parents[2] / "docs" / "tasks.md").read_text()
+    rows = re.findall(r"^\| `(\w+)` \| (.+?) \|", text, re.MULTILINE)
+    assert rows == [(name, TASKS.load(name).summary) for name in TASKS.names()]
