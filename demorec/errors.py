@@ -160,6 +160,12 @@ def without_path(error: BaseException, path: Path) -> str:
     return str(error).removesuffix(f": {path}")
 
 
+def as_reason(error: BaseException) -> str:
+    """The message of an error as the rest of a sentence, behind "since"."""
+    text = in_words(error)
+    return text[:1].lower() + text[1:].rstrip(".")
+
+
 def error_chain(error: BaseException) -> Iterator[BaseException]:
     """An error, what it was raised from, and so on."""
     cause: BaseException | None = error

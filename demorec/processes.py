@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
+import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from multiprocessing import connection, resource_tracker
 from multiprocessing.context import SpawnContext, SpawnProcess
+from types import FrameType
 from typing import Any
 
+_PATIENCE_S = 3.0
+"""How long a program may take to end when it is asked to."""
 _hiding = threading.Lock()
 _starting = threading.Lock()
 
@@ -66,6 +71,43 @@ def _start_tracker() -> None:
                 os.environ[name] = before
 
 
+def start_program(command: Sequence[str], **options: Any) -> subprocess.Popen[Any]:
+    """Start a program that ends when this process ends, whatever it dies of.
+
+    A process of ours stands between them: it starts the program, ends when it does, and ends it when its standard
+    input, of which nobody else has the other end, is closed.
+
+    Args:
+        command: The program and its arguments; its standard input is empty.
+        options: Of `subprocess.Popen`, but for `stdin`.
+
+    Returns:
+        That process: what terminates it ends the program.
+    """
+    return subprocess.Popen([sys.executable, "-P", "-m", __name__, *command], stdin=subprocess.PIPE, **options)
+
+
+def _stand_between(command: Sequence[str]) -> int:
+    program = subprocess.Popen(command, stdin=subprocess.DEVNULL)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the program, too
+
+    def end(number: int, frame: FrameType | None) -> None:
+        program.terminate()
+        killing = threading.Timer(_PATIENCE_S, program.kill)
+        killing.daemon = True
+        killing.start()
+
+    signal.signal(signal.SIGTERM, end)
+
+    def watch() -> None:
+        while os.read(0, 1):
+            pass
+        program.kill()
+
+    threading.Thread(target=watch, daemon=True).start()
+    return abs(program.wait())
+
+
 def _end_with_parent() -> None:
     """Leave no orphan behind when the parent is killed: its end of a pipe closes, whatever it died of.
 
@@ -89,3 +131,7 @@ def _main_hidden() -> Iterator[None]:
             yield
         finally:
             vars(main).update(held)
+
+
+if __name__ == "__main__":
+    sys.exit(_stand_between(sys.argv[1:]))

@@ -70,18 +70,19 @@ def parse(command: type, args: Sequence[str], *, prog: str, defaults: object) ->
 
 
 def _parse(command: type, args: Sequence[str], *, prog: str, defaults: object, say_why: bool) -> Any:
+    asks_for_help = "-h" in args or "--help" in args
     # tyro draws its boxes as the encoding allows, but knows that of Unicode by one spelling only.
     page = io.TextIOWrapper(io.BytesIO(), encoding=codecs.lookup(sys.stdout.encoding or "utf-8").name)
     try:
         with FLAG_TYPES, redirect_stdout(page):
             return tyro.cli(
                 command,
-                args=args,
+                args=["--help"] if asks_for_help else args,  # else usage would lack what stands in front of it
                 prog=prog,
                 description=inspect.cleandoc(command.__doc__ or ""),
                 default=MISSING_NONPROP if defaults is None else defaults,
                 config=(tyro.conf.OmitArgPrefixes,),
-                console_outputs=say_why or "-h" in args or "--help" in args,
+                console_outputs=say_why or asks_for_help,
             )
     except SystemExit:
         page.seek(0)

@@ -86,9 +86,8 @@ def print_result(result: RunResult, export: ExportRecord | None, checked: CheckS
     if result.made:
         wall = result.session.wall_seconds
         rate = sum(a.success for a in result.made) / wall * 60
-        rows.append(
-            ("wall time", f"{wall:.1f} s with {_workers(result.session.workers)}, {rate:.1f} episodes a minute")
-        )
+        made = f"{wall:.1f} s for making episodes with {_workers(result.session.workers)}, {rate:.1f} a minute"
+        rows.append(("wall time", f"{made}; export and checks are extra"))
     if aside := set_aside(folder):
         rows.append(("set aside", f"{', '.join(aside)}: {folder / UNFINISHED}"))
     rows.append(("run digest", run.digest))
@@ -173,6 +172,9 @@ def print_estimate(estimate: Estimate, options: RunOptions) -> None:
     workers = _workers(estimate.workers)
     if options.executor == "local" and estimate.workers > cores:
         workers += f" on {cores} cores: at least {duration(estimate.seconds * estimate.workers / cores)}"
+    sizes = f"recording {megabytes(estimate.num_bytes)}"
+    if estimate.dataset_bytes:
+        sizes += f" and dataset {megabytes(estimate.dataset_bytes)}"
     rows = [
         ("success", f"{estimate.successes} of {estimate.attempts} at the first try"),
         ("CPU s/episode", f"{each:.2f} ({stages}), {estimate.num_frames} frames"),
@@ -180,7 +182,7 @@ def print_estimate(estimate: Estimate, options: RunOptions) -> None:
             "time",
             f"{duration(estimate.seconds)} for {estimate.num_episodes} episodes with {workers}; the export is extra",
         ),
-        ("size", f"{megabytes(estimate.total_bytes)} ({megabytes(estimate.num_bytes)} an episode, and the dataset)"),
+        ("size", f"{megabytes(estimate.total_bytes)} ({sizes} an episode)"),
         ("memory", f"{megabytes(estimate.peak_worker_bytes)} a worker"),
         ("free disk", f"{megabytes(estimate.free_bytes)} at {options.out}"),
     ]

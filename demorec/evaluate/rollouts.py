@@ -13,12 +13,13 @@ import functools
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field, replace
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from demorec.config import EpisodePlan, GenerateConfig
+from demorec.config import EpisodePlan, GenerateConfig, deciding_versions
 from demorec.errors import ConfigError, DemorecError, in_words
 from demorec.evaluate.policy import Policy, check_steps, find_checkpoint, policy_summary, trained_action
 from demorec.evaluate.progress import EvaluationObserver, factors_of
@@ -33,6 +34,7 @@ from demorec.plain import from_plain, to_plain
 from demorec.recording import EpisodeWriter
 from demorec.runs.find import EVALUATION_NAME
 from demorec.runs.run_file import EPISODES, FAILED, Attempt
+from demorec.safety.own_versions import version_differences
 from demorec.safety.replacing import Kind, check_replaceable, json_object, replaced_parts, settle_parts
 from demorec.scene.episode import Outcome
 from demorec.scene.features import ENVIRONMENT_STATE, IMAGE_PREFIX, ActionKind
@@ -74,11 +76,14 @@ class Evaluation:
         settings: What decides the result.
         rollouts: One line each, in the order of the episodes.
         factors: For each of these, what was randomised in its scene.
+        versions: package -> version, of what decides scenes, rollouts and the policy's answers; none in evaluations of
+            older versions of demorec.
     """
 
     settings: Settings
     rollouts: tuple[Attempt, ...] = ()
     factors: tuple[Mapping[str, float], ...] = field(default=())
+    versions: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def rate(self) -> Rate:
@@ -176,10 +181,10 @@ def evaluate(
                 if isinstance(report, Lost):
                     raise DemorecError(f"Episode {report.plan.episode_index} was lost: {report.reason}.")
                 rollouts.append(report.attempt)
-                evaluation = _with(settings, rollouts)
+                evaluation = _with(evaluation, rollouts)
                 _save(evaluation, out)
                 progress(evaluation)
-    return _with(settings, [r for r in evaluation.rollouts if r.episode_index < num_episodes])
+    return _with(evaluation, [r for r in evaluation.rollouts if r.episode_index < num_episodes])
 
 
 def load_evaluation(folder: Path) -> Evaluation:
@@ -282,16 +287,20 @@ def _open(settings: Settings, out: Path, *, overwrite: bool) -> Evaluation:
 
 def _begin_or_continue(settings: Settings, out: Path) -> Evaluation:
     """Bring the folder and its evaluation.json to what is known now."""
-    evaluation = Evaluation(settings=settings)
+    versions = _versions(settings.config)
+    evaluation = Evaluation(settings=settings, versions=versions)
     if (out / EVALUATION_NAME).is_file():
         evaluation = load_evaluation(out)
-        lines = plain_differences(_deciding(evaluation.settings), _deciding(settings))
+        lines = [
+            *plain_differences(_deciding(evaluation.settings), _deciding(settings)),
+            *(version_differences(evaluation.versions, versions) if evaluation.versions else ()),
+        ]
         if lines:
             raise ConfigError(
                 f"Another evaluation is in this folder ({'; '.join(lines)}): choose another --out or --overwrite: {out}"
             )
         kept = [r for r in evaluation.rollouts if (out / r.file).is_file()]
-        evaluation = _with(settings, kept)
+        evaluation = _with(replace(evaluation, settings=settings), kept)
     for place in (EPISODES, FAILED):
         (out / place).mkdir(parents=True, exist_ok=True)
     _save(evaluation, out)
@@ -319,12 +328,21 @@ def _deciding(settings: Settings) -> dict[str, Any]:
     return {key: value for key, value in to_plain(settings).items() if key != "policy"}
 
 
-def _with(settings: Settings, rollouts: list[Attempt]) -> Evaluation:
+def _versions(config: GenerateConfig) -> dict[str, str]:
+    """Of what decides the scenes, and of what the policy runs with."""
+    versions = deciding_versions(config)
+    for package in ("lerobot", "torch"):
+        with suppress(PackageNotFoundError):
+            versions[package] = version(package)
+    return versions
+
+
+def _with(evaluation: Evaluation, rollouts: list[Attempt]) -> Evaluation:
     ordered = sorted(rollouts, key=lambda r: r.episode_index)
-    return Evaluation(
-        settings=settings,
+    return replace(
+        evaluation,
         rollouts=tuple(ordered),
-        factors=tuple(_factors(settings.config, r.episode_index, r.attempt) for r in ordered),
+        factors=tuple(_factors(evaluation.settings.config, r.episode_index, r.attempt) for r in ordered),
     )
 
 

@@ -93,7 +93,8 @@ def _strangers(folder: Path) -> list[str]:
         found += [f"{UNFINISHED}/{name}" for name in files_below(folder / UNFINISHED) if not _is_unfinished(name)]
     dataset = folder / DATASET_FOLDER
     if os.path.lexists(dataset) and not is_dataset_of_run(dataset, str(run.get("config_digest"))):
-        found.append(DATASET_FOLDER)
+        inside = () if dataset.is_symlink() else DATASET.strangers(dataset)
+        found += [f"{DATASET_FOLDER}/{name}" for name in inside] or [DATASET_FOLDER]
     return found
 
 

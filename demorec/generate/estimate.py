@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import shutil
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,14 +14,13 @@ from demorec.errors import ConfigError, GenerationError
 from demorec.generate.executor import MAKE_EPISODE, Made, Raised
 from demorec.generate.local import LocalExecutor
 from demorec.generate.options import RunOptions, available_cores
+from demorec.lerobot import ExportOptions, export_lerobot
 from demorec.runs.run_file import EPISODES, FAILED, STARTING, UNFINISHED
 
 _MEASURED = 2
 """Attempts with pictures: the first of a worker compiles, loads and fills caches, the second is what counts."""
 _TRIED = 20
 """Episodes made without pictures, to see how often they succeed: pictures do not touch the physics."""
-DATASET_SHARE = 0.8
-"""Size of a dataset relative to its recordings: the same coded pictures, fewer numbers (measured: 0.77 to 0.8)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,6 +34,7 @@ class Estimate:
         cpu_seconds: stage -> CPU seconds of the measured attempt.
         start_seconds: CPU seconds that a worker needs before its first frame.
         num_bytes: Of the measured attempt's recording.
+        dataset_bytes: That it adds to the dataset; 0 without one.
         peak_worker_bytes: Memory of a worker.
         num_episodes, workers: Of the run.
         free_bytes: On the disk of the output folder.
@@ -45,6 +46,7 @@ class Estimate:
     cpu_seconds: dict[str, float]
     start_seconds: float
     num_bytes: int
+    dataset_bytes: int
     peak_worker_bytes: int
     num_episodes: int
     workers: int
@@ -59,7 +61,7 @@ class Estimate:
     @property
     def total_bytes(self) -> float:
         """Recordings and dataset."""
-        return self.num_bytes * self.num_episodes * (1 + DATASET_SHARE)
+        return (self.num_bytes + self.dataset_bytes) * self.num_episodes
 
 
 def estimate(config: GenerateConfig, options: RunOptions, *, maker: str = MAKE_EPISODE) -> Estimate:
@@ -82,6 +84,8 @@ def estimate(config: GenerateConfig, options: RunOptions, *, maker: str = MAKE_E
             [EpisodePlan(config=blind, episode_index=i) for i in range(min(_TRIED, options.num_episodes))],
             min(workers, available_cores()),
         )
+        recordings = [folder / report.attempt.file for report in measured if report.attempt.file]
+        dataset_bytes = _added_to_dataset(recordings, folder) if options.export else 0
     seconds = dict(measured[-1].attempt.seconds)
     return Estimate(
         attempts=len(tried),
@@ -90,6 +94,7 @@ def estimate(config: GenerateConfig, options: RunOptions, *, maker: str = MAKE_E
         cpu_seconds=seconds,
         start_seconds=measured[0].attempt.seconds.get(STARTING, 0.0),
         num_bytes=measured[-1].attempt.num_bytes,
+        dataset_bytes=dataset_bytes,
         peak_worker_bytes=max(report.peak_bytes for report in measured),
         num_episodes=options.num_episodes,
         workers=workers,
@@ -114,6 +119,17 @@ def _make(maker: str, folder: Path, plans: list[EpisodePlan], workers: int) -> l
                 else:
                     raise GenerationError(f"The pilot episode cannot be made: {report.reason}.")
     return made
+
+
+def _added_to_dataset(recordings: Sequence[Path], folder: Path) -> int:
+    """Bytes by which the last of some recordings makes their dataset larger: what every dataset has counts once."""
+    sizes = [0, 0]
+    for count in range(max(1, len(recordings) - 1), len(recordings) + 1):
+        dataset = folder / f"dataset_of_{count}"
+        options = ExportOptions(repo_id="local/pilot", verify=False, include_failures=True)
+        export_lerobot(recordings[:count], dataset, options)
+        sizes.append(sum(path.stat().st_size for path in dataset.rglob("*") if path.is_file()))
+    return max(0, sizes[-1] - sizes[-2])
 
 
 def _existing(path: Path) -> Path:

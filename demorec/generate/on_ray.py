@@ -10,6 +10,8 @@ from __future__ import annotations
 import logging
 import socket
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -35,18 +37,19 @@ _RECOUNT_S = 5.0
 
 
 class RayExecutor:
-    """Attempts as Ray tasks; bounded in flight by the size of the cluster, which may change while the run works.
+    """Attempts as Ray tasks on the cluster of `connected`.
+
+    Bounded in flight by the size of the cluster, which may change while the run works.
 
     Args:
         maker: What a worker does with a plan, as "module:function".
         folder: Of the run; the workers must see it under the same path.
         workers: Attempts at the same time; None: as many as the cluster has room for.
-        address: Of the cluster; "local" starts one on this machine. A connection that exists already is used.
         cpus_per_worker, gpus_per_worker: That each attempt reserves.
         recycle_after: Attempts after which Ray replaces a worker process.
 
     Raises:
-        ConfigError: The cluster cannot be reached or has no room for a worker.
+        ConfigError: The cluster has no room for a worker.
     """
 
     def __init__(
@@ -55,7 +58,6 @@ class RayExecutor:
         folder: Path,
         *,
         workers: int | None,
-        address: str,
         cpus_per_worker: float,
         gpus_per_worker: float,
         recycle_after: int,
@@ -67,9 +69,6 @@ class RayExecutor:
         self._pending: dict[Any, EpisodePlan] = {}
         self._counted_at = -1e9
         self._size = 0
-        self._owns_connection = not ray.is_initialized()
-        if self._owns_connection:
-            _connect(address, workers or available_cores())
         self._task = ray.remote(
             num_cpus=cpus_per_worker,
             num_gpus=gpus_per_worker,
@@ -137,14 +136,12 @@ class RayExecutor:
             ray.cancel(reference, force=False)
 
     def close(self) -> None:
-        """Cancel what is in flight and leave the cluster (which ends it if it was started here)."""
+        """Cancel what is in flight."""
         if not ray.is_initialized():
             return
         for reference in self._pending:
             ray.cancel(reference, force=True)
         self._pending.clear()
-        if self._owns_connection:
-            ray.shutdown()
 
     def __enter__(self) -> RayExecutor:
         return self
@@ -162,6 +159,27 @@ def _attempt(maker: str, plan: EpisodePlan, folder: str) -> Report:
             f"nodes share under one path: {folder}"
         )
     return attempt_episode(maker, plan, path)
+
+
+@contextmanager
+def connected(address: str, workers: int | None) -> Iterator[None]:
+    """Be connected to a cluster, unless this process is already, and leave it in the end (which ends one of our own).
+
+    Args:
+        address: Of the cluster; "local" starts one on this machine.
+        workers: CPUs of that one; None: every core.
+
+    Raises:
+        ConfigError: It cannot be reached.
+    """
+    if ray.is_initialized():
+        yield
+        return
+    _connect(address, workers or available_cores())
+    try:
+        yield
+    finally:
+        ray.shutdown()
 
 
 def _connect(address: str, cores: int) -> None:

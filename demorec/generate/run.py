@@ -62,13 +62,19 @@ def generate(
         episodes: Order in which episodes are begun (default: ascending); the result does not depend on it.
 
     Raises:
-        ConfigError: The task cannot be loaded, or the folder is in use, holds another run or cannot be written to.
+        MissingDependencyError: Ray is not installed.
+        ConfigError: The task cannot be loaded, the Ray cluster cannot be reached, or the folder is in use, holds
+            another run or cannot be written to.
         GenerationError: The run cannot go on; everything finished is kept.
         KeyboardInterrupt: At the second Ctrl-C.
     """
     progress = progress or NoProgress()
     _refuse_impossible(config, options)
     with ExitStack() as stack:
+        if options.executor == "ray":
+            from demorec.generate.on_ray import connected
+
+            stack.enter_context(connected(options.address, options.workers))  # before anything is written
         folder = stack.enter_context(open_run(config, options, progress=progress, inspect=inspect))
         schedule = Schedule(folder.run, episodes=episodes)
         first = schedule.take()
@@ -95,8 +101,6 @@ def _refuse_impossible(config: GenerateConfig, options: RunOptions) -> None:
     from demorec.loop import load_task
 
     load_task(config)
-    if options.executor == "ray":
-        import demorec.generate.on_ray  # noqa: F401  # MissingDependencyError without Ray
 
 
 def make_executor(options: RunOptions, folder: Path, run: RunFile, maker: str) -> Executor:
@@ -108,7 +112,6 @@ def make_executor(options: RunOptions, folder: Path, run: RunFile, maker: str) -
             maker,
             folder,
             workers=options.workers,
-            address=options.address,
             cpus_per_worker=options.cpus_per_worker,
             gpus_per_worker=options.gpus_per_worker,
             recycle_after=options.recycle_after,

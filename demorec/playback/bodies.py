@@ -11,7 +11,7 @@ import rerun as rr
 import trimesh
 from numpy.typing import NDArray
 
-from demorec.errors import DemorecError
+from demorec.errors import DemorecError, as_reason
 from demorec.geometry import Array, Pose
 from demorec.playback.episode import PlayedEpisode
 from demorec.playback.meshes import SurfaceMesh, joined, mesh_file, of_trimesh, sphere_mesh, urdf_meshes
@@ -95,11 +95,11 @@ def _installed_mesh(shape: Shape) -> SurfaceMesh | None:
     try:
         mesh = _model_mesh(shape)
     except (DemorecError, OSError, ValueError) as error:
-        log.warning("An object is drawn as the recording describes it: its model is not installed here (%s)", error)
+        log.warning("An object is drawn as the recording describes it, since %s.", as_reason(error))
         return None
     extents = mesh.vertices.max(axis=0) - mesh.vertices.min(axis=0)
     if np.abs(extents - shape.extents).max() > _SAME_SIZE * max(shape.extents):
-        log.warning("An object is drawn as the recording describes it: the model %s has another size", shape.file)
+        log.warning("An object is drawn as the recording describes it, since %s has another size.", shape.file)
         return None
     return mesh
 

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 import numpy as np
 import rerun as rr
 
-from demorec.errors import DemorecError, in_words
+from demorec.errors import DemorecError, as_reason
 from demorec.geometry import Array, quat_multiply
 from demorec.playback.episode import PlayedEpisode
 from demorec.playback.meshes import SurfaceMesh, urdf_meshes
@@ -102,14 +102,14 @@ def robot_model(urdf: str, scale: float, description: str | None) -> tuple[Urdf,
     except (DemorecError, OSError, ValueError) as error:
         if recorded is None:
             raise
-        reason = f"its model is not installed here ({in_words(error)})"
+        reason = as_reason(error)
     else:
         if recorded is None or _same_joints(installed, recorded):
             return installed, meshes
         reason = f"the model installed here has other joints ({urdf})"
     assert description is not None
     assert recorded is not None
-    log.warning("The robot is drawn as the boxes and cylinders of the recording: %s", reason)
+    log.warning("The robot is drawn as the boxes and cylinders of the recording, since %s.", reason)
     return recorded, urdf_meshes(description, None)
 
 

@@ -20,6 +20,7 @@ from rerun.experimental import ViewerClient
 from demorec.errors import ConfigError, DemorecError, RecordingError
 from demorec.playback.programs import free_port, has_display, viewer_environment, viewer_program
 from demorec.playback.times import SECONDS
+from demorec.processes import start_program
 from demorec.safety.replacing import PICTURE, written_whole
 
 _START_SECONDS = 60.0
@@ -51,7 +52,7 @@ def show(recordings: Sequence[Path]) -> None:
         "--hide-welcome-screen",
         *map(str, recordings),
     ]
-    code = subprocess.run(command, env=viewer_environment(), check=False).returncode
+    code = start_program(command, env=viewer_environment()).wait()
     if code:
         raise RecordingError(f"Rerun's viewer ended with exit code {code}.")
 
@@ -96,13 +97,12 @@ class HeadlessViewer:
         self._recordings = recordings
         # Not a pipe, which would fill up when nobody reads it.
         self._said = tempfile.TemporaryFile(mode="w+", errors="replace")  # noqa: SIM115 (closed by close)
-        self._process = subprocess.Popen(
+        self._process = start_program(
             [
                 viewer_program(), "--headless", "--port", str(self._port), "--bind", "127.0.0.1",
                 "--window-size", f"{width}x{height}", "--hide-welcome-screen", *map(str, recordings),
             ],
             env=viewer_environment(),
-            stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=self._said,
         )  # fmt: skip
@@ -269,13 +269,12 @@ def serve_web(recordings: Sequence[Path], *, web_port: int = 0) -> Iterator[tupl
     """
     data_port, web_port = free_port(), web_port or free_port()
     memory = max(1024, 3 * sum(recording.stat().st_size for recording in recordings) // 2**20)
-    process = subprocess.Popen(
+    process = start_program(
         [
             viewer_program(), "--serve-web", "--bind", "127.0.0.1", "--port", str(data_port),
             "--web-viewer-port", str(web_port), "--server-memory-limit", f"{memory}MiB", *map(str, recordings),
         ],
         env=viewer_environment(),
-        stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
     )  # fmt: skip
     try:
@@ -299,6 +298,8 @@ def _wait_for_page(page: str, process: subprocess.Popen[Any]) -> None:
 
 def end_process(process: subprocess.Popen[Any]) -> None:
     """Ask a process to end, and make it when it does not within some seconds."""
+    if process.stdin is not None:
+        process.stdin.close()
     if process.poll() is None:
         process.terminate()
         try:

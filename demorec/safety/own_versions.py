@@ -1,8 +1,10 @@
 """What modules of the user's own are made of: their part in the versions that decide an episode.
 
 A module counts with its source and with that of what it imports of its own surroundings: modules of its own package
-and, unless it is installed, modules of the folder that it lies in. Imports are read, not carried out. A robot counts
-with its URDF and the meshes that this names, too. What an installed distribution brings has its version as well.
+and, unless it is installed, modules of the folder that it lies in. Imports are read, not carried out. The files beside
+a module that its source names in a string ("mug.obj", "data/heights.csv") count as well, and those that a model among
+them names; a name that is put together while the program runs is not seen. A robot counts with its URDF and the meshes
+that this names, too. What an installed distribution brings has its version as well.
 """
 
 from __future__ import annotations
@@ -11,6 +13,7 @@ import ast
 import functools
 import hashlib
 import importlib.metadata
+import os
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -24,6 +27,9 @@ from demorec.tables import load_robot
 SOURCE = "source of "
 """Begins the name of a digest among versions: "source of my_tasks"."""
 _INSTALLED = ("site-packages", "dist-packages")
+_LONGEST_NAME = 256
+_NAMES_IN_MODELS = {".urdf": [r'filename="([^"]+)"'], ".obj": [r"^mtllib (.+)$"], ".mtl": [r"^map_\w+ (.+)$"]}
+"""How models name other files: suffix -> patterns."""
 
 
 def own_versions(modules: Sequence[str], *, robot: str = "") -> dict[str, str]:
@@ -82,7 +88,7 @@ def changed_sources(versions: Mapping[str, str], allowed: Collection[str]) -> tu
 
 @functools.cache
 def source_digest(module: str) -> str:
-    """SHA-256 (16 hex digits) of a module's source and of what it imports of its own surroundings.
+    """SHA-256 (16 hex digits) of a module's source, of what it imports of its own surroundings, and of files they name.
 
     Kept as it was at the first call in a process, since that is also what the process has imported.
 
@@ -91,7 +97,7 @@ def source_digest(module: str) -> str:
     """
     top, root = module.partition(".")[0], import_root(module)
     is_installed = root.name in _INSTALLED or root == Path(ast.__file__).parent
-    waiting, sources = [module], dict[str, Path]()
+    waiting, sources, data = [module], dict[str, Path](), dict[str, Path]()
     while waiting:
         name = waiting.pop()
         if name in sources or (is_installed and name.partition(".")[0] != top):
@@ -99,9 +105,10 @@ def source_digest(module: str) -> str:
         source = _file_of(name, root)
         if source is not None:
             sources[name] = source
+            data |= {path.relative_to(root).as_posix(): path for path in _files_named(source, root)}
             waiting += _imports(source, name if source.stem == "__init__" else name.rpartition(".")[0])
             waiting += name.rpartition(".")[:1]  # the package around it, which is run first
-    return _digest((name, path.read_bytes()) for name, path in sorted(sources.items()))
+    return _digest((name, path.read_bytes()) for name, path in (*sorted(sources.items()), *sorted(data.items())))
 
 
 @functools.cache
@@ -119,11 +126,7 @@ def _file_of(name: str, root: Path) -> Path | None:
 
 def _imports(source: Path, package: str) -> Iterator[str]:
     """Every name that may be that of a module which the source imports; nothing where it is no Python."""
-    try:
-        tree = ast.parse(source.read_bytes())
-    except (SyntaxError, ValueError):
-        return
-    for node in ast.walk(tree):
+    for node in _nodes(source):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -131,6 +134,34 @@ def _imports(source: Path, package: str) -> Iterator[str]:
             base = ".".join([*around, node.module] if node.module else around)
             yield base
             yield from (f"{base}.{alias.name}" for alias in node.names)
+
+
+def _files_named(source: Path, root: Path) -> Iterator[Path]:
+    """The files below `root` that a string in a source names, relative to it, and those that models among them name."""
+    names = {node.value for node in _nodes(source) if isinstance(node, ast.Constant) and isinstance(node.value, str)}
+    waiting = [(source.parent, name) for name in names if 0 < len(name) < _LONGEST_NAME]
+    seen: set[Path] = set()
+    while waiting:
+        folder, name = waiting.pop()
+        path = Path(os.path.normpath(folder / name))
+        try:
+            is_new = path not in seen and path.is_relative_to(root) and path.is_file()
+        except (OSError, ValueError):  # no name of a file
+            continue
+        if is_new:
+            seen.add(path)
+            yield path
+            for pattern in _NAMES_IN_MODELS.get(path.suffix.lower(), ()):
+                found = re.findall(pattern, path.read_text(errors="replace"), re.MULTILINE)
+                waiting += [(path.parent, inner.strip()) for inner in found]
+
+
+def _nodes(source: Path) -> Iterator[ast.AST]:
+    """All of a source's syntax tree; nothing where it is no Python."""
+    try:
+        yield from ast.walk(ast.parse(source.read_bytes()))
+    except (SyntaxError, ValueError):
+        return
 
 
 def _model_digest(urdf: Path) -> str:

@@ -71,6 +71,13 @@ def test_required_flags_say_so(capsys: pytest.CaptureFixture[str], monkeypatch: 
     assert "Runs, recordings, or folders of recordings. (required)" in text
 
 
+@pytest.mark.parametrize("program", ["demorec export", *(f"demorec export {name}" for name in EXPORTERS.names())])
+def test_the_usage_of_an_export_has_the_format(
+    program: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert help_of(program, 120, capsys, monkeypatch)[0].endswith("FORMAT [[PATH [PATH ...]]]")
+
+
 def test_an_empty_hint_leaves_no_empty_row(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     for width in range(70, 90):
         assert not [line for line in help_of("demorec view", width, capsys, monkeypatch) if re.fullmatch(r"│ +│", line)]

@@ -194,6 +194,20 @@ def test_info_of_something_else(
     assert error.count("\n") == 1
 
 
+@pytest.mark.parametrize("command", ["info", "view"])
+@pytest.mark.parametrize("inside", ["", "a.mcap.part", "failed/a.mcap", "run/episodes/a.mcap"])
+def test_an_unfit_folder_is_told_in_one_sentence(
+    tmp_path: Path, command: str, inside: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if inside:
+        (tmp_path / inside).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / inside).touch()
+    assert run(command, tmp_path) == 2
+    said = capsys.readouterr().err
+    assert said.endswith(f": {tmp_path}\n")
+    assert ". " not in said.removesuffix(f"{tmp_path}\n")
+
+
 def test_info_without_a_path(capsys: pytest.CaptureFixture[str]) -> None:
     assert run("info") == 2
     assert "No path is given" in capsys.readouterr().err

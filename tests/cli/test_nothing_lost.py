@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 from collections.abc import Callable
+from importlib.metadata import version
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -170,6 +171,11 @@ def write_a_chapter(run: Path, made: Path) -> None:
     (run / "failed/chapter/1.tex").write_text("mine")
 
 
+def note_in_dataset(run: Path, made: Path) -> None:
+    (run / "dataset").mkdir()
+    (run / "dataset" / "note.txt").write_text("mine")
+
+
 SPOILERS: dict[str, Callable[[Path, Path], object]] = {
     "episodes/notes.txt": lambda run, made: (run / "episodes/notes.txt").write_text("mine"),
     "episodes/episode_000077.mcap": lambda run, made: (run / "episodes/episode_000077.mcap").write_text("mine"),
@@ -177,6 +183,7 @@ SPOILERS: dict[str, Callable[[Path, Path], object]] = {
     "failed/chapter/1.tex": write_a_chapter,
     "unfinished/ideas.txt": lambda run, made: (run / "unfinished/ideas.txt").write_text("mine"),
     "dataset": spoil_dataset,
+    "dataset/note.txt": note_in_dataset,
 }  # fmt: skip
 
 
@@ -294,6 +301,19 @@ def test_an_evaluation_is_overwritten_and_what_lies_beside_stays(evaluation: Pat
     (evaluation / "notes.txt").write_text("mine")
     _open(SETTINGS, evaluation, overwrite=True)
     assert files_of(evaluation).keys() == {EVALUATION_NAME, "notes.txt"}
+
+
+def test_an_evaluation_says_with_which_versions_it_was_made(evaluation: Path) -> None:
+    plain = json.loads((evaluation / EVALUATION_NAME).read_text())
+    for package in ("demorec", "pybullet", "numpy", "lerobot", "torch"):
+        assert plain["versions"][package] == version(package)
+    plain["versions"]["torch"] = "1.0"
+    (evaluation / EVALUATION_NAME).write_text(json.dumps(plain))
+    with pytest.raises(ConfigError, match=r"version of torch is 1\.0 there"):
+        _open(SETTINGS, evaluation, overwrite=False)
+    del plain["versions"]  # as of an older demorec
+    (evaluation / EVALUATION_NAME).write_text(json.dumps(plain))
+    assert not _open(SETTINGS, evaluation, overwrite=False).versions
 
 
 @pytest.mark.parametrize("content", ["{}", "[]", "", '{"settings": 1, "rollouts": []}'])

@@ -207,3 +207,10 @@ def test_too_large_workers_are_refused(tmp_path: Path, cluster: object) -> None:
 def test_an_unreachable_cluster_is_told_at_once(tmp_path: Path, address: str) -> None:
     with pytest.raises(ConfigError, match=r"cannot be reached .* give the address that `ray start --head` has printed"):
         on_ray._connect(address, 1)
+
+
+def test_an_unreachable_cluster_leaves_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(on_ray.ray, "is_initialized", lambda: False)  # whatever the tests before have begun
+    with pytest.raises(ConfigError, match="cannot be reached"):
+        run_on_ray(tmp_path / "run", maker="make", address="127.0.0.1:1")
+    assert list(tmp_path.iterdir()) == []

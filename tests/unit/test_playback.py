@@ -261,6 +261,7 @@ def test_a_recording_shows_everything_where_the_models_are_not_installed(
     said = caplog.text
     assert "The robot is drawn as the boxes and cylinders of the recording" in said
     assert said.count("An object is drawn as the recording describes it") == 2
+    assert all(message.endswith(".") and ". " not in message for message in caplog.messages)  # a sentence each
     links = {entity for entity in drawn if "/robot/" in entity and _has(drawn[entity], "Mesh3D:vertex_positions")}
     assert {link.rpartition("/")[2] for link in links} >= {f"panda_link{n}" for n in range(8)} | {"panda_hand"}
     for entity in [*sorted(links), "/world/bodies/duck", "/world/bodies/brick"]:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
 from pathlib import Path
 
 import psutil
+
+from demorec.processes import start_program
 
 SCRIPT = """
 import sys
@@ -75,3 +78,39 @@ def test_workers_of_a_pool_end_with_their_parent_busy_or_idle(tmp_path: Path) ->
     parent.wait()
     _, alive = psutil.wait_procs(descendants, timeout=120)
     assert not alive
+
+
+STARTS = """
+import sys
+from demorec.processes import start_program
+
+process = start_program([sys.executable, "-c", "import time; print('ready', flush=True); time.sleep(600)"])
+process.wait()
+"""
+
+
+def test_a_program_ends_with_the_process_that_started_it(tmp_path: Path) -> None:
+    parent = subprocess.Popen([sys.executable, "-c", STARTS], cwd=tmp_path, stdout=subprocess.PIPE, text=True)
+    assert parent.stdout is not None
+    assert parent.stdout.readline() == "ready\n"
+    descendants = psutil.Process(parent.pid).children(recursive=True)
+    assert len(descendants) == 2  # the program, and ours in between
+    parent.kill()
+    parent.wait()
+    _, alive = psutil.wait_procs(descendants, timeout=20)
+    assert not alive
+
+
+def test_a_program_ends_when_it_is_asked_to_and_tells_how_it_ended() -> None:
+    command = [sys.executable, "-c", "import time; print('ready', flush=True); time.sleep(600)"]
+    process = start_program(command, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "ready\n"
+    programs = psutil.Process(process.pid).children()
+    assert len(programs) == 1
+    process.terminate()
+    assert process.wait(20) == signal.SIGTERM
+    _, alive = psutil.wait_procs(programs, timeout=20)
+    assert not alive
+    with start_program([sys.executable, "-c", "raise SystemExit(7)"]) as failing:
+        assert failing.wait(20) == 7

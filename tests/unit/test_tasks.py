@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,6 +20,7 @@ from demorec.scene.episode import Frame
 from demorec.scene.scene import Body, Shape, ShapeKind
 from demorec.sim.robots.panda import PANDA
 from demorec.sim.world import World
+from demorec.tables import TASKS
 from demorec.tasks import skills
 from demorec.tasks.conditions import lasting
 from demorec.tasks.grasping import grasp_yaws, grasps_beside, hand_down, hand_yaw, raised, symmetric_yaws
@@ -303,3 +306,9 @@ def test_a_cube_that_slips_is_dropped_and_fails_after_three_tries() -> None:
     assert outcome.num_retries == 2
     assert outcome.failure_phase in ("lift", "close", "transport")
     assert outcome.failure_reason
+
+
+def test_the_documented_table_has_every_task_in_its_own_words() -> None:
+    text = (Path(__file__).parents[2] / "docs" / "tasks.md").read_text()
+    rows = re.findall(r"^\| `(\w+)` \| (.+?) \|", text, re.MULTILINE)
+    assert rows == [(name, TASKS.load(name).summary) for name in TASKS.names()]

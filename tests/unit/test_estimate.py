@@ -1,0 +1,54 @@
+"""The size that a dry run tells, compared with that of a whole run and its dataset."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from support.export import export, make_run
+
+from demorec.config import EpisodePlan, GenerateConfig
+from demorec.generate import estimate as estimating
+from demorec.generate.executor import Made
+from demorec.generate.options import RunOptions
+from demorec.runs.run_file import Attempt
+
+LENGTHS = [40] * 8
+
+
+def bytes_in(folder: Path) -> int:
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+
+
+def made(file: Path, folder: Path) -> Made:
+    attempt = Attempt(
+        episode_index=0, attempt=0, seed=0, success=True, file=file.relative_to(folder).as_posix(), sha256="",
+        digest="", num_frames=40, num_bytes=file.stat().st_size,
+    )  # fmt: skip
+    return Made(plan=EpisodePlan(config=GenerateConfig(), episode_index=0), attempt=attempt, peak_bytes=0)
+
+
+@pytest.mark.parametrize("cameras", [(), ("front",)])
+@pytest.mark.parametrize("exports", [True, False])
+def test_the_size_is_about_that_of_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cameras: tuple[str, ...], exports: bool
+) -> None:
+    run = make_run(tmp_path / "run", LENGTHS, cameras=cameras)
+    files = sorted((run / "episodes").glob("*.mcap"))
+
+    def make(maker: str, folder: Path, plans: list[EpisodePlan], workers: int) -> list[Made]:
+        for file in files[: len(plans)]:
+            (folder / "episodes" / file.name).write_bytes(file.read_bytes())
+        return [made(folder / "episodes" / file.name, folder) for file in files[: len(plans)]]
+
+    monkeypatch.setattr(estimating, "_make", make)
+    options = RunOptions(out=tmp_path / "new", num_episodes=len(LENGTHS), export=exports)
+    told = estimating.estimate(GenerateConfig(cameras=cameras), options)
+    size = bytes_in(run / "episodes")
+    if exports:
+        export(run, tmp_path / "dataset")
+        export(files[0], tmp_path / "first")  # with what every dataset has, however many episodes
+        growth = bytes_in(tmp_path / "dataset") - bytes_in(tmp_path / "first")
+        size += growth * len(files) // (len(files) - 1)
+    assert told.total_bytes == pytest.approx(size, rel=0.15)
+    assert bool(told.dataset_bytes) == exports
