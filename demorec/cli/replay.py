@@ -129,17 +129,23 @@ def demonstrations(
 ) -> Iterator[Demonstration]:
     """What there is to replay in some paths, in order; with a limit: so many of each path, spread evenly.
 
-    Tells where modules of the user's own are not what they were when the episodes were recorded.
+    Tells, before each of them, in which versions what recorded it differs from what is here, and where modules of the
+    user's own are not what they were.
     """
-    from demorec.safety.own_versions import changed_sources
+    from demorec.config import deciding_versions
+    from demorec.safety.own_versions import changed_sources, version_differences
     from demorec.scene.assets import allow_models
 
     allow_models(options.allowed)
     noted: set[str] = set()
+    here = deciding_versions()
     for demonstration in _found(paths, options, episodes=episodes, limit=limit):
-        for line in changed_sources(demonstration.info.versions, options.allowed):
+        versions = demonstration.info.versions
+        lines = [f"{line} since this was recorded" for line in changed_sources(versions, options.allowed)]
+        lines += version_differences({name: versions[name] for name in versions if name in here}, here)
+        for line in lines:
             if line not in noted:
-                tell(f"Note: {line} since this was recorded.")
+                tell(f"Note: {line}.")
             noted.add(line)
         yield demonstration
 

@@ -16,8 +16,9 @@ from demorec.cli.output import say, tell
 class Reproduce:
     """Make a run or a dataset again and compare every episode to the bit.
 
-    Everything that is needed is read from run.json, or from what a dataset says about itself. Exit code 1 when an
-    episode differs. The same command again goes on where it stopped.
+    Config and seed are read from run.json, or from what a dataset says about itself; compared is what the recordings,
+    or the dataset's tables and videos, hold now. Exit code 1 when an episode differs or cannot be read. The same
+    command again goes on where it stopped.
 
     Examples:
       demorec reproduce recordings/cubes --out /tmp/cubes
@@ -52,8 +53,6 @@ class Reproduce:
         if not isinstance(found, Comparison):
             tell(f"Interrupted; the same command goes on: {self.out}")
             return 130
-        for difference in found.versions:
-            tell(f"Note: {difference}.")
         total = len(found.same) + len(found.different)
         say(f"{len(found.same)} of {total} episodes are the same to the bit: {self.source} and {found.result.folder}")
         before = total - len(found.result.made)
@@ -61,6 +60,7 @@ class Reproduce:
             tell(
                 f"Note: {before} of them were in {self.out} before and were not made now: a new --out proves them, too."
             )
+        tell(*found.faults[:10])
         if found.different:
             shown = ", ".join(f"{episode} (attempt {attempt})" for episode, attempt in found.different[:10])
             tell(f"Different: {shown}{', ...' if len(found.different) > 10 else ''}")

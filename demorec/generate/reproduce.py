@@ -1,7 +1,7 @@
 """The same data again, from what a run or a dataset says about itself, and whether it is the same.
 
-A run is compared recording by recording (content digest); a dataset is exported again with its own options and
-compared episode by episode, since all that is left of its recordings is in it.
+A run is compared recording by recording: what its files hold now, whatever run.json says of them. A dataset is exported
+again with its own options and compared episode by episode, by what its tables and videos hold.
 """
 
 from __future__ import annotations
@@ -12,18 +12,21 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from demorec.config import GenerateConfig, parse_config
-from demorec.errors import ConfigError, DemorecError, in_words, resource_error
+from demorec.config import GenerateConfig, deciding_versions, parse_config
+from demorec.errors import ConfigError, DemorecError, RecordingError, in_words, resource_error
 from demorec.generate.contents import is_dataset_of_run
 from demorec.generate.observer import RunObserver, RunResult
 from demorec.generate.options import RunOptions
 from demorec.generate.run import generate
 from demorec.lerobot import ExportOptions, export_lerobot
 from demorec.lerobot.files import read_json, read_table
+from demorec.lerobot.inspect import episode_digests
+from demorec.lerobot.layout import DatasetInfo
 from demorec.lerobot.paths import SIDECAR_DIR
 from demorec.lerobot.sidecar import CONFIGS_PATH, EXPORT_PATH
+from demorec.recording import Recording
 from demorec.runs.find import expect
-from demorec.runs.run_file import DATASET, load_run_file
+from demorec.runs.run_file import DATASET, RUN_NAME, load_run_file
 from demorec.safety.own_versions import version_differences
 from demorec.safety.replacing import use_as_source
 from demorec.scene.validity import read_episode_info
@@ -39,15 +42,17 @@ class Original:
     Attributes:
         config: That decided the data.
         num_episodes: Of the run, as many as are needed to have all that is compared.
-        versions: package -> version that it was made with; empty where a dataset does not say.
-        digests: (episode, attempt) -> content digest.
+        versions: package -> version that episodes were made with, each such set once.
+        digests: (episode, attempt) -> digest of the content that is there now; "" where `faults` tells of it.
+        faults: One line for each recording that is missing, cannot be read, or is not what run.json says of it.
         export: Options of the dataset; None for a run.
     """
 
     config: GenerateConfig
     num_episodes: int
-    versions: Mapping[str, str]
+    versions: tuple[Mapping[str, str], ...]
     digests: Mapping[Key, str]
+    faults: tuple[str, ...] = ()
     export: ExportOptions | None
 
 
@@ -59,13 +64,13 @@ class Comparison:
         result: The run that was made.
         same: Episodes and attempts whose content is the same to the bit.
         different: Those whose content is not, or that the copy does not have.
-        versions: Package versions in which the two differ, in words.
+        faults: As of `Original`.
     """
 
     result: RunResult
     same: tuple[Key, ...]
     different: tuple[Key, ...]
-    versions: tuple[str, ...]
+    faults: tuple[str, ...]
 
 
 def reproduce(
@@ -76,7 +81,7 @@ def reproduce(
     Args:
         source: A run or a dataset.
         options: How it is carried out.
-        progress: Is told how it goes.
+        progress: Is told how it goes, and first of all in which versions the source differs from what is here.
         allowed: The user's own modules that may be imported for what the source names.
 
     Raises:
@@ -90,6 +95,9 @@ def reproduce(
     if overlap:
         raise ConfigError(f"The copy needs a place of its own, but {overlap}: choose another --out: {options.out}")
     original.config.check_names(allowed)
+    here = deciding_versions(original.config)
+    for line in dict.fromkeys(line for there in original.versions for line in version_differences(there, here)):
+        progress.says(f"Note: {line}.")
     result = generate(original.config, replace(options, num_episodes=original.num_episodes), progress=progress)
     if result.interrupted:
         return result
@@ -109,7 +117,7 @@ def reproduce(
         result=result,
         same=same,
         different=tuple(key for key in original.digests if key not in same),
-        versions=version_differences(original.versions, result.run.versions) if original.versions else (),
+        faults=original.faults,
     )
 
 
@@ -126,20 +134,44 @@ def _is_such_a_copy(target: Path, original: Original, config_digest: str) -> boo
 def read_original(source: Path) -> Original:
     """What a run or a dataset says about itself; ConfigError when that is not enough to make it again."""
     if expect(source, "run", "dataset").kind == "run":
-        run = load_run_file(source)
-        if not run.attempts:
-            raise ConfigError(f"The run has no episodes yet: {source}")
-        run.config.validate()
-        return Original(
-            config=run.config,
-            num_episodes=1 + max(a.episode_index for a in run.attempts),
-            versions=run.versions,
-            digests={(a.episode_index, a.attempt): a.digest for a in run.attempts},
-            export=None,
-        )
+        return _read_run(source)
     if not os.path.lexists(source / CONFIGS_PATH):
         raise ConfigError(f"The dataset does not say what it was made with ({CONFIGS_PATH} is missing): {source}")
     return _read_dataset(source)
+
+
+def _read_run(source: Path) -> Original:
+    run = load_run_file(source)
+    if not run.attempts:
+        raise ConfigError(f"The run has no episodes yet: {source}")
+    run.config.validate()
+    digests: dict[Key, str] = {}
+    versions, faults = [run.versions], []
+    for attempt in run.attempts:
+        key, path = (attempt.episode_index, attempt.attempt), source / attempt.file
+        digests[key] = attempt.digest
+        if not attempt.file:  # no scene could be laid out, so that nothing was recorded
+            continue
+        try:
+            with Recording(path) as recording:
+                info, found = recording.info, recording.digest()
+        except RecordingError as error:
+            digests[key] = ""
+            faults.append(str(error))
+            continue
+        if (info.episode_index, info.attempt, found) != (*key, attempt.digest):
+            digests[key] = ""
+            faults.append(f"The recording is not the one that {RUN_NAME} lists: {path}")
+        if info.versions not in versions:
+            versions.append(info.versions)
+    return Original(
+        config=run.config,
+        num_episodes=1 + max(a.episode_index for a in run.attempts),
+        versions=tuple(there for there in versions if there),
+        digests=digests,
+        faults=tuple(faults),
+        export=None,
+    )
 
 
 def _read_dataset(source: Path) -> Original:
@@ -160,8 +192,8 @@ def _read_dataset(source: Path) -> Original:
         return Original(
             config=original,
             num_episodes=1 + max(row["run_episode_index"] for row in rows),
-            versions=read_episode_info(rows[0]["episode_info"]).versions,
-            digests=_digests(rows),
+            versions=(read_episode_info(rows[0]["episode_info"]).versions,),
+            digests=_digests(source, rows),
             export=ExportOptions(
                 action=made_with["action"],
                 privileged=made_with["privileged"],
@@ -178,11 +210,15 @@ def _read_dataset(source: Path) -> Original:
 
 
 def _dataset_digests(dataset: Path) -> dict[Key, str]:
-    return _digests(_rows(dataset))
+    return _digests(dataset, _rows(dataset))
 
 
-def _digests(rows: list[dict[str, Any]]) -> dict[Key, str]:
-    return {(row["run_episode_index"], row["attempt"]): row["content_digest"] for row in rows}
+def _digests(dataset: Path, rows: list[dict[str, Any]]) -> dict[Key, str]:
+    """Of what the tables and videos hold."""
+    digests = episode_digests(dataset, DatasetInfo.load(dataset))
+    if len(digests) != len(rows):
+        raise ConfigError(f"The dataset has {len(digests)} episodes, its sidecar tells of {len(rows)}: {dataset}")
+    return {(row["run_episode_index"], row["attempt"]): found for row, found in zip(rows, digests, strict=True)}
 
 
 def _rows(dataset: Path) -> list[dict[str, Any]]:
