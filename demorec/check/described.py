@@ -147,6 +147,8 @@ def noise_as_said(episode: RecordedEpisode) -> Found:
         frame = int(np.argmax(loud)) if len(loud) else None
         return Measurement(value=0.0 if loud.max(initial=0.0) < 1e-9 else 1.0, frame=frame, detail="none is said")
     noisy = loud > 0.5 * sigma
+    if loud.max(initial=0.0) < 1e-9 and any(c.phase):
+        return Measurement(value=1.0, detail=f"{sigma:.4f} rad are said, there is none")
     if noisy.sum() < 15:
         return NotMeasured(why=f"{int(noisy.sum())} frames have noise")
     found = float(np.sqrt((noise[noisy] ** 2).mean()))
