@@ -19,7 +19,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from demorec.check.limits import TABLE, Calibration, LimitTable, limit_table
+from demorec.check.limits import TABLE, Calibration, LimitTable, read_table
 from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.config import EpisodePlan, GenerateConfig, VideoConfig
 from demorec.errors import SceneError
@@ -106,7 +106,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--anew", action="store_true", help="forget the values in the table")
     options = parser.parse_args(argv)
     first, step = (int(word) for word in options.part.split("/"))
-    before = limit_table()
+    before = read_table()
     largest = {name: 0.0 if options.anew else limit.largest for name, limit in before.checks.items()}
     count = 0 if options.anew else before.calibration.episodes
     with tempfile.TemporaryDirectory() as folder:
@@ -114,15 +114,16 @@ def main(argv: list[str] | None = None) -> None:
             for index in range(options.first, options.first + options.episodes):
                 count += measure(config, index, Path(folder) / "episode.mcap", largest)
             # After each setting, so that one can stop at any time.
-            write_table(before, largest, seed=options.seed, episodes=count)
+            write_table(largest, seed=options.seed, episodes=count)
     print(f"{count} episodes in all; limits that are too near:")
-    for name, limit in before.checks.items():
-        if largest[name] * before.calibration.margin > limit.warn:
-            print(f"  {name}: warns above {limit.warn:g}, the largest value is {largest[name]:g}")
+    for name, limit in read_table().checks.items():
+        if largest.get(name, 0.0) * before.calibration.margin > limit.warn:
+            print(f"  {name}: warns above {limit.warn:g}, the largest value is {largest.get(name, 0.0):g}")
 
 
-def write_table(before: LimitTable, largest: Mapping[str, float], *, seed: int, episodes: int) -> None:
-    """The same limits with what was measured."""
+def write_table(largest: Mapping[str, float], *, seed: int, episodes: int) -> None:
+    """The limits as they are now, with what was measured."""
+    before = read_table()
     calibration = Calibration(
         seed=seed,
         date=datetime.datetime.now(datetime.UTC).date().isoformat(),
@@ -130,7 +131,10 @@ def write_table(before: LimitTable, largest: Mapping[str, float], *, seed: int, 
         settings="all tasks, robots and variations; 64 to 640 pixels, 10 to 60 fps, three codecs, depth and labels",
         margin=before.calibration.margin,
     )
-    checks = {name: replace(limit, largest=round(largest[name], 6)) for name, limit in before.checks.items()}
+    checks = {
+        name: replace(limit, largest=round(largest.get(name, limit.largest), 6))
+        for name, limit in before.checks.items()
+    }
     TABLE.write_text(written(LimitTable(calibration=calibration, checks=checks)))
 
 

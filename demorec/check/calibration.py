@@ -197,7 +197,7 @@ def picture_lag(episode: RecordedEpisode) -> Found:
 
 @check(
     group="calibration",
-    measures="difference of depth pictures from what the recorded numbers make of them, of 255 for 3 m",
+    measures="share of a depth picture that is not what the recorded numbers make of it",
     needs_pictures=True,
     reads=(
         "/camera/{camera}/depth",
@@ -209,12 +209,12 @@ def picture_lag(episode: RecordedEpisode) -> Found:
 )
 def depth_matches_scene(episode: RecordedEpisode) -> Found:
     """Depth is metres along the optical axis, in every frame: catches other units, distances along the ray, flips."""
-    return _unlike(episode, "depth")
+    return _strays(episode, "depth")
 
 
 @check(
     group="calibration",
-    measures="difference of labels from what the recorded numbers make of them, of 255",
+    measures="share of a picture of labels that is not what the recorded numbers make of it",
     needs_pictures=True,
     reads=(
         "/camera/{camera}/segmentation",
@@ -225,19 +225,19 @@ def depth_matches_scene(episode: RecordedEpisode) -> Found:
 )
 def segmentation_matches_scene(episode: RecordedEpisode) -> Found:
     """Every pixel has the label of the body that geometry puts there, in every frame."""
-    return _unlike(episode, "labels")
+    return _strays(episode, "labels")
 
 
-def _unlike(episode: RecordedEpisode, kind: Kind) -> Found:
-    """The largest difference of any picture of a kind from the drawn one."""
+def _strays(episode: RecordedEpisode, kind: Kind) -> Found:
+    """The largest share of any picture of a kind."""
     found: list[Found] = []
     for camera in episode.cameras:
         if kind not in episode.kinds(camera.name):
             continue
-        compared = episode.compared(camera, kind)
-        if isinstance(compared, NotMeasured):
-            found.append(compared)
+        share = episode.strays(camera, kind)
+        if isinstance(share, NotMeasured):
+            found.append(share)
             continue
-        frame = int(np.argmax(compared.unlike))
-        found.append(Measurement(value=float(compared.unlike[frame]), frame=frame, detail=f"camera {camera.name}"))
+        frame = int(np.argmax(share))
+        found.append(Measurement(value=float(share[frame]), frame=frame, detail=f"camera {camera.name}"))
     return worst(*found)

@@ -57,14 +57,13 @@ def _statements(episode: RecordedEpisode) -> Iterator[tuple[str, object, object]
     found: dict[str, Any] = {"task": info.task, "seed": info.root_seed, "fps": info.fps, "physics_hz": info.physics_hz}
     for name, value in found.items():
         yield name, value, config.get(name, value)
-    yield "robot", info.robot.name, str(config.get("robot", info.robot.name)).rpartition(":")[2] and info.robot.name
     yield "robot of the scene", info.scene.robot.name, info.robot.name
     yield "physics rate of the scene", info.scene.physics.hz, info.physics_hz
     if "max_attempts" in config:
         yield "attempt within the allowed", info.attempt < int(config["max_attempts"]), True
     if "robot" in config and config["robot"] in ROBOTS.rows:
         yield "robot", info.robot.name, config["robot"]
-    if "cameras" not in config:
+    if "cameras" not in config or info.origin:  # a rendering may have cameras of its own
         return
     yield "cameras", [camera.name for camera in episode.cameras], [camera_name(str(n)) for n in config["cameras"]]
     for camera in episode.cameras:
@@ -147,6 +146,8 @@ def noise_as_said(episode: RecordedEpisode) -> Found:
         frame = int(np.argmax(loud)) if len(loud) else None
         return Measurement(value=0.0 if loud.max(initial=0.0) < 1e-9 else 1.0, frame=frame, detail="none is said")
     noisy = loud > 0.5 * sigma
+    if loud.max(initial=0.0) < 1e-9 and any(c.phase):
+        return Measurement(value=1.0, detail=f"{sigma:.4f} rad are said, there is none")
     if noisy.sum() < 15:
         return NotMeasured(why=f"{int(noisy.sum())} frames have noise")
     found = float(np.sqrt((noise[noisy] ** 2).mean()))

@@ -144,6 +144,8 @@ class Comparison:
     shown: Array
 
 
+_STRAY = 4.0
+"""Of 255: a depth or label that is off by more is another."""
 _MAX_LAG = 3
 _MOVING = 1.0
 _MIN_MOVING = 12
@@ -180,6 +182,23 @@ def compare(seen: Cells, drawn: Cells) -> Comparison:
         motion=motion,
         shown=(observed * step).sum(axis=(1, 2, 3)) / np.maximum((step**2).sum(axis=(1, 2, 3)), 1e-6),
     )
+
+
+def strays(seen: Cells, drawn: Cells) -> Array:
+    """(T,) share of the cells whose value lies outside those of the drawn cell and its eight neighbours.
+
+    For depth and labels, which are coded without loss: edges may lie elsewhere by a cell, nothing else may differ.
+    """
+    drawn = drawn[: len(seen)]
+    padded = np.pad(drawn, ((0, 0), (1, 1), (1, 1), (0, 0)), mode="edge")
+    height, width = drawn.shape[1:3]
+    around = [padded[:, i : i + height, j : j + width] for i in range(3) for j in range(3)]
+    low, high = around[0].copy(), around[0].copy()
+    for cells in around[1:]:
+        np.minimum(low, cells, out=low)
+        np.maximum(high, cells, out=high)
+    off = np.maximum(low - seen, seen - high).max(axis=3) > _STRAY
+    return np.asarray(off.mean(axis=(1, 2)), dtype=np.float64)
 
 
 def _rms(cells: Cells) -> Array:

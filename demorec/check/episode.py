@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.check.base import NotMeasured
-from demorec.check.drawn import NOT_DRAWABLE, Cells, Comparison, Kind, compare, draw_all
+from demorec.check.drawn import NOT_DRAWABLE, Cells, Comparison, Kind, compare, draw_all, strays
 from demorec.check.pictures_summary import PictureSummary, summarise
 from demorec.check.rows import inverse, link_matrices, matrices
 from demorec.errors import RecordingError
@@ -217,6 +217,15 @@ class RecordedEpisode:
             return draw_all(self.info, self.columns, {camera.name: self.kinds(camera.name) for camera in self.cameras})
         except NOT_DRAWABLE as error:
             return NotMeasured(why=f"the recording cannot be drawn here: {error}")
+
+    def strays(self, camera: Camera, kind: Kind) -> Array | NotMeasured:
+        """(T,) share of the cells of depth or labels that are not what the recorded numbers make of them."""
+        if isinstance(self._drawn, NotMeasured):
+            return self._drawn
+        seen = self.pictures(camera, kind).cells
+        if not len(seen):
+            return NotMeasured(why=f"camera {camera.name} has no picture that can be read")
+        return strays(seen, self._drawn[camera.name, kind])
 
     def compared(self, camera: Camera, kind: Kind = "color") -> Comparison | NotMeasured:
         """A camera's pictures against what the recorded numbers make of them."""

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from demorec.check.base import Found, Measurement, NotMeasured, check, worst
+from demorec.check.base import Found, Measurement, NotMeasured, check
 from demorec.check.episode import RecordedEpisode
 from demorec.geometry import Array
 
@@ -110,10 +110,9 @@ def touches_nothing(episode: RecordedEpisode) -> Measurement | None:
     """Fingers far above all supports and away from all objects touch nothing but each other."""
     c, scene = episode.columns, episode.info.scene
     tcp = episode.world_from_tcp[:, :3, 3]
-    tops = [float(b.world_from_body.position[2]) + max(b.shape.extents) / 2 for b in scene.fixed if b.collides
-            and max(b.shape.extents) < 1.0]  # fmt: skip
-    surfaces = [float(b.world_from_body.position[2]) + b.shape.extents[2] / 2 for b in scene.fixed if b.collides]
-    alone = tcp[:, 2] > max([*tops, *surfaces], default=-math.inf) + 0.06
+    # A tray may have its origin at its bottom.
+    tops = [float(b.world_from_body.position[2]) + b.shape.extents[2] for b in scene.fixed if b.collides]
+    alone = tcp[:, 2] > max(tops, default=-math.inf) + 0.06
     for body in scene.movable:
         reach = math.hypot(*body.shape.extents) / 2 + 0.08
         alone &= np.linalg.norm(c.object_poses[body.name][:, :3] - tcp, axis=1) > reach
@@ -133,7 +132,7 @@ def touches_nothing(episode: RecordedEpisode) -> Measurement | None:
     fail=1.05,
     reads=("/joint_states", "info.robot.torque_limit", "info.robot.gripper.force"),
 )
-def joint_effort(episode: RecordedEpisode) -> Found:
+def joint_effort(episode: RecordedEpisode) -> Measurement | None:
     """No motor gives more than it can; a gripper that presses gives all that it has."""
     c, n, robot = episode.columns, episode.num_arm, episode.info.robot
     limit = np.array([*robot.torque_limit, *[robot.gripper.force] * (len(robot.joint_names) - n)])
@@ -141,5 +140,4 @@ def joint_effort(episode: RecordedEpisode) -> Found:
     if not table.size:
         return None
     frame, joint = (int(i) for i in np.unravel_index(int(np.argmax(table)), table.shape))
-    largest = Measurement(value=float(table[frame, joint]), frame=frame, detail=robot.joint_names[joint])
-    return worst(largest)
+    return Measurement(value=float(table[frame, joint]), frame=frame, detail=robot.joint_names[joint])

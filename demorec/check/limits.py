@@ -58,7 +58,10 @@ class LimitTable:
     checks: Mapping[str, Limit]
 
 
-@cache
-def limit_table() -> LimitTable:
-    """The table that comes with demorec."""
+def read_table() -> LimitTable:
+    """The table that comes with demorec, as it is on disk now."""
     return from_plain(tomllib.loads(TABLE.read_text()), LimitTable)
+
+
+limit_table = cache(read_table)
+"""The same, read once."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -254,6 +256,10 @@ def pixel_statistics(episode: RecordedEpisode) -> Found:
         if not len(decoded):
             continue
         counted = episode.recording.pixel_statistics(camera.name)
+        if counted.num_images != (episode.num_frames + 1) // 2:  # every other picture is counted
+            detail = f"camera {camera.name}: {counted.num_images} pictures are counted of {episode.num_frames}"
+            found.append(Measurement(value=math.inf, detail=detail))
+            continue
         levels = np.arange(256)
         recorded = (counted.counts * levels).sum(axis=1) / np.maximum(counted.counts.sum(axis=1), 1)
         off = np.abs(decoded.mean(axis=0) - recorded)

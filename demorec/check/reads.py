@@ -29,7 +29,6 @@ Kind = Literal["topic", "field", "column"]
 UNCHECKED: Mapping[str, str] = {
     "info.origin": "a text for people: of which recording a replay or a picture was made",
     "info.scene.hold": "how things are held shows only in a replay (--replay, --deep)",
-    "info.scene.bodies.mass": "shows only in a replay (--replay, --deep)",
     "info.scene.bodies.lateral_friction": "shows only in a replay (--replay, --deep)",
     "info.scene.bodies.spinning_friction": "shows only in a replay (--replay, --deep)",
     "info.scene.bodies.rolling_friction": "shows only in a replay (--replay, --deep)",

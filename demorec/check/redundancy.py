@@ -5,6 +5,7 @@ Each form is made again from the other and compared, the moving coordinate frame
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 
 import numpy as np
@@ -110,9 +111,13 @@ def moving_frames(episode: RecordedEpisode) -> Found:
     layout = transforms_layout([*((j.parent, j.child) for j in joints), *((WORLD, name) for name in names)])
     with episode.container() as container, damage_as_recording_error(episode.path):
         block = container.blocks((channels.TF,))[channels.TF]
-        values = layout.decode_rows(block.rows(len(layout.constant))).reshape(len(block), -1, 7)
-    if len(values) != c.num_frames:
-        return Measurement(value=float("inf"), detail=f"{len(values)} messages for {c.num_frames} frames")
+        rows = layout.decode_rows(block.rows(len(layout.constant)))
+    if len(rows) != c.num_frames:
+        return Measurement(value=math.inf, detail=f"{len(rows)} messages for {c.num_frames} frames")
+    stale = [a != b for a, b in zip(layout.encode(block.time_ns.tolist(), rows), block.messages(), strict=True)]
+    if any(stale):
+        return Measurement(value=math.inf, frame=stale.index(True), detail="stamps inside are of another time")
+    values = rows.reshape(len(rows), -1, 7)
     expected = [joint_matrices(joint, c.joint_position[:, number[joint.name]]) for joint in joints]
     expected += [episode.world_from_object(name) for name in names]
     found: list[Measurement | None] = []

@@ -80,8 +80,8 @@ def phases_match_motion(episode: RecordedEpisode) -> Found:
         return unknown
     c, robot = episode.columns, episode.info.robot
     closed = c.action_gripper < 0.5 * robot.gripper.max_width
-    wrong = np.array([phase in (OPEN_PHASES if shut else CLOSED_PHASES) for phase, shut in zip(c.phase, closed,
-                      strict=True)])  # fmt: skip
+    against_gripper = (CLOSED_PHASES, OPEN_PHASES)
+    wrong = np.array([phase in against_gripper[shut] for phase, shut in zip(c.phase, closed.tolist(), strict=True)])
     for stretch in _stretches(c.phase):
         rise = float(c.action_base_from_tcp[stretch.last, 2] - c.action_base_from_tcp[stretch.first, 2])
         inner = slice(stretch.first + 1, stretch.last + 1)
@@ -111,10 +111,13 @@ def story(episode: RecordedEpisode) -> Found:
     if (unknown := _is_scripted(episode)) is not None:
         return unknown
     stretches = _stretches(episode.columns.phase)
-    order = ["", *(stretch.phase for stretch in stretches)]
-    wrong = [f"{after!r} after {before!r}" for before, after in pairwise(order) if after not in NEXT.get(before, set())]
-    frame = next((s.first for s, (b, a) in zip(stretches, pairwise(order), strict=True) if a not in NEXT.get(b, set())),
-                 None)  # fmt: skip
+    order = pairwise(["", *(stretch.phase for stretch in stretches)])
+    strange = [
+        (stretch.first, f"{after!r} after {before!r}")
+        for stretch, (before, after) in zip(stretches, order, strict=True)
+        if after not in NEXT.get(before, set())
+    ]
+    wrong = [text for _, text in strange]
     approaches = [stretch.first for stretch in stretches if stretch.phase in ("approach", "above_cube")]
     grasps = [time_ns for time_ns, event in episode.recording.events() if event.name == "grasp"]
     if len(grasps) != len(approaches):
@@ -125,6 +128,7 @@ def story(episode: RecordedEpisode) -> Found:
     outcome, goals = episode.recording.outcome, episode.info.scene.goals
     if outcome is not None and outcome.success and len(approaches) != len(goals) + outcome.num_retries:
         wrong.append(f"{len(approaches)} approaches for {len(goals)} goals and {outcome.num_retries} retries")
+    frame = strange[0][0] if strange else None
     return Measurement(value=len(wrong), frame=frame, detail="; ".join(wrong[:3]) or f"{len(stretches)} phases")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -95,6 +96,24 @@ def without(topic: str, *, at: int | None = None) -> Edit:
     return lambda m: [] if m[0] == topic and (at is None or m[3] == at) else [m]
 
 
+def stamped(topic: str, second: int, *, at: int | None = None) -> Edit:
+    """Another time in the first stamp of a message that begins with a number of elements."""
+
+    def edit(m: Message) -> list[Message]:
+        chosen = m[0] == topic and m[3] >= SECOND and at in (None, m[3])
+        return [(m[0], m[1], m[2][:8] + struct.pack("<iI", second, 0) + m[2][16:], m[3])] if chosen else [m]
+
+    return edit
+
+
+def counted_twice(m: Message) -> list[Message]:
+    """The histogram of twice as many pictures."""
+    if m[0] != channels.camera_topic("front", "histogram"):
+        return [m]
+    told = messages.read_pixel_statistics(m[2])
+    return [(m[0], m[1], messages.pixel_statistics(replace(told, num_images=2 * told.num_images)), m[3])]
+
+
 def event_at(change: Callable[[Event], list[Event]]) -> Edit:
     """Other events of the changes of phase."""
 
@@ -115,6 +134,8 @@ CASES: list[tuple[str, Edit, str]] = [
     ("frames of the frame before", message_before(channels.TF), "moving_frames"),
     ("another name of a frame", bytes_for(channels.TF, b"panda_link4", b"panda_link9"), "moving_frames"),
     ("a frame at another parent", bytes_for(channels.TF, b"world\x00", b"wurld\x00"), "moving_frames"),
+    ("stamps of the start", stamped(channels.TF, 0), "moving_frames"),
+    ("one stamp of the start", stamped(channels.TF, 0, at=2 * SECOND), "moving_frames"),
     ("no frames at one moment", without(channels.TF, at=2 * SECOND), "moving_frames"),
     ("a standing frame off", floats_for(channels.TF_STATIC, entry(0, plus=0.01)), "latched_messages"),
     ("a standing frame of another name", bytes_for(channels.TF_STATIC, b"camera_front", b"camera_fr0nt"),
@@ -147,6 +168,7 @@ CASES: list[tuple[str, Edit, str]] = [
     ("depth of another camera", bytes_for(DEPTH, b"camera_front", b"camera_wrist"), "picture_messages"),
     ("labels of another camera", bytes_for(LABELED, b"camera_front", b"camera_wrist"), "picture_messages"),
     ("depth of another format", bytes_for(DEPTH, b"16UC1", b"32FC1"), "picture_messages"),
+    ("a histogram of more pictures", counted_twice, "pixel_statistics"),
     ("an event of a phase less", event_at(lambda e: [] if e.message == "lift" else [e]), "phase_events"),
     ("an event of a phase twice", event_at(lambda e: [e, Event(name="phase", message="again")]), "phase_events"),
     ("an event of another phase", event_at(lambda e: [Event(name="phase", message=e.message[::-1])]), "phase_events"),

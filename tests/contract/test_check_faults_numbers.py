@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from support.check import simulate
 from support.faults import Changed, Rows, frozen, halved, inverted, judged, late, noisy, one_alien, upside_down
@@ -84,6 +85,15 @@ def missed(frames: slice) -> Fault:
     return fault
 
 
+def stuck(first: int, last: int) -> Callable[[Rows], Rows]:
+    def change(rows: Rows) -> Rows:
+        out = rows.copy()
+        out[first:last] = rows[first]
+        return out
+
+    return change
+
+
 def doubled(rows: Rows) -> Rows:
     return rows * 2
 
@@ -117,7 +127,7 @@ CASES: list[tuple[str, Fault, str]] = [
     ("gripper late in both", both_grippers(late), "phases_match_motion"),
     ("opening halved", column("gripper_width", halved), "gripper_follows"),
     ("opening inverted", column("gripper_width", upside_down), "gripper_follows"),
-    ("opening frozen", column("gripper_width", frozen), "gripper_follows"),
+    ("opening frozen", column("gripper_width", frozen), "gripper_width"),
     ("contact force halved", column("contact_force", halved), "grip_force"),
     ("contact force doubled", column("contact_force", doubled), "grip_force"),
     ("contact force inverted", column("contact_force", inverted), "grip_force"),
@@ -129,6 +139,22 @@ CASES: list[tuple[str, Fault, str]] = [
     ("efforts doubled", column("joint_effort", doubled), "joint_effort"),
     ("efforts in another unit", column("joint_effort", lambda rows: rows * 1000), "joint_effort"),
     ("efforts of exchanged joints", column("joint_effort", lambda rows: rows[:, ::-1]), "joint_effort"),
+    ("efforts of the next joint", column("joint_effort", lambda r: np.roll(r, 1, axis=1)), "effort_bears_the_arm"),
+    ("efforts halved", column("joint_effort", halved), "effort_bears_the_arm"),
+    ("efforts inverted", column("joint_effort", inverted), "effort_bears_the_arm"),
+    ("efforts upside down", column("joint_effort", upside_down), "effort_bears_the_arm"),
+    ("efforts of zero", column("joint_effort", lambda rows: rows * 0), "effort_bears_the_arm"),
+    ("efforts of noise", column("joint_effort", noisy), "effort_bears_the_arm"),
+    ("efforts frozen", column("joint_effort", frozen), "stuck_sensors"),
+    ("efforts frozen for a while", column("joint_effort", stuck(60, 70)), "stuck_sensors"),
+    ("velocities frozen for a while", column("joint_velocity", stuck(60, 70)), "stuck_sensors"),
+    ("wrench frozen", column("wrench", frozen), "stuck_sensors"),
+    ("wrench halved", column("wrench", halved), "wrench_bears_the_hand"),
+    ("wrench doubled", column("wrench", doubled), "wrench_bears_the_hand"),
+    ("wrench in another unit", column("wrench", lambda rows: rows / 9.81), "wrench_bears_the_hand"),
+    ("wrench of zero", column("wrench", lambda rows: rows * 0), "wrench_bears_the_hand"),
+    ("wrench of exchanged axes", column("wrench", lambda r: r[:, [2, 1, 0, 5, 4, 3]]), "wrench_bears_the_hand"),
+    ("wrench in the world's axes", column("wrench", lambda r: r * [1, -1, -1, 1, -1, -1]), "wrench_bears_the_hand"),
     ("noise doubled", lambda c: c.with_columns(
         command_joint_target=2 * c.columns.command_joint_target - c.columns.action_joint_target), "noise_as_said"),
     ("labels in place of commands", lambda c: c.with_columns(

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.check.base import Result
-from demorec.check.drawn import CellGrid, Kind, planes_of
+from demorec.check.drawn import CellGrid, Comparison, Kind, planes_of
 from demorec.check.episode import RecordedEpisode
 from demorec.check.pictures_summary import PictureSummary
 from demorec.scene.episode import EpisodeColumns, EpisodeInfo, Outcome
@@ -58,6 +58,9 @@ class Good:
         spoilt.__dict__["_drawn"] = self.episode._drawn
         for key in self.pictures.keys() - changed.keys():
             spoilt._pictures[key] = self.episode.pictures(self._cameras[key[0]], key[1])
+            compared = self.episode.compared(self._cameras[key[0]], key[1])
+            assert isinstance(compared, Comparison)
+            spoilt._comparisons[key] = compared
         for (name, kind), pictures in changed.items():
             grid = CellGrid(pictures.shape[2], pictures.shape[1])
             planes = planes_of(kind, pictures)

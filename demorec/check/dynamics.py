@@ -1,0 +1,196 @@
+"""Are forces those that the motion needs: efforts and wrench against inverse dynamics, and streams that stand still.
+
+The model's masses, each at its link's centre of mass, accelerated as the recorded joints say, give the torque of every
+arm joint and the force on the hand (Newton and d'Alembert, without the links' own rotational inertia). What is carried
+adds its weight. That is exact enough where nothing is hit: the medians are told.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.check.base import Found, Measurement, NotMeasured, check, worst
+from demorec.check.episode import RecordedEpisode
+from demorec.check.rows import link_matrices, longest_run
+from demorec.errors import SceneError
+from demorec.geometry import Array
+from demorec.scene.assets import asset_path
+from demorec.scene.urdf import parse_xml
+
+MIN_LOAD = 3.0
+"""N m: joints that bear less, root mean square, say nothing about efforts."""
+MIN_FRAMES = 20
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Load:
+    """A mass with its way: `point` (T, 3) metres, `force` (T, 3) N that it needs, and the links that carry it."""
+
+    point: Array
+    force: Array
+    joints: frozenset[str]
+
+
+class _Dynamics:
+    """Inverse dynamics of a recorded episode with point masses.
+
+    Raises:
+        SceneError: The robot's model is not to be had.
+    """
+
+    def __init__(self, episode: RecordedEpisode) -> None:
+        self.episode = episode
+        self._positions = dict(zip(episode.info.robot.joint_names, episode.columns.joint_position.T, strict=True))
+        self.loads = [*self._link_loads(), *self._carried_loads()]
+
+    def frames_of(self, link: str) -> Array:
+        """(T, 4, 4) world_from_link."""
+        episode = self.episode
+        poses = link_matrices(episode.urdf, link, self._positions, episode.num_frames)
+        return np.asarray(episode.world_from_base @ poses)
+
+    def _link_loads(self) -> list[_Load]:
+        episode = self.episode
+        scale, found = episode.info.scene.robot.scale, []
+        gravity = np.array(episode.info.scene.physics.gravity)
+        for name, (mass, centre) in _inertials(episode.info.robot.urdf).items():
+            pose = self.frames_of(name)
+            point = pose[:, :3, :3] @ (scale * centre) + pose[:, :3, 3]
+            acceleration = np.zeros_like(point)
+            acceleration[1:-1] = (point[2:] - 2 * point[1:-1] + point[:-2]) * episode.info.fps**2
+            joints = frozenset(joint.name for joint in episode.urdf.path_to(name))
+            found.append(_Load(point=point, force=mass * (acceleration - gravity), joints=joints))
+        return found
+
+    def _carried_loads(self) -> list[_Load]:
+        episode = self.episode
+        gravity = np.array(episode.info.scene.physics.gravity)
+        joints = frozenset(joint.name for joint in episode.urdf.path_to(episode.info.robot.tcp_link))
+        found = []
+        for body in episode.info.scene.movable:
+            point = episode.columns.object_poses[body.name][:, :3]
+            force: Array = self._carries(point)[:, None] * (-body.mass * gravity)
+            found.append(_Load(point=point, force=force, joints=joints))
+        return found
+
+    def _carries(self, point: Array) -> NDArray[np.bool_]:
+        c = self.episode.columns
+        near = np.linalg.norm(point - self.episode.world_from_tcp[:, :3, 3], axis=1) < 0.05
+        return np.asarray(near & (point[:, 2] > point[0, 2] + 0.01) & (c.command_gripper < 0.5 * c.gripper_width))
+
+    @cached_property
+    def is_free(self) -> NDArray[np.bool_]:
+        """(T,) frames in which the hand touches nothing but what it carries."""
+        c = self.episode.columns
+        carries = np.zeros(c.num_frames, dtype=bool)
+        for poses in c.object_poses.values():
+            carries |= self._carries(poses[:, :3])
+        free = (c.contact_force == 0) | carries
+        free[:1] = free[-1:] = False
+        return np.asarray(free, dtype=np.bool_)
+
+    def below(self, joint: str) -> list[_Load]:
+        """What a joint bears."""
+        return [load for load in self.loads if joint in load.joints]
+
+
+def _inertials(urdf: str) -> dict[str, tuple[float, Array]]:
+    """Link -> mass, kg, and centre of mass in the link's frame, metres."""
+    try:
+        root = parse_xml(asset_path(urdf).read_text())
+        found = {}
+        for link in root.findall("link"):
+            mass, origin = link.find("inertial/mass"), link.find("inertial/origin")
+            if mass is not None:
+                words = "0 0 0" if origin is None else origin.get("xyz", "0 0 0")
+                centre = np.array([float(word) for word in words.split()])
+                found[link.attrib["name"]] = (float(mass.attrib["value"]), centre)
+    except (OSError, ValueError, KeyError) as error:
+        raise SceneError(f"The masses of the model {urdf!r} cannot be read.") from error
+    return found
+
+
+@check(
+    group="physics",
+    measures="arm torques against inverse dynamics, median difference of the load",
+    reads=("/joint_states", "info.scene.physics.gravity", "info.scene.bodies.mass", "/robot_description"),
+)
+def effort_bears_the_arm(episode: RecordedEpisode) -> Found:
+    """The motors of the joints that bear the arm give the torques that its weight and motion need.
+
+    Catches torques of other joints, of another sign or unit, halved or frozen.
+    """
+    dynamics = _dynamics(episode)
+    if isinstance(dynamics, NotMeasured):
+        return dynamics
+    free, found = dynamics.is_free, []
+    for number, name in enumerate(episode.info.robot.arm_joints):
+        joint = next(joint for joint in episode.urdf.joints if joint.name == name)
+        pose = dynamics.frames_of(joint.child)
+        axis = pose[:, :3, :3] @ np.array(joint.axis)
+        arms = [np.cross(load.point - pose[:, :3, 3], load.force) for load in dynamics.below(name)]
+        torque = (axis * np.sum(arms, axis=0)).sum(axis=1)[free]
+        size = float(np.sqrt(np.median(torque**2)))
+        if size < MIN_LOAD:
+            continue
+        off = float(np.median(np.abs(episode.columns.joint_effort[free, number] - torque))) / size
+        found.append(Measurement(value=off, detail=f"{name}, which bears {size:.0f} N m"))
+    return worst(*found) or NotMeasured(why="no joint of the arm bears a load")
+
+
+@check(
+    group="physics",
+    measures="force on the hand against the weight and motion of what it bears, median difference of it",
+    reads=("/wrench", "info.scene.physics.gravity", "info.scene.bodies.mass", "/robot_description"),
+)
+def wrench_bears_the_hand(episode: RecordedEpisode) -> Found:
+    """The arm holds the hand, and what it carries, with the force that their masses need: catches other units."""
+    wrench = episode.columns.wrench
+    if wrench is None:
+        return None
+    dynamics = _dynamics(episode)
+    if isinstance(dynamics, NotMeasured):
+        return dynamics
+    link = episode.info.robot.hand_link
+    mount = episode.urdf.path_to(link)[-1].name
+    force = np.sum([load.force for load in dynamics.below(mount)], axis=0)
+    turned = np.einsum("tji,tj->ti", dynamics.frames_of(link)[:, :3, :3], force)
+    off = np.linalg.norm(wrench[:, :3] - turned, axis=1) / np.maximum(np.linalg.norm(turned, axis=1), 1e-6)
+    return Measurement(value=float(np.median(off[dynamics.is_free])), detail=f"{int(dynamics.is_free.sum())} frames")
+
+
+def _dynamics(episode: RecordedEpisode) -> _Dynamics | NotMeasured:
+    if not any(episode.info.scene.physics.gravity):
+        return NotMeasured(why="there is no gravity")
+    try:
+        dynamics = _Dynamics(episode)
+    except (SceneError, KeyError) as error:
+        return NotMeasured(why=f"the robot's masses are not to be had here: {error}")
+    num_free = int(dynamics.is_free.sum())
+    return dynamics if num_free >= MIN_FRAMES else NotMeasured(why=f"the hand is free in {num_free} frames")
+
+
+@check(
+    group="physics",
+    measures="longest run of frames in which a sensor stands still to the last bit while the arm moves",
+    warn=2,
+    fail=4,
+    reads=("/joint_states", "/ee_pose", "/wrench"),
+)
+def stuck_sensors(episode: RecordedEpisode) -> Found:
+    """What is measured changes, if ever so little, while the arm moves."""
+    c, n = episode.columns, episode.num_arm
+    moves = np.abs(np.diff(c.joint_position[:, :n], axis=0)).max(axis=1, initial=0.0) > 1e-5
+    tables = {"joint velocities": c.joint_velocity, "efforts": c.joint_effort[:, :n], "EE pose": c.base_from_tcp}
+    if c.wrench is not None:
+        tables["wrench"] = c.wrench
+    found: list[Measurement | None] = []
+    for name, table in tables.items():
+        same = (table[1:] == table[:-1]).all(axis=1) & moves
+        length, start = longest_run(same)
+        found.append(Measurement(value=length, frame=start + 1 if length else None, detail=name))
+    return worst(*found)
