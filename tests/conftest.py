@@ -25,3 +25,14 @@ def _no_real_time_threads() -> Iterator[None]:
     """LeRobot's own AV1 encoding, run by root, would leave the test process with real-time priority."""
     with ordinary_scheduling():
         yield
+
+
+@pytest.fixture(scope="module")
+def hf_datasets_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Copies of the tables that the package datasets makes go to a temporary folder."""
+    import datasets
+
+    before = datasets.config.HF_DATASETS_CACHE
+    datasets.config.HF_DATASETS_CACHE = tmp_path_factory.mktemp("hf-datasets")
+    yield
+    datasets.config.HF_DATASETS_CACHE = before

@@ -26,6 +26,7 @@ class Command(Protocol):
     """A dataclass whose fields are the flags and whose docstring is the help.
 
     A classmethod `defaults(args)`, where there is one, returns the instance whose values are the flags' defaults.
+    A field `others`, where there is one, is no flag: it takes the words that are not the command's own.
     """
 
     def run(self) -> int:
@@ -42,6 +43,7 @@ COMMANDS: Registry[type[Command]] = Registry(
         "check": "demorec.cli.check:Check",
         "replay": "demorec.cli.replay:Replay",
         "render": "demorec.cli.render:Render",
+        "train": "demorec.cli.train:Train",
         "evaluate": "demorec.cli.evaluate:Evaluate",
         "reproduce": "demorec.cli.reproduce:Reproduce",
         "recover": "demorec.cli.recover:Recover",

@@ -37,6 +37,9 @@ from demorec.safety.text import printable
 
 FLAG_TYPES = tyro.constructors.ConstructorRegistry()
 
+OTHERS = "others"
+"""Field of a command that takes the words that are not its own, for another program."""
+
 _NARROWEST = 40
 """Columns; on a narrower terminal lines are broken there, as tyro breaks the table of flags."""
 
@@ -46,7 +49,7 @@ def terminal_width() -> int:
     return max(_NARROWEST, shutil.get_terminal_size().columns)
 
 
-def parse(command: type, args: Sequence[str], *, prog: str, defaults: object) -> Any:
+def parse(command: type[Any], args: Sequence[str], *, prog: str, defaults: object) -> Any:
     """An instance of the command from its flags.
 
     Args:
@@ -69,13 +72,13 @@ def parse(command: type, args: Sequence[str], *, prog: str, defaults: object) ->
         raise
 
 
-def _parse(command: type, args: Sequence[str], *, prog: str, defaults: object, say_why: bool) -> Any:
+def _parse(command: type[Any], args: Sequence[str], *, prog: str, defaults: object, say_why: bool) -> Any:
     asks_for_help = "-h" in args or "--help" in args
     # tyro draws its boxes as the encoding allows, but knows that of Unicode by one spelling only.
     page = io.TextIOWrapper(io.BytesIO(), encoding=codecs.lookup(sys.stdout.encoding or "utf-8").name)
     try:
         with FLAG_TYPES, redirect_stdout(page):
-            return tyro.cli(
+            parsed = tyro.cli(  # type: ignore[call-overload]  # which knows True and False, but no bool
                 command,
                 args=["--help"] if asks_for_help else args,  # else usage would lack what stands in front of it
                 prog=prog,
@@ -83,11 +86,16 @@ def _parse(command: type, args: Sequence[str], *, prog: str, defaults: object, s
                 default=MISSING_NONPROP if defaults is None else defaults,
                 config=(tyro.conf.OmitArgPrefixes,),
                 console_outputs=say_why or asks_for_help,
+                return_unknown_args=OTHERS in command.__dataclass_fields__,
             )
     except SystemExit:
         page.seek(0)
         say(*laid_out(page.read(), terminal_width()))
         raise
+    if OTHERS not in command.__dataclass_fields__:
+        return parsed
+    instance, others = parsed
+    return dataclasses.replace(instance, **{OTHERS: tuple(others)})
 
 
 def laid_out(page: str, width: int) -> list[str]:
@@ -114,6 +122,8 @@ def _options(info: StructTypeInfo) -> StructConstructorSpec | None:
     texts = _field_texts(info.type)
     fields = []
     for field in dataclasses.fields(info.type):
+        if field.name == OTHERS:
+            continue
         default = _default(field, info.default)
         kind = types[field.name]
         hint = "(required)" if default is MISSING_NONPROP else "" if default in (None, "", ()) else None

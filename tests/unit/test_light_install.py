@@ -18,6 +18,7 @@ from demorec.lerobot import ExportOptions, export_lerobot
 from demorec.lerobot.hub import push_to_hub
 from demorec.lerobot.verify import LEROBOT
 from demorec.tables import CHECKS
+from demorec.training.command import train
 
 ROOT = Path(__file__).parents[2]
 ABSENT = ("lerobot", "torch", "torchvision", "torchcodec", "datasets", "pandas", "huggingface_hub", "accelerate")
@@ -30,7 +31,7 @@ LEFT_OUT = {LEROBOT, "torch>=2.7", "huggingface-hub>=1.6,<2"}
 @pytest.fixture
 def light(monkeypatch: pytest.MonkeyPatch) -> None:
     """As if these packages were not installed: importing them fails, and none is found."""
-    for name in ("lerobot", "datasets", "huggingface_hub"):  # tyro and pyarrow look for others among the modules
+    for name in ("lerobot", "datasets", "huggingface_hub", "accelerate"):  # others are looked for by tyro and pyarrow
         monkeypatch.setitem(sys.modules, name, None)
 
 
@@ -73,20 +74,23 @@ def test_what_needs_lerobot_names_it(run: Path, tmp_path: Path, monkeypatch: pyt
     monkeypatch.setitem(sys.modules, "torch", None)
     with pytest.raises(MissingDependencyError, match="train"):
         Policy(tmp_path)
+    with pytest.raises(MissingDependencyError, match=r"Training needs .* pip install 'demorec\[train\]'"):
+        train([], frame_cache_bytes=0, on_replaced=lambda: None)
     with pytest.raises(MissingDependencyError, match="huggingface_hub") as error:
         push_to_hub(dataset, "me/cubes", private=True)
     assert str(dataset) in str(error.value)
     assert not isinstance(error.value, ExportError)
 
 
-def test_no_module_but_the_plug_in_needs_them() -> None:
+def test_no_module_but_the_plug_ins_needs_them() -> None:
     """In a fresh process, every module of the package, so every command, imports without them."""
     code = f"""
 import importlib, pkgutil, sys
 sys.modules.update(dict.fromkeys({ABSENT!r}))
 import demorec
 for module in pkgutil.walk_packages(demorec.__path__, "demorec."):
-    if not module.name.startswith("demorec.lerobot_env") and module.name != "demorec.generate.on_ray":
+    plug_ins = ("demorec.lerobot_env", "demorec.training.")
+    if not module.name.startswith(plug_ins) and module.name != "demorec.generate.on_ray":
         importlib.import_module(module.name)
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=300)

@@ -1,0 +1,89 @@
+"""Datasets that LeRobot itself writes, and the comparison of two readers' items."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+CAMERA, DEPTH = "observation.images.top", "observation.images.top_depth"
+SIZE = 64
+"""Of the pictures: the least that LeRobot's AV1 encoder takes."""
+
+
+def write_by_lerobot(
+    root: Path, lengths: Sequence[int], *, stored_as: str = "video", depth: bool = False, **arguments: Any
+) -> Path:
+    """A dataset with a feature of every type, two instructions, and small files, so that there are several.
+
+    Args:
+        root: A folder that does not exist yet.
+        lengths: Frames of each episode.
+        stored_as: "video" or "image": how pictures are kept.
+        depth: Whether there is a depth camera, too.
+        arguments: Of `LeRobotDataset.create`.
+    """
+    from lerobot.datasets import LeRobotDataset
+
+    axes = ["height", "width", "channels"]
+    features: dict[str, dict[str, Any]] = {
+        "observation.state": {"dtype": "float32", "shape": (5,), "names": None},
+        "observation.single": {"dtype": "float64", "shape": (1,), "names": None},
+        "observation.grid": {"dtype": "float32", "shape": (2, 3), "names": None},
+        "observation.counts": {"dtype": "int64", "shape": (3,), "names": None},
+        "observation.touch": {"dtype": "bool", "shape": (1,), "names": None},
+        "note": {"dtype": "string", "shape": (1,), "names": None},
+        CAMERA: {"dtype": stored_as, "shape": (SIZE, SIZE, 3), "names": axes},
+        "action": {"dtype": "float32", "shape": (4,), "names": None},
+    }
+    if depth:
+        about = {"is_depth_map": True, "depth_unit": "m"}
+        features[DEPTH] = {"dtype": stored_as, "shape": (SIZE, SIZE, 1), "names": axes, "info": about}
+    files: dict[str, Any] = {"video_files_size_in_mb": 0.001, "data_files_size_in_mb": 0.008}
+    dataset = LeRobotDataset.create(
+        "local/test", 30, features, root=root, use_videos=stored_as == "video", **{**files, **arguments}
+    )
+    rng = np.random.default_rng(0)
+    for episode, length in enumerate(lengths):
+        for t in range(length):
+            frame: dict[str, Any] = {
+                "observation.state": rng.normal(size=5).astype(np.float32),
+                "observation.single": rng.normal(size=1),
+                "observation.grid": rng.normal(size=(2, 3)).astype(np.float32),
+                "observation.counts": rng.integers(-9, 1 << 40, 3),
+                "observation.touch": np.array([t % 3 == 0]),
+                "note": f"frame {t} of {episode}",
+                CAMERA: _picture(episode, t),
+                "action": rng.normal(size=4).astype(np.float32),
+                "task": ("push it", "pull it")[episode % 2],
+            }
+            if depth:
+                frame[DEPTH] = rng.uniform(0.2, 4, (SIZE, SIZE, 1)).astype(np.float32)
+            dataset.add_frame(frame)
+        dataset.save_episode()
+    dataset.finalize()
+    return root
+
+
+def _picture(episode: int, t: int) -> NDArray[np.uint8]:
+    """A block that moves over a slope: every frame differs from the others."""
+    rows, columns = np.mgrid[0:SIZE, 0:SIZE]
+    picture = np.stack([rows * 2 + 40, columns * 3, np.full_like(rows, 30 * episode % 256)], axis=-1).astype(np.uint8)
+    picture[3 * t % 48 : 3 * t % 48 + 16, 5 * t % 48 : 5 * t % 48 + 16] = (250, 20 + 4 * t, 200)
+    return picture
+
+
+def assert_same_item(found: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
+    """The same keys in the same order, types, shapes and bits."""
+    assert list(found) == list(wanted)
+    for key, value in wanted.items():
+        assert type(found[key]) is type(value), key
+        if isinstance(value, torch.Tensor):
+            assert (found[key].dtype, found[key].shape) == (value.dtype, value.shape), key
+            assert found[key].numpy().tobytes() == value.numpy().tobytes(), key
+        else:
+            assert found[key] == value, key

@@ -1,0 +1,161 @@
+"""Columns as arrays, the cache of frames and open video files, each by itself."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import av
+import numpy as np
+import pyarrow as pa
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from demorec.training import columns
+from demorec.training.columns import Column, numbers
+from demorec.training.frame_cache import DecodedFrame, FrameCache
+from demorec.training.video_file import VideoFile
+
+
+@given(
+    lengths=st.lists(st.integers(1, 5), min_size=1, max_size=6),
+    rows=st.lists(st.integers(0, 10**6), max_size=12),
+    joined=st.booleans(),
+)
+def test_rows_are_taken_from_any_chunks(lengths: list[int], rows: list[int], joined: bool) -> None:
+    values = np.arange(3 * sum(lengths), dtype=np.float32).reshape(-1, 3)
+    chunks = np.split(values, np.cumsum(lengths)[:-1])
+    wanted = np.array([row % len(values) for row in rows], np.int64)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(columns, "_JOINED_BYTES", 1 << 20 if joined else 0)
+        column = Column(chunks)
+    assert len(column) == len(values)
+    assert np.array_equal(column.take(wanted), values[wanted])
+    assert np.array_equal(column.take(wanted.reshape(1, -1)), values[wanted][None])
+
+
+@pytest.mark.parametrize(
+    ("kind", "rows"),
+    [
+        (pa.float32(), [0.1, -0.0, 3e-39]),
+        (pa.float64(), [0.1, 1e300, float("inf")]),
+        (pa.int32(), [1, -2, 3]),
+        (pa.uint8(), [255, 0, 7]),
+        (pa.bool_(), [True, False, True]),
+        (pa.list_(pa.float32(), 2), [[0.1, 2.0], [3.0, 4.0], [5.0, 6.0]]),
+        (pa.list_(pa.list_(pa.int64())), [[[1, 2], [3, 4]], [[5, 6], [7, 8]], [[9, 1], [2, 3]]]),
+        (pa.list_(pa.bool_()), [[True], [False], [True]]),
+    ],
+)
+def test_numbers_get_the_types_that_torch_gives_them(kind: pa.DataType, rows: list[object]) -> None:
+    column = numbers(pa.chunked_array([pa.array(rows[:1], kind), pa.array([], kind), pa.array(rows[1:], kind)]))
+    assert column is not None
+    for found, row in zip(column.tensor(np.arange(3)), rows, strict=True):
+        wanted = torch.tensor(row)
+        assert (found.dtype, found.shape) == (wanted.dtype, wanted.shape)
+        assert torch.equal(found, wanted)
+
+
+@pytest.mark.parametrize(
+    "array",
+    [
+        pa.array(["a", "b"]),
+        pa.array([1.0, None]),
+        pa.array([[1.0], [2.0, 3.0]]),
+        pa.array([[1.0, None], [2.0, 3.0]]),
+        pa.array([[[1.0], [2.0, 3.0]], [[1.0, 2.0], [3.0]]]),
+        pa.array([[], []], pa.list_(pa.float32())),
+        pa.array([1 << 63, 2], pa.uint64()),
+        pa.array([{"bytes": b"x"}, {"bytes": b"y"}]),
+        pa.array([1, 2], pa.timestamp("s")),
+    ],
+)
+def test_what_is_no_array_of_numbers_is_left_to_lerobot(array: pa.Array) -> None:
+    assert numbers(pa.chunked_array([array])) is None
+
+
+def test_lists_that_differ_between_chunks_are_left_to_lerobot() -> None:
+    kind = pa.list_(pa.float32())
+    assert numbers(pa.chunked_array([pa.array([[1.0]], kind), pa.array([[1.0, 2.0]], kind)])) is None
+
+
+@given(sizes=st.lists(st.integers(1, 40), max_size=30), limit=st.integers(0, 100))
+def test_the_cache_stays_within_its_limit_and_keeps_the_latest(sizes: list[int], limit: int) -> None:
+    cache = FrameCache(limit)
+    for number, size in enumerate(sizes):
+        frame = DecodedFrame(torch.zeros(size, dtype=torch.uint8), 0.0)
+        cache.put("a", number, frame)
+        assert (cache.get("a", number) is frame) is (size <= limit)
+        assert cache.get("b", number) is None
+        held = [size for n, size in enumerate(sizes[: number + 1]) if cache.get("a", n) is not None]
+        assert cache.num_bytes == sum(held) <= limit
+
+
+def test_what_was_wanted_lately_is_kept() -> None:
+    cache = FrameCache(20)
+    for number in (0, 1):
+        cache.put("a", number, DecodedFrame(torch.zeros(10, dtype=torch.uint8), 0.0))
+    cache.get("a", 0)
+    cache.put("a", 2, DecodedFrame(torch.zeros(10, dtype=torch.uint8), 0.0))
+    assert [cache.get("a", number) is not None for number in range(3)] == [True, False, True]
+
+
+def write_video(path: Path, count: int, **options: str) -> list[np.ndarray]:
+    """A video of grey pictures by x264, and its pictures as PyAV decodes them from first to last."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=30, options={"sc_threshold": "0", **options})
+        stream.width, stream.height, stream.pix_fmt = 32, 32, "yuv420p"
+        for number in range(count):
+            picture = np.random.default_rng(number).integers(0, 255, (4, 4, 3), np.uint8)
+            frame = av.VideoFrame.from_ndarray(np.kron(picture, np.ones((8, 8, 1), np.uint8)), format="rgb24")
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    with av.open(str(path)) as container:
+        return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+
+
+@pytest.mark.parametrize("options", [{"g": "2", "bf": "0"}, {"g": "9", "bf": "3"}, {"g": "100"}], ids=str)
+def test_any_frames_in_any_order_are_those_of_a_straight_decoding(options: dict[str, str], tmp_path: Path) -> None:
+    pictures = write_video(tmp_path / "v.mp4", 40, **options)
+    with av.open(str(tmp_path / "v.mp4")) as container:
+        assert any(packet.pts != packet.dts for packet in container.demux(video=0)) is (options.get("bf") != "0")
+    file = VideoFile(str(tmp_path / "v.mp4"), "rgb24")
+    rng = np.random.default_rng(0)
+    for _ in range(12):
+        wanted = sorted(rng.choice(40, rng.integers(1, 6), replace=False).tolist())
+        assert file.numbers(np.array(wanted) / 30 + 1e-3).tolist() == wanted
+        for number, frame in file.decode(wanted):
+            assert frame.time_s == pytest.approx(number / 30)
+            assert np.array_equal(frame.picture.numpy().transpose(1, 2, 0), pictures[number])
+    file.close()
+
+
+def test_frames_of_a_batch_are_decoded_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_video(tmp_path / "v.mp4", 40, g="10", bf="0")
+    file = VideoFile(str(tmp_path / "v.mp4"), "rgb24")
+    passed: list[int] = []
+
+    find_number = file._number
+
+    def counting(pts: int | None) -> float:
+        passed.append(int(find_number(pts)))
+        return find_number(pts)
+
+    monkeypatch.setattr(file, "_number", counting)
+    assert [number for number, _ in file.decode([3, 5, 12, 38])] == [3, 5, 12, 38]
+    # Each from its key frame on, or from where the one before has ended.
+    assert passed == [*range(6), *range(10, 13), *range(30, 39)]
+    file.close()
+
+
+def test_a_video_without_frames_is_refused(tmp_path: Path) -> None:
+    from lerobot.datasets.video_utils import FrameTimestampError
+
+    path = tmp_path / "v.mp4"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=30)
+        stream.width, stream.height, stream.pix_fmt = 32, 32, "yuv420p"
+        container.mux(stream.encode())
+    with pytest.raises((FrameTimestampError, OSError)):
+        VideoFile(str(path), "rgb24")
