@@ -210,7 +210,7 @@ def test_an_unreachable_cluster_is_told_at_once(tmp_path: Path, address: str) ->
 
 
 def test_an_unreachable_cluster_leaves_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(on_ray.ray, "is_initialized", lambda: False)  # whatever the tests before have begun
+    monkeypatch.setattr("ray.is_initialized", lambda: False)  # whatever the tests before have begun
     with pytest.raises(ConfigError, match="cannot be reached"):
         run_on_ray(tmp_path / "run", maker="make", address="127.0.0.1:1")
     assert list(tmp_path.iterdir()) == []

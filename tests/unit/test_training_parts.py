@@ -11,6 +11,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from demorec.training import columns
 from demorec.training.columns import Column, numbers
@@ -101,7 +102,7 @@ def test_what_was_wanted_lately_is_kept() -> None:
     assert [cache.get("a", number) is not None for number in range(3)] == [True, False, True]
 
 
-def write_video(path: Path, count: int, **options: str) -> list[np.ndarray]:
+def write_video(path: Path, count: int, **options: str) -> list[NDArray[np.uint8]]:
     """A video of grey pictures by x264, and its pictures as PyAV decodes them from first to last."""
     with av.open(str(path), "w") as container:
         stream = container.add_stream("libx264", rate=30, options={"sc_threshold": "0", **options})
@@ -111,8 +112,10 @@ def write_video(path: Path, count: int, **options: str) -> list[np.ndarray]:
             frame = av.VideoFrame.from_ndarray(np.kron(picture, np.ones((8, 8, 1), np.uint8)), format="rgb24")
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
-    with av.open(str(path)) as container:
-        return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+    container = av.open(str(path))
+    pictures = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+    container.close()
+    return pictures
 
 
 @pytest.mark.parametrize("options", [{"g": "2", "bf": "0"}, {"g": "9", "bf": "3"}, {"g": "100"}], ids=str)
