@@ -112,9 +112,9 @@ def write_video(path: Path, count: int, **options: str) -> list[NDArray[np.uint8
             frame = av.VideoFrame.from_ndarray(np.kron(picture, np.ones((8, 8, 1), np.uint8)), format="rgb24")
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
-    container = av.open(str(path))
-    pictures = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
-    container.close()
+    video = av.open(str(path))
+    pictures = [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
+    video.close()
     return pictures
 
 
