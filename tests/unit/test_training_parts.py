@@ -113,7 +113,7 @@ def write_video(path: Path, count: int, **options: str) -> list[NDArray[np.uint8
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
     video = av.open(str(path))
-    pictures = [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
+    pictures = [np.asarray(frame.to_ndarray(format="rgb24"), dtype=np.uint8) for frame in video.decode(video=0)]
     video.close()
     return pictures
 
