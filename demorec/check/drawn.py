@@ -80,7 +80,8 @@ def planes_of(kind: Kind, pictures: NDArray[Any]) -> list[NDArray[np.float32]]:
 
 def _scattered(values: NDArray[np.int64], multiplier: int) -> NDArray[np.int64]:
     """A brightness for each label, far apart for neighbours: the upper bits of a product (Knuth's hash)."""
-    return (((values + 2) * multiplier) >> 16) & 255
+    body_and_link = (values & 0xFFFFFF) + 1009 * (values >> 24)
+    return (((body_and_link + 2) * multiplier) >> 16) & 255
 
 
 def draw_all(

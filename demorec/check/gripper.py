@@ -8,7 +8,9 @@ import numpy as np
 
 from demorec.check.base import Found, Measurement, NotMeasured, check
 from demorec.check.episode import RecordedEpisode
+from demorec.check.objects import SOLID
 from demorec.geometry import Array
+from demorec.scene.scene import Body
 
 SETTLE_SECONDS = 0.6
 """After a new command the fingers need so long to arrive; they close at 0.2 m/s from an opening of 0.1 m."""
@@ -110,9 +112,7 @@ def touches_nothing(episode: RecordedEpisode) -> Measurement | None:
     """Fingers far above all supports and away from all objects touch nothing but each other."""
     c, scene = episode.columns, episode.info.scene
     tcp = episode.world_from_tcp[:, :3, 3]
-    # A tray may have its origin at its bottom.
-    tops = [float(b.world_from_body.position[2]) + b.shape.extents[2] for b in scene.fixed if b.collides]
-    alone = tcp[:, 2] > max(tops, default=-math.inf) + 0.06
+    alone = tcp[:, 2] > max((_top(body) for body in scene.fixed if body.collides), default=-math.inf) + 0.06
     for body in scene.movable:
         reach = math.hypot(*body.shape.extents) / 2 + 0.08
         alone &= np.linalg.norm(c.object_poses[body.name][:, :3] - tcp, axis=1) > reach
@@ -123,6 +123,12 @@ def touches_nothing(episode: RecordedEpisode) -> Measurement | None:
     force = np.where(alone, np.abs(c.contact_force), 0.0)
     frame = int(np.argmax(force))
     return Measurement(value=float(force[frame]), frame=frame, detail=f"{int(alone.sum())} frames alone")
+
+
+def _top(body: Body) -> float:
+    """Height of a standing body, metres, or more: a model may have its origin at its bottom."""
+    share = 0.5 if body.shape.kind in SOLID else 1.0
+    return float(body.world_from_body.position[2]) + share * body.shape.extents[2]
 
 
 @check(

@@ -19,6 +19,8 @@ MIN_MOTION = 2.5
 STALE_SHARE, STALE_EXCESS = 0.3, 1.5
 """A picture is stale that shows less than this share of the motion, and is more unlike the drawn one than the usual
 picture by more than this, of 255: a predicted picture may leave a small motion to the next keyframe."""
+_PREDICTED_WEIGHT = 0.5
+"""Of the difference of a predicted picture of AV1, which at low qualities leaves whole motions to the next keyframe."""
 
 
 @check(
@@ -35,16 +37,17 @@ picture by more than this, of 255: a predicted picture may leave a small motion 
     ),
 )
 def pictures_decode(episode: RecordedEpisode) -> Found:
-    """Every camera's video decodes to its end, one picture a frame."""
+    """Every camera's video, depth and labels decode to their end, one picture a frame."""
     found = []
     for camera in episode.cameras:
-        summary = episode.pictures(camera)
-        missing = episode.num_frames - summary.num_pictures
-        detail = f"camera {camera.name}: {summary.error or f'{summary.num_pictures} pictures'}"
-        if summary.error and missing == 0:
-            missing = 1
-        frame = summary.num_pictures if missing else None
-        found.append(Measurement(value=abs(missing), frame=frame, detail=detail))
+        for kind in episode.kinds(camera.name):
+            summary = episode.pictures(camera, kind)
+            missing = episode.num_frames - summary.num_pictures
+            detail = f"camera {camera.name}, {kind}: {summary.error or f'{summary.num_pictures} pictures'}"
+            if summary.error and missing == 0:
+                missing = 1
+            frame = summary.num_pictures if missing else None
+            found.append(Measurement(value=abs(missing), frame=frame, detail=detail))
     return worst(*found)
 
 
@@ -137,7 +140,7 @@ def odd_pictures(episode: RecordedEpisode) -> Found:
         if isinstance(compared, NotMeasured):
             found.append(compared)
             continue
-        excess = _excess(compared)
+        excess = np.where(_is_exact(episode, camera), 1.0, _PREDICTED_WEIGHT) * _excess(compared)
         frame = int(np.argmax(excess))
         found.append(Measurement(value=float(excess[frame]), frame=frame, detail=f"camera {camera.name}"))
     return worst(*found)
@@ -146,6 +149,13 @@ def odd_pictures(episode: RecordedEpisode) -> Found:
 def _excess(compared: Comparison) -> Array:
     """(T,) by how much each picture is more unlike the drawn one than the usual picture."""
     return np.maximum(compared.unlike - np.median(compared.unlike), 0.0)
+
+
+def _is_exact(episode: RecordedEpisode, camera: Camera) -> NDArray[np.bool_]:
+    """(T,) pictures whose coder leaves nothing to the next: all but the predicted ones of AV1."""
+    packets = episode.recording.packets(camera.name)
+    is_av1 = episode.recording.video_settings(camera.name).codec == "av1"
+    return np.array([packet.is_keyframe or not is_av1 for packet in packets], dtype=np.bool_)
 
 
 def _stale(compared: Comparison) -> NDArray[np.bool_]:
@@ -197,6 +207,8 @@ def _stale_frames(episode: RecordedEpisode, camera: Camera, *, in_runs: bool) ->
     if not num_moving:
         return NotMeasured(why=f"too little moves before camera {camera.name}")
     stale = _stale(compared)
+    if not in_runs:
+        stale &= _is_exact(episode, camera)
     value, start = longest_run(stale) if in_runs else (int(stale.sum()), int(np.argmax(stale)))
     detail = f"camera {camera.name}, of {num_moving} frames with motion"
     return Measurement(value=value, frame=start if value else None, detail=detail)

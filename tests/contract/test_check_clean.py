@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 from support.check import checked, simulate
 from support.tasks import tasks_with_long_ones_slow
 
 from demorec.cli import main
+from demorec.config import VideoConfig
 from demorec.tables import CHECKS, ROBOTS, TASKS
 
 
@@ -31,6 +33,26 @@ def test_every_task_with_pictures(task: str, tmp_path: Path) -> None:
 def test_every_robot_and_variation(robot: str, variation: str, tmp_path: Path) -> None:
     report = checked(simulate(tmp_path / "e.mcap", robot=robot, variation=variation, seed=23))
     assert [r for r in report.results if r.level in ("warn", "fail")] == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "config",
+    [
+        {"robot": "iiwa", "width": 128, "height": 128},
+        {"robot": "iiwa", "variation": "full", "depth": True, "segmentation": True},
+        {"variation": "full", "depth": True, "segmentation": True},
+        {"width": 320, "height": 240},
+        {"width": 128, "height": 128, "video": VideoConfig(codec="av1", crf=35)},
+        {"video": VideoConfig(codec="jpeg", jpeg_quality=60)},
+        {"fps": 60},
+        {"fps": 10},
+    ],
+    ids=str,
+)
+def test_pictures_of_every_kind(config: dict[str, Any], tmp_path: Path) -> None:
+    path = simulate(tmp_path / "e.mcap", seed=24, cameras=("front", "wrist"), **config)
+    assert [r for r in checked(path).results if r.level in ("warn", "fail")] == []
 
 
 def test_every_check_says_what_it_measures() -> None:

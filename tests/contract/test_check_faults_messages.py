@@ -168,6 +168,8 @@ CASES: list[tuple[str, Edit, str]] = [
     ("depth of another camera", bytes_for(DEPTH, b"camera_front", b"camera_wrist"), "picture_messages"),
     ("labels of another camera", bytes_for(LABELED, b"camera_front", b"camera_wrist"), "picture_messages"),
     ("depth of another format", bytes_for(DEPTH, b"16UC1", b"32FC1"), "picture_messages"),
+    ("a depth picture that is none", bytes_for(DEPTH, b"IDAT", b"IDOT", at=2 * SECOND), "pictures_decode"),
+    ("a picture of labels that is none", bytes_for(LABELED, b"IHDR", b"IHOR", at=2 * SECOND), "pictures_decode"),
     ("a histogram of more pictures", counted_twice, "pixel_statistics"),
     ("an event of a phase less", event_at(lambda e: [] if e.message == "lift" else [e]), "phase_events"),
     ("an event of a phase twice", event_at(lambda e: [e, Event(name="phase", message="again")]), "phase_events"),
