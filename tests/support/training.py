@@ -43,7 +43,7 @@ def write_by_lerobot(
     if depth:
         about = {"is_depth_map": True, "depth_unit": "m"}
         features[DEPTH] = {"dtype": stored_as, "shape": (SIZE, SIZE, 1), "names": axes, "info": about}
-    files: dict[str, Any] = {"video_files_size_in_mb": 0.001, "data_files_size_in_mb": 0.008}
+    files: dict[str, Any] = {"video_files_size_in_mb": 0.001, "data_files_size_in_mb": 0.004}
     dataset = LeRobotDataset.create(
         "local/test", 30, features, root=root, use_videos=stored_as == "video", **{**files, **arguments}
     )
