@@ -111,6 +111,7 @@ CHECKS: Registry[Check] = Registry(
         "starts_as_scene_says": "demorec.check.objects:starts_as_scene_says",
         "penetration": "demorec.check.objects:penetration",
         "carried_by_gripper": "demorec.check.objects:carried_by_gripper",
+        "finger_depth": "demorec.check.fingers:finger_depth",
         "wrench_holds_the_hand": "demorec.check.physics:wrench_holds_the_hand",
         "moving_frames": "demorec.check.redundancy:moving_frames",
         "derived_values": "demorec.check.redundancy:derived_values",

@@ -14,6 +14,7 @@ import pytest
 from support.check import Message, Spoilt, checked, flip_bits, level_of, rewrite_messages, simulate
 from support.present import present
 
+from demorec.check.rows import matrices
 from demorec.recording import channels, messages
 from demorec.scene.episode import SuccessCheck
 
@@ -194,6 +195,25 @@ def carried_by_an_open_hand(s: Spoilt) -> None:
     )
 
 
+def held(s: Spoilt) -> np.ndarray:
+    """(T,) whether the cube is lifted and carried."""
+    return np.isin(s.columns.phase, ["lift", "transport"])
+
+
+def fingers_in_the_cube(s: Spoilt) -> None:
+    joints = s.columns.joint_position.copy()
+    joints[held(s), -2:] -= 0.0025
+    s.set(joint_position=joints, gripper_width=joints[:, -2:].sum(axis=1))
+
+
+def a_cube_beside_the_middle_of_the_fingers(s: Spoilt) -> None:
+    poses = s.columns.object_poses["red_cube"].copy()
+    rows = np.flatnonzero(held(s))
+    hands = matrices(s.columns.base_from_tcp[rows])  # the robot's base is the origin of the world
+    poses[rows, :3] += 0.003 * hands[:, :3, 1]
+    s.pose_of("red_cube", poses)
+
+
 def long_standstill(s: Spoilt) -> None:
     still = [len(s.frames) - 1] * (len(s.frames) * 2)
     s.frames = s.frames + still
@@ -277,6 +297,8 @@ NUMBERS: list[tuple[Fault, str]] = [
     (sunk_into_the_table, "penetration"),
     (carried_without_a_grip, "carried_by_gripper"),
     (carried_by_an_open_hand, "carried_by_gripper"),
+    (fingers_in_the_cube, "finger_depth"),
+    (a_cube_beside_the_middle_of_the_fingers, "finger_depth"),
     (long_standstill, "idle_frames"),
     (a_velocity_spike, "joint_velocity"),
     (trembling_labels, "action_acceleration"),
