@@ -137,7 +137,7 @@ def deepest_finger(episode: Episode, frames: Sequence[Frame]) -> tuple[float, st
     joints = np.array([frame.observation.joint_position for frame in frames])
     base = scene.robot.world_from_base.matrix()
     deepest = (0.0, "")
-    for name in robot.finger_links:
+    for name in robot.gripper.finger_links:
         by_name = dict(zip(robot.joint_names, joints.T, strict=True))
         finger = base @ link_matrices(urdf, name, by_name, len(frames))
         parts = _parts(links[name], path.parent)

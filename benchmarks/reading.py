@@ -81,7 +81,7 @@ def written_by_lerobot(folder: Path, args: argparse.Namespace, size: int) -> Pat
 
 def without_pictures(folder: Path, args: argparse.Namespace) -> Path:
     """The numbers of demorec's default features, 13 columns, of as many episodes as a training has."""
-    from support.recording import write_episode  # type: ignore[import-not-found]
+    from support.recording import write_episode
 
     from demorec.lerobot import ExportOptions, export_lerobot
 

@@ -92,7 +92,7 @@ def finger_depth(episode: RecordedEpisode) -> Measurement | None:
     robot, c = episode.info.robot, episode.columns
     links = {link.name: link for link in read_links(episode.recording.description())}
     found = []
-    for name in robot.finger_links:
+    for name in robot.gripper.finger_links:
         finger = episode.world_from_base @ episode.base_from_link(name, c.joint_position)
         parts = [Convex.of_shape(shape).moved(shape.link_from_shape.matrix()) for shape in links[name].visuals]
         reach = max((float(np.linalg.norm(part.points, axis=1).max()) + part.radius for part in parts), default=0.0)

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from support.check import Message, Spoilt, checked, flip_bits, level_of, rewrite_messages, simulate
 from support.present import present
 
@@ -195,7 +196,7 @@ def carried_by_an_open_hand(s: Spoilt) -> None:
     )
 
 
-def held(s: Spoilt) -> np.ndarray:
+def held(s: Spoilt) -> NDArray[np.bool_]:
     """(T,) whether the cube is lifted and carried."""
     return np.isin(s.columns.phase, ["lift", "transport"])
 
