@@ -140,7 +140,8 @@ def odd_pictures(episode: RecordedEpisode) -> Found:
         if isinstance(compared, NotMeasured):
             found.append(compared)
             continue
-        excess = np.where(_is_exact(episode, camera), 1.0, _PREDICTED_WEIGHT) * _excess(compared)
+        excess = _excess(compared)
+        excess[~_is_exact(episode, camera)[: len(excess)]] *= _PREDICTED_WEIGHT
         frame = int(np.argmax(excess))
         found.append(Measurement(value=float(excess[frame]), frame=frame, detail=f"camera {camera.name}"))
     return worst(*found)
@@ -208,7 +209,7 @@ def _stale_frames(episode: RecordedEpisode, camera: Camera, *, in_runs: bool) ->
         return NotMeasured(why=f"too little moves before camera {camera.name}")
     stale = _stale(compared)
     if not in_runs:
-        stale &= _is_exact(episode, camera)
+        stale &= _is_exact(episode, camera)[: len(stale)]
     value, start = longest_run(stale) if in_runs else (int(stale.sum()), int(np.argmax(stale)))
     detail = f"camera {camera.name}, of {num_moving} frames with motion"
     return Measurement(value=value, frame=start if value else None, detail=detail)
