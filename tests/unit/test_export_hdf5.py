@@ -167,7 +167,7 @@ def test_no_times_are_kept(run: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("option", "value"), [("valid_share", 1.0), ("valid_share", -0.1), ("compression", 10)])
 def test_impossible_options(run: Path, tmp_path: Path, option: str, value: float) -> None:
-    with pytest.raises(ConfigError, match=option.replace("_", "-")):
+    with pytest.raises(ConfigError, match=option):
         export(run, tmp_path / "d.hdf5", "hdf5", **{option: value})
 
 
@@ -175,7 +175,7 @@ def test_the_command(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[st
     out = tmp_path / "d.hdf5"
     for arguments, code in (
         (["hdf5", run, "--out", out, "--compression", "0", "--valid-share", "0.5"], 0),
-        (["hdf5", run, "--out", out], 1),
+        (["hdf5", run, "--out", out], 2),
         (["hdf6", run, "--out", out], 2),
         (["--out", "lerobot", "hdf5", run], 2),
     ):
