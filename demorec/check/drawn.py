@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any, Literal
 
 import numpy as np
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 
 from demorec.errors import RenderError, SceneError
 from demorec.geometry import Array
+from demorec.render import Renderer
 from demorec.render.painter import Painter
 from demorec.render.recorded import RecordedWorld
 from demorec.scene.episode import EpisodeColumns, EpisodeInfo
@@ -35,7 +37,7 @@ DEPTH_RANGE = 3.0
 
 
 class CellGrid:
-    """Means over a grid of equal areas, for pictures of one size.
+    """Means over a grid of (nearly) equal areas, for pictures of one size.
 
     Args:
         width, height: Of the pictures, pixels.
@@ -43,12 +45,15 @@ class CellGrid:
 
     def __init__(self, width: int, height: int) -> None:
         columns, rows = cell_counts(width, height)
-        self._columns = _shares(width, columns).T.copy()
-        self._rows = _shares(height, rows)
+        x, y = (np.arange(count + 1) * size // count for count, size in ((columns, width), (rows, height)))
+        self._columns, self._rows = x[:-1], y[:-1]
+        self._areas = np.outer(np.diff(y), np.diff(x)).astype(np.float32)
 
     def means(self, planes: Sequence[NDArray[np.float32]]) -> Cells:
         """(N, h, w, channels) of so many planes (N, H, W)."""
-        return np.stack([self._rows @ (plane @ self._columns) for plane in planes], axis=-1)
+        # No matrix product: its threads wait for each other on a busy machine.
+        sums = (np.add.reduceat(np.add.reduceat(p, self._rows, axis=1), self._columns, axis=2) for p in planes)
+        return np.stack([part / self._areas for part in sums], axis=-1)
 
 
 def cell_counts(width: int, height: int) -> tuple[int, int]:
@@ -56,14 +61,6 @@ def cell_counts(width: int, height: int) -> tuple[int, int]:
     longer = max(width, height)
     count = min(CELLS, longer // 2)
     return max(round(count * width / longer), 2), max(round(count * height / longer), 2)
-
-
-def _shares(size: int, count: int) -> NDArray[np.float32]:
-    """(count, size): which share of a cell each pixel makes up."""
-    edges = np.arange(count + 1) * (size / count)
-    pixels = np.arange(size)
-    overlap = np.minimum(edges[1:, None], pixels + 1) - np.maximum(edges[:-1, None], pixels)
-    return np.asarray(np.maximum(overlap, 0.0) * (count / size), dtype=np.float32)
 
 
 def planes_of(kind: Kind, pictures: NDArray[Any]) -> list[NDArray[np.float32]]:
@@ -96,8 +93,6 @@ def draw_all(
     Raises:
         SceneError, RenderError: A model is not there, or cannot be drawn.
     """
-    from demorec.render.raster import RasterRenderer
-
     cameras = tuple(_small(camera) for camera in info.scene.cameras)
     wanted = {kind for of_camera in kinds.values() for kind in of_camera}
     world = RecordedWorld(
@@ -105,18 +100,25 @@ def draw_all(
     )
     grids = {camera.name: CellGrid(camera.width, camera.height) for camera in cameras}
     found: dict[tuple[str, Kind], list[Cells]] = {(name, kind): [] for name in kinds for kind in kinds[name]}
-    with RasterRenderer() as renderer:
-        painter = Painter(renderer, cameras, depth="depth" in wanted, segmentation="labels" in wanted)
-        painter.setup(world)
-        for frame in range(columns.num_frames):
-            world.frame = frame
-            images = painter.images()
-            for name, kind in found:
-                image = images[name]
-                pictures = {"color": image.color, "depth": image.depth, "labels": image.segmentation}[kind]
-                assert pictures is not None
-                found[name, kind].append(grids[name].means(planes_of(kind, pictures[None]))[0])
+    painter = Painter(_renderer(), cameras, depth="depth" in wanted, segmentation="labels" in wanted)
+    painter.setup(world)
+    for frame in range(columns.num_frames):
+        world.frame = frame
+        images = painter.images()
+        for name, kind in found:
+            image = images[name]
+            pictures = {"color": image.color, "depth": image.depth, "labels": image.segmentation}[kind]
+            assert pictures is not None
+            found[name, kind].append(grids[name].means(planes_of(kind, pictures[None]))[0])
     return {key: np.stack(cells) for key, cells in found.items()}
+
+
+@cache
+def _renderer() -> Renderer:
+    """Kept warm from one recording to the next: it has read the robot's meshes."""
+    from demorec.render.raster import RasterRenderer
+
+    return RasterRenderer()
 
 
 def _small(camera: Camera) -> Camera:

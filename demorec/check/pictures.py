@@ -16,7 +16,7 @@ from demorec.scene.scene import Camera
 
 MIN_MOTION = 2.5
 """Root mean square change of the drawn cells from frame to frame, of 255, that a picture must show."""
-STALE_SHARE, STALE_EXCESS = 0.3, 1.5
+STALE_SHARE, STALE_EXCESS = 0.3, 2.5
 """A picture is stale that shows less than this share of the motion, and is more unlike the drawn one than the usual
 picture by more than this, of 255: a predicted picture may leave a small motion to the next keyframe."""
 _PREDICTED_WEIGHT = 0.5
@@ -154,9 +154,9 @@ def _excess(compared: Comparison) -> Array:
 
 def _is_exact(episode: RecordedEpisode, camera: Camera) -> NDArray[np.bool_]:
     """(T,) pictures whose coder leaves nothing to the next: all but the predicted ones of AV1."""
-    packets = episode.recording.packets(camera.name)
-    is_av1 = episode.recording.video_settings(camera.name).codec == "av1"
-    return np.array([packet.is_keyframe or not is_av1 for packet in packets], dtype=np.bool_)
+    if episode.recording.video_settings(camera.name).codec != "av1":
+        return np.ones(episode.num_frames, dtype=np.bool_)
+    return np.array([packet.is_keyframe for packet in episode.recording.packets(camera.name)], dtype=np.bool_)
 
 
 def _stale(compared: Comparison) -> NDArray[np.bool_]:
