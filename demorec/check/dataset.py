@@ -7,11 +7,13 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
+from demorec.check.dataset_video import EpisodePictures, episode_pictures
 from demorec.errors import ExportError, in_words
 from demorec.lerobot.files import read_table
-from demorec.lerobot.layout import DatasetInfo
+from demorec.lerobot.layout import AUTOMATIC_FEATURES, DatasetInfo
 from demorec.lerobot.paths import SIDECAR_DIR
 from demorec.lerobot.reader import EpisodePlace, RowReader, episode_places, read_tasks
 from demorec.lerobot.sidecar import EPISODE_SCHEMA
@@ -31,6 +33,7 @@ class Dataset:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self._pictures: dict[str, list[EpisodePictures]] = {}
 
     @cached_property
     def info(self) -> DatasetInfo:
@@ -49,9 +52,37 @@ class Dataset:
 
     @cached_property
     def rows(self) -> list[Rows]:
-        """Feature -> (T, D) of every episode."""
+        """Feature -> (T, D) of every episode: all counters are there, no episode is empty, every number is one."""
+        missing = [name for name in AUTOMATIC_FEATURES if name not in self.info.features]
+        if missing:
+            raise ExportError(f"info.json has no feature {', '.join(missing)}: {self.path}")
         reader = RowReader(self.path, self.info)
-        return [reader.read(place) for place in self.places]
+        return [self._usable(place, reader.read(place)) for place in self.places]
+
+    def _usable(self, place: EpisodePlace, rows: Rows) -> Rows:
+        if place.length == 0:
+            raise ExportError(f"Episode {place.episode_index} has no frames: {self.path}")
+        for name, values in rows.items():
+            kind = self.info.features[name].dtype
+            if kind in ("int64", "bool") and values.dtype.kind not in "iub":
+                raise ExportError(f"Episode {place.episode_index} lacks values of {name}: {self.path}")
+            if values.dtype.kind == "f" and not (finite := np.isfinite(values)).all():
+                frame, component = (int(number) for number in np.argwhere(~finite)[0])
+                raise ExportError(
+                    f"Episode {place.episode_index} has no number in {name}[{component}] at frame {frame}: {self.path}"
+                )
+        return rows
+
+    @property
+    def colour_keys(self) -> list[str]:
+        """Names of the camera features, less those of depth."""
+        return [key for key in self.info.video_keys if not self.info.features[key].is_depth]
+
+    def pictures(self, key: str) -> list[EpisodePictures]:
+        """What is decoded of a camera in each episode, kept from the first call on."""
+        if key not in self._pictures:
+            self._pictures[key] = episode_pictures(self.path, self.info, self.places, key)
+        return self._pictures[key]
 
     @cached_property
     def sidecar(self) -> list[dict[str, Any]]:

@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 import re
 import subprocess
 import sys
 import tempfile
-from typing import Any
 
 import numpy as np
 
-from demorec.check.base import Measurement, check, worst
+from demorec.check.base import Measurement, check
 from demorec.check.dataset import Dataset
-from demorec.errors import ExportError, MissingDependencyError, in_words
-from demorec.geometry import Array
-from demorec.lerobot.files import check_video, read_json
+from demorec.errors import ExportError, MissingDependencyError
 from demorec.lerobot.inspect import episode_digests
 from demorec.lerobot.reader import PacketReader
 from demorec.lerobot.verify import LEROBOT, lerobot_is_installed
@@ -76,7 +72,7 @@ def dataset_counts(dataset: Dataset) -> Measurement:
         if place.episode_index != number or place.from_index != start:
             wrong.append(f"the place of episode {number}")
         used = {int(index) for index in rows["task_index"].reshape(-1)}
-        names = {dataset.tasks[index] if index < len(dataset.tasks) else "" for index in used}
+        names = {dataset.tasks[index] if 0 <= index < len(dataset.tasks) else "" for index in used}
         if names != set(place.tasks):
             wrong.append(f"the task of episode {number}")
         start += place.length
@@ -114,108 +110,6 @@ def dataset_videos(dataset: Dataset) -> Measurement | None:
         finally:
             reader.close()
     return Measurement(value=len(wrong), detail="; ".join(wrong[:2]) or f"{len(dataset.info.video_keys)} cameras")
-
-
-@check(
-    group="dataset",
-    scope="dataset",
-    measures="statistics against those recomputed from all rows, in standard deviations",
-    warn=0.01,
-    fail=0.05,
-    reads=(
-        "meta/stats.json",
-        "observation.state",
-        "observation.velocity",
-        "observation.ee_pose",
-        "observation.environment_state",
-        "action",
-    ),
-)
-def dataset_statistics(dataset: Dataset) -> Measurement | None:
-    """meta/stats.json, by which training normalises, is that of the data."""
-    stats, found = _stats(dataset), []
-    if not dataset.rows:
-        return None
-    for name, feature in dataset.info.features.items():
-        if feature.is_video or feature.dtype == "string":
-            continue
-        values = np.concatenate([rows[name].reshape(len(rows[name]), -1) for rows in dataset.rows]).astype(np.float64)
-        said = stats.get(name)
-        if said is None:
-            found.append(Measurement(value=math.inf, detail=f"{name} has no statistics"))
-            continue
-        deviation = values.std(axis=0)
-        scale = np.maximum(deviation, 1e-4)
-        true = {"min": values.min(axis=0), "max": values.max(axis=0), "mean": values.mean(axis=0), "std": deviation}
-        for quantity, value in true.items():
-            told = _numbers(said.get(quantity, np.inf))
-            off = np.abs(told - value) / scale if told.shape == value.shape else np.array([np.inf])
-            found.append(Measurement(value=float(off.max()), detail=f"{quantity} of {name}"))
-    return worst(*found)
-
-
-def _stats(dataset: Dataset) -> dict[str, Any]:
-    path = dataset.path / "meta" / "stats.json"
-    try:
-        found = read_json(path)
-        if not isinstance(found, dict) or not all(isinstance(entry, dict) for entry in found.values()):
-            raise ValueError("it holds no object of objects")
-    except (OSError, ValueError) as error:
-        raise ExportError(f"The statistics cannot be read ({in_words(error)}): {path}") from error
-    return found
-
-
-def _numbers(value: Any) -> Array:
-    """(N,) numbers of an entry in the statistics, however nested; (0,) for what is none."""
-    try:
-        return np.asarray(value, dtype=np.float64).reshape(-1)
-    except (ValueError, TypeError, OverflowError):
-        return np.zeros(0)
-
-
-@check(
-    group="dataset",
-    scope="dataset",
-    measures="mean colour in the statistics against decoded pictures, of 1",
-    warn=0.06,
-    fail=0.12,
-    needs_pictures=True,
-    reads=(
-        "meta/stats.json",
-        "observation.images.{camera}",
-    ),
-)
-def dataset_picture_statistics(dataset: Dataset) -> Measurement | None:
-    """The statistics of each camera are those of its pictures, by a sample of each file."""
-    import av
-
-    stats, found = _stats(dataset), []
-    for key in dataset.info.video_keys:
-        if dataset.info.features[key].is_depth:
-            continue
-        means = []
-        for path in sorted((dataset.path / "videos" / key).glob("*/*.mp4")):
-            check_video(path)
-            try:
-                with av.open(str(path), format="mp4") as container:
-                    _bound_pictures(container, dataset.info.features[key].shape)
-                    for number, frame in enumerate(container.decode(video=0)):
-                        if number % 10 == 0:
-                            means.append(frame.to_ndarray(format="rgb24").mean(axis=(0, 1)) / 255)
-            except (OSError, av.FFmpegError) as error:
-                raise ExportError(f"The video cannot be decoded ({in_words(error)}): {path}") from error
-        said = _numbers(stats.get(key, {}).get("mean", np.full(3, np.inf)))
-        if means:
-            value = float(np.abs(np.mean(means, axis=0) - said).max()) if said.shape == (3,) else math.inf
-            found.append(Measurement(value=value, detail=f"{key}, {len(means)} pictures"))
-    return worst(*found)
-
-
-def _bound_pictures(container: Any, shape: tuple[int, ...]) -> None:
-    """Refuse to decode pictures much larger than the dataset says: a few bytes can announce gigabytes."""
-    height, width = shape[:2]
-    for stream in container.streams.video:
-        stream.codec_context.options = {"max_pixels": str((height + 128) * (width + 128))}
 
 
 @check(

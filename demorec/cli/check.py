@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -51,8 +52,8 @@ class Check:
     replay: int = 0
     """Also replay this many episodes of each run or dataset, spread evenly, and every recording given by itself."""
     deep: bool = False
-    """Also make every recording again, from its config and seed, and compare every number and picture with it; takes
-    about as long as generating it."""
+    """Also make every recording, and every episode of a dataset, again from config and seed, and compare every number
+    and picture; takes about as long as generating them."""
     coverage_picture: Path | None = None
     """Draw start places, goals and ranges of all episodes into this PNG file."""
     overwrite: bool = False
@@ -112,11 +113,16 @@ class Check:
 
     def _remade(self, subjects: Sequence[Subject], allowed: tuple[str, ...]) -> Iterator[DeepReport]:
         from demorec.cli.deep import deep_lines
-        from demorec.replay.deep import deep_checks
+        from demorec.replay.deep import deep_checks, deep_dataset_checks
 
         paths = [subject.path for subject in subjects if subject.kind == "recording"]
-        with ProgressBar("making again", total=len(paths)) as bar:
-            for report in deep_checks(paths, workers=self.workers, allowed=allowed):
+        runs = [subject.path for subject in subjects if subject.kind == "run"]
+        # The dataset of a run is compared with the run's recordings already.
+        datasets = [s.path for s in subjects if s.kind == "dataset" and s.path.parent not in runs]
+        found = [deep_checks(paths, workers=self.workers, allowed=allowed)]
+        found += [deep_dataset_checks(path, allowed=allowed) for path in datasets]
+        with ProgressBar("making again", total=0 if datasets else len(paths)) as bar:
+            for report in chain.from_iterable(found):
                 bar.advance()
                 if not self.json:
                     say(*deep_lines(report, verbose=self.verbose))

@@ -13,6 +13,7 @@ from tyro.conf import arg
 from demorec.cli.config_file import config_path, with_file_values
 from demorec.cli.output import tell
 from demorec.config import GenerateConfig
+from demorec.errors import ConfigError
 from demorec.generate.options import RunOptions, default_out, default_repo_id
 
 if TYPE_CHECKING:
@@ -42,6 +43,9 @@ class Generate:
     """How it is carried out; leaves the data alone."""
     check: bool = True
     """Check run, recordings and dataset at the end, without decoding pictures (demorec check decodes them)."""
+    deep_every: int = 50
+    """Make one of so many episodes again at the end, from config and seed, and compare every number and picture with
+    the recorded ones (demorec check --deep does it with all); 0: none."""
     dry_run: bool = False
     """Make a few pilot episodes in a temporary folder and tell what the whole run would take."""
     view: bool = False
@@ -59,6 +63,8 @@ class Generate:
         """Generate, export, check, report."""
         self.episodes.validate()
         self.options.validate()
+        if self.deep_every < 0:
+            raise ConfigError(f"deep-every is {self.deep_every}, allowed are 0 (none) and more.")
         options = replace(
             self.options,
             out=self.options.out or default_out(self.episodes.task),
@@ -90,7 +96,7 @@ class Generate:
                     result.folder, repo_id=options.repo_id, progress=progress.exporting, says=progress.says
                 )
             if self.check and result.run.successes:
-                checked = check_run(result, progress=progress.checking)
+                checked = check_run(result, deep_every=self.deep_every, progress=progress.checking)
         print_result(result, export, checked)
         if report is not None and report.not_verified:
             tell(f"Not verified: {report.not_verified}")

@@ -33,33 +33,55 @@ class CheckSummary:
         failures: One line for each check that failed.
         failed_attempts: How many failed attempts fail checks of what they recorded, which is told but counts for
             nothing.
+        made_again: How many episodes were made a second time and compared in every number and picture.
     """
 
     subjects: int
     warnings: int
     failures: tuple[str, ...]
     failed_attempts: int
+    made_again: int = 0
 
 
-def check_run(result: RunResult, *, progress: Callable[[int, int], None]) -> CheckSummary:
-    """Every check of run, recordings and dataset that needs no decoded pictures; of the episodes asked for."""
+def check_run(result: RunResult, *, deep_every: int = 0, progress: Callable[[int, int], None]) -> CheckSummary:
+    """Every check of run, recordings and dataset that needs no decoded pictures; of the episodes asked for.
+
+    Args:
+        result: Of the run.
+        deep_every: One of so many episodes is made again; 0 for none.
+        progress: Is told how many things of how many are done.
+    """
     from demorec.check.report import CheckOptions, check_subjects, find_subjects
+    from demorec.replay.deep import deep_checks
 
     beyond = {result.folder / attempt.file for attempt in result.run.beyond}
     subjects = [subject for subject in find_subjects([result.folder]) if subject.path not in beyond]
+    sample = [a.file for a in result.run.successes[deep_every - 1 :: deep_every]] if deep_every else []
+    total = len(subjects) + len(sample)
     workers = available_cores() if len(subjects) > _WORTH_PROCESSES else 1
     warnings = 0
     failures: list[str] = []
     failed_attempts = 0
     for done, report in enumerate(check_subjects(subjects, CheckOptions(pictures=False, workers=workers))):
-        progress(done + 1, len(subjects))
+        progress(done + 1, total)
         if report.is_failed_attempt and not report.is_bad():
             failed_attempts += report.level == "fail"
             continue
         warnings += report.count("warn")
         failures += [f"{report.path.name}: {r.check}: {r.detail}" for r in report.results if r.level == "fail"]
+    paths = [result.folder / file for file in sample]
+    for done, again in enumerate(deep_checks(paths, allowed=result.run.config.modules), start=len(subjects) + 1):
+        progress(done, total)
+        warnings += again.level == "warn"
+        if again.level == "fail":
+            first = again.error or str(again.differences[0])
+            failures.append(f"{again.path.name}: made again it is not the same: {first}")
     return CheckSummary(
-        subjects=len(subjects), warnings=warnings, failures=tuple(failures), failed_attempts=failed_attempts
+        subjects=len(subjects),
+        warnings=warnings,
+        failures=tuple(failures),
+        failed_attempts=failed_attempts,
+        made_again=len(sample),
     )
 
 
@@ -96,7 +118,8 @@ def print_result(result: RunResult, export: ExportRecord | None, checked: CheckS
     if checked is not None:
         verdict = f"{len(checked.failures)} failed" if checked.failures else "none failed"
         apart = f" (not counted: those of {checked.failed_attempts} failed attempts)" if checked.failed_attempts else ""
-        rows.append(("checks", f"{verdict}, {checked.warnings} warnings{apart}"))
+        again = f"; {checked.made_again} episodes made again and compared" if checked.made_again else ""
+        rows.append(("checks", f"{verdict}, {checked.warnings} warnings{apart}{again}"))
     width = max(len(name) for name, _ in rows)
     for name, value in rows:
         say(f"{name:<{width}}  {value}")

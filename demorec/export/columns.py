@@ -68,7 +68,7 @@ def feature_columns(recording: Recording, options: CommonOptions) -> FeatureColu
     where the robot shall be when the next observation is taken.
 
     Raises:
-        ExportError: The recording has no frames.
+        ExportError: The recording has no frames, or a value that is not finite, with which no policy can be trained.
         RecordingError: It is damaged.
     """
     info = recording.info
@@ -84,6 +84,12 @@ def feature_columns(recording: Recording, options: CommonOptions) -> FeatureColu
         )
     )
     features[ACTION] = action_vectors(columns, info.scene, options.action, action_rows)
+    for name, values in features.items():
+        if len(wrong := np.flatnonzero(~np.isfinite(values.astype(np.float64)).all(axis=1))):
+            raise ExportError(
+                f"The feature {name} is not finite in frame {int(rows[wrong[0]])}, leave the recording out: "
+                f"{recording.path}"
+            )
     success = recording.outcome is not None and recording.outcome.success
     is_last = rows == rows[-1]
     features[REWARD] = (is_last & success).astype(np.float32)

@@ -14,18 +14,21 @@ from typing import Any
 import numpy as np
 import pytest
 from mcap_ros2._dynamic import generate_dynamic, serialize_dynamic
-from support.check import Spoilt, rewrite_messages, simulate
+from support.check import Spoilt, rewrite_messages, simulate, simulate_run
 from support.mcap import rewritten
 
 from demorec.cli import main
+from demorec.cli.generate_report import check_run
+from demorec.generate.run import RunResult
 from demorec.loop import Workshop
 from demorec.plain import to_plain
-from demorec.recording import Recording
+from demorec.recording import Recording, recover
 from demorec.recording.metadata import EPISODE, OUTCOME
 from demorec.recording.ros2 import DEFINITIONS
 from demorec.replay.deep import DeepReport, deep_check, deep_checks
 from demorec.replay.deep.contents import CODED, Contents, content_differences
 from demorec.replay.rerender import RerenderOptions, rerender
+from demorec.runs.run_file import Session, load_run_file
 
 FPS = 10
 
@@ -398,3 +401,34 @@ def test_a_damaged_file_among_good_ones(blind: Path, tmp_path: Path, workshop: W
     reports = list(deep_checks([damaged, blind]))
     assert [report.level for report in reports] == ["fail", "pass"]
     assert "cut off" in reports[0].error
+
+
+def test_a_run_makes_a_sample_again(tmp_path: Path) -> None:
+    """What generate-dataset does at the end: the second and the fourth of four episodes."""
+    folder = simulate_run(tmp_path / "run", 4, seed=7, fps=FPS)
+    path = folder / "episodes" / "episode_000003.mcap"
+    run = load_run_file(folder)
+    result = RunResult(folder=folder, run=run, session=Session(started=""), made=(), interrupted=False)
+    found = check_run(result, deep_every=2, progress=lambda done, total: None)
+    assert found.made_again == 2
+    assert not [failure for failure in found.failures if "made again" in failure]
+    with Recording(path) as recording:
+        info = to_plain(recording.info)
+    info["instruction"] = "Do something else."
+    path.write_bytes(rewritten(path, change={EPISODE: {"info": json.dumps(info)}}))
+    found = check_run(result, deep_every=2, progress=lambda done, total: None)
+    (failure,) = (failure for failure in found.failures if "made again" in failure)
+    assert failure.startswith(path.name)
+    assert "info.instruction" in failure
+    assert check_run(result, deep_every=5, progress=lambda done, total: None).made_again == 0
+
+
+def test_a_recording_that_a_crash_cut_off_is_compared_as_far_as_it_goes(
+    filmed: Path, tmp_path: Path, workshop: Workshop
+) -> None:
+    part = tmp_path / "cut.mcap.part"
+    part.write_bytes(filmed.read_bytes()[: int(0.7 * filmed.stat().st_size)])
+    recover(part, tmp_path / "cut.mcap")
+    report = deep_check(tmp_path / "cut.mcap", workshop)
+    assert (report.level, report.differences) == ("pass", ())
+    assert report.num_frames > 5

@@ -71,7 +71,7 @@ def deep_check(path: Path, workshop: Workshop, allowed: Sequence[str] = ()) -> D
     try:
         with tempfile.TemporaryDirectory(prefix="demorec-deep-") as folder, Recording(path) as recording:
             info, num_frames, is_derived = recording.info, recording.num_frames, bool(recording.info.origin)
-            versions = version_differences(info.versions, _versions_here(info, allowed))
+            versions = version_differences(info.versions, versions_here(info, allowed))
             again = Path(folder) / "again.mcap"
             remake(recording, again, workshop, allowed)
             differences = tuple(_differences(recording, again, workshop, allowed))
@@ -92,7 +92,8 @@ def deep_check(path: Path, workshop: Workshop, allowed: Sequence[str] = ()) -> D
     )
 
 
-def _versions_here(info: EpisodeInfo, allowed: Sequence[str]) -> Mapping[str, str]:
+def versions_here(info: EpisodeInfo, allowed: Sequence[str]) -> Mapping[str, str]:
+    """package -> version of what would make such an episode here."""
     with suppress(DemorecError):
         return deciding_versions(recorded_config(info, allowed))
     return deciding_versions()

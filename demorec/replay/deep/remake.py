@@ -55,12 +55,15 @@ def remake(recording: Recording, path: Path, workshop: Workshop, allowed: Sequen
     """
     if recording.info.origin:
         _send_again(recording, path, workshop, allowed)
-        return
-    config = recorded_config(recording.info, allowed)
-    episode = prepare(
-        EpisodePlan(config=config, episode_index=recording.info.episode_index, attempt=recording.info.attempt)
-    )
-    info = replace(episode.info, format_version=recording.info.format_version)
+    else:
+        generate_again(recording.info, path, workshop, allowed)
+
+
+def generate_again(recorded: EpisodeInfo, path: Path, workshop: Workshop, allowed: Sequence[str] = ()) -> None:
+    """`remake` of a generated episode, of which nothing but its description is needed; errors as there."""
+    config = recorded_config(recorded, allowed)
+    episode = prepare(EpisodePlan(config=config, episode_index=recorded.episode_index, attempt=recorded.attempt))
+    info = replace(episode.info, format_version=recorded.format_version)
     world, renderer = workshop.equip(info)
     session = Session.of_episode(world, episode, renderer)
     with EpisodeWriter(path, info, video=config.video) as writer:

@@ -1,0 +1,146 @@
+"""Are a dataset's statistics, by which training normalises, those of its data: of all together and of each episode."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from demorec.check.base import Measurement, check, worst
+from demorec.check.dataset import Dataset
+from demorec.errors import ExportError
+from demorec.geometry import Array
+from demorec.lerobot.files import read_json, read_table
+from demorec.lerobot.layout import STATS_PATH
+from demorec.lerobot.stats import NAMES, QUANTILES
+
+_SMALLEST_DEVIATION = 1e-4
+"""A component that hardly moves is measured against this."""
+
+
+@check(
+    group="dataset",
+    scope="dataset",
+    measures="statistics against those recomputed from all rows, in standard deviations",
+    warn=0.01,
+    fail=0.05,
+    reads=(
+        "meta/stats.json",
+        "observation.state",
+        "observation.velocity",
+        "observation.ee_pose",
+        "observation.environment_state",
+        "action",
+    ),
+)
+def dataset_statistics(dataset: Dataset) -> Measurement | None:
+    """meta/stats.json: minimum, maximum, mean, deviation, count and quantiles of every feature.
+
+    A quantile may also be the mean of the episodes' ones, as LeRobot has it.
+    """
+    if not dataset.rows:
+        return None
+    stats, found = read_statistics(dataset), []
+    for name in _numeric(dataset):
+        episodes = [_flat(rows[name]) for rows in dataset.rows]
+        true = statistics_of(np.concatenate(episodes))
+        weights = [len(values) for values in episodes]
+        averaged = {
+            q: np.average([np.quantile(values, share, axis=0) for values in episodes], axis=0, weights=weights)
+            for q, share in QUANTILES.items()
+        }
+        found.append(_off(stats.get(name), true, averaged, detail=name))
+    return worst(*found)
+
+
+@check(
+    group="dataset",
+    scope="dataset",
+    measures="statistics of single episodes against those recomputed, in standard deviations",
+    warn=0.01,
+    fail=0.05,
+    reads=("meta/episodes",),
+)
+def dataset_episode_statistics(dataset: Dataset) -> Measurement | None:
+    """The columns stats/... of the episodes' table, from which LeRobot merges those of several datasets."""
+    names = _numeric(dataset)
+    tables = sorted((dataset.path / "meta" / "episodes").glob("*/*.parquet"))
+    columns = [f"stats/{name}/{quantity}" for name in names for quantity in NAMES]
+    told = [row for path in tables for row in read_table(path, columns).to_pylist()]
+    found = []
+    for number, (row, rows) in enumerate(zip(told, dataset.rows, strict=False)):
+        for name in names:
+            said = {quantity: row[f"stats/{name}/{quantity}"] for quantity in NAMES}
+            found.append(_off(said, statistics_of(_flat(rows[name])), {}, detail=f"episode {number}, {name}"))
+    return worst(*found)
+
+
+def episode_column(dataset: Dataset, name: str) -> list[Any]:
+    """The values of a column of the episodes' table; ExportError when there is none."""
+    tables = sorted((dataset.path / "meta" / "episodes").glob("*/*.parquet"))
+    return [value for path in tables for value in read_table(path, [name]).column(name).to_pylist()]
+
+
+def read_statistics(dataset: Dataset) -> dict[str, Any]:
+    """meta/stats.json; ExportError when it cannot be read."""
+    path = dataset.path / STATS_PATH
+    try:
+        found = read_json(path)
+        if not isinstance(found, dict) or not all(isinstance(entry, dict) for entry in found.values()):
+            raise ValueError("it holds no object of objects")
+    except (OSError, ValueError) as error:
+        raise ExportError(f"The statistics cannot be read ({error}): {path}") from error
+    return found
+
+
+def numbers_of(value: Any) -> Array:
+    """(N,) numbers of an entry in the statistics, however nested; (0,) for what is none."""
+    try:
+        return np.asarray(value, dtype=np.float64).reshape(-1)
+    except (ValueError, TypeError, OverflowError):
+        return np.zeros(0)
+
+
+def statistics_of(values: Array) -> dict[str, Array]:
+    """The ten numbers of the rows (T, D), by NumPy alone: each (D,), the count (1,)."""
+    return {
+        "min": values.min(axis=0),
+        "max": values.max(axis=0),
+        "mean": values.mean(axis=0),
+        "std": values.std(axis=0),
+        "count": np.array([float(len(values))]),
+        **{name: np.quantile(values, share, axis=0) for name, share in QUANTILES.items()},
+    }
+
+
+def _numeric(dataset: Dataset) -> list[str]:
+    features = dataset.info.features
+    return [name for name, feature in features.items() if not feature.is_video and feature.dtype != "string"]
+
+
+def _flat(rows: Any) -> Array:
+    return np.asarray(rows, dtype=np.float64).reshape(len(rows), -1)
+
+
+def _off(
+    said: Mapping[str, Any] | None, true: Mapping[str, Array], others: Mapping[str, Array], *, detail: str
+) -> Measurement:
+    """How far the worst quantity of a feature is off, by the nearer of two values where there are two."""
+    if said is None:
+        return Measurement(value=math.inf, detail=f"{detail} has no statistics")
+    found = []
+    scale = np.maximum(true["std"], _SMALLEST_DEVIATION)
+    for quantity, value in true.items():
+        told = numbers_of(said.get(quantity, np.inf))
+        off = math.inf
+        if told.shape == value.shape:
+            distance = np.abs(told - value)
+            if quantity in others:
+                distance = np.minimum(distance, np.abs(told - others[quantity]))
+            off = float((distance if quantity == "count" else distance / scale).max())
+        found.append(Measurement(value=off, detail=f"{quantity} of {detail}"))
+    measurement = worst(*found)
+    assert measurement is not None
+    return measurement

@@ -1,0 +1,96 @@
+"""The videos of a dataset, decoded once and summed up episode by episode."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+from demorec.errors import ExportError
+from demorec.geometry import Array
+from demorec.lerobot.files import check_video
+from demorec.lerobot.layout import VIDEO_PATH, DatasetInfo
+from demorec.lerobot.reader import EpisodePlace
+
+_FLAT_LEVELS = 1.0
+"""Standard deviation over a picture, of 255: less is a black, green or otherwise empty one."""
+_ALIEN_LEVELS, _ALIEN_TIMES = 6.0, 4.0
+"""A picture from elsewhere differs so much from both of its neighbours, and so many times more than they do."""
+_PARTS = 16
+"""Parts a side, whose mean colours stand for a picture."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class EpisodePictures:
+    """The colour pictures of one camera in one episode.
+
+    Attributes:
+        count: How many there are.
+        mean: (3,) mean red, green and blue, of 1.
+        flat: Frames whose picture is of one colour.
+        alien: Frames whose picture is unlike both of its neighbours, which are like each other.
+    """
+
+    count: int
+    mean: Array
+    flat: tuple[int, ...]
+    alien: tuple[int, ...]
+
+
+def episode_pictures(root: Path, info: DatasetInfo, places: Sequence[EpisodePlace], key: str) -> list[EpisodePictures]:
+    """Of every episode, in order, one episode in memory at a time.
+
+    Raises:
+        ExportError: A video cannot be decoded, or has too few pictures.
+    """
+    files: dict[Path, Iterator[Array]] = {}
+    found = []
+    for place in places:
+        position, _ = place.videos[key]
+        path = root / position.path(info.video_path or VIDEO_PATH, key)
+        if path not in files:
+            files[path] = _decoded(path, info.features[key].shape)
+        pictures = list(islice(files[path], place.length))
+        if len(pictures) < place.length or not pictures:
+            raise ExportError(
+                f"Episode {place.episode_index} has {place.length} frames, {len(pictures)} pictures decode: {path}"
+            )
+        found.append(_summary(np.stack(pictures)))
+    return found
+
+
+def _decoded(path: Path, shape: tuple[int, ...]) -> Iterator[Array]:
+    """(16, 16, 3) mean colours of the parts of every picture, 0 to 255."""
+    import av
+
+    check_video(path)
+    try:
+        with av.open(str(path), format="mp4") as container:
+            height, width = shape[:2]
+            for stream in container.streams.video:  # a few bytes can announce pictures of gigabytes
+                stream.codec_context.options = {"max_pixels": str((height + 128) * (width + 128))}
+            for frame in container.decode(video=0):
+                small = frame.reformat(width=_PARTS, height=_PARTS, format="rgb24", interpolation="AREA")
+                yield small.to_ndarray().astype(np.float64)
+    except (OSError, av.FFmpegError) as error:
+        raise ExportError(f"The video cannot be decoded ({error}): {path}") from error
+
+
+def _summary(parts: Array) -> EpisodePictures:
+    """Of the parts (T, 16, 16, 3) of an episode's pictures."""
+    flat = parts.std(axis=(1, 2)).max(axis=1) < _FLAT_LEVELS
+    alien = np.zeros(len(parts), dtype=np.bool_)
+    if len(parts) > 2:
+        step = np.abs(np.diff(parts, axis=0)).mean(axis=(1, 2, 3))
+        across = np.abs(parts[2:] - parts[:-2]).mean(axis=(1, 2, 3))
+        least = np.minimum(step[:-1], step[1:])
+        alien[1:-1] = (least > _ALIEN_LEVELS) & (least > _ALIEN_TIMES * across)
+    return EpisodePictures(
+        count=len(parts),
+        mean=parts.mean(axis=(0, 1, 2)) / 255,
+        flat=tuple(np.flatnonzero(flat).tolist()),
+        alien=tuple(np.flatnonzero(alien).tolist()),
+    )

@@ -1,0 +1,165 @@
+"""Is the dataset in a run's folder that of the run: every episode against the recording that it comes from."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import ExitStack, closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from demorec.check.base import Measurement, check
+from demorec.check.dataset import Dataset, Rows
+from demorec.check.run import CheckedRun
+from demorec.errors import ConfigError, DemorecError, RecordingError, resource_error
+from demorec.export.columns import frame_stride
+from demorec.lerobot.files import read_json, read_table
+from demorec.lerobot.options import ExportOptions
+from demorec.lerobot.paths import SIDECAR_DIR, is_dataset
+from demorec.lerobot.prepare import prepare_episode
+from demorec.lerobot.reader import PacketReader
+from demorec.lerobot.sidecar import EPISODE_SCHEMA, EXPORT_PATH
+from demorec.lerobot.transcode import reason_to_transcode
+from demorec.recording import Recording
+from demorec.scene.features import IMAGE_PREFIX
+
+_OF_THE_PLACE = ("episode_index", "source", "content_digest")
+"""What the sidecar keeps that is not of the recording."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class DatasetEpisode:
+    """One episode of a dataset that has a sidecar.
+
+    Attributes:
+        number: In the dataset.
+        rows: Feature -> (T, D).
+        videos: Camera feature -> SHA-256 (hex) of its coded pictures.
+        tasks: Instructions.
+        told: The sidecar's row.
+    """
+
+    number: int
+    rows: Rows
+    videos: Mapping[str, str]
+    tasks: tuple[str, ...]
+    told: Mapping[str, Any]
+
+
+@check(
+    group="run",
+    scope="run",
+    measures="episodes of the run's dataset that are not what was recorded",
+    warn=0,
+    reads=(
+        "observation.state",
+        "observation.velocity",
+        "observation.ee_pose",
+        "action",
+    ),
+)
+def run_dataset_content(run: CheckedRun) -> Measurement | None:
+    """Every number and coded picture of each episode is that of its recording, exported with the same options."""
+    path = run.path / "dataset"
+    if not is_dataset(path):
+        return None
+    dataset = Dataset(path)
+    if not dataset.sidecar:
+        return Measurement(value=1, detail="the dataset does not say which recordings it comes from")
+    options = export_options(path)
+    wrong: list[str] = []
+    for episode in dataset_episodes(dataset):
+        file = run.path / ("episodes" if episode.told["success"] else "failed") / Path(str(episode.told["source"])).name
+        if words := [what for what, _ in episode_differences(file, options, episode)]:
+            wrong.append(f"episode {episode.number}: {', '.join(words)}")
+    return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{len(dataset.sidecar)} episodes")
+
+
+def dataset_episodes(dataset: Dataset) -> Iterator[DatasetEpisode]:
+    """Every episode in order; ExportError when a file cannot be read."""
+    tables = sorted((dataset.path / SIDECAR_DIR / "episodes").glob("*/*.parquet"))
+    told = [row for path in tables for row in read_table(path, EPISODE_SCHEMA.names).to_pylist()]
+    with ExitStack() as stack:
+        readers = {
+            key: stack.enter_context(closing(PacketReader(dataset.path, dataset.info, key)))
+            for key in dataset.info.video_keys
+        }
+        for number, (row, rows, place) in enumerate(zip(told, dataset.rows, dataset.places, strict=False)):
+            videos = {key: _digest(reader.read(place)) for key, reader in readers.items()}
+            yield DatasetEpisode(number=number, rows=rows, videos=videos, tasks=place.tasks, told=row)
+
+
+def _digest(samples: Iterable[bytes]) -> str:
+    digest = hashlib.sha256()
+    for sample in samples:
+        digest.update(sample)
+    return digest.hexdigest()
+
+
+def export_options(dataset: Path) -> ExportOptions:
+    """With which a dataset was made, as far as they decide its episodes.
+
+    Raises:
+        ConfigError: It does not say so.
+    """
+    try:
+        made = read_json(dataset / EXPORT_PATH)
+        options = ExportOptions(
+            action=made["action"],
+            privileged=made["privileged"],
+            features=tuple(made.get("features", ())),
+            include_failures=made["include_failures"],
+            fps=made["fps"],
+            depth=made["depth"],
+            verify=False,
+        )
+        options.validate()
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ConfigError(f"The dataset does not say how it was exported ({error}): {dataset}") from error
+    return options
+
+
+def episode_differences(
+    recording_file: Path, options: ExportOptions, episode: DatasetEpisode
+) -> Iterator[tuple[str, tuple[int, ...]]]:
+    """(what, in which frames) of an episode is not what a recording gives with the same options.
+
+    Raises:
+        ResourceError: This machine cannot read it.
+    """
+    try:
+        with Recording(recording_file) as recording:
+            prepared = prepare_episode(recording, options, code_depth=False)
+            stride = frame_stride(recording.info.fps, options.fps)
+            # Coded anew, pictures have the bytes of the version and machine that coded them.
+            transcoded = {
+                IMAGE_PREFIX + name
+                for name in recording.cameras
+                if reason_to_transcode(recording.video_settings(name), stride)
+            }
+    except RecordingError as error:
+        yield str(error), ()
+        return
+    except DemorecError as error:
+        if (lack := resource_error(error)) is not None:
+            raise lack from error
+        yield f"its recording gives no such episode ({error})", ()
+        return
+    expected = prepared.data
+    if episode.tasks != (expected.task,):
+        yield "instruction", ()
+    for name, values in expected.columns.items():
+        found, true = episode.rows.get(name), values.reshape(len(values), -1)
+        if found is None or found.shape != true.shape:
+            yield name, ()
+        elif len(frames := np.flatnonzero((found != true).any(axis=1))):
+            yield name, tuple(frames.tolist())
+    for key, video in expected.videos.items():
+        if key not in transcoded and episode.videos.get(key) != video.digest:
+            yield key, ()
+    for name, value in prepared.record.row.items():
+        if name not in _OF_THE_PLACE and episode.told.get(name) != value:
+            yield f"sidecar's {name}", ()

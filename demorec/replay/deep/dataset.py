@@ -1,0 +1,66 @@
+"""The deep check of a dataset: each episode is made again from what the sidecar says of it, exported, and compared."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from demorec.check.dataset import Dataset
+from demorec.check.run_dataset import DatasetEpisode, dataset_episodes, episode_differences, export_options
+from demorec.errors import ConfigError, DemorecError, resource_error
+from demorec.lerobot.options import ExportOptions
+from demorec.loop import Workshop
+from demorec.replay.deep.check import DeepReport, versions_here
+from demorec.replay.deep.difference import Difference
+from demorec.replay.deep.remake import generate_again
+from demorec.safety.own_versions import version_differences
+from demorec.scene.episode import EpisodeInfo
+
+
+def deep_dataset_checks(path: Path, *, allowed: Sequence[str] = ()) -> Iterator[DeepReport]:
+    """One report for each episode of a dataset, in order; a single one where that cannot be done.
+
+    Raises:
+        ResourceError: This machine cannot do it, which says nothing about the dataset.
+    """
+    dataset, workshop = Dataset(path), Workshop()
+    try:
+        if not dataset.sidecar:
+            raise ConfigError(f"The dataset does not say how its episodes were made (no demorec/episodes): {path}")
+        options = export_options(path)
+        for episode, info in zip(dataset_episodes(dataset), dataset.infos, strict=True):
+            yield _report(path / f"episode {episode.number}", episode, info, options, workshop, allowed)
+    except DemorecError as error:
+        if (lack := resource_error(error)) is not None:
+            raise lack from error
+        yield DeepReport(path=path, error=str(error))
+    finally:
+        workshop.close()
+
+
+def _report(
+    name: Path,
+    episode: DatasetEpisode,
+    info: EpisodeInfo,
+    options: ExportOptions,
+    workshop: Workshop,
+    allowed: Sequence[str],
+) -> DeepReport:
+    versions = version_differences(info.versions, versions_here(info, allowed))
+    num_frames = len(episode.rows["index"])
+    try:
+        if info.origin:
+            raise ConfigError(f"Its recording was derived ({info.origin}), and a dataset does not hold its commands.")
+        with tempfile.TemporaryDirectory(prefix="demorec-deep-") as folder:
+            again = Path(folder) / "again.mcap"
+            generate_again(info, again, workshop, allowed)
+            found = tuple(
+                Difference(stream="dataset", field=what, frames=frames, recorded="not what comes out", again="")
+                for what, frames in episode_differences(again, options, episode)
+            )
+    except DemorecError as error:
+        if (lack := resource_error(error)) is not None:
+            raise lack from error
+        return DeepReport(path=name, versions=versions, error=str(error), num_frames=num_frames)
+    return DeepReport(path=name, versions=versions, differences=found, num_frames=num_frames)
