@@ -150,9 +150,15 @@ def _splits(dataset: Dataset) -> Iterator[str]:
 
 
 @check(
-    group="dataset", scope="dataset", measures="statements of info.json that the episodes' own descriptions contradict",
-    warn=0, reads=("meta/info.json", "demorec/",),
-)  # fmt: skip
+    group="dataset",
+    scope="dataset",
+    measures="statements of info.json that the episodes' own descriptions contradict",
+    warn=0,
+    reads=(
+        "meta/info.json",
+        "demorec/",
+    ),
+)
 def dataset_description(dataset: Dataset) -> Measurement | None:
     """Robot, rate, names of components and sizes of pictures are those of the scenes that the sidecar keeps."""
     if not dataset.sidecar:

@@ -189,8 +189,8 @@ def _nothing_in(path: Path, entries: Sequence[str]) -> str:
     reason = f"The folder holds no recording (*.mcap), run ({RUN_NAME}) or dataset ({INFO_PATH})"
     parts = sorted(name for name in entries if name.endswith(".mcap.part"))
     if parts:
-        return f"{reason}. It has unfinished recordings; demorec recover {parts[0]} reads one"
+        return f"{reason}; it has unfinished recordings, of which demorec recover {parts[0]} reads one"
     below = sorted(name for name in entries if _is_there(path / name / RUN_NAME) or _is_there(path / name / EPISODES))
     if below:
-        return f"{reason}. It holds runs, name one: {', '.join(below[:_SHOWN])}{', ...' if below[_SHOWN:] else ''}"
+        return f"{reason}; it holds runs, name one ({', '.join(below[:_SHOWN])}{', ...' if below[_SHOWN:] else ''})"
     return reason

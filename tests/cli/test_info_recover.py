@@ -194,8 +194,13 @@ def test_info_of_something_else(
     assert error.count("\n") == 1
 
 
-@pytest.mark.parametrize("command", ["info", "view"])
-@pytest.mark.parametrize("inside", ["", "a.mcap.part", "failed/a.mcap", "run/episodes/a.mcap"])
+@pytest.mark.parametrize(
+    ("command", "inside"),
+    [
+        *(("info", inside) for inside in ("", "a.mcap.part", "run/episodes/a.mcap")),
+        *(("view", inside) for inside in ("", "a.mcap.part", "run/episodes/a.mcap", "failed/a.mcap")),
+    ],
+)
 def test_an_unfit_folder_is_told_in_one_sentence(
     tmp_path: Path, command: str, inside: str, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -13,6 +13,7 @@ from support.check import simulate
 from support.faults import Changed, Rows, frozen, halved, inverted, judged, late, noisy, one_alien, upside_down
 
 from demorec.scene.episode import SuccessCheck
+from demorec.sim.robots.panda import PANDA
 from demorec.tables import CHECKS
 
 Fault = Callable[[Changed], Changed]
@@ -203,7 +204,7 @@ CASES: list[tuple[str, Fault, str]] = [
     ("physics of another rate", scene(lambda s: replace(s, physics=replace(s.physics, hz=120))), "config_agrees"),
     ("a scene with another robot", scene(lambda s: replace(s, robot=replace(s.robot, name="iiwa"))), "config_agrees"),
     ("a robot of another name", robot(name="iiwa"), "config_agrees"),
-    ("a stronger gripper", robot(gripper_force=40.0), "robot_as_known"),
+    ("a stronger gripper", robot(gripper=replace(PANDA.gripper, force=40.0)), "robot_as_known"),
     ("a faster robot", robot(velocity_limit=(99.0,) * 7), "robot_as_known"),
     ("wider limits", robot(position_upper=(9.0,) * 7), "robot_as_known"),
     ("another hand", robot(hand_link="panda_link7"), "robot_as_known"),

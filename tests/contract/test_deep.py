@@ -19,7 +19,7 @@ from support.mcap import rewritten
 
 from demorec.cli import main
 from demorec.cli.generate_report import check_run
-from demorec.generate.run import RunResult
+from demorec.generate.observer import RunResult
 from demorec.loop import Workshop
 from demorec.plain import to_plain
 from demorec.recording import Recording, recover
