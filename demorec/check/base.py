@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, overload
 
 from demorec.check.limits import limit_table
-from demorec.errors import DemorecError, MissingDependencyError, resource_error
+from demorec.errors import DemorecError, MissingDependencyError, NotAllowedError, resource_error
 
 Level = Literal["pass", "warn", "fail", "skip"]
 Scope = Literal["recording", "run", "dataset"]
@@ -97,6 +97,8 @@ class Check:
             found = self.measure(subject)
         except MissingDependencyError as error:
             return self.skipped(str(error))
+        except NotAllowedError as error:  # a model of the user's own, which says nothing about the recording
+            return self.skipped(f"not measured: {error}")
         except DemorecError as error:
             if (lack := resource_error(error)) is not None:
                 raise lack from error
