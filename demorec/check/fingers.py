@@ -82,7 +82,14 @@ def _reach(body: Convex, world_from_body: Array, axes: Array) -> tuple[Array, Ar
     return centre + points.min(axis=1) - body.radius, centre + points.max(axis=1) + body.radius
 
 
-@check(group="physics", measures="depth to which a finger is inside an object", unit="m", warn=0.001, fail=0.002)
+@check(
+    group="physics",
+    measures="depth to which a finger is inside an object",
+    unit="m",
+    warn=0.001,
+    fail=0.002,
+    reads=("/joint_states", "/robot_description", "/object/{body}/pose", "info.scene.bodies.shape.size"),
+)
 def finger_depth(episode: RecordedEpisode) -> Measurement | None:
     """Fingers press on the outside of what they hold (boxes, spheres, cylinders, capsules).
 
