@@ -1,4 +1,4 @@
-"""Franka Emika Panda with its hand (`demorec/sim/assets/panda.urdf`, meshes of pybullet_data).
+"""Franka Emika Panda with its hand, from pybullet_data.
 
 Limits are the manufacturer's (the URDF's position limits are wider than the real ones).
 """
@@ -11,7 +11,7 @@ from demorec.scene.robot import ParallelGripper, RobotSpec
 
 PANDA = RobotSpec(
     name="panda",
-    urdf="demorec:panda.urdf",
+    urdf="franka_panda/panda.urdf",
     base_link="panda_link0",
     arm_joints=tuple(f"panda_joint{i}" for i in range(1, 8)),
     tcp_link="panda_grasptarget",
