@@ -1,11 +1,11 @@
 """How deep fingers sink into what they hold, whether it slips, how often tasks succeed, and what physics costs.
 
     python benchmarks/grasps.py --episodes 340 --workers 8 --out grasps.jsonl     # all tasks, both arms: 20,000 grasps
-    python benchmarks/grasps.py --tasks pick_place --robots panda --baseline --episodes 50
+    python benchmarks/grasps.py --robots panda --against path/of/boxed_fingers.urdf --episodes 50
 
 Whole episodes without pictures. The depth is that of a finger's collision shapes in the object's, from poses alone. A
-grasp slips when the object moves by more than a millimetre in the hand while it is lifted and carried. `--baseline`
-simulates every episode once more, right after, with the Panda's fingers as pybullet_data has them.
+grasp slips when the object moves by more than a millimetre in the hand while it is lifted and carried. `--against`
+simulates every episode once more, right after, with another URDF of the same robot, to compare fingers.
 The episodes that stand in `--out` already are not made again: the same command goes on after `--minutes` or Ctrl-C.
 """
 
@@ -41,9 +41,6 @@ from demorec.tables import ROBOTS, TASKS
 
 LIMIT = 0.001
 """Of depth and slip, metres."""
-BASELINE = {"panda": "franka_panda/panda.urdf"}
-"""Robot -> the URDF that it had before."""
-
 Cell = tuple[str, str, str]
 
 
@@ -56,7 +53,7 @@ class Row:
         depth, deepest: Of the deepest finger, and where: phase and object.
         slip: The largest motion of a lifted object in the hand.
         cpu, simulated: CPU time of reset and control loop, and simulated time.
-        before_depth, before_cpu, before_simulated: The same with the fingers before; 0 without `--baseline`.
+        other_depth, other_cpu, other_simulated: The same with the other URDF; 0 without `--against`.
     """
 
     task: str
@@ -73,12 +70,12 @@ class Row:
     slip: float = 0.0
     cpu: float = 0.0
     simulated: float = 0.0
-    before_depth: float = 0.0
-    before_cpu: float = 0.0
-    before_simulated: float = 0.0
+    other_depth: float = 0.0
+    other_cpu: float = 0.0
+    other_simulated: float = 0.0
 
 
-def run_episode(config: GenerateConfig, index: int, baseline: bool) -> Row:
+def run_episode(config: GenerateConfig, index: int, against: str = "") -> Row:
     """Simulate and measure one episode; one without a layout has no frames."""
     row = Row(
         task=config.task,
@@ -108,17 +105,16 @@ def run_episode(config: GenerateConfig, index: int, baseline: bool) -> Row:
         cpu=cpu,
         simulated=len(frames) / config.fps,
     )
-    if not baseline or config.robot not in BASELINE:
+    if not against:
         return row
-    robot = replace(episode.info.robot, urdf=BASELINE[config.robot])
-    before = replace(episode, info=replace(episode.info, robot=robot))
-    with make_world(before.info) as world:
-        cpu, frames = _timed(Session.of_episode(world, before), before)
+    other = replace(episode, info=replace(episode.info, robot=replace(episode.info.robot, urdf=against)))
+    with make_world(other.info) as world:
+        cpu, frames = _timed(Session.of_episode(world, other), other)
     return replace(
         row,
-        before_depth=deepest_finger(before, frames)[0],
-        before_cpu=cpu,
-        before_simulated=len(frames) / config.fps,
+        other_depth=deepest_finger(other, frames)[0],
+        other_cpu=cpu,
+        other_simulated=len(frames) / config.fps,
     )
 
 
@@ -204,7 +200,7 @@ def _hull(path: Path, scale: tuple[float, ...]) -> Convex:
 
 def _warm_up() -> None:
     """Compile the kinematics and load what is loaded once, so that no episode's CPU time has it."""
-    run_episode(GenerateConfig(cameras=()), 0, baseline=True)
+    run_episode(GenerateConfig(cameras=()), 0)
 
 
 def portion(jobs: Iterable[tuple[GenerateConfig, int]], args: argparse.Namespace) -> Iterator[Row]:
@@ -217,7 +213,7 @@ def portion(jobs: Iterable[tuple[GenerateConfig, int]], args: argparse.Namespace
         while True:
             room = 2 * args.workers - len(waiting) if time.monotonic() < end else 0
             for config, index in itertools.islice(jobs, room):
-                waiting.add(pool.submit(run_episode, config, index, args.baseline))
+                waiting.add(pool.submit(run_episode, config, index, args.against))
             if not waiting:
                 return
             done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
@@ -252,7 +248,7 @@ def main() -> None:
     parser.add_argument("--split", default="all", choices=["all", "train", "eval"])
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--minutes", type=float, default=1e6, help="start no episode after so long")
-    parser.add_argument("--baseline", action="store_true", help="simulate each episode with the fingers before as well")
+    parser.add_argument("--against", default="", metavar="URDF", help="simulate each episode with this URDF as well")
     parser.add_argument("--out", type=Path, help="a line of JSON for each episode; what stands there is not made again")
     args = parser.parse_args()
     tasks = TASKS.names() if args.tasks == ["all"] else args.tasks
@@ -278,14 +274,14 @@ def main() -> None:
     print("\n".join(table(rows)))
     simulated = sum(row.simulated for row in rows)
     print(f"CPU ms per simulated second: {1e3 * sum(row.cpu for row in rows) / max(simulated, 1e-9):.1f}")
-    compared = [row for row in rows if row.before_simulated]
+    compared = [row for row in rows if row.other_simulated]
     if compared:
         now = sum(row.cpu for row in compared) / sum(row.simulated for row in compared)
-        before = sum(row.before_cpu for row in compared) / sum(row.before_simulated for row in compared)
-        deeper = sum(row.before_depth > LIMIT for row in compared)
+        other = sum(row.other_cpu for row in compared) / sum(row.other_simulated for row in compared)
+        deeper = sum(row.other_depth > LIMIT for row in compared)
         print(
-            f"against before, {len(compared)} episodes: CPU time {now / before:.3f} times, deeper than 1 mm "
-            f"in {sum(row.depth > LIMIT for row in compared)} now, in {deeper} before"
+            f"against {args.against}, {len(compared)} episodes: CPU time {now / other:.3f} times, deeper than 1 mm "
+            f"in {sum(row.depth > LIMIT for row in compared)}, in {deeper} with the other"
         )
 
 
