@@ -44,7 +44,7 @@ class Check:
     paths: Positional[tuple[Path, ...]]
     """Recordings, runs, datasets, or folders of recordings."""
     pictures: bool = True
-    """Decode all pictures; without, a recording is checked at over 100 times real time."""
+    """Decode all pictures; without, a recording is checked at about 50 times real time."""
     only: tuple[str, ...] = ()
     """Names of the checks to run; default: all."""
     strict: bool = False
