@@ -135,7 +135,7 @@ class Check:
             check=self.name,
             group=self.group,
             level=level,
-            value=None if math.isnan(found.value) else float(found.value),
+            value=float(found.value) if math.isfinite(found.value) else None,
             unit=self.unit,
             warn=self.warn,
             fail=self.fail,
@@ -151,7 +151,7 @@ class Result:
     Attributes:
         check, group, unit, warn, fail: As in `Check`.
         level: "skip" where there was nothing to measure.
-        value: What was found; None when nothing could be measured.
+        value: What was found; None when nothing could be measured, or it is beyond all numbers.
         frame, detail: As in `Measurement`.
     """
 

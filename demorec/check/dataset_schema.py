@@ -11,7 +11,7 @@ import pyarrow as pa
 
 from demorec.check.base import Measurement, check
 from demorec.check.dataset import Dataset
-from demorec.errors import ExportError
+from demorec.errors import ExportError, in_words
 from demorec.lerobot.files import check_video, open_table, read_json
 from demorec.lerobot.layout import AUTOMATIC_FEATURES, VIDEO_PATH, Feature
 from demorec.lerobot.paths import INFO_PATH
@@ -126,7 +126,7 @@ def _stream(path: Path) -> tuple[dict[str, Any], float]:
             codec = {"libdav1d": "av1"}.get(context.name, context.name)
             found = {"height": context.height, "width": context.width, "pix_fmt": context.pix_fmt, "codec": codec}
     except (OSError, IndexError, av.FFmpegError) as error:
-        raise ExportError(f"The video cannot be opened ({error}): {path}") from error
+        raise ExportError(f"The video cannot be opened ({in_words(error)}): {path}") from error
     return found, float(rate or 0)
 
 

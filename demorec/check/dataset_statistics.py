@@ -10,7 +10,7 @@ import numpy as np
 
 from demorec.check.base import Measurement, check, worst
 from demorec.check.dataset import Dataset
-from demorec.errors import ExportError
+from demorec.errors import ExportError, in_words
 from demorec.geometry import Array
 from demorec.lerobot.files import read_json, read_table
 from demorec.lerobot.layout import STATS_PATH
@@ -91,7 +91,7 @@ def read_statistics(dataset: Dataset) -> dict[str, Any]:
         if not isinstance(found, dict) or not all(isinstance(entry, dict) for entry in found.values()):
             raise ValueError("it holds no object of objects")
     except (OSError, ValueError) as error:
-        raise ExportError(f"The statistics cannot be read ({error}): {path}") from error
+        raise ExportError(f"The statistics cannot be read ({in_words(error)}): {path}") from error
     return found
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from demorec.errors import ExportError
+from demorec.errors import ExportError, in_words
 from demorec.geometry import Array
 from demorec.lerobot.files import check_video
 from demorec.lerobot.layout import VIDEO_PATH, DatasetInfo
@@ -76,7 +76,7 @@ def _decoded(path: Path, shape: tuple[int, ...]) -> Iterator[Array]:
                 small = frame.reformat(width=_PARTS, height=_PARTS, format="rgb24", interpolation="AREA")
                 yield small.to_ndarray().astype(np.float64)
     except (OSError, av.FFmpegError) as error:
-        raise ExportError(f"The video cannot be decoded ({error}): {path}") from error
+        raise ExportError(f"The video cannot be decoded ({in_words(error)}): {path}") from error
 
 
 def _summary(parts: Array) -> EpisodePictures:

@@ -14,7 +14,7 @@ import numpy as np
 from demorec.check.base import Measurement, check
 from demorec.check.dataset import Dataset, Rows
 from demorec.check.run import CheckedRun
-from demorec.errors import ConfigError, DemorecError, RecordingError, resource_error
+from demorec.errors import ConfigError, DemorecError, RecordingError, in_words, resource_error
 from demorec.export.columns import frame_stride
 from demorec.lerobot.files import read_json, read_table
 from demorec.lerobot.options import ExportOptions
@@ -118,7 +118,7 @@ def export_options(dataset: Path) -> ExportOptions:
         )
         options.validate()
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ConfigError(f"The dataset does not say how it was exported ({error}): {dataset}") from error
+        raise ConfigError(f"The dataset does not say how it was exported ({in_words(error)}): {dataset}") from error
     return options
 
 
@@ -146,7 +146,7 @@ def episode_differences(
     except DemorecError as error:
         if (lack := resource_error(error)) is not None:
             raise lack from error
-        yield f"its recording gives no such episode ({error})", ()
+        yield f"its recording gives no such episode ({in_words(error)})", ()
         return
     expected = prepared.data
     if episode.tasks != (expected.task,):
