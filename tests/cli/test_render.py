@@ -103,7 +103,7 @@ def test_a_damaged_one_is_not_taken_for_drawn(run: Path, tmp_path: Path) -> None
     assert target.read_bytes() == whole
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGKILL, marks=pytest.mark.slow)])
 def test_ended_from_outside_it_is_quiet_and_goes_on(run: Path, tmp_path: Path, number: signal.Signals) -> None:
     """With two workers, which hold semaphores that Python would call leaked."""
     out = tmp_path / "out"

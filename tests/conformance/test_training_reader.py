@@ -94,6 +94,7 @@ def test_every_window_is_equal(kind: str, roots: dict[str, Path]) -> None:
     assert_same(fast, slow)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["ours", "lerobot"])
 def test_torchcodec_gives_equal_items_too(kind: str, roots: dict[str, Path]) -> None:
     try:

@@ -194,7 +194,7 @@ def test_the_good_one_passes(good: Good) -> None:
 
 
 @pytest.mark.parametrize(("kind", "name", "fault", "check"), CASES, ids=[f"{kind}: {name}" for kind, name, *_ in CASES])
-@pytest.mark.parametrize("camera", ["front", "wrist"])
+@pytest.mark.parametrize("camera", ["front", pytest.param("wrist", marks=pytest.mark.slow)])
 def test_a_fault(camera: str, kind: Kind, name: str, fault: Fault, check: str, good: Good) -> None:
     rows = good.pictures[camera, kind]
     changed = fault(rows)
