@@ -23,6 +23,10 @@ Group = Literal["file", "time", "physics", "alignment", "calibration", "pictures
 _BLOCKED = "it needs what is damaged"
 
 
+COLOR_TOPICS = ("/camera/{camera}/h264", "/camera/{camera}/video", "/camera/{camera}/image/compressed")
+"""Where a camera's coded colour pictures are, whatever the codec; for `Check.reads`."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Measurement:
     """What a check found.

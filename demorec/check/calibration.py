@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from demorec.check.base import Found, Measurement, NotMeasured, check, worst
+from demorec.check.base import COLOR_TOPICS, Found, Measurement, NotMeasured, check, worst
 from demorec.check.drawn import Kind
 from demorec.check.episode import RecordedEpisode
 from demorec.check.rows import displacement, matrices
@@ -101,9 +101,7 @@ def _allowance(episode: RecordedEpisode, camera: Camera) -> float:
     unit="%",
     needs_pictures=True,
     reads=(
-        "/camera/{camera}/h264",
-        "/camera/{camera}/video",
-        "/camera/{camera}/image/compressed",
+        *COLOR_TOPICS,
         "/camera/{camera}/camera_info",
         "info.scene.cameras",
         "info.behaviour",
@@ -139,9 +137,7 @@ def projection(episode: RecordedEpisode) -> Found:
     measures="size of what the pictures show against what the recorded numbers make of it, off 1",
     needs_pictures=True,
     reads=(
-        "/camera/{camera}/h264",
-        "/camera/{camera}/video",
-        "/camera/{camera}/image/compressed",
+        *COLOR_TOPICS,
         "/camera/{camera}/camera_info",
         "info.scene.cameras.fov_y",
     ),
@@ -166,9 +162,7 @@ def projected_size(episode: RecordedEpisode) -> Found:
     measures="lag between pictures and numbers, frames",
     needs_pictures=True,
     reads=(
-        "/camera/{camera}/h264",
-        "/camera/{camera}/video",
-        "/camera/{camera}/image/compressed",
+        *COLOR_TOPICS,
         "/camera/{camera}/depth",
         "/camera/{camera}/segmentation",
         "/joint_states",

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.check.base import Found, Measurement, NotMeasured, check, worst
+from demorec.check.base import COLOR_TOPICS, Found, Measurement, NotMeasured, check, worst
 from demorec.check.drawn import Comparison
 from demorec.check.episode import RecordedEpisode
 from demorec.check.rows import longest_run
@@ -29,9 +29,7 @@ _PREDICTED_WEIGHT = 0.5
     warn=0,
     needs_pictures=True,
     reads=(
-        "/camera/{camera}/h264",
-        "/camera/{camera}/video",
-        "/camera/{camera}/image/compressed",
+        *COLOR_TOPICS,
         "/camera/{camera}/depth",
         "/camera/{camera}/segmentation",
     ),
@@ -56,11 +54,7 @@ def pictures_decode(episode: RecordedEpisode) -> Found:
     measures="pictures that are nearly all black or nearly all white",
     warn=0,
     needs_pictures=True,
-    reads=(
-        "/camera/{camera}/h264",
-        "/camera/{camera}/video",
-        "/camera/{camera}/image/compressed",
-    ),
+    reads=(*COLOR_TOPICS,),
 )
 def pictures_exposed(episode: RecordedEpisode) -> Found:
     """No picture is black or burnt out: 95 % of its pixels darker than 12 or brighter than 250 of 255."""
@@ -77,11 +71,7 @@ def pictures_exposed(episode: RecordedEpisode) -> Found:
     group="pictures",
     measures="largest share of a picture that is black or white",
     needs_pictures=True,
-    reads=(
-        "/camera/{camera}/h264",
-        "/camera/{camera}/video",
-        "/camera/{camera}/image/compressed",
-    ),
+    reads=(*COLOR_TOPICS,),
 )
 def exposure(episode: RecordedEpisode) -> Found:
     """Most of every picture is neither under- nor overexposed."""
@@ -100,9 +90,7 @@ def exposure(episode: RecordedEpisode) -> Found:
     measures="difference of the pictures from what the recorded numbers make of them, median of 255",
     needs_pictures=True,
     reads=(
-        "/camera/{camera}/h264",
-        "/camera/{camera}/video",
-        "/camera/{camera}/image/compressed",
+        *COLOR_TOPICS,
         "info.scene.bodies.rgba",
         "info.scene.bodies.texture",
         "info.scene.light",
@@ -125,9 +113,7 @@ def pictures_as_drawn(episode: RecordedEpisode) -> Found:
     measures="difference of a single picture from what was recorded at its frame, beyond the usual, of 255",
     needs_pictures=True,
     reads=(
-        "/camera/{camera}/h264",
-        "/camera/{camera}/video",
-        "/camera/{camera}/image/compressed",
+        *COLOR_TOPICS,
         "/joint_states",
         "/object/{body}/pose",
     ),
@@ -170,9 +156,7 @@ def _stale(compared: Comparison) -> NDArray[np.bool_]:
     measures="longest run of unchanged pictures while something moves before the camera, frames",
     needs_pictures=True,
     reads=(
-        "/camera/{camera}/h264",
-        "/camera/{camera}/video",
-        "/camera/{camera}/image/compressed",
+        *COLOR_TOPICS,
         "/joint_states",
         "/object/{body}/pose",
     ),
@@ -187,9 +171,7 @@ def frozen(episode: RecordedEpisode) -> Found:
     measures="pictures that repeat the one before, in the midst of motion",
     needs_pictures=True,
     reads=(
-        "/camera/{camera}/h264",
-        "/camera/{camera}/video",
-        "/camera/{camera}/image/compressed",
+        *COLOR_TOPICS,
         "/joint_states",
         "/object/{body}/pose",
     ),
@@ -219,11 +201,7 @@ def _stale_frames(episode: RecordedEpisode, camera: Camera, *, in_runs: bool) ->
     group="pictures",
     measures="likeness of two cameras' pictures (correlation over time)",
     needs_pictures=True,
-    reads=(
-        "/camera/{camera}/h264",
-        "/camera/{camera}/video",
-        "/camera/{camera}/image/compressed",
-    ),
+    reads=(*COLOR_TOPICS,),
 )
 def distinct_cameras(episode: RecordedEpisode) -> Found:
     """Two cameras in different places do not show the same pictures."""
@@ -255,9 +233,7 @@ def _correlation(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
     measures="mean colour of the decoded pictures against the recorded histogram, of 255",
     needs_pictures=True,
     reads=(
-        "/camera/{camera}/h264",
-        "/camera/{camera}/video",
-        "/camera/{camera}/image/compressed",
+        *COLOR_TOPICS,
         "/camera/{camera}/histogram",
     ),
 )
