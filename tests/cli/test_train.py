@@ -14,7 +14,6 @@ from support.docs import ROOT
 from support.export import export, make_run
 
 from demorec.cli import main
-from demorec.training import FastDataset
 
 pytestmark = pytest.mark.usefixtures("hf_datasets_cache")
 
@@ -47,6 +46,8 @@ def test_flags_go_on_and_the_reader_is_replaced_meanwhile(
     dataset: Path, instead: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from lerobot.datasets import LeRobotDataset, factory
+
+    from demorec.training import FastDataset
 
     seen: dict[str, Any] = {}
 

@@ -90,6 +90,7 @@ def test_what_cannot_be_shown_is_said(
     assert len(said.strip().splitlines()) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.viewer
 def test_a_saved_file_is_shown(run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     need_vulkan()
@@ -136,6 +137,7 @@ def _check_views(viewer: HeadlessViewer, cameras: tuple[str, ...] = ("front", "w
         assert red.mean() > 0.01, f"no video of {camera}"
 
 
+@pytest.mark.slow
 @pytest.mark.viewer
 def test_the_viewer_shows_a_run(run_folder: Path, tmp_path: Path) -> None:
     need_vulkan()

@@ -80,6 +80,7 @@ def test_a_run_knows_the_versions_that_its_recordings_know(reference: RunResult)
     assert prepare(EpisodePlan(config=CONFIG, episode_index=0)).info.versions == deciding_versions()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("unverified")
 def test_reproduce_makes_runs_and_datasets_again_and_sees_a_difference(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], reference: RunResult

@@ -4,20 +4,29 @@ from __future__ import annotations
 
 import pickle
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-import torch
 from support.docs import run_examples
 from support.export import export, make_run
 from support.training import CAMERA, assert_same_item, write_by_lerobot
 
-from demorec.training import FastDataset
+if TYPE_CHECKING:
+    import torch
+
+    from demorec.training import FastDataset
 
 LENGTHS = (7, 11, 5, 9)
 KINDS = ("ours", "lerobot", "lerobot_images", "lerobot_long_gops")
 """All but the last with depth; LeRobot codes colours as AV1, those of the last as H.264 in long groups."""
+
+
+def quick(*chosen: str) -> list[Any]:
+    """All kinds, those that are not chosen as slow tests: LeRobot's reader takes its time."""
+    return [kind if kind in chosen else pytest.param(kind, marks=pytest.mark.slow) for kind in KINDS]
+
+
 HISTORY = [-2 / 30, 0.0]
 CHUNK = [k / 30 for k in range(16)]
 
@@ -58,6 +67,8 @@ def pair(root: Path, **arguments: Any) -> tuple[FastDataset, Any]:
     """Both readers with the same arguments."""
     from lerobot.datasets import LeRobotDataset
 
+    from demorec.training import FastDataset
+
     arguments = {"root": root, "video_backend": "pyav", "return_uint8": True, **arguments}
     return FastDataset("local/test", **arguments), LeRobotDataset("local/test", **arguments)
 
@@ -79,7 +90,7 @@ def assert_same(fast: FastDataset, slow: Any, *, batch: int = 16, seed: int = 0)
             assert_same_item(item, slow[row])
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", quick("lerobot_images", "lerobot_long_gops"))
 def test_every_item_is_equal(kind: str, roots: dict[str, Path]) -> None:
     fast, slow = pair(roots[kind])
     assert_same(fast, slow)
@@ -87,7 +98,7 @@ def test_every_item_is_equal(kind: str, roots: dict[str, Path]) -> None:
     assert_same_item(fast[-1], slow[-1])
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", quick("ours", "lerobot"))
 def test_every_window_is_equal(kind: str, roots: dict[str, Path]) -> None:
     _, plain = pair(roots[kind])
     fast, slow = pair(roots[kind], delta_timestamps=windows(plain), return_uint8=False, depth_output_unit="m")
@@ -115,6 +126,8 @@ def test_some_episodes_only(roots: dict[str, Path]) -> None:
 
 
 def test_transforms_draw_the_same_random_numbers(roots: dict[str, Path]) -> None:
+    import torch
+
     def noisy(picture: torch.Tensor) -> torch.Tensor:
         return picture + torch.rand(picture.shape[-3:])
 
@@ -139,8 +152,10 @@ def test_items_own_their_values(kind: str, roots: dict[str, Path]) -> None:
     assert_same_item(fast[3], slow[3])
 
 
-@pytest.mark.parametrize("start_method", [None, "fork", pytest.param("spawn", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("start_method", [None, *(pytest.param(m, marks=pytest.mark.slow) for m in ("fork", "spawn"))])
 def test_batches_of_a_loader_are_equal(start_method: str | None, roots: dict[str, Path]) -> None:
+    import torch
+
     workers = {"num_workers": 2, "multiprocessing_context": start_method} if start_method else {}
 
     def loader(dataset: Any, **arguments: Any) -> Any:
@@ -164,6 +179,8 @@ def test_a_pickled_dataset_carries_no_arrays_and_no_files(roots: dict[str, Path]
 
 
 def test_a_dataset_being_written_is_refused_and_then_read(tmp_path: Path) -> None:
+    from demorec.training import FastDataset
+
     features = {"action": {"dtype": "float32", "shape": (2,), "names": None}}
     dataset = FastDataset.create("local/test", 30, features, root=tmp_path / "d")
     for value in (1.0, 2.0, 3.0):

@@ -8,14 +8,14 @@ from typing import Any
 
 import pytest
 from support.check import checked, simulate
-from support.tasks import tasks_with_long_ones_slow
+from support.tasks import tasks_with_slow_ones
 
 from demorec.cli import main
 from demorec.config import VideoConfig
 from demorec.tables import CHECKS, ROBOTS, TASKS
 
 
-@pytest.mark.parametrize("task", tasks_with_long_ones_slow())
+@pytest.mark.parametrize("task", tasks_with_slow_ones())
 def test_every_task(task: str, tmp_path: Path) -> None:
     report = checked(simulate(tmp_path / "e.mcap", task=task, seed=21))
     assert [r for r in report.results if r.level in ("warn", "fail")] == []

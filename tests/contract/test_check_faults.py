@@ -574,6 +574,7 @@ def test_histograms_of_the_other_camera(filmed: Path, tmp_path: Path) -> None:
     assert level_of(rewrite_messages(filmed, tmp_path / "s.mcap", edit), "pixel_statistics") == "fail"
 
 
+@pytest.mark.slow
 def test_depth_and_segmentation(tmp_path: Path) -> None:
     fine = simulate(tmp_path / "f.mcap", seed=7, cameras=("front",), depth=True, segmentation=True)
     assert level_of(fine, "depth_matches_scene") == "pass"

@@ -15,7 +15,7 @@ from support.check import simulate
 from support.docs import run_examples
 from support.present import present
 from support.sim import episode
-from support.tasks import tasks_with_long_ones_slow
+from support.tasks import tasks_with_slow_ones
 
 import demorec.gym_env
 from demorec.errors import ConfigError, SceneError
@@ -44,7 +44,7 @@ def make(task: str = "pick_place", **options: Any) -> DemorecEnv:
     return env
 
 
-@pytest.mark.parametrize("task", tasks_with_long_ones_slow())
+@pytest.mark.parametrize("task", tasks_with_slow_ones())
 @pytest.mark.filterwarnings("ignore:.*(action space|observation space|Box).*:UserWarning")
 def test_gymnasium_accepts_the_environment(task: str) -> None:
     env = make(task)
@@ -54,7 +54,7 @@ def test_gymnasium_accepts_the_environment(task: str) -> None:
     env.close()
 
 
-@pytest.mark.parametrize("task", tasks_with_long_ones_slow())
+@pytest.mark.parametrize("task", tasks_with_slow_ones())
 def test_a_recordings_commands_give_its_observations_to_the_bit(task: str, tmp_path: Path) -> None:
     """The numbers of the exported features of a file on disk, against those that a policy would see."""
     with Recording(simulate(tmp_path / "e.mcap", episode_index=3, task=task)) as recording:

@@ -13,7 +13,7 @@ import pytest
 from support.check import Spoilt, simulate, simulate_run
 from support.commands import exit_code
 from support.recording import make_episode
-from support.tasks import tasks_with_long_ones_slow
+from support.tasks import tasks_with_slow_ones
 
 from demorec.errors import ConfigError
 from demorec.lerobot.export import export_lerobot
@@ -32,7 +32,7 @@ def _replay(path: Path, **options: object) -> ReplayReport:
     return next(iter(replay_all([open_file(path, chosen)], chosen)))[0]
 
 
-@pytest.mark.parametrize("task", tasks_with_long_ones_slow())
+@pytest.mark.parametrize("task", tasks_with_slow_ones())
 def test_every_task_replays_to_the_bit(task: str, tmp_path: Path) -> None:
     path = simulate(tmp_path / "e.mcap", task=task, seed=5)
     report = _replay(path)

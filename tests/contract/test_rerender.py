@@ -141,7 +141,9 @@ main(sys.argv[1:])
 USING_IT = "from demorec.sim.client import connect; connect()"
 
 
-@pytest.mark.parametrize(("robot", "task"), [("panda", "pick_shapes"), ("iiwa", "tutorial")])
+@pytest.mark.parametrize(
+    ("robot", "task"), [("panda", "pick_shapes"), pytest.param("iiwa", "tutorial", marks=pytest.mark.slow)]
+)
 def test_the_recording_alone_is_drawn_without_a_simulator(robot: str, task: str, tmp_path: Path) -> None:
     # Both arms, one of them scaled; primitives, meshes and URDFs; textures, segmentation, a camera on the hand.
     config: dict[str, Any] = {

@@ -8,10 +8,10 @@ import pytest
 
 from demorec.tables import TASKS
 
-LONG_TASKS = ("line_up", "sort_by_color", "stack_three")
-"""Several objects are moved, which takes three times as long; `tests/contract/test_tasks.py` runs these always."""
+QUICK_TASKS = ("pick_place", "pick_from_clutter", "pick_shapes", "tutorial")
+"""One cube, bodies around it, other shapes, an own script; `tests/contract/test_tasks.py` runs every task always."""
 
 
-def tasks_with_long_ones_slow() -> list[Any]:
-    """Parameters: every row of the table, the long ones marked as slow."""
-    return [pytest.param(name, marks=pytest.mark.slow if name in LONG_TASKS else ()) for name in TASKS.names()]
+def tasks_with_slow_ones() -> list[Any]:
+    """Parameters: every row of the table, all but the quick ones marked as slow."""
+    return [pytest.param(name, marks=() if name in QUICK_TASKS else pytest.mark.slow) for name in TASKS.names()]

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 CAMERA, DEPTH = "observation.images.top", "observation.images.top_depth"
@@ -79,6 +78,8 @@ def _picture(episode: int, t: int) -> NDArray[np.uint8]:
 
 def assert_same_item(found: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
     """The same keys in the same order, types, shapes and bits."""
+    import torch
+
     assert list(found) == list(wanted)
     for key, value in wanted.items():
         assert type(found[key]) is type(value), key
