@@ -84,7 +84,8 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
     Action: float32 of one of the kinds of `demorec.scene.features.action_vectors`; float64 is taken as it is. Targets
     are held within the joint limits in position and velocity; a pose out of reach keeps the last target.
     Reward: 1 at the step that completes a success, else 0, as `next.reward` of the datasets.
-    `info["is_success"]` is `next.success`; `info["episode_index"]` names the scene.
+    `info["is_success"]` says that the conditions have held for so long (the datasets' `next.success` is how an episode
+    ended); `info["episode_index"]` names the scene.
 
     `reset(seed=N)` gives the scene of episode N of the split, the same whatever was done before; without a seed, a
     random one. `reset(options={"scene": scene})` gives a scene of a recording.

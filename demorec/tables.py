@@ -1,4 +1,7 @@
-"""The tables of everything that a user can name. Adding a row here and one file makes a new one (CONTRIBUTING.md)."""
+"""The tables of everything that a user can name, but for commands (`COMMANDS` in demorec/cli).
+
+A row here and one file make a new one (CONTRIBUTING.md).
+"""
 
 from __future__ import annotations
 

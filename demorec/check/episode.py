@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from demorec.check.base import NotMeasured
 from demorec.check.drawn import NOT_DRAWABLE, Cells, Comparison, Kind, compare, draw_all, strays
 from demorec.check.pictures_summary import PictureSummary, summarise
-from demorec.check.rows import inverse, link_matrices, matrices
+from demorec.check.rows import link_matrices, matrices
 from demorec.errors import RecordingError
 from demorec.geometry import Array
 from demorec.recording import Recording
@@ -189,10 +189,6 @@ class RecordedEpisode:
     def cameras(self) -> tuple[Camera, ...]:
         """Of the scene."""
         return self.info.scene.cameras
-
-    def camera_from_world(self, camera: str) -> Array:
-        """(T, 4, 4) as recorded."""
-        return inverse(matrices(self.columns.world_from_camera[camera]))
 
     def recorded_intrinsics(self, camera: str) -> Array:
         """(3, 3) K as the camera's own calibration message has it, which is what other programs read."""

@@ -37,7 +37,7 @@ NEXT = {
     "hold": {"carry"},
     "carry": {"release"},
 }
-"""Phase -> those that may follow; "" is the beginning. The last row of phases is the tutorial's."""
+"""Phase -> those that may follow; "" is the beginning. The last four rows are the tutorial's."""
 
 
 @dataclass(frozen=True, kw_only=True)

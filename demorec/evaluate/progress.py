@@ -8,7 +8,7 @@ from demorec.gym_env import Situation
 from demorec.scene.episode import SuccessCheck
 from demorec.scene.scene import Goal, Scene
 from demorec.sim.world import World
-from demorec.tasks.checks import goal_pose
+from demorec.tasks.success import goal_pose
 
 PHASES = ("reach", "lift", "transport", "place")
 """reach: nothing was grasped; lift: grasped, never lifted; transport: lifted, never brought near its goal; place:

@@ -29,7 +29,7 @@ SINGLE_THREADED = dict.fromkeys(_THREAD_SETTINGS, "1")
 
 @dataclass(frozen=True, kw_only=True)
 class Made:
-    """An attempt has come to its end, with a recording."""
+    """An attempt has come to its end, with a recording unless no scene was found for it."""
 
     plan: EpisodePlan
     attempt: Attempt

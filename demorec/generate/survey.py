@@ -34,12 +34,10 @@ class Survey:
     Attributes:
         attempts: Those whose recordings are there and sound, and those that failed without one.
         set_aside: file -> why it was moved to unfinished/.
-        num_adopted: Recordings that run.json did not know yet.
     """
 
     attempts: tuple[Attempt, ...]
     set_aside: Mapping[str, str]
-    num_adopted: int
 
 
 def recordings_of(folder: Path) -> list[Path]:
@@ -64,7 +62,6 @@ def survey(
     known = {a.file: a for a in run.known if a.file}
     kept = [a for a in run.known if not a.file]
     set_aside: dict[str, str] = {}
-    num_adopted = 0
     files = recordings_of(folder)
     for number, path in enumerate(files):
         file = path.relative_to(folder).as_posix()
@@ -72,7 +69,6 @@ def survey(
         try:
             if line is None:
                 line = _adopt(path, run, inspect)
-                num_adopted += 1
             elif path.stat().st_size != line.num_bytes or sha256_of(path) != line.sha256:
                 raise DemorecError("its bytes are not those that run.json knows")
             kept.append(line)
@@ -82,7 +78,7 @@ def survey(
             set_aside[file] = without_path(error, path) if isinstance(error, DemorecError) else in_words(error)
             _set_aside(path, folder)
         progress(number + 1, len(files))
-    return Survey(attempts=tuple(kept), set_aside=set_aside, num_adopted=num_adopted)
+    return Survey(attempts=tuple(kept), set_aside=set_aside)
 
 
 def _adopt(path: Path, run: RunFile, inspect: Inspector) -> Attempt:

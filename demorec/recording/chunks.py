@@ -38,7 +38,6 @@ _MESSAGE_HEAD = np.dtype(
 _HEAD_BYTES = np.arange(_MESSAGE_HEAD.itemsize)
 _CHUNK_HEAD = struct.Struct("<QQQII")
 _PLACE_HEAD = struct.Struct("<QQQQI")
-_OFFSET_BYTES = 10
 
 
 @dataclass(frozen=True, kw_only=True)

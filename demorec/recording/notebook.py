@@ -70,7 +70,7 @@ def frame_table(recording: RecordingReader) -> pd.DataFrame:
 
     Columns are named as in `demorec.scene.episode.EpisodeColumns`, vectors with their component:
     `joint_position.panda_joint1` (rad, fingers m), `base_from_tcp.x` (m), `base_from_tcp.qw`,
-    `wrench.fz` (N) and `wrench.tx` (N m) where they were recorded, `object_poses.cube.z` (m, world frame), `phase`.
+    `wrench.fz` (N) and `wrench.tx` (N m) where they were recorded, `object_poses.red_cube.z` (m, world frame), `phase`.
     `time_ns` is simulated time since the episode's start.
 
     Raises:

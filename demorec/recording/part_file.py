@@ -222,7 +222,7 @@ class PartFile:
 
         Raises:
             ConfigError: A file of that name has appeared meanwhile.
-        RecordingError: The disk is full.
+            RecordingError: The disk is full.
         """
         try:
             self.end()

@@ -146,10 +146,11 @@ class EpisodeInfo:
         fps: Frames per second.
         physics_hz: Steps per second.
         behaviour: name -> value of everything else that was drawn for this episode (speed, approach height,
-            chosen yaws, noise level), for the card and for analysis.
+            noise level), for the card and for analysis.
         config: The resolved GenerateConfig as plain JSON data.
         config_digest: SHA-256 of it, 16 hex digits.
-        versions: package -> version, of what decides the bits (demorec, pybullet, numpy).
+        versions: package -> version, of what decides the bits (demorec, pybullet, numpy, numba, av), with
+            the sources of modules of one's own.
         origin: "" for a generated episode; "replay of DIGEST", "render of DIGEST" for a derived one.
     """
 
@@ -175,7 +176,7 @@ class SuccessCheck:
     """One condition of success.
 
     Attributes:
-        name: What is measured ("distance_to_target").
+        name: What is measured ("distance_to_goal").
         value: What was found, in `unit`.
         limit: What is allowed; `passed` tells on which side.
         unit: "m", "rad", "m/s", "N" or "".

@@ -74,7 +74,8 @@ class RobotSpec:
 
     Attributes:
         name: Row of the robots' table.
-        urdf: Path below pybullet_data, or "demorec:NAME" for a file of `demorec/sim/assets`.
+        urdf: Path below pybullet_data, "demorec:NAME" for a file of `demorec/sim/assets`, or "MODULE:NAME" for one
+            beside a module of one's own.
         base_link: Root link of the URDF.
         arm_joints: Names of the arm's joints, base to flange.
         tcp_link: Link whose frame is the tool centre point: z out of the hand, y along the fingers' motion.

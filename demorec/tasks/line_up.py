@@ -10,10 +10,10 @@ from demorec.scene.episode import SuccessCheck
 from demorec.scene.robot import RobotSpec
 from demorec.scene.scene import Scene
 from demorec.sim.world import World
-from demorec.tasks.checks import at_most
 from demorec.tasks.furniture import mark, robot_at_origin, table_and_floor
 from demorec.tasks.placing import PlacingTask, on_table, random_cube
 from demorec.tasks.sampling import WORKSPACE, Region, Sampler, wording
+from demorec.tasks.success import at_most
 
 ROW = Region(x=(0.40, 0.60), y=(-0.10, 0.10))
 CUBES = Region(x=(0.33, 0.68), y=(-0.33, 0.33))

@@ -12,11 +12,11 @@ from demorec.scene.episode import SuccessCheck
 from demorec.scene.scene import Body, Goal, Rgba, Shape
 from demorec.sim.world import World
 from demorec.tasks.base import Task
-from demorec.tasks.checks import at_most, gripper_open_check, placement_checks
 from demorec.tasks.furniture import COLORS, cube
 from demorec.tasks.sampling import Sampler
 from demorec.tasks.script import Step
 from demorec.tasks.skills import Expert
+from demorec.tasks.success import at_most, gripper_open_check, placement_checks
 
 TRAY_FLOOR = 0.004
 """Height of a tray's floor above its lower face, metres (tray.urdf)."""

@@ -1,6 +1,6 @@
 """The pick-and-place skill: every task of the arm is a sequence of it.
 
-perceive, approach, descend, close, lift, transport, lower, release, retreat, verify; tried again up to three times.
+perceive, approach, descend, close, lift, transport, lower, release, retreat, verify; three tries in all.
 The poses of objects are looked at only where a camera could see them still: before the approach and before lowering.
 No step is wasted waiting: a policy that learns from idle frames learns to stand still.
 """
@@ -18,10 +18,10 @@ from demorec.scene.episode import Action, Event
 from demorec.scene.motion import MotionLimits, plan_straight
 from demorec.scene.scene import Body, Goal, yaw_of
 from demorec.sim.world import World
-from demorec.tasks.checks import goal_pose, on_support, placement_checks, resting_half_height
-from demorec.tasks.conditions import steady_width
 from demorec.tasks.grasping import grasp_yaws, grasps_beside, hand_down, hand_yaw, raised, symmetric_yaws
 from demorec.tasks.script import Behaviour, Step
+from demorec.tasks.success import goal_pose, on_support, placement_checks, resting_half_height
+from demorec.tasks.waiting import steady_width
 
 MAX_TRIES = 3
 FREE_SPEED, DESCEND_SPEED, LIFT_SPEED, TOUCH_DOWN_SPEED = 0.6, 0.25, 0.3, 0.08

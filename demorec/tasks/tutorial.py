@@ -16,7 +16,12 @@ from demorec.scene.robot import RobotSpec
 from demorec.scene.scene import Body, Goal, RobotPlacement, Scene, Shape
 from demorec.sim.world import World
 from demorec.tasks.base import Task
-from demorec.tasks.checks import (
+from demorec.tasks.furniture import COLORS
+from demorec.tasks.grasping import raised
+from demorec.tasks.sampling import Sampler, wording
+from demorec.tasks.script import Step
+from demorec.tasks.skills import Expert
+from demorec.tasks.success import (
     MAX_SPEED,
     MAX_SPIN,
     MAX_TILT,
@@ -25,12 +30,7 @@ from demorec.tasks.checks import (
     gripper_open_check,
     tilt_of,
 )
-from demorec.tasks.conditions import lasting, steady_width
-from demorec.tasks.furniture import COLORS
-from demorec.tasks.grasping import raised
-from demorec.tasks.sampling import Sampler, wording
-from demorec.tasks.script import Step
-from demorec.tasks.skills import Expert
+from demorec.tasks.waiting import lasting, steady_width
 
 ROBOT_SCALE = 1.3
 BASE = (1.0, 0.0, 0.1)

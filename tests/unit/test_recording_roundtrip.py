@@ -16,7 +16,7 @@ from demorec.config import VideoConfig
 from demorec.errors import RecordingError
 from demorec.recording import EpisodeWriter, Recording
 from demorec.recording.container import Container
-from demorec.scene.episode import EpisodeInfo, Event, Frame, Outcome
+from demorec.scene.episode import FORMAT_VERSION, EpisodeInfo, Event, Frame, Outcome
 
 CODECS = [VideoConfig(), VideoConfig(codec="av1"), VideoConfig(codec="jpeg"), VideoConfig(gop=30, crf=30)]
 
@@ -276,6 +276,6 @@ def test_the_outcome_is_for_people_too(tmp_path: Path) -> None:
     assert episode is not None
     assert outcome is not None
     assert episode["instruction"] == "pick up the red cube and place it on the green target"
-    assert episode["format_version"] == "2"
+    assert episode["format_version"] == str(FORMAT_VERSION)
     assert json.loads(episode["info"])["config"]["task"] == "pick_place"
     assert outcome["success"] == "false"

@@ -22,10 +22,10 @@ from demorec.sim.robots.panda import PANDA
 from demorec.sim.world import World
 from demorec.tables import TASKS
 from demorec.tasks import skills
-from demorec.tasks.conditions import lasting
 from demorec.tasks.grasping import grasp_yaws, grasps_beside, hand_down, hand_yaw, raised, symmetric_yaws
 from demorec.tasks.sampling import WORKSPACE, Region, Sampler
 from demorec.tasks.script import Behaviour
+from demorec.tasks.waiting import lasting
 
 
 def sampler(seed: int = 0) -> Sampler:
