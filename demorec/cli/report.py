@@ -20,9 +20,9 @@ from demorec.safety.replacing import REPORT, check_replaceable
 class Report:
     """Write one HTML page about a run, recordings or a dataset, to be opened from the file and passed on.
 
-    The page has what failed first: outcomes, check results, how the randomised ranges are covered, distributions of
-    states and actions, and a filmstrip of every episode. It needs no network. Exit code 0 says that it was written,
-    whatever it says; demorec check judges.
+    It tells outcomes, what the checks found, how the randomised ranges are covered and how states and actions are
+    distributed, and shows a filmstrip of every episode, those that failed first. It needs no network. Exit code 0 says
+    that the page was written, whatever it tells; demorec check judges.
 
     Examples:
       demorec report recordings/cubes --out cubes.html

@@ -62,14 +62,14 @@ def coverage(values: Array, failed: NDArray[np.bool_], title: str) -> Markup:
             bars.append(_bar(left, middle, width - 1, _HEIGHT - middle, "succeeded"))
         if wrong:
             bars.append(_bar(left, top, width - 1, middle - top, "failed"))
-    return _chart(joined(bars), _number(edges[0]), _number(edges[-1]), title, f"{most}")
+    return _chart(joined(bars), _number(edges[0]), _number(edges[-1]), title, f"up to {most}")
 
 
 def _bar(x: float, y: float, width: float, height: float, name: str) -> Markup:
     return tag("rect", x=x, y=round(y, 1), width=round(width, 1), height=round(height, 1), class_=name)
 
 
-def _chart(content: Markup, low: str, high: str, title: str, most: str = "") -> Markup:
+def _chart(content: Markup, low: str, high: str, title: str, middle: str = "") -> Markup:
     return tag(
         "svg",
         tag("title", title),
@@ -77,7 +77,7 @@ def _chart(content: Markup, low: str, high: str, title: str, most: str = "") -> 
         content,
         tag("text", low, x=0, y=_HEIGHT + 14),
         tag("text", high, x=_WIDTH, y=_HEIGHT + 14, text_anchor="end"),
-        tag("text", most, x=_WIDTH, y=10, text_anchor="end") if most else None,
+        tag("text", middle, x=_WIDTH / 2, y=_HEIGHT + 14, text_anchor="middle") if middle else None,
         viewBox=f"0 0 {_WIDTH} {_HEIGHT + _BELOW}",
         role="img",
     )

@@ -115,7 +115,7 @@ def _outcomes(episodes: Sequence[ReportedEpisode]) -> Iterator[Markup]:
         (
             name,
             len(groups[name]),
-            f"{100 * len(groups[name]) / len(episodes):.1f} %",
+            f"{100 * len(groups[name]) / len(episodes):.1f}\u00a0%",
             _links(groups[name], episodes),
         )
         for name in order
