@@ -37,12 +37,22 @@ def randomised(infos: Sequence[EpisodeInfo]) -> dict[str, Array]:
     episodes have, or that take only a few values, are left out. Lengths in metres, yaws in rad within the body's
     symmetry.
     """
-    rows = [_values(info.scene) for info in infos]
+    return drawn_columns([_values(info.scene) for info in infos])
+
+
+def drawn_columns(rows: Sequence[Mapping[str, float]]) -> dict[str, Array]:
+    """Name -> its value in each row, of those that all rows have and that take more than a few values."""
     if not rows:
         return {}
     names = [name for name in rows[0] if all(name in row for row in rows)]
     columns = {name: np.array([row[name] for row in rows]) for name in names}
     return {name: values for name, values in columns.items() if len(np.unique(values)) >= _MIN_VALUES}
+
+
+def with_unit(name: str) -> str:
+    """The name of a quantity of `randomised` for people, with its unit."""
+    unit = _UNITS.get(name.rpartition(" ")[2])
+    return f"{name} ({unit})" if unit else name
 
 
 def _values(scene: Scene) -> dict[str, float]:
@@ -176,11 +186,11 @@ def _draw_map(draw: ImageDraw.ImageDraw, infos: Sequence[EpisodeInfo]) -> None:
             _TOP + _SIZE / 2 - (x - middle[0]) / side * _SIZE,
         )
 
-    for tick in _ticks(middle[0] - side / 2, middle[0] + side / 2):
+    for tick in ticks(middle[0] - side / 2, middle[0] + side / 2):
         _, v = place(tick, middle[1])
         draw.line((_LEFT - 5, v, _LEFT, v), fill="black")
         draw.text((_LEFT - 8, v), f"{tick:g}", fill="black", anchor="rm")
-    for tick in _ticks(middle[1] - side / 2, middle[1] + side / 2):
+    for tick in ticks(middle[1] - side / 2, middle[1] + side / 2):
         u, _ = place(middle[0], tick)
         draw.line((u, _TOP + _SIZE, u, _TOP + _SIZE + 5), fill="black")
         draw.text((u, _TOP + _SIZE + 8), f"{tick:g}", fill="black", anchor="mt")
@@ -196,7 +206,7 @@ def _draw_map(draw: ImageDraw.ImageDraw, infos: Sequence[EpisodeInfo]) -> None:
     draw.text((_LEFT, _TOP - 8), title, fill="black", anchor="lb")
 
 
-def _ticks(low: float, high: float) -> list[float]:
+def ticks(low: float, high: float) -> list[float]:
     """Three to eight round numbers in a range."""
     rough = (high - low) / 8
     power = 10.0 ** math.floor(math.log10(rough))
@@ -206,9 +216,8 @@ def _ticks(low: float, high: float) -> list[float]:
 
 def _draw_histogram(draw: ImageDraw.ImageDraw, name: str, values: Array, left: int, top: int) -> None:
     counts, edges = np.histogram(values, bins=14)
-    unit = _UNITS.get(name.rpartition(" ")[2])
     bottom, most = top + _PLOT_HEIGHT, max(int(counts.max()), 1)
-    draw.text((left, top - 6), f"{name} ({unit})" if unit else name, fill="black", anchor="lb")
+    draw.text((left, top - 6), with_unit(name), fill="black", anchor="lb")
     draw.rectangle((left, top, left + _PLOT_WIDTH, bottom), outline="grey")
     for number, count in enumerate(counts.tolist()):
         bar = _PLOT_HEIGHT * count / most

@@ -81,11 +81,12 @@ class SubjectReport:
         whose file is damaged, which the checks of file and time find.
         """
         limit = _SEVERITY["warn" if strict else "fail"]
-        return any(
-            _SEVERITY[result.level] >= limit
-            for result in self.results
-            if not self.is_failed_attempt or result.group in _OF_THE_FILE
-        )
+        return any(_SEVERITY[result.level] >= limit for result in self.judged)
+
+    @property
+    def judged(self) -> tuple[Result, ...]:
+        """The results that count: all, or of a failed attempt those about its file."""
+        return tuple(r for r in self.results if not self.is_failed_attempt or r.group in _OF_THE_FILE)
 
     def count(self, level: Level) -> int:
         """How many results have a level."""

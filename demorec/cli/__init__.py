@@ -41,6 +41,7 @@ COMMANDS: Registry[type[Command]] = Registry(
         "view": "demorec.cli.view:View",
         "export": "demorec.cli.export:Export",
         "check": "demorec.cli.check:Check",
+        "report": "demorec.cli.report:Report",
         "replay": "demorec.cli.replay:Replay",
         "render": "demorec.cli.render:Render",
         "train": "demorec.cli.train:Train",

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-import av
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from demorec.errors import ExportError, in_words
 from demorec.export.staging import sync_file
 from demorec.lerobot.layout import DatasetInfo
 from demorec.lerobot.paths import SIDECAR_DIR
-from demorec.lerobot.reader import EpisodePlace, episode_places
+from demorec.lerobot.reader import episode_places
+from demorec.lerobot.stills import pictures_at
 from demorec.safety.text import printable
 from demorec.scene.features import IMAGE_PREFIX
 
@@ -40,7 +37,7 @@ def write_thumbnails(root: Path, info: DatasetInfo) -> bool:
         label = f"episode {place.episode_index}, camera {key.removeprefix(IMAGE_PREFIX)}: {', '.join(place.tasks)}"
         draw.text((4, top + 1), printable(label), fill="black", font=font)
         moments = np.linspace(0, place.length - 1, _MOMENTS).round().astype(int).tolist()
-        for column, picture in enumerate(_pictures(root, info, key, place, moments)):
+        for column, picture in enumerate(pictures_at(root, info, key, place, moments)):
             corner = column * size[0], top + _LABEL
             sheet.paste(Image.fromarray(picture).resize(size, reducing_gap=1.0), corner)
             time = f"{moments[column] / info.fps:.1f} s"
@@ -53,24 +50,3 @@ def write_thumbnails(root: Path, info: DatasetInfo) -> bool:
     sheet.save(path, quality=85)
     sync_file(path)
     return True
-
-
-def _pictures(
-    root: Path, info: DatasetInfo, key: str, place: EpisodePlace, moments: Sequence[int]
-) -> Iterable[NDArray[np.uint8]]:
-    position, first = place.videos[key]
-    path = root / position.path(info.video_path or "", key)
-    try:
-        with av.open(str(path)) as container:
-            stream = container.streams.video[0]
-            stream.thread_type = "NONE"  # starting threads costs more than a few pictures
-            for moment in moments:
-                time = (first + moment) / info.fps
-                assert stream.time_base is not None
-                container.seek(round(time / stream.time_base), stream=stream)
-                for frame in container.decode(stream):
-                    if frame.time is not None and frame.time > time - 0.5 / info.fps:
-                        yield np.asarray(frame.to_ndarray(format="rgb24"), dtype=np.uint8)
-                        break
-    except (OSError, av.FFmpegError) as error:
-        raise ExportError(f"The finished video cannot be read back ({in_words(error)}): {path}") from error

@@ -270,11 +270,16 @@ class RecordingReader:
         Raises:
             IndexError: There is no such frame; negative ones count from the end.
         """
-        number = range(self.num_frames)[frame]
-        packets = list(islice(self.packets(camera), number + 1))
-        keyframe = max(index for index, packet in enumerate(packets) if packet.is_keyframe)
-        *_, picture = decode(self.video_settings(camera), packets[keyframe:])
-        return picture
+        return next(self.images_at(camera, [frame]))
+
+    def images_at(self, camera: str, frames: Sequence[int]) -> Iterator[Rgb]:
+        """As `image`, of several frames, read in one pass."""
+        numbers = [range(self.num_frames)[frame] for frame in frames]
+        packets = list(islice(self.packets(camera), max(numbers, default=-1) + 1))
+        for number in numbers:
+            keyframe = max(index for index, packet in enumerate(packets[: number + 1]) if packet.is_keyframe)
+            *_, picture = decode(self.video_settings(camera), packets[keyframe : number + 1])
+            yield picture
 
     def calibration(self, camera: str) -> messages.Calibration:
         """What the calibration message of a camera says, which is what other programs go by."""

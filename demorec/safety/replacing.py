@@ -59,6 +59,8 @@ def _begins_with(*magics: bytes) -> Callable[[Path], bool]:
 RECORDING = Kind(name="a recording (MCAP)", recognises=_begins_with(MCAP_MAGIC))
 RERUN_FILE = Kind(name="a Rerun file (.rrd)", recognises=_begins_with(*RERUN_MAGICS))
 PICTURE = Kind(name="a picture (PNG)", recognises=_begins_with(b"\x89PNG\r\n\x1a\n"))
+REPORT_MARK = "<!doctype html>\n<!-- A report by demorec. -->\n"
+REPORT = Kind(name="a report (HTML)", recognises=_begins_with(REPORT_MARK.encode()))
 
 
 def check_replaceable(

@@ -85,6 +85,7 @@ COMMANDS = {
     "info": ["info", "{path}"],
     "view": ["view", "{path}", "--save", "{out}/view.rrd"],
     "check": ["check", "{path}", "--replay", "1", "--no-pictures"],
+    "report": ["report", "{path}", "--out", "{path}.html"],
     "replay": ["replay", "{path}", "--out", "{out}/replayed"],
     "replay states": ["replay", "{path}", "--out", "{out}/replayed", "--states"],
     "render": ["render", "{path}", "--out", "{out}/rendered", "--workers", "1"],

@@ -124,7 +124,7 @@ def test_recordings(hostile: Path, name: str, tmp_path: Path) -> None:
     path = hostile / name
     for arguments in (
         ["info", path], ["info", path, "--json"], ["check", path, "--verbose"], ["check", path, "--json"],
-        ["view", path, "--save", tmp_path / f"{NAME}.rrd"],
+        ["view", path, "--save", tmp_path / f"{NAME}.rrd"], ["report", path, "--out", tmp_path / f"{NAME}.html"],
         ["export", "lerobot", path, "--out", tmp_path / "out", "--no-verify"],
         ["replay", path], ["render", path, "--cameras", HOSTILE, "--out", tmp_path / "new.mcap", "--workers", "1"],
         ["recover", path, "--out", tmp_path / NAME], ["reproduce", path, "--out", tmp_path / "again"],
@@ -144,6 +144,7 @@ def test_runs_and_datasets(hostile: Path, name: str, tmp_path: Path) -> None:
     for arguments in (
         ["info", path], ["info", path, "--json"], ["check", path, "--no-pictures", "--verbose"],
         ["view", path, "--save", tmp_path / "view.rrd"], ["replay", path],
+        ["report", path, "--out", tmp_path / "report.html"],
         ["export", "lerobot", hostile / "good.mcap", "--out", path, "--append", "--no-verify"],
         ["reproduce", path, "--out", tmp_path / NAME],
     ):  # fmt: skip

@@ -26,7 +26,15 @@ from demorec.generate.observer import NoProgress
 from demorec.generate.options import RunOptions
 from demorec.lerobot import ExportOptions
 from demorec.runs.find import EVALUATION_NAME
-from demorec.safety.replacing import PICTURE, RECORDING, RERUN_FILE, check_replaceable, settle_parts, written_whole
+from demorec.safety.replacing import (
+    PICTURE,
+    RECORDING,
+    REPORT_MARK,
+    RERUN_FILE,
+    check_replaceable,
+    settle_parts,
+    written_whole,
+)
 
 
 @pytest.fixture(scope="module")
@@ -429,6 +437,27 @@ def test_pictures_replace_pictures_only(place: Path, capsys: pytest.CaptureFixtu
     assert exit_code(command, place / "alone.mcap", flag, place / "photo.png") == 2
     assert "--overwrite to replace it" in capsys.readouterr().err
     assert files_of(place.parent) == before
+
+
+def test_a_report_replaces_reports_only(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (place / "thesis.html").write_text("<!doctype html>\n<p>years of work")
+    (place / "link.html").symlink_to(place / "alone.mcap")
+    inside = place / "dataset" / "report.html"
+    inside.write_text(REPORT_MARK)
+    before = files_of(place.parent)
+    for source, target, word in (
+        ("alone.mcap", place / "thesis.html", "it is not a report"),
+        ("alone.mcap", place / "link.html", "this command reads it"),
+        ("dataset", inside, "it lies in what this command reads"),
+    ):
+        assert exit_code("report", place / source, "--out", target, "--overwrite") == 2
+        assert word in capsys.readouterr().err
+    assert files_of(place.parent) == before
+    target = place / "report.html"
+    for flags, code in (((), 0), ((), 2), (("--overwrite",), 0)):
+        assert exit_code("report", place / "alone.mcap", "--no-checks", "--out", target, *flags) == code
+    assert "--overwrite to replace it" in capsys.readouterr().err
+    assert target.read_text().startswith(REPORT_MARK)
 
 
 def test_a_coverage_picture_is_replaced_on_request(place: Path) -> None:

@@ -69,6 +69,7 @@ ODD: tuple[tuple[Callable[[Path], None], str], ...] = (
 COMMANDS = {
     "info": (),
     "check": (),
+    "report": ("--out", "out.html"),
     "recover": ("--out", "out.mcap"),
     "view": ("--save", "out.rrd"),
     "export": ("--out", "out"),

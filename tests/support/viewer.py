@@ -13,6 +13,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 from urllib.request import urlopen
 
 import numpy as np
@@ -93,10 +94,22 @@ class Chromium:
         self._socket = create_connection(page["webSocketDebuggerUrl"], timeout=60)
         self._number = 0
 
-    def picture(self) -> bytes:
+    def call(self, method: str, **parameters: object) -> dict[str, Any]:
+        """The answer to a command of the protocol."""
         self._number += 1
-        self._socket.send(json.dumps({"id": self._number, "method": "Page.captureScreenshot"}))
+        self._socket.send(json.dumps({"id": self._number, "method": method, "params": parameters}))
         while True:
             answer = json.loads(self._socket.recv())
             if answer.get("id") == self._number:
-                return base64.b64decode(answer["result"]["data"])
+                assert "error" not in answer, answer
+                result: dict[str, Any] = answer["result"]
+                return result
+
+    def value(self, expression: str) -> Any:
+        """What JavaScript gives for an expression; promises are awaited."""
+        answer = self.call("Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True)
+        assert "exceptionDetails" not in answer, answer
+        return answer["result"].get("value")
+
+    def picture(self) -> bytes:
+        return base64.b64decode(self.call("Page.captureScreenshot")["data"])

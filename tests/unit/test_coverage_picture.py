@@ -13,17 +13,17 @@ from hypothesis import strategies as st
 from PIL import Image, ImageDraw
 from support.recording import make_episode
 
-from demorec.check.coverage import _ticks, draw_coverage
+from demorec.check.coverage import draw_coverage, ticks
 from demorec.geometry import Pose
 
 
 @given(st.floats(-5, 5), st.floats(1e-3, 10))
 def test_ticks_are_round_numbers_within_the_range(low: float, width: float) -> None:
-    ticks = _ticks(low, low + width)
-    assert 3 <= len(ticks) <= 9
-    assert low - 1e-9 <= min(ticks) <= max(ticks) <= low + width + 1e-9
-    step = np.diff(ticks).mean()
-    assert np.allclose(np.array(ticks) / step, np.round(np.array(ticks) / step), atol=1e-4)
+    found = ticks(low, low + width)
+    assert 3 <= len(found) <= 9
+    assert low - 1e-9 <= min(found) <= max(found) <= low + width + 1e-9
+    step = np.diff(found).mean()
+    assert np.allclose(np.array(found) / step, np.round(np.array(found) / step), atol=1e-4)
     assert f"{step:.3e}"[0] in "125"
 
 

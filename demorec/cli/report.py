@@ -1,0 +1,78 @@
+"""`demorec report`: a run or a dataset on one page."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from tyro.conf import Positional
+
+from demorec.cli.allow import Allow, allowed_modules
+from demorec.cli.output import say
+from demorec.cli.paths import places_read
+from demorec.cli.progress import ProgressBar
+from demorec.errors import ConfigError, check_option
+from demorec.runs.find import EPISODE_FOLDERS, expect
+from demorec.safety.replacing import REPORT, check_replaceable
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report:
+    """Write one HTML page about a run, recordings or a dataset, to be opened from the file and passed on.
+
+    It tells outcomes, what the checks found, how the randomised ranges are covered and how states and actions are
+    distributed, and shows a filmstrip of every episode, those that failed first. It needs no network. Exit code 0 says
+    that the page was written, whatever it tells; demorec check judges.
+
+    Examples:
+      demorec report recordings/cubes --out cubes.html
+      demorec report datasets/cubes --out cubes.html --camera wrist
+      demorec report recordings/cubes --out cubes.html --pictures --workers 4
+    """
+
+    path: Positional[Path]
+    """A run, a recording, a folder of recordings, an evaluation or a LeRobot dataset."""
+    out: Path
+    """The page (.html)."""
+    camera: str = ""
+    """Whose pictures the filmstrips show; default: the first one."""
+    checks: bool = True
+    """Run the checks."""
+    pictures: bool = False
+    """Run those checks, too, that decode all pictures."""
+    workers: int = 1
+    """Processes that read and check recordings."""
+    allow: Allow = ()
+    """A module or package of your own beside which the models of robots and objects may be read."""
+    overwrite: bool = False
+    """Replace the report that is there."""
+
+    def run(self) -> int:
+        """Gather, then write."""
+        self._validate()
+        from demorec.report.gather import ReportOptions, gather
+        from demorec.report.page import write_page
+
+        options = ReportOptions(
+            camera=self.camera,
+            checks=self.checks,
+            pictures=self.pictures,
+            workers=self.workers,
+            allowed=allowed_modules(self.allow),
+        )
+        with ProgressBar("reading", unit="item") as bar:
+            report = gather(self.path, options, bar.set)
+        size = write_page(report, self.out)
+        say(f"{len(report.episodes)} episodes, {size / 1e6:.1f} MB: {self.out}")
+        return 0
+
+    def _validate(self) -> None:
+        if self.out.suffix.lower() not in (".html", ".htm"):
+            raise ConfigError(f"--out names an .html file, found the name {self.out.name!r}.")
+        check_option("workers", self.workers, 1, 1024)
+        if self.pictures and not self.checks:
+            raise ConfigError("--pictures chooses checks, and --no-checks runs none: leave one of them out.")
+        expect(self.path, "recording", "dataset", *EPISODE_FOLDERS)
+        if not self.out.absolute().parent.is_dir():
+            raise ConfigError(f"--out: there is no folder {self.out.parent}.")
+        check_replaceable(self.out, REPORT, overwrite=self.overwrite, sources=places_read([self.path]))

@@ -1,0 +1,131 @@
+"""One recording, as a report tells it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from itertools import groupby
+from pathlib import Path
+
+from demorec.errors import ConfigError, RecordingError, without_path
+from demorec.recording import Recording
+from demorec.report.content import PhaseSpan, ReportedEpisode
+from demorec.report.filmstrip import filmstrip
+from demorec.report.histogram import Histogram
+from demorec.runs.run_file import FAILED
+from demorec.scene.episode import EpisodeColumns, EpisodeInfo
+from demorec.scene.features import (
+    ACTION,
+    STATE,
+    ObservationRows,
+    action_names,
+    action_vectors,
+    observation_names,
+    observation_vectors,
+)
+
+Components = dict[tuple[str, str], Histogram]
+"""(feature, name of the component) -> its values over all frames."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ReadEpisode:
+    """An episode and the numbers of its frames, counted."""
+
+    episode: ReportedEpisode
+    components: Components = field(default_factory=dict)
+
+
+def read_recording(path: Path, root: Path, *, camera: str, strip_bytes: int) -> ReadEpisode:
+    """What a recording holds; one that is damaged is told as such.
+
+    Args:
+        path: The file.
+        root: What is reported on, of which the file is part.
+        camera: Whose pictures the filmstrip shows; "" for the first one.
+        strip_bytes: How large the filmstrip may be; 0 for none.
+
+    Raises:
+        ConfigError: The recording has no such camera.
+    """
+    source = path.name if path == root else path.relative_to(root).as_posix()
+    is_failed = path.parent.name == FAILED
+    try:
+        with Recording(path) as recording:
+            return _read(recording, source, is_failed=is_failed, camera=camera, strip_bytes=strip_bytes)
+    except RecordingError as error:
+        problem = without_path(error, path)
+        return ReadEpisode(episode=ReportedEpisode(name=path.stem, source=source, problem=problem))
+
+
+def _read(recording: Recording, source: str, *, is_failed: bool, camera: str, strip_bytes: int) -> ReadEpisode:
+    info, outcome = recording.info, recording.outcome
+    if camera and camera not in recording.cameras:
+        there = ", ".join(recording.cameras) or "none"
+        raise ConfigError(f"There is no camera {camera!r}, the cameras are {there}: {recording.path}")
+    strip = None
+    if strip_bytes and recording.cameras:
+        shown = camera or recording.cameras[0]
+        strip = filmstrip(
+            shown,
+            recording.num_frames,
+            lambda frames: recording.images_at(shown, frames),
+            most_bytes=strip_bytes,
+        )
+    columns = recording.columns()
+    episode = ReportedEpisode(
+        name=episode_name(info, is_failed=is_failed),
+        source=source,
+        problem="" if outcome is not None else "A crash cut the recording off; it was recovered.",
+        instruction=info.instruction,
+        success=None if outcome is None else outcome.success,
+        failure_phase="" if outcome is None else outcome.failure_phase,
+        failure_reason="" if outcome is None else outcome.failure_reason,
+        num_frames=recording.num_frames,
+        fps=info.fps,
+        num_retries=0 if outcome is None else outcome.num_retries,
+        seed=info.root_seed,
+        phases=phase_spans(columns.phase),
+        conditions=() if outcome is None else outcome.checks,
+        filmstrip=strip,
+        info=info,
+    )
+    return ReadEpisode(episode=episode, components=_components(info, columns))
+
+
+def episode_name(info: EpisodeInfo, *, is_failed: bool) -> str:
+    """ "episode 3", and of an attempt that failed or came after one, which attempt."""
+    attempt = f", attempt {info.attempt}" if is_failed or info.attempt else ""
+    return f"episode {info.episode_index}{attempt}"
+
+
+def phase_spans(phases: Sequence[str]) -> tuple[PhaseSpan, ...]:
+    """The phases of T frames, in order."""
+    spans, first = [], 0
+    for name, frames in groupby(phases):
+        end = first + sum(1 for _ in frames)
+        spans.append(PhaseSpan(name=name, first=first, end=end))
+        first = end
+    return tuple(spans)
+
+
+def _components(info: EpisodeInfo, columns: EpisodeColumns) -> Components:
+    """State and action as an export with joint targets has them."""
+    if not columns.num_frames:
+        return {}
+    state = observation_vectors(ObservationRows.of_columns(columns), info.robot, info.scene)[STATE]
+    action = action_vectors(columns, info.scene, "joint")
+    found: Components = {}
+    for feature, names, values in (
+        (STATE, observation_names(info.robot, info.scene)[STATE], state),
+        (ACTION, action_names(info.robot, "joint"), action),
+    ):
+        for number, name in enumerate(names):
+            found.setdefault((feature, name), Histogram()).add(values[:, number])
+    return found
+
+
+def merge(into: Components, found: Iterable[tuple[tuple[str, str], Histogram]]) -> None:
+    """Add what one episode counted to what all have."""
+    for key, histogram in found:
+        into.setdefault(key, Histogram()).merge(histogram)

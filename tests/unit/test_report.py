@@ -1,0 +1,297 @@
+"""`demorec report`: read by an HTML parser that is not ours, its pictures by Pillow."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import re
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from support.commands import exit_code
+from support.export import export, make_run
+from support.mcap import rewritten
+from support.recording import frame_number, write_episode
+
+from demorec.recording import Recording
+from demorec.report.content import Filmstrip, Report
+from demorec.report.episodes import MOST_SHOWN
+from demorec.report.filmstrip import filmstrip, strip_budget
+from demorec.report.gather import ReportOptions, gather
+from demorec.report.markup import tag
+from demorec.report.page import page
+
+HOSTILE = "</p><script>document.title = 'taken'</script><img src=x onerror=alert(1)>\"'&\u202e"
+MOST_BYTES = 30_000_000
+VOID = ("img", "meta", "input", "br")
+
+
+@dataclass
+class Page(HTMLParser):
+    """What a parser finds in a page.
+
+    Attributes:
+        tags: (name, attributes) of every element.
+        articles: Text of every article.
+        words: Text outside of style and script.
+        code: Content of style and script.
+    """
+
+    tags: list[tuple[str, dict[str, str | None]]] = field(default_factory=list)
+    articles: list[str] = field(default_factory=list)
+    words: str = ""
+    code: dict[str, str] = field(default_factory=dict)
+    open: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        super().__init__()
+
+    def handle_starttag(self, name: str, attributes: list[tuple[str, str | None]]) -> None:
+        self.tags.append((name, dict(attributes)))
+        if name == "article":
+            self.articles.append("")
+        if name not in VOID:
+            self.open.append(name)
+
+    def handle_endtag(self, name: str) -> None:
+        assert self.open.pop() == name, "elements close in the order in which they open"
+
+    def handle_data(self, data: str) -> None:
+        if self.open and self.open[-1] in ("style", "script"):
+            self.code[self.open[-1]] = self.code.get(self.open[-1], "") + data
+            return
+        self.words += data
+        if "article" in self.open:
+            self.articles[-1] += f"{data} "
+
+    def all(self, name: str) -> Iterator[dict[str, str | None]]:
+        return (attributes for found, attributes in self.tags if found == name)
+
+
+def parsed(text: str) -> Page:
+    found = Page()
+    found.feed(text)
+    found.close()
+    assert found.open == []
+    return found
+
+
+def report_on(path: Path, **options: object) -> Page:
+    return parsed(page(gathered(path, **options)))
+
+
+def gathered(path: Path, **options: object) -> Report:
+    return gather(path, ReportOptions(**{"checks": False, **options}), lambda done, total: None)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three episodes and a failed attempt, without a run.json: a folder of recordings."""
+    return make_run(
+        tmp_path_factory.mktemp("report") / "cubes", (24, 30, 24), failures=(1,), cameras=("front", "wrist")
+    )
+
+
+@pytest.fixture(scope="module")
+def dataset(run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("report") / "cubes_dataset"
+    export(run, out)
+    return out
+
+
+def test_what_failed_comes_first(run: Path) -> None:
+    found = report_on(run)
+    assert [words.split(" failed")[0].strip() for words in found.articles[:1]] == ["episode 1, attempt 0"]
+    assert "distance_to_target in phase place" in found.articles[0]
+    assert ["failed" in words for words in found.articles] == [True, False, False, False]
+    assert "3 of 4 attempts succeeded: 75.0 %" in found.words
+
+
+def test_links_lead_somewhere(run: Path) -> None:
+    found = report_on(run)
+    ids = {attributes.get("id") for _, attributes in found.tags}
+    links = [attributes["href"] or "" for attributes in found.all("a")]
+    assert len(links) > 10
+    assert {link.removeprefix("#") for link in links} <= ids
+
+
+def test_nothing_is_loaded_from_elsewhere(run: Path) -> None:
+    text = page(gathered(run))
+    assert "://" not in text
+    found = parsed(text)
+    assert {name for name, _ in found.tags} & {"link", "iframe", "object", "base", "form"} == set()
+    assert all((image["src"] or "").startswith("data:image/jpeg;base64,") for image in found.all("img"))
+    assert not [key for _, attributes in found.tags for key in attributes if key.startswith("on") or key == "style"]
+
+
+def test_a_filmstrip_shows_the_frames_that_it_names(run: Path) -> None:
+    """Each picture carries its frame's number as a bar code."""
+    found = report_on(run)
+    assert len(list(found.all("img"))) == 4
+    for image, words in zip(found.all("img"), found.articles, strict=True):
+        strip = Image.open(io.BytesIO(base64.b64decode((image["src"] or "").partition(",")[2])))
+        assert strip.size == (int(image["width"] or 0), int(image["height"] or 0))
+        length = int(re.findall(r"(\d+) frames", words)[0])
+        width = strip.width // 8
+        for number in range(8):
+            part = strip.crop((number * width, 0, (number + 1) * width, strip.height)).resize((64, 48))
+            assert frame_number(np.asarray(part)) == round(number * (length - 1) / 7)
+
+
+def test_the_camera_is_chosen(run: Path, dataset: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    for path in (run, dataset):
+        for camera in ("front", "wrist"):
+            alts = [image["alt"] or "" for image in report_on(path, camera=camera).all("img")]
+            assert alts
+            assert all(f"camera {camera}," in alt for alt in alts)
+        assert exit_code("report", path, "--no-checks", "--camera", "rear", "--out", tmp_path / "r.html") == 2
+        assert "the cameras are front, wrist" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_dataset_tells_the_same_as_its_run(run: Path, dataset: Path) -> None:
+    ours, theirs = gathered(run), gathered(dataset)
+    of_run = {
+        (d.feature, d.name): (d.histogram.exponent, d.histogram.bins) for d in gathered(run / "episodes").distributions
+    }
+    assert {(d.feature, d.name): (d.histogram.exponent, d.histogram.bins) for d in theirs.distributions} == of_run
+    assert [e.success for e in theirs.episodes] == [e.success for e in ours.episodes]
+    assert [e.phases for e in theirs.episodes[:3]] == [e.phases for e in ours.episodes[:3]]
+    assert theirs.episodes[3].failure == ours.episodes[3].failure
+    assert not theirs.missing[:-1]
+
+
+def test_a_dataset_of_others_says_what_is_missing(dataset: Path, tmp_path: Path) -> None:
+    other = shutil.copytree(dataset, tmp_path / "other")
+    shutil.rmtree(other / "demorec")
+    found = report_on(other)
+    assert "was not exported by demorec" in found.words
+    assert "3 of 3 attempts succeeded" in found.words  # the column next.success tells
+    assert len(list(found.all("img"))) == 3
+    file = other / "meta" / "info.json"
+    plain = json.loads(file.read_text())
+    for name in ("next.success", "action"):
+        del plain["features"][name]
+    plain["features"]["observation.images.front"]["dtype"] = "image"
+    del plain["features"]["observation.images.wrist"]
+    file.write_text(json.dumps(plain))
+    found = report_on(other)
+    for words in (
+        "No column next.success tells which episodes succeeded.",
+        "Its pictures lie as single images in the data files",
+        "It has no column action",
+    ):
+        assert words in found.words
+    assert list(found.all("img")) == []
+    assert all("outcome unknown" in words for words in found.articles)
+
+
+def test_foreign_text_does_nothing(run: Path, tmp_path: Path) -> None:
+    """Whatever a recording says is text: the page has the same elements as without it."""
+    good = run / "episodes" / "episode_000000.mcap"
+    with Recording(good) as recording:
+        episode, outcome = (recording._container.metadata(f"demorec.{name}") for name in ("episode", "outcome"))
+    assert episode is not None
+    assert outcome is not None
+    info, ended = json.loads(episode["info"]), json.loads(outcome["outcome"])
+    for key in ("task", "instruction"):
+        info[key] = HOSTILE
+    info["robot"]["name"] += HOSTILE
+    info["config"] = {HOSTILE: HOSTILE}
+    info["versions"] = {"demorec": HOSTILE}
+    ended.update(success=False, failure_phase=HOSTILE, failure_reason=HOSTILE)
+    ended["checks"][0].update(name=HOSTILE, unit=HOSTILE, passed=False)
+    change = {"demorec.episode": {"info": json.dumps(info)}, "demorec.outcome": {"outcome": json.dumps(ended)}}
+    folder = tmp_path / "<script>alert(1)<"
+    folder.mkdir()
+    (folder / "<b>.mcap").write_bytes(rewritten(good, change=change))
+    text = page(gathered(folder))
+    found = parsed(text)
+    assert "\u202e" not in text
+    assert [name for name, _ in found.tags].count("script") == 1
+    assert found.code["script"] == (Path(__file__).parents[2] / "demorec/report/page.js").read_text()
+    shown = HOSTILE.replace("\u202e", "\\u202e")
+    assert found.articles[0].count(shown) >= 4
+    assert found.words.count(shown) >= 9
+
+
+def test_attributes_and_content_are_escaped() -> None:
+    found = parsed(tag("p", "<b>", tag("b", "&amp;"), title='"><script>', class_="x", hidden=""))
+    assert found.tags == [("p", {"title": '"><script>', "class": "x", "hidden": None}), ("b", {})]
+    assert found.words == "<b>&amp;"
+
+
+@pytest.mark.parametrize("count", [1000, 9000])
+def test_a_large_run_stays_small(run: Path, count: int) -> None:
+    """As many episodes, each with a filmstrip that takes all that it may."""
+    strip = Filmstrip(
+        jpeg=bytes(strip_budget(min(count, MOST_SHOWN))), camera="front", moments=8, width=800, height=100
+    )
+    report = gathered(run)
+    many = tuple(replace(report.episodes[number % 4], filmstrip=strip) for number in range(count))
+    text = page(replace(report, episodes=many))
+    assert 15_000_000 < len(text.encode()) < MOST_BYTES
+    assert text.count("<article ") == min(count, MOST_SHOWN)
+    assert text.count('class="failed" data-words') == count // 4
+    assert f"{3 * count // 4} of {count} attempts succeeded" in text
+
+
+def test_a_strip_is_as_large_as_its_budget_allows() -> None:
+    pictures = [np.full((48, 64, 3), 30 * number, np.uint8) for number in range(8)]
+
+    def strip(most_bytes: int) -> Filmstrip | None:
+        return filmstrip("front", 8, lambda frames: [pictures[frame] for frame in frames], most_bytes=most_bytes)
+
+    sizes = [len(found.jpeg) for found in map(strip, (10_000, 3_000, 1_500)) if found is not None]
+    assert sizes == sorted(sizes, reverse=True)
+    for most, size in zip((10_000, 3_000, 1_500), sizes, strict=False):
+        assert size <= most
+    assert strip(300) is None
+
+
+def test_what_cannot_be_read_is_told(run: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(run, tmp_path / "run")
+    file = folder / "episodes" / "episode_000002.mcap"
+    file.write_bytes(file.read_bytes()[:2000])
+    found = report_on(folder)
+    assert found.articles[0].startswith("episode_000002")
+    assert "unreadable" in found.articles[0]
+    assert len(found.articles) == 4
+
+
+def test_checks_are_summed_up(run: Path) -> None:
+    report = gathered(run, checks=True)
+    assert report.checks is not None
+    for summary in report.checks.by_name.values():
+        assert sum(summary.counts.values()) <= 4
+    flagged = [episode for episode in report.episodes if episode.flags]
+    found = parsed(page(report))
+    assert "--pictures runs them, too" in found.words
+    for episode in flagged:
+        (words,) = (words for words in found.articles if words.startswith(f"{episode.name} "))
+        assert all(flag.check in words for flag in episode.flags)
+
+
+def test_workers_find_the_same(run: Path) -> None:
+    assert page(gathered(run, workers=2)) == page(gathered(run))
+
+
+def test_refusals(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for arguments, words in (
+        ((run, "--out", tmp_path / "x.pdf"), "--out names an .html file"),
+        ((run, "--out", tmp_path / "no" / "x.html"), "there is no folder"),
+        ((run, "--out", tmp_path / "x.html", "--workers", "0"), "--workers is 0"),
+        ((run, "--out", tmp_path / "x.html", "--no-checks", "--pictures"), "leave one of them out"),
+    ):
+        assert exit_code("report", *arguments) == 2
+        assert words in capsys.readouterr().err
+    write_episode(tmp_path / "one.mcap", num_frames=3, cameras=())
+    assert exit_code("report", tmp_path / "one.mcap", "--no-checks", "--out", tmp_path / "x.html") == 0
+    assert capsys.readouterr().out.startswith("1 episodes, ")
