@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 MOST_BINS = 48
 _FINEST = 40
-"""Bins are no finer than 2^-40 of the largest value, so that their numbers stay exact."""
+"""Bins are no finer than 2^-40 of the largest value, so that their numbers stay exact, and no finer than 2^-40: what is
+smaller counts as zero, whether a zero came before it or after."""
 
 
 class Histogram:
@@ -70,7 +71,7 @@ class Histogram:
         self.total += total
         self.count += count
         largest = max(abs(self.minimum), abs(self.maximum))
-        exponent = max(self.exponent, least, math.frexp(largest)[1] - _FINEST)
+        exponent = max(self.exponent, least, max(math.frexp(largest)[1], 0) - _FINEST)
         while self._number(self.maximum, exponent) - self._number(self.minimum, exponent) >= MOST_BINS:
             exponent += 1
         if self.bins and exponent != self.exponent:

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from demorec.report.histogram import MOST_BINS, Histogram
@@ -34,6 +34,7 @@ def test_every_value_is_in_the_bin_that_holds_it(values: list[float]) -> None:
 
 
 @given(VALUES, VALUES)
+@example([0.0], [2.9e-205])
 def test_parts_count_as_the_whole_in_any_order(first: list[float], second: list[float]) -> None:
     whole = counted(first + second)
     merged, other = counted(second), counted(first)
