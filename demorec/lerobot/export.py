@@ -186,4 +186,5 @@ class _Export:
             "episodes": options.episodes,
             "fps": options.fps,
             "depth": options.depth,
+            **({} if options.language is None else {"language": options.spoken}),
         }

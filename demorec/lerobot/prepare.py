@@ -4,8 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from demorec.export.columns import DONE, REWARD, SUCCESS, check_feature_names, feature_columns, frame_stride
+from demorec.export.columns import (
+    DONE,
+    REWARD,
+    SUCCESS,
+    FeatureColumns,
+    check_feature_names,
+    feature_columns,
+    frame_stride,
+)
+from demorec.language.narration import narrate
 from demorec.lerobot.depth import depth_info, depth_video
+from demorec.lerobot.language import COLUMNS, EpisodeLanguage, episode_language
 from demorec.lerobot.layout import AUTOMATIC_FEATURES, Feature
 from demorec.lerobot.options import ExportOptions
 from demorec.lerobot.sidecar import EpisodeRecord
@@ -20,6 +30,8 @@ _SCALARS = {
     DONE: Feature(dtype="bool", shape=(1,)),
     SUCCESS: Feature(dtype="bool", shape=(1,)),
 }
+
+_LANGUAGE = Feature(dtype="language", shape=(1,))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -52,7 +64,8 @@ def dataset_features(recording: Recording, options: ExportOptions) -> dict[str, 
             features[IMAGE_PREFIX + camera + DEPTH_SUFFIX] = _camera_feature((height, width, 1), described)
     names = action_names(info.robot, options.action)
     features[ACTION] = Feature(dtype="float32", shape=(len(names),), names=names)
-    return _chosen({**features, **_SCALARS, **AUTOMATIC_FEATURES}, options)
+    told = {} if options.language is None else dict.fromkeys(COLUMNS, _LANGUAGE)
+    return {**_chosen({**features, **_SCALARS, **AUTOMATIC_FEATURES}, options), **told}
 
 
 def _chosen(offered: dict[str, Feature], options: ExportOptions) -> dict[str, Feature]:
@@ -95,5 +108,13 @@ def prepare_episode(recording: Recording, options: ExportOptions, *, code_depth:
         videos=videos,
         video_info={key: wanted[key].info or {} for key in videos},
         pixels=pixels,
+        language=_language(recording, columns, options, fps=recording.info.fps // stride),
     )
     return PreparedEpisode(data=data, record=EpisodeRecord.of(recording, columns.recorded, columns.rows))
+
+
+def _language(recording: Recording, columns: FeatureColumns, options: ExportOptions, *, fps: int) -> EpisodeLanguage:
+    """What the dataset shall say about the recording; nothing unless it was asked for."""
+    if options.language is None:
+        return EpisodeLanguage()
+    return episode_language(narrate(recording, columns.recorded, columns.rows, options.spoken), fps=fps)

@@ -21,6 +21,7 @@ from demorec.errors import ExportError
 from demorec.export.staging import sync_file
 from demorec.lerobot.data_stats import data_statistics
 from demorec.lerobot.digest import episode_digest
+from demorec.lerobot.language import REPEATING, EpisodeLanguage, language_arrays, language_digests
 from demorec.lerobot.layout import (
     AUTOMATIC_FEATURES,
     DATA_PATH,
@@ -55,6 +56,7 @@ class EpisodeData:
         videos: Camera feature -> coded pictures, T of them.
         video_info: Camera feature -> how they were coded, the `info` of the feature.
         pixels: Camera feature -> histogram, for the statistics.
+        language: What is said about it; written where the dataset has the columns for it.
     """
 
     task: str
@@ -62,6 +64,7 @@ class EpisodeData:
     videos: Mapping[str, CodedVideo] = field(default_factory=dict)
     video_info: Mapping[str, dict[str, Any]] = field(default_factory=dict)
     pixels: Mapping[str, PixelHistogram] = field(default_factory=dict)
+    language: EpisodeLanguage = field(default_factory=EpisodeLanguage)
 
     @property
     def num_frames(self) -> int:
@@ -112,17 +115,18 @@ class DatasetWriter:
         self._info = info
         self._start = start or WriterStart()
         self._schema = data_schema(info.features)
-        self._numeric = [name for name in self._schema.names if info.features[name].dtype != "string"]
+        self._numeric = [name for name in self._schema.names if info.features[name].is_numeric]
+        self._language = [name for name in self._schema.names if info.features[name].dtype == "language"]
         self._tasks = {task: index for index, task in enumerate(self._start.tasks)}
         self.num_episodes = self._start.num_episodes
         self.num_frames = self._start.num_frames
-        strings = [name for name in self._schema.names if name not in self._numeric]
+        strings = [name for name in self._schema.names if name not in (*self._numeric, *self._language)]
         self._data = RollingParquet(
             root,
             DATA_PATH,
             self._schema,
             start=self._start.data,
-            repeating=["episode_index", "task_index", *strings],
+            repeating=["episode_index", "task_index", *strings, *(REPEATING if self._language else ())],
             **_sizes(info),
         )
         self._episodes = RollingParquet(
@@ -150,8 +154,11 @@ class DatasetWriter:
         if frames == 0:
             raise ExportError("An episode without frames cannot be exported.")
         task_index = self._tasks.setdefault(episode.task, len(self._tasks))
+        spoken = set(self._language)
         columns = {
-            **{name: episode.columns[name] for name in self._schema.names if name not in AUTOMATIC_FEATURES},
+            **{
+                name: episode.columns[name] for name in self._schema.names if name not in {*AUTOMATIC_FEATURES, *spoken}
+            },
             "timestamp": (np.arange(frames) / self._info.fps).astype(np.float32),
             "frame_index": np.arange(frames),
             "episode_index": np.full(frames, self.num_episodes),
@@ -159,7 +166,11 @@ class DatasetWriter:
             "task_index": np.full(frames, task_index),
         }
         position = self._data.make_room(frames)
-        arrays = [vector_array(columns[item.name], item.type) for item in self._schema]
+        texts = language_arrays(episode.language, frames) if spoken else {}
+        arrays = [
+            texts[item.name] if item.name in spoken else vector_array(columns[item.name], item.type)
+            for item in self._schema
+        ]
         self._data.write(pa.Table.from_arrays(arrays, schema=self._schema))
         row: dict[str, Any] = {
             "episode_index": self.num_episodes,
@@ -185,6 +196,8 @@ class DatasetWriter:
             self._write_episode_rows()
         self.num_frames += frames
         self.num_episodes += 1
+        if spoken:
+            columns.update(language_digests(episode.language, frames))
         return WrittenEpisode(
             episode_index=self.num_episodes - 1, digest=episode_digest(episode.task, columns, digests)
         )

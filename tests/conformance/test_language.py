@@ -1,0 +1,243 @@
+"""LeRobot's language columns of all ten tasks, judged by LeRobot, by the recordings' phases and by brute force."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.check import simulate_run
+from support.export import data_table, export
+from support.language import active, language_of, meant, phrases
+
+from demorec.errors import ConfigError, ExportError
+from demorec.geometry import Pose
+from demorec.language.kinds import KINDS
+from demorec.language.situation import nouns_of, place_of
+from demorec.lerobot import dataset_digest
+from demorec.recording import Recording
+from demorec.scene.scene import Body, Shape
+from demorec.scene.variation import Ranges
+from demorec.tables import TASKS
+from demorec.tasks.things import THINGS
+
+RECIPE = Path(__file__).parents[2] / "examples" / "language_recipe.yaml"
+MISSING = ("pick_place", "stack", "sort_by_color")
+"""Tasks whose episode begins with a deliberate miss."""
+PLAIN = Ranges(miss_probability=0.0)
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """A run of one episode of every task, numbers only."""
+    folder = tmp_path_factory.mktemp("runs")
+    return [
+        simulate_run(
+            folder / task, 1, task=task, seed=3, cameras=(),
+            ranges=Ranges(miss_probability=1.0) if task in MISSING else PLAIN,
+        )
+        for task in TASKS.names()
+    ]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def dataset(runs: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """All of them in one dataset, with everything that can be said."""
+    out = tmp_path_factory.mktemp("dataset") / "all"
+    report = export(runs, out, language=())
+    assert report.digest == dataset_digest(out)
+    return out
+
+
+def _recording(run: Path) -> Recording:
+    (path,) = (run / "episodes").glob("*.mcap")
+    return Recording(path)
+
+
+def test_lerobots_own_validator_finds_nothing(dataset: Path, tmp_path: Path) -> None:
+    from lerobot.annotations.steerable_pipeline.reader import iter_episodes
+    from lerobot.annotations.steerable_pipeline.staging import EpisodeStaging
+    from lerobot.annotations.steerable_pipeline.validator import StagingValidator
+    from lerobot.datasets.language import column_for_style, validate_camera_field
+
+    spoken = language_of(dataset)
+    records = list(iter_episodes(dataset))
+    assert len(records) == len(spoken) == len(TASKS.names())
+    for record, frames in zip(records, spoken, strict=True):
+        persistent = frames[0][0]
+        assert all(rows == persistent and events == [] for rows, events in frames)
+        assert {row["style"] for row in persistent} == set(KINDS)
+        for row in persistent:
+            assert column_for_style(row["style"]) == "language_persistent"
+            validate_camera_field(row["style"], row["camera"])
+            assert row["timestamp"] in record.frame_timestamps
+        EpisodeStaging(tmp_path, record.episode_index).write("plan", persistent)
+    report = StagingValidator().validate(records, tmp_path)
+    assert (report.errors, report.warnings, report.episodes_checked) == ([], [], len(records))
+
+
+def test_our_recipe_gives_messages_for_every_frame(dataset: Path) -> None:
+    from lerobot.configs.recipe import TrainingRecipe
+    from lerobot.datasets.language_render import render_sample
+
+    recipe = TrainingRecipe.from_yaml(RECIPE)
+    table = data_table(dataset).select(["index", "timestamp", "language_persistent", "language_events"])
+    kinds = set()
+    for row in table.slice(0, 600).to_pylist() + table.slice(table.num_rows - 200).to_pylist():
+        rendered = render_sample(
+            recipe=recipe, persistent=row["language_persistent"], events=row["language_events"],
+            t=row["timestamp"], sample_idx=row["index"],
+        )  # fmt: skip
+        assert rendered is not None
+        assert all(message["content"].strip() for message in rendered["messages"])
+        kinds.add(rendered["message_streams"][-1])
+        if len(rendered["messages"]) == 3:
+            assert rendered["messages"][1]["content"].startswith("So far: I ")
+    assert kinds == {"high_level", "low_level"}
+
+
+def test_one_subtask_holds_at_every_frame_and_changes_with_the_phase(runs: list[Path], dataset: Path) -> None:
+    for run, frames in zip(runs, language_of(dataset), strict=True):
+        with _recording(run) as recording:
+            phase, misses = recording.columns().phase, recording.columns().is_deliberate_miss
+            times = (np.arange(len(phase)) / recording.info.fps).astype(np.float32).tolist()
+        rows = [active(frames[0][0], "subtask", time) for time in times]
+        assert all(len(row) == 1 for row in rows)
+        changes = [frame for frame in range(1, len(phase)) if phase[frame] != phase[frame - 1]]
+        assert [frame for frame in range(1, len(phase)) if rows[frame] != rows[frame - 1]] == changes
+        said = np.array(
+            [bool(re.search("to miss it on purpose|missing it on purpose", row[0]["content"])) for row in rows]
+        )
+        assert np.array_equal(said, misses)
+        if misses.any():
+            retry = int(np.flatnonzero(misses)[-1]) + 1 + phase[int(np.flatnonzero(misses)[-1]) + 1 :].index("approach")
+            assert rows[retry][0]["content"].startswith("try again: ")
+            plans = [row["timestamp"] for row in frames[0][0] if row["style"] == "plan"]
+            assert plans == [0.0, times[retry]]
+
+
+def test_subtasks_name_the_thing_that_rises_and_the_place_where_it_ends(runs: list[Path], dataset: Path) -> None:
+    for run, frames in zip(runs, language_of(dataset), strict=True):
+        with _recording(run) as recording:
+            columns, scene, fps = recording.columns(), recording.info.scene, recording.info.fps
+        lifts = 0
+        subtasks = [row for row in frames[0][0] if row["style"] == "subtask"]
+        for row, after in itertools.pairwise(subtasks):
+            first, last = (round(part["timestamp"] * fps) for part in (row, after))
+            if row["content"].startswith("lift the "):
+                risen = {name: poses[last, 2] - poses[first, 2] for name, poses in columns.object_poses.items()}
+                assert max(risen, key=lambda name: risen[name]) in meant(phrases(row["content"])[0], scene)
+                lifts += 1
+            if row["content"].startswith("lower the ") and "gripper" not in row["content"]:
+                _, place = (meant(phrase, scene) for phrase in phrases(row["content"]))
+                tcp = scene.robot.world_from_base.apply(columns.base_from_tcp[last, :3])
+                bodies = {body.name: columns.object_poses.get(body.name) for body in scene.bodies if body.name in place}
+                for name, poses in bodies.items():
+                    where = scene.body(name).world_from_body.position if poses is None else poses[last]
+                    assert np.abs(tcp[:2] - where[:2]).max() < 0.5 * max(scene.body(name).shape.extents)
+        assert lifts >= len(scene.goals)
+
+
+def test_every_wording_means_the_task_and_nothing_else(runs: list[Path], dataset: Path) -> None:
+    for run, frames in zip(runs, language_of(dataset), strict=True):
+        with _recording(run) as recording:
+            scene, instruction = recording.info.scene, recording.info.instruction
+        wordings = [row["content"] for row in frames[0][0] if row["style"] == "task_aug"]
+        assert all(
+            row["role"] == "user" and row["timestamp"] == 0 for row in frames[0][0] if row["style"] == "task_aug"
+        )
+        assert len(wordings) == len(set(wordings)) >= 20
+        assert wordings[0] == instruction
+        things = {goal.object for goal in scene.goals} | {place_of(scene, goal) for goal in scene.goals}
+        for wording in wordings[1:]:
+            found = [(phrase, meant(phrase, scene)) for phrase in phrases(wording)]
+            assert all(len(names) == 1 or phrase[1] == "every" for phrase, names in found), wording
+            named = {name for _, names in found for name in names}
+            assert things <= named, wording
+            assert named - things <= {body.name for body in scene.movable}, wording
+            assert "{" not in wording
+            assert "  " not in wording
+
+
+def test_motions_are_those_of_the_tcp(runs: list[Path], dataset: Path) -> None:
+    axes = {"forward": (0, 1), "backward": (0, -1), "left": (1, 1), "right": (1, -1), "up": (2, 1), "down": (2, -1)}
+    for run, frames in zip(runs, language_of(dataset), strict=True):
+        with _recording(run) as recording:
+            columns, fps = recording.columns(), recording.info.fps
+        rows = [row for row in frames[0][0] if row["style"] == "motion"]
+        starts = [round(row["timestamp"] * fps) for row in rows]
+        for row, first, last in zip(rows, starts, [*starts[1:], len(frames) - 1], strict=True):
+            told = np.zeros(3)
+            for centimetres, direction in re.findall(r"(\d+) cm (\w+)", row["content"]):
+                axis, sign = axes[direction]
+                told[axis] = sign * int(centimetres) / 100
+            assert np.abs(told - (columns.base_from_tcp[last, :3] - columns.base_from_tcp[first, :3])).max() <= 0.005001
+            opened = columns.gripper_width[last] - columns.gripper_width[first]
+            if match := re.search(r"(open|close) the gripper by ([\d.]+) cm", row["content"]):
+                assert abs(float(match[2]) / 100 * (1 if match[1] == "open" else -1) - opened) <= 0.002501
+            else:
+                assert abs(opened) < 0.0026
+
+
+def test_memories_come_when_it_is_done(runs: list[Path], dataset: Path) -> None:
+    for run, frames in zip(runs, language_of(dataset), strict=True):
+        with _recording(run) as recording:
+            goals, tutorial = recording.info.scene.goals, recording.info.task == "tutorial"
+        memories = [row for row in frames[0][0] if row["style"] == "memory"]
+        subtasks = {row["timestamp"]: row["content"] for row in frames[0][0] if row["style"] == "subtask"}
+        assert {row["timestamp"] for row in memories} <= set(subtasks)
+        for row in memories:
+            if "picked up" in row["content"].split(". ")[-1]:
+                assert subtasks[row["timestamp"]].startswith("carry the ")
+        if not tutorial:  # which ends with the fall
+            assert len(re.findall(r"I put the", memories[-1]["content"])) == len(goals)
+
+
+def test_fewer_frames_begin_a_subtask_at_the_first_frame_that_is_left(runs: list[Path], tmp_path: Path) -> None:
+    export(runs[0], tmp_path / "slow", language=("subtask",), fps=10)
+    with _recording(runs[0]) as recording:
+        phase = recording.columns().phase[::3]
+    (frames,) = language_of(tmp_path / "slow")
+    rows = frames[0][0]
+    assert {row["style"] for row in rows} == {"subtask"}
+    starts = [0, *(frame for frame in range(1, len(phase)) if phase[frame] != phase[frame - 1])]
+    assert [row["timestamp"] for row in rows] == [float(np.float32(start / 10)) for start in starts]
+
+
+def test_the_same_seed_says_the_same_and_nothing_else_of_the_dataset_changes(
+    runs: list[Path], dataset: Path, tmp_path: Path
+) -> None:
+    export(runs, tmp_path / "again", language=())
+    assert dataset_digest(tmp_path / "again") == dataset_digest(dataset)
+    export(runs, tmp_path / "without")
+    without, spoken = data_table(tmp_path / "without"), data_table(dataset)
+    assert spoken.select(without.column_names).equals(without)
+    assert set(spoken.column_names) - set(without.column_names) == {"language_persistent", "language_events"}
+    assert dataset_digest(tmp_path / "without") != dataset_digest(dataset)
+
+
+def test_appending_needs_language_where_the_dataset_has_it(runs: list[Path], tmp_path: Path) -> None:
+    out = tmp_path / "grown"
+    export(runs[0], out, language=())
+    with pytest.raises(ExportError, match="language_persistent"):
+        export(runs[1], out, append=True)
+    report = export(runs[1], out, append=True, language=())
+    assert report.digest == dataset_digest(out)
+    first, second = language_of(out)
+    assert first[0] != second[0]
+    assert all(rows == second[0][0] for rows, _ in second)
+
+
+def test_unknown_kinds_are_refused(runs: list[Path], tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="'poem', its kinds are subtask, plan"):
+        export(runs[0], tmp_path / "out", language=("poem",))
+
+
+@pytest.mark.parametrize("kind", list(THINGS))
+def test_things_are_called_as_the_instructions_call_them(kind: str) -> None:
+    shape = Shape(kind="mesh", size=(0.03, 0.03, 0.03))
+    for name in (kind, f"red_{kind}", f"other_red_{kind}", f"red_{kind}_2"):
+        body = Body(name=name, role="object", shape=shape, world_from_body=Pose(), mass=0.1)
+        assert nouns_of(body)[0] == THINGS[kind].noun
