@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 import re
+from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -88,17 +90,18 @@ def story_of(recording: Recording, columns: EpisodeColumns) -> Story:
     scene = recording.info.scene
     tries = _tries(recording, columns, scene)
     starts = [attempt.first for attempt in tries]
-    stretches: list[Stretch] = []
-    for frame, phase in enumerate(columns.phase):
-        number = int(np.searchsorted(starts, frame, side="right")) - 1
-        attempt, missing = tries[max(0, number)], bool(columns.is_deliberate_miss[frame])
-        last = stretches[-1] if stretches else None
-        if last is not None and last.phase == phase and last.attempt is attempt:
-            stretches[-1] = replace(last, end=frame + 1, is_deliberate_miss=last.is_deliberate_miss or missing)
-        else:
-            stretches.append(
-                Stretch(first=frame, end=frame + 1, phase=phase, attempt=attempt, is_deliberate_miss=missing)
-            )
+    phases = columns.phase
+    first = sorted({0, *starts, *(t for t in range(1, len(phases)) if phases[t] != phases[t - 1])})
+    stretches = [
+        Stretch(
+            first=start,
+            end=end,
+            phase=phases[start],
+            attempt=tries[max(0, bisect_right(starts, start) - 1)],
+            is_deliberate_miss=bool(columns.is_deliberate_miss[start:end].any()),
+        )
+        for start, end in pairwise([*first, len(phases)])
+    ]
     return Story(tries=tuple(tries), stretches=tuple(stretches))
 
 

@@ -10,7 +10,8 @@ from demorec.safety.replacing import Kind, files_below, json_object
 
 _NUMBERED = r"(file-\d+|episode_\d+)"
 _PARTS = re.compile(
-    r"meta/(info|stats)\.json"
+    r"meta/(info|stats|temporal_proportions_(sparse|dense))\.json"
+    r"|sarm_progress\.parquet"
     r"|meta/tasks\.parquet"
     r"|meta/(tasks|episodes|episodes_stats)\.jsonl"
     rf"|meta/episodes/chunk-\d+/{_NUMBERED}\.parquet"

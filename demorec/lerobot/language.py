@@ -128,8 +128,16 @@ def _structs(rows: Sequence[LanguageRow], kind: pa.StructType) -> pa.StructArray
 def language_digests(language: EpisodeLanguage, frames: int) -> dict[str, NDArray[np.str_]]:
     """Column -> (T, 1) SHA-256 (hex) of what stands in each row; equal to `column_digests` of the column read back."""
     state = _digest([row.to_json() for row in language.persistent])
-    events = [_digest([row.to_json() for row in language.events.get(row, ())]) for row in range(frames)]
-    return {PERSISTENT: np.full((frames, 1), state), EVENTS: np.array(events, dtype="<U64").reshape(-1, 1)}
+    events = np.full((frames, 1), _digest([]))
+    for row, told in language.events.items():
+        events[row] = _digest([entry.to_json() for entry in told])
+    return {PERSISTENT: np.full((frames, 1), state), EVENTS: events}
+
+
+def is_language(kind: pa.DataType) -> bool:
+    """Whether a column of this type can hold statements; where none has any, LeRobot's tools write lists of nulls."""
+    listed = pa.types.is_list(kind) or pa.types.is_large_list(kind)
+    return bool(listed) and bool(pa.types.is_struct(kind.value_type) or pa.types.is_null(kind.value_type))
 
 
 def column_digests(column: pa.Array) -> NDArray[np.str_]:
@@ -138,7 +146,7 @@ def column_digests(column: pa.Array) -> NDArray[np.str_]:
     Raises:
         ValueError: It is no list of structures.
     """
-    if not pa.types.is_list(column.type) or not pa.types.is_struct(column.type.value_type):
+    if not is_language(column.type):
         raise ValueError(f"a language column of type {column.type}")
     found: list[str] = []
     before: pa.Array | None = None

@@ -19,6 +19,9 @@ class ExportOptions(CommonOptions):
     language: tuple[str, ...] | None = None
     """Add LeRobot's language columns: say in words what the robot does, from what was recorded. Named kinds alone
     (subtask plan memory motion task_aug), or all of them."""
+    progress: bool = False
+    """Add how far each frame has come (0 to 1) and the stages of the task, where LeRobot's sample weighting and SARM
+    look for them."""
     repo_id: str = "local/demorec"
     """Name of the dataset on the Hub, OWNER/NAME; also written into its card."""
     append: bool = False

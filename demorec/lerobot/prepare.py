@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 from demorec.export.columns import (
     DONE,
@@ -14,10 +15,14 @@ from demorec.export.columns import (
     frame_stride,
 )
 from demorec.language.narration import narrate
+from demorec.language.progress import dense_runs
+from demorec.language.tries import story_of
 from demorec.lerobot.depth import depth_info, depth_video
+from demorec.lerobot.facts import episode_facts
 from demorec.lerobot.language import COLUMNS, EpisodeLanguage, episode_language
 from demorec.lerobot.layout import AUTOMATIC_FEATURES, Feature
 from demorec.lerobot.options import ExportOptions
+from demorec.lerobot.progress import EpisodeProgress
 from demorec.lerobot.sidecar import EpisodeRecord
 from demorec.lerobot.stats import PixelHistogram, colour_levels
 from demorec.lerobot.transcode import coded_videos, dataset_settings, video_info
@@ -109,6 +114,7 @@ def prepare_episode(recording: Recording, options: ExportOptions, *, code_depth:
         video_info={key: wanted[key].info or {} for key in videos},
         pixels=pixels,
         language=_language(recording, columns, options, fps=recording.info.fps // stride),
+        facts=_facts(recording, columns, options),
     )
     return PreparedEpisode(data=data, record=EpisodeRecord.of(recording, columns.recorded, columns.rows))
 
@@ -118,3 +124,12 @@ def _language(recording: Recording, columns: FeatureColumns, options: ExportOpti
     if options.language is None:
         return EpisodeLanguage()
     return episode_language(narrate(recording, columns.recorded, columns.rows, options.spoken), fps=fps)
+
+
+def _facts(recording: Recording, columns: FeatureColumns, options: ExportOptions) -> dict[str, Any]:
+    """What is known of the episode, its stages among it if they were asked for."""
+    facts = episode_facts(recording, columns.recorded)
+    if options.progress:
+        runs = dense_runs(story_of(recording, columns.recorded), columns.rows)
+        facts |= EpisodeProgress(num_goals=len(recording.info.scene.goals), dense=tuple(runs)).row()
+    return facts

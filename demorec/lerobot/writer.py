@@ -21,6 +21,7 @@ from demorec.errors import ExportError
 from demorec.export.staging import sync_file
 from demorec.lerobot.data_stats import data_statistics
 from demorec.lerobot.digest import episode_digest
+from demorec.lerobot.facts import fact_type
 from demorec.lerobot.language import REPEATING, EpisodeLanguage, language_arrays, language_digests
 from demorec.lerobot.layout import (
     AUTOMATIC_FEATURES,
@@ -57,6 +58,7 @@ class EpisodeData:
         video_info: Camera feature -> how they were coded, the `info` of the feature.
         pixels: Camera feature -> histogram, for the statistics.
         language: What is said about it; written where the dataset has the columns for it.
+        facts: Column of the table of episodes -> value; written where the dataset has the column.
     """
 
     task: str
@@ -65,6 +67,7 @@ class EpisodeData:
     video_info: Mapping[str, dict[str, Any]] = field(default_factory=dict)
     pixels: Mapping[str, PixelHistogram] = field(default_factory=dict)
     language: EpisodeLanguage = field(default_factory=EpisodeLanguage)
+    facts: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def num_frames(self) -> int:
@@ -108,11 +111,15 @@ class DatasetWriter:
         root: Folder of the dataset; for an appending writer it holds the old files already.
         info: Features and limits; its counters are taken from `start`.
         start: Where to go on.
+        facts: Which of the episodes' facts the table of episodes has (`demorec.lerobot.facts`).
     """
 
-    def __init__(self, root: Path, info: DatasetInfo, start: WriterStart | None = None) -> None:
+    def __init__(
+        self, root: Path, info: DatasetInfo, start: WriterStart | None = None, facts: Sequence[str] = ()
+    ) -> None:
         self._root = root
         self._info = info
+        self._facts = tuple(facts)
         self._start = start or WriterStart()
         self._schema = data_schema(info.features)
         self._numeric = [name for name in self._schema.names if info.features[name].is_numeric]
@@ -180,6 +187,7 @@ class DatasetWriter:
             "data/file_index": position.file,
             "dataset_from_index": self.num_frames,
             "dataset_to_index": self.num_frames + frames,
+            **{name: episode.facts.get(name) for name in self._facts},
         }
         statistics = vector_statistics({name: columns[name] for name in self._numeric})
         digests = {}
@@ -269,6 +277,7 @@ class DatasetWriter:
             if key in self._info.video_keys:
                 number = pa.list_(pa.list_(number))
             fields += [(f"stats/{key}/{name}", pa.list_(pa.int64()) if name == "count" else number) for name in NAMES]
+        fields += [(name, fact_type(name)) for name in self._facts]
         fields += [("meta/episodes/chunk_index", pa.int64()), ("meta/episodes/file_index", pa.int64())]
         return pa.schema(fields)
 

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import itertools
+import json
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from support.check import simulate_run
-from support.export import data_table, export
+from support.export import data_table, episode_rows, export, files_of
 from support.language import active, language_of, meant, phrases
 
 from demorec.errors import ConfigError, ExportError
@@ -17,6 +20,8 @@ from demorec.geometry import Pose
 from demorec.language.kinds import KINDS
 from demorec.language.situation import nouns_of, place_of
 from demorec.lerobot import dataset_digest
+from demorec.lerobot.inspect import episode_digests
+from demorec.lerobot.layout import DatasetInfo
 from demorec.recording import Recording
 from demorec.scene.scene import Body, Shape
 from demorec.scene.variation import Ranges
@@ -27,6 +32,8 @@ RECIPE = Path(__file__).parents[2] / "examples" / "language_recipe.yaml"
 MISSING = ("pick_place", "stack", "sort_by_color")
 """Tasks whose episode begins with a deliberate miss."""
 PLAIN = Ranges(miss_probability=0.0)
+
+pytestmark = pytest.mark.usefixtures("hf_datasets_cache")
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +53,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 def dataset(runs: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """All of them in one dataset, with everything that can be said."""
     out = tmp_path_factory.mktemp("dataset") / "all"
-    report = export(runs, out, language=())
+    report = export(runs, out, language=(), progress=True)
     assert report.digest == dataset_digest(out)
     return out
 
@@ -209,8 +216,8 @@ def test_fewer_frames_begin_a_subtask_at_the_first_frame_that_is_left(runs: list
 def test_the_same_seed_says_the_same_and_nothing_else_of_the_dataset_changes(
     runs: list[Path], dataset: Path, tmp_path: Path
 ) -> None:
-    export(runs, tmp_path / "again", language=())
-    assert dataset_digest(tmp_path / "again") == dataset_digest(dataset)
+    export(runs, tmp_path / "again", language=(), progress=True)
+    assert files_of(tmp_path / "again") == files_of(dataset)
     export(runs, tmp_path / "without")
     without, spoken = data_table(tmp_path / "without"), data_table(dataset)
     assert spoken.select(without.column_names).equals(without)
@@ -241,3 +248,121 @@ def test_things_are_called_as_the_instructions_call_them(kind: str) -> None:
     for name in (kind, f"red_{kind}", f"other_red_{kind}", f"red_{kind}_2"):
         body = Body(name=name, role="object", shape=shape, world_from_body=Pose(), mass=0.1)
         assert nouns_of(body)[0] == THINGS[kind].noun
+
+
+def test_progress_is_lerobots_own_over_the_true_stages(runs: list[Path], dataset: Path) -> None:
+    from lerobot.rewards.sarm.sarm_utils import find_stage_and_tau, normalize_stage_tau
+
+    table = pq.read_table(dataset / "sarm_progress.parquet").to_pydict()
+    rows = episode_rows(dataset)
+    assert table["index"] == list(range(sum(row["length"] for row in rows)))
+    assert table["episode_index"] == data_table(dataset).column("episode_index").to_pylist()
+    for head in ("sparse", "dense"):
+        share = json.loads((dataset / "meta" / f"temporal_proportions_{head}.json").read_text())
+        found = np.array(table[f"progress_{head}"])
+        assert 0 <= found.min() <= found.max() <= 1
+        for row, run in zip(rows, runs, strict=True):
+            names, starts, ends = (row[f"{head}_subtask_{part}"] for part in ("names", "start_frames", "end_frames"))
+            assert starts == [0, *(end + 1 for end in ends[:-1])]
+            assert ends[-1] == row["length"] - 1
+            own = found[row["dataset_from_index"] : row["dataset_to_index"]]
+            assert own[0] == 0
+            assert own[-1] == 1  # all of them succeed
+            stages = [stage for stage in share if stage in names]
+            assert all(f"goal {goal + 1}: " in " ".join(stages) for goal in range(row["num_goals"]))
+            for frame in range(row["length"]):
+                value = find_stage_and_tau(
+                    frame, row["length"], names, starts, ends, stages, share, return_combined=True
+                )
+                assert isinstance(value, float)
+                shares = {stage: share[stage] for stage in stages}
+                expected = normalize_stage_tau(value, temporal_proportions=shares, subtask_names=stages)
+                assert abs(float(expected) - own[frame]) < 2e-3, (run, frame)
+            with _recording(run) as recording:
+                misses, phase = recording.columns().is_deliberate_miss, recording.columns().phase
+            if head == "dense":
+                changes = {frame for frame in range(1, len(phase)) if phase[frame] != phase[frame - 1]}
+                assert set(starts[1:]) <= changes
+            # It rises but where a try came to nothing.
+            falls = np.flatnonzero(np.diff(own) < 0)
+            assert falls.tolist() == (np.flatnonzero(misses)[-1:].tolist() if misses.any() else [])
+
+
+def test_sample_weighting_gives_no_weight_to_a_miss(dataset: Path) -> None:
+    import torch
+    from lerobot.rewards.sarm.rabc import RABCWeights
+    from lerobot.utils.sample_weighting import SampleWeightingConfig, make_sample_weighter
+
+    policy = SimpleNamespace(config=SimpleNamespace(chunk_size=10))
+    for head in ("sparse", "dense"):
+        config = SampleWeightingConfig(head_mode=head)
+        weighter = make_sample_weighter(config, policy, torch.device("cpu"), dataset_root=str(dataset))
+        assert isinstance(weighter, RABCWeights)
+        row = next(row for row in episode_rows(dataset) if row["has_deliberate_miss"])
+        ends = row[f"{head}_subtask_end_frames"]
+        missed = ends[0] if head == "sparse" else ends[2]  # the last frame of the missed pick, or of its close
+        frames = torch.arange(row["dataset_from_index"], row["dataset_from_index"] + missed + 20)
+        weights, _ = weighter.compute_batch_weights({"index": frames})
+        assert (weights[missed - 8 : missed + 1] == 0).all()
+        assert (weights[: missed - 10] > 0).all()
+        assert (weights[missed + 1 :] > 0).all()
+
+
+def test_episodes_are_filtered_by_what_is_known_of_them(runs: list[Path], dataset: Path) -> None:
+    from lerobot.datasets import LeRobotDataset
+
+    meta = LeRobotDataset("local/all", root=dataset).meta
+    several = meta.filter_episodes(lambda e: e["num_goals"] > 1 and e["success"])
+    assert [TASKS.names()[index] for index in several] == ["stack_three", "sort_by_color", "line_up"]
+    missed = meta.filter_episodes(lambda e: e["has_deliberate_miss"] and e["num_retries"] == 1)
+    assert {TASKS.names()[index] for index in missed} == set(MISSING)
+    for run, row in zip(runs, episode_rows(dataset), strict=True):
+        with _recording(run) as recording:
+            info, outcome = recording.info, recording.outcome
+            assert row["duration_s"] == recording.num_frames / info.fps
+        assert outcome is not None
+        body = info.scene.body(info.scene.goals[0].object)
+        assert (row["task_name"], row["seed"], row["split"], row["variation"]) == (info.task, 3, "all", "mild")
+        assert (row["object_x"], row["object_y"]) == tuple(body.world_from_body.position[:2])
+        assert row["drawn/speed"] == info.behaviour["speed"]
+        assert row["drawn/object_mass"] == body.mass
+        found = [check.value for check in outcome.checks if check.name.split(":")[0] == "tilt"]
+        assert row["success_checks/tilt"] == max(found)
+        assert (row["success_checks/distance_to_goal"] is None) == (info.task == "tutorial")
+
+
+def test_lerobots_tools_keep_the_words(runs: list[Path], tmp_path: Path) -> None:
+    from lerobot.datasets import LeRobotDataset
+    from lerobot.datasets.aggregate import aggregate_datasets
+    from lerobot.datasets.dataset_tools import delete_episodes, split_dataset
+
+    parts = [tmp_path / "first", tmp_path / "second"]
+    chosen = [[runs[0], runs[2]], [runs[3]]]
+    for run, part in zip(chosen, parts, strict=True):
+        export(run, part, language=(), progress=True)
+    known = [digest for part in parts for digest in episode_digests(part, DatasetInfo.load(part))]
+    aggregate_datasets(["local/1", "local/2"], "local/all", roots=parts, aggr_root=tmp_path / "merged")
+    assert episode_digests(tmp_path / "merged", DatasetInfo.load(tmp_path / "merged")) == known
+    facts = [row["task_name"] for row in episode_rows(tmp_path / "merged")]
+    assert facts == [run.name for part in chosen for run in part]
+
+    first = LeRobotDataset("local/1", root=parts[0])
+    delete_episodes(first, [0], output_dir=tmp_path / "left", repo_id="local/left")
+    split_dataset(first, {"one": [0], "other": [1]}, output_dir=tmp_path / "split")
+    for out, digest in (("left", known[1]), ("split/one", known[0]), ("split/other", known[1])):
+        assert episode_digests(tmp_path / out, DatasetInfo.load(tmp_path / out)) == [digest]
+        assert "task_name" not in episode_rows(tmp_path / out)[0]  # LeRobot leaves out what it does not know
+        assert not (tmp_path / out / "sarm_progress.parquet").exists()
+
+
+def test_progress_goes_on_where_a_dataset_ends(runs: list[Path], tmp_path: Path) -> None:
+    out = tmp_path / "grown"
+    export(runs[0], out, progress=True)
+    with pytest.raises(ExportError, match="has the stages of --progress: export with it"):
+        export(runs[1], out, append=True)
+    export(runs[1], out, append=True, progress=True)
+    export(runs[:2], tmp_path / "at_once", progress=True)
+    assert (out / "sarm_progress.parquet").read_bytes() == (tmp_path / "at_once" / "sarm_progress.parquet").read_bytes()
+    export(runs[0], tmp_path / "plain")
+    with pytest.raises(ExportError, match="lacks the stages of --progress: export without it"):
+        export(runs[1], tmp_path / "plain", append=True, progress=True)
