@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from demorec.geometry import Array
 from demorec.language.kinds import KINDS, Kind
+from demorec.language.questions import questions, traces
 from demorec.language.situation import Situation, situation
 from demorec.language.subtasks import GoalWords, goal_words, memories, plan, subtask, tcp_motion
 from demorec.language.tries import Story, story_of
@@ -23,23 +24,29 @@ from demorec.seeding import generator
 
 @dataclass(frozen=True, kw_only=True)
 class Statement:
-    """One sentence, true from a row of the dataset on until the next one of its kind.
+    """One sentence, true from a row of the dataset on until the next one of its kind, or about this row alone.
 
     Attributes:
         row: Of the episode, from 0.
         kind: What it tells; `task_aug` is another wording of the task.
         role: Who says it: the user asks, the assistant does.
         text: The sentence.
+        camera: Of the picture that it is about, None for all that is about no picture.
     """
 
     row: int
     kind: Kind
     role: Literal["user", "assistant"]
     text: str
+    camera: str | None = None
 
 
 def narrate(
-    recording: Recording, columns: EpisodeColumns, rows: NDArray[np.intp], kinds: Collection[Kind]
+    recording: Recording,
+    columns: EpisodeColumns,
+    rows: NDArray[np.intp],
+    kinds: Collection[Kind],
+    cameras: Sequence[str] = (),
 ) -> list[Statement]:
     """Everything of the wanted kinds, in the order of the rows; kinds of one row in the order of `KINDS`.
 
@@ -47,19 +54,22 @@ def narrate(
         recording: With its events.
         columns: All of its numbers.
         rows: (T,) which of its frames the dataset has.
-        kinds: What shall be said.
+        kinds: What shall be said, as far as the recording has it.
+        cameras: Those whose pictures may be spoken of.
 
     Raises:
         RecordingError: The recording is damaged.
     """
     story = story_of(recording, columns)
     told = _Told(recording, columns, rows, story)
-    found = {
+    found: dict[Kind, Callable[[], Iterator[Statement]]] = {
         "subtask": told.subtasks,
         "plan": told.plans,
         "memory": told.memories,
         "motion": told.motions,
         "task_aug": told.wordings,
+        "vqa": lambda: told.questions(cameras),
+        "trace": lambda: told.traces(cameras),
     }
     statements = [statement for kind in KINDS if kind in kinds for statement in found[kind]()]
     return sorted(statements, key=lambda statement: statement.row)
@@ -69,6 +79,7 @@ class _Told:
     """The sentences of one episode, kind by kind."""
 
     def __init__(self, recording: Recording, columns: EpisodeColumns, rows: NDArray[np.intp], story: Story) -> None:
+        self._recording = recording
         self._info, self._columns, self._rows, self._story = recording.info, columns, rows, story
         self._scene: Scene = recording.info.scene
         self._words = {
@@ -139,3 +150,17 @@ class _Told:
         )
         for text in task_wordings(self._scene, info.instruction, rng, is_dropped=self._story.is_dropped):
             yield Statement(row=0, kind="task_aug", role="user", text=text)
+
+    def _fps(self) -> int:
+        """Of the dataset."""
+        stride = int(self._rows[1] - self._rows[0]) if len(self._rows) > 1 else 1
+        return self._info.fps // stride
+
+    def questions(self, cameras: Sequence[str]) -> Iterator[Statement]:
+        for item in questions(self._recording, self._columns, self._rows, cameras, fps=self._fps()):
+            yield Statement(row=item.row, kind="vqa", role="user", text=item.text, camera=item.camera)
+            yield Statement(row=item.row, kind="vqa", role="assistant", text=item.answer, camera=item.camera)
+
+    def traces(self, cameras: Sequence[str]) -> Iterator[Statement]:
+        for item in traces(self._recording, self._columns, self._rows, cameras, fps=self._fps()):
+            yield Statement(row=item.row, kind="trace", role="assistant", text=item.answer, camera=item.camera)

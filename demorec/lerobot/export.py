@@ -16,6 +16,7 @@ from demorec.errors import ConfigError, ExportError
 from demorec.export.options import ExportReport, ProgressCallback
 from demorec.export.sources import ExportSource, Intake, find_recordings, places_of
 from demorec.export.staging import CODED, staged_folder
+from demorec.lerobot.boxes import BoxWriter
 from demorec.lerobot.card import CardFacts, write_card
 from demorec.lerobot.digest import combined_digest
 from demorec.lerobot.existing import Existing, features_to_append, link_files, open_existing
@@ -107,11 +108,16 @@ class _Export:
         with (
             DatasetWriter(self._folder, info, start, self._facts(begun[-1])) as writer,
             SidecarWriter(self._folder, sidecar_start, **limits) as sidecar,
+            BoxWriter(self._folder, fps=info.fps) as boxes,
         ):
             for reading in chain(begun, found):
                 self._add(writer, sidecar, reading)
+                if reading.prepared is not None and self._options.boxes:
+                    data = reading.prepared.data
+                    boxes.add(writer.num_episodes - 1, reading.prepared.boxes, data.num_frames)
             self._refuse_duplicates()
             finished = writer.finish()
+            boxes.finish()
             configs = sidecar.finish(self._about_this_export())
         if self._options.progress:
             write_progress(self._folder, [*self._progress_before(), *self._progress])
@@ -208,6 +214,7 @@ class _Export:
             "episodes": options.episodes,
             "fps": options.fps,
             "depth": options.depth,
+            **({"boxes": True} if options.boxes else {}),
             **({"progress": True} if options.progress else {}),
             **({} if options.language is None else {"language": options.spoken}),
         }

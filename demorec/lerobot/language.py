@@ -10,12 +10,15 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
+
+from demorec.language.kinds import STATES
+from demorec.scene.features import IMAGE_PREFIX
 
 if TYPE_CHECKING:
     from demorec.language.narration import Statement
@@ -79,16 +82,16 @@ class EpisodeLanguage:
 
 def episode_language(statements: Sequence[Statement], *, fps: int) -> EpisodeLanguage:
     """The statements in LeRobot's form; times are those of the `timestamp` column to the bit."""
-    rows = [
-        LanguageRow(
-            role=statement.role,
-            content=statement.text,
-            style=statement.kind,
-            timestamp=float(np.float32(statement.row / fps)),
-        )
-        for statement in statements
-    ]
-    return EpisodeLanguage(persistent=tuple(rows))
+    persistent: list[LanguageRow] = []
+    events: dict[int, list[LanguageRow]] = {}
+    for statement in statements:
+        said = LanguageRow(role=statement.role, content=statement.text, style=statement.kind)
+        if statement.kind in STATES:
+            persistent.append(replace(said, timestamp=float(np.float32(statement.row / fps))))
+        else:
+            camera = None if statement.camera is None else IMAGE_PREFIX + statement.camera
+            events.setdefault(statement.row, []).append(replace(said, camera=camera))
+    return EpisodeLanguage(persistent=tuple(persistent), events={row: tuple(told) for row, told in events.items()})
 
 
 def language_feature(name: str) -> dict[str, Any]:

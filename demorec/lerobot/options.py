@@ -18,10 +18,13 @@ class ExportOptions(CommonOptions):
 
     language: tuple[str, ...] | None = None
     """Add LeRobot's language columns: say in words what the robot does, from what was recorded. Named kinds alone
-    (subtask plan memory motion task_aug), or all of them."""
+    (subtask plan memory motion task_aug vqa trace), or all that the recordings support."""
     progress: bool = False
     """Add how far each frame has come (0 to 1) and the stages of the task, where LeRobot's sample weighting and SARM
     look for them."""
+    boxes: bool = False
+    """Write boxes and masks of what the cameras see beside the dataset, in COCO's format (of recordings with
+    segmentation)."""
     repo_id: str = "local/demorec"
     """Name of the dataset on the Hub, OWNER/NAME; also written into its card."""
     append: bool = False
@@ -67,6 +70,8 @@ class ExportOptions(CommonOptions):
             raise ConfigError("--append and --overwrite exclude each other: choose one.")
         if self.allow_duplicates and not self.append:
             raise ConfigError("--allow-duplicates belongs to --append.")
+        if self.append and self.boxes:
+            raise ConfigError("--boxes are written for a whole dataset: leave --append out and export all of it anew.")
         if self.workers < 0:
             raise OptionError("workers", f"is {self.workers}, it must be 0 (as many as pay) or more.")
         if unknown := [kind for kind in self.language or () if kind not in KINDS]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
 from types import TracebackType
@@ -229,6 +229,17 @@ class RecordingReader:
         topic, size = channels.camera_topic(camera, "segmentation"), self._size(camera)
         for _, labels in self._pictures(topic, lambda data: decode_labels(messages.read_compressed_image(data), size)):
             yield labels
+
+    def segmentation_at(self, camera: str, frames: Collection[int]) -> Iterator[tuple[int, NDArray[np.int32]]]:
+        """(frame, segmentation picture) of some frames, in order; the other pictures are not unpacked."""
+        if not self.has_segmentation(camera):
+            raise RecordingError(f"The recording has no segmentation pictures of the camera {camera!r}: {self.path}")
+        topic, size = channels.camera_topic(camera, "segmentation"), self._size(camera)
+        for frame, (_, data) in enumerate(self._pictures(topic, messages.read_compressed_image)):
+            if frame in frames:
+                with damage_as_recording_error(self.path):
+                    labels = decode_labels(data, size)
+                yield frame, labels
 
     def _size(self, camera: str) -> tuple[int, int]:
         """(height, width) of all pictures of a camera."""

@@ -17,7 +17,7 @@ from support.language import active, language_of, meant, phrases
 
 from demorec.errors import ConfigError, ExportError
 from demorec.geometry import Pose
-from demorec.language.kinds import KINDS
+from demorec.language.kinds import STATES
 from demorec.language.situation import nouns_of, place_of
 from demorec.lerobot import dataset_digest
 from demorec.lerobot.inspect import episode_digests
@@ -75,7 +75,7 @@ def test_lerobots_own_validator_finds_nothing(dataset: Path, tmp_path: Path) -> 
     for record, frames in zip(records, spoken, strict=True):
         persistent = frames[0][0]
         assert all(rows == persistent and events == [] for rows, events in frames)
-        assert {row["style"] for row in persistent} == set(KINDS)
+        assert {row["style"] for row in persistent} == set(STATES)
         for row in persistent:
             assert column_for_style(row["style"]) == "language_persistent"
             validate_camera_field(row["style"], row["camera"])
