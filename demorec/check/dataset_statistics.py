@@ -117,7 +117,7 @@ def statistics_of(values: Array) -> dict[str, Array]:
 
 def _numeric(dataset: Dataset) -> list[str]:
     features = dataset.info.features
-    return [name for name, feature in features.items() if not feature.is_video and feature.dtype != "string"]
+    return [name for name, feature in features.items() if feature.is_numeric]
 
 
 def _flat(rows: Any) -> Array:

@@ -211,6 +211,20 @@ def _optional_pair(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | N
     )
 
 
+@FLAG_TYPES.primitive_rule
+def _optional_words(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+    """`--language [STR ...]` where leaving the flag away (None) is another thing than giving it without a value."""
+    if _kind_beside_none(info.type) != tuple[str, ...]:
+        return None
+    return PrimitiveConstructorSpec(
+        nargs="*",
+        metavar="[STR ...]",
+        instance_from_str=tuple,
+        is_instance=lambda value: value is None or isinstance(value, tuple),
+        str_from_instance=lambda value: [] if value is None else list(value),
+    )
+
+
 def _kind_beside_none(kind: Any) -> Any:
     """`X` of `X | None`; None for every other type."""
     kinds = [part for part in get_args(kind) if part is not NoneType]

@@ -32,13 +32,13 @@ def data_statistics(files: Iterable[Path], features: Mapping[str, Feature]) -> d
 
     Args:
         files: Parquet files with the columns of `features`.
-        features: All features; cameras and strings are left out.
+        features: All features; what is no numbers is left out.
 
     Raises:
         ExportError: A column holds integers below 0 or above 2^32 - 1, what is no number, or no rows at all.
     """
     paths = list(files)
-    names = [name for name, feature in features.items() if not feature.is_video and feature.dtype != "string"]
+    names = [name for name, feature in features.items() if feature.is_numeric]
     widths = [features[name].shape[0] for name in names]
     moments = _Moments()
     selection: _Selection | None = None

@@ -13,9 +13,11 @@ from pathlib import Path
 from typing import Any
 
 from demorec.errors import ExportError, in_words
+from demorec.lerobot.facts import facts_of
 from demorec.lerobot.files import open_table, read_json, read_table
 from demorec.lerobot.layout import AUTOMATIC_FEATURES, STATS_PATH, TASKS_PATH, DatasetInfo, Feature, FilePosition
 from demorec.lerobot.paths import INFO_PATH, SIDECAR_DIR
+from demorec.lerobot.progress import PROGRESS_PATH, PROPORTIONS_PATH
 from demorec.lerobot.reader import read_tasks
 from demorec.lerobot.sidecar import CONFIGS_PATH, SidecarStart
 from demorec.lerobot.stats import Statistics
@@ -36,12 +38,20 @@ _CODING = (
 
 @dataclass(frozen=True, kw_only=True)
 class Existing:
-    """A dataset to be continued."""
+    """A dataset to be continued.
+
+    Attributes:
+        root: Its folder.
+        info: What meta/info.json says.
+        writer, sidecar: Where to go on.
+        facts: Which columns of facts its table of episodes has.
+    """
 
     root: Path
     info: DatasetInfo
     writer: WriterStart
     sidecar: SidecarStart
+    facts: tuple[str, ...] = ()
 
 
 def open_existing(root: Path) -> Existing:
@@ -61,6 +71,7 @@ def open_existing(root: Path) -> Existing:
         rows = sum(open_table(path).metadata.num_rows for path in (root / "data").glob("*/*.parquet"))
         tasks = tuple(read_tasks(root)) if info.total_tasks else ()
         found = read_json(root / STATS_PATH) if (root / STATS_PATH).exists() else {}
+        facts = facts_of(root)
         configs = read_json(root / CONFIGS_PATH) if (root / CONFIGS_PATH).exists() else {}
         statistics = {key: part for key in info.video_keys if (part := _statistics(found, key, info)) is not None}
         if not isinstance(configs, dict) or not all(isinstance(config, dict) for config in configs.values()):
@@ -88,7 +99,7 @@ def open_existing(root: Path) -> Existing:
         camera_poses=_after(side / "camera_poses", ".parquet", info.chunks_size),
         configs=configs,
     )
-    return Existing(root=root, info=info, writer=writer, sidecar=sidecar)
+    return Existing(root=root, info=info, writer=writer, sidecar=sidecar, facts=facts)
 
 
 def _statistics(found: dict[str, Any], key: str, info: DatasetInfo) -> Statistics | None:
@@ -159,7 +170,8 @@ def link_files(source: Path, target: Path) -> None:
 
     Only files that are never changed in place are linked; what the writer will write anew is left out.
     """
-    renewed = {INFO_PATH, STATS_PATH, TASKS_PATH}
+    renewed = {INFO_PATH, STATS_PATH, TASKS_PATH, PROGRESS_PATH}
+    renewed |= {PROPORTIONS_PATH.format(head=head) for head in ("sparse", "dense")}
     for folder, _, names in os.walk(source):
         for name in names:
             path = Path(folder) / name

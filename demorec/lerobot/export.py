@@ -12,10 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from demorec.errors import ConfigError
+from demorec.errors import ConfigError, ExportError
 from demorec.export.options import ExportReport, ProgressCallback
 from demorec.export.sources import ExportSource, Intake, find_recordings, places_of
 from demorec.export.staging import CODED, staged_folder
+from demorec.lerobot.boxes import BoxWriter
 from demorec.lerobot.card import CardFacts, write_card
 from demorec.lerobot.digest import combined_digest
 from demorec.lerobot.existing import Existing, features_to_append, link_files, open_existing
@@ -24,6 +25,7 @@ from demorec.lerobot.inspect import episode_digests
 from demorec.lerobot.kind import DATASET, GROWING_DATASET
 from demorec.lerobot.layout import DatasetInfo
 from demorec.lerobot.options import ExportOptions
+from demorec.lerobot.progress import STAGE_COLUMNS, EpisodeProgress, read_progress, write_progress
 from demorec.lerobot.readings import Reading, readings
 from demorec.lerobot.sidecar import SidecarStart, SidecarWriter
 from demorec.lerobot.verify import LEROBOT, MAX_EPISODES, Sample, Verifier, lerobot_is_installed
@@ -84,6 +86,7 @@ class _Export:
         self._before = episode_digests(existing.root, existing.info) if existing is not None else []
         self._left_out: tuple[str, ...] = ()
         self._transcoded: dict[str, None] = {}
+        self._progress: list[EpisodeProgress] = []
         self._digests: list[str] = []
         self._recordings: list[Path] = []
         self._intake = Intake(found, options)
@@ -103,14 +106,21 @@ class _Export:
         sidecar_start = self._existing.sidecar if self._existing else SidecarStart()
         limits: dict[str, Any] = {"limit_mb": info.data_files_size_in_mb, "chunks_size": info.chunks_size}
         with (
-            DatasetWriter(self._folder, info, start) as writer,
+            DatasetWriter(self._folder, info, start, self._facts(begun[-1])) as writer,
             SidecarWriter(self._folder, sidecar_start, **limits) as sidecar,
+            BoxWriter(self._folder, fps=info.fps) as boxes,
         ):
             for reading in chain(begun, found):
                 self._add(writer, sidecar, reading)
+                if reading.prepared is not None and self._options.boxes:
+                    data = reading.prepared.data
+                    boxes.add(writer.num_episodes - 1, reading.prepared.boxes, data.num_frames)
             self._refuse_duplicates()
             finished = writer.finish()
+            boxes.finish()
             configs = sidecar.finish(self._about_this_export())
+        if self._options.progress:
+            write_progress(self._folder, [*self._progress_before(), *self._progress])
         facts = CardFacts(options=self._options, configs=configs, is_transcoded=bool(self._transcoded))
         write_card(self._folder, finished, facts)
         return ExportReport(
@@ -145,6 +155,21 @@ class _Export:
             video_files_size_in_mb=self._options.video_files_mb,
         )
 
+    def _facts(self, first: Reading) -> tuple[str, ...]:
+        """Which columns of facts the table of episodes has, or gets from the first episode."""
+        if self._existing is None:
+            return () if first.prepared is None else tuple(first.prepared.data.facts)
+        has_progress = set(STAGE_COLUMNS) <= set(self._existing.facts)
+        if has_progress != self._options.progress:
+            raise ExportError(
+                f"These recordings cannot be appended, since the dataset {'has' if has_progress else 'lacks'} the "
+                f"stages of --progress: export {'with' if has_progress else 'without'} it: {self._existing.root}"
+            )
+        return self._existing.facts
+
+    def _progress_before(self) -> list[EpisodeProgress]:
+        return [] if self._existing is None else read_progress(self._existing.root)
+
     def _noted(self, found: Iterable[Reading]) -> Iterator[Reading]:
         """The same, each counted and held against the others before it is written."""
         for reading in found:
@@ -160,6 +185,9 @@ class _Export:
             return
         written = writer.add(reading.prepared.data)
         sidecar.add(written, reading.prepared.record)
+        if self._options.progress:
+            facts = reading.prepared.data.facts
+            self._progress.append(EpisodeProgress.from_row(facts, facts["num_goals"]))
         self._digests.append(written.digest)
         self._recordings.append(reading.path)
         self._transcoded.update(dict.fromkeys(reading.transcoded))
@@ -186,4 +214,7 @@ class _Export:
             "episodes": options.episodes,
             "fps": options.fps,
             "depth": options.depth,
+            **({"boxes": True} if options.boxes else {}),
+            **({"progress": True} if options.progress else {}),
+            **({} if options.language is None else {"language": options.spoken}),
         }

@@ -10,7 +10,8 @@ from demorec.safety.replacing import Kind, files_below, json_object
 
 _NUMBERED = r"(file-\d+|episode_\d+)"
 _PARTS = re.compile(
-    r"meta/(info|stats)\.json"
+    r"meta/(info|stats|temporal_proportions_(sparse|dense))\.json"
+    r"|sarm_progress\.parquet"
     r"|meta/tasks\.parquet"
     r"|meta/(tasks|episodes|episodes_stats)\.jsonl"
     rf"|meta/episodes/chunk-\d+/{_NUMBERED}\.parquet"
@@ -19,6 +20,7 @@ _PARTS = re.compile(
     rf"|videos/chunk-\d+/[^/]+/{_NUMBERED}\.mp4"
     r"|images/[^/]+/episode[-_]\d+/frame[-_]\d+\.(png|jpe?g|tiff?)"
     rf"|{SIDECAR_DIR}/(episodes|attempts|camera_poses)/chunk-\d+/file-\d+\.parquet"
+    rf"|{SIDECAR_DIR}/boxes/[^/]+\.json"
     rf"|{SIDECAR_DIR}/(configs\.json|export\.json|thumbnails\.jpg|README\.md)"
     r"|README\.md|\.gitattributes|\.cache/huggingface/.*"
 )

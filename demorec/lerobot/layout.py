@@ -14,6 +14,7 @@ import pyarrow as pa
 
 from demorec.errors import ExportError, in_words
 from demorec.lerobot.files import read_json
+from demorec.lerobot.language import TYPES, language_feature
 from demorec.lerobot.paths import INFO_PATH, SIDECAR_DIR
 
 CODEBASE_VERSION = "v3.0"
@@ -61,6 +62,11 @@ class Feature:
     def is_video(self) -> bool:
         """Whether its frames are in mp4 files rather than in the data table."""
         return self.dtype == "video"
+
+    @property
+    def is_numeric(self) -> bool:
+        """Whether its frames are numbers, which have statistics of their own."""
+        return self.dtype not in ("video", "string", "language")
 
     @property
     def is_depth(self) -> bool:
@@ -265,6 +271,10 @@ def data_schema(features: dict[str, Feature]) -> pa.Schema:
     fields, described = [], {}
     for name, feature in features.items():
         if feature.is_video:
+            continue
+        if feature.dtype == "language" and name in TYPES:
+            fields.append(pa.field(name, TYPES[name]))
+            described[name] = language_feature(name)
             continue
         if feature.dtype not in _ARROW_TYPES or len(feature.shape) != 1:
             raise ExportError(

@@ -9,12 +9,22 @@ from typing import Literal
 from demorec.config import VideoConfig
 from demorec.errors import ConfigError, OptionError
 from demorec.export.options import CommonOptions
+from demorec.language.kinds import KINDS, Kind
 
 
 @dataclass(frozen=True, kw_only=True)
 class ExportOptions(CommonOptions):
     """How recordings become a LeRobot dataset."""
 
+    language: tuple[str, ...] | None = None
+    """Add LeRobot's language columns: say in words what the robot does, from what was recorded. Named kinds alone
+    (subtask plan memory motion task_aug vqa trace), or all that the recordings support."""
+    progress: bool = False
+    """Add how far each frame has come (0 to 1) and the stages of the task, where LeRobot's sample weighting and SARM
+    look for them."""
+    boxes: bool = False
+    """Write boxes and masks of what the cameras see beside the dataset, in COCO's format (of recordings with
+    segmentation)."""
     repo_id: str = "local/demorec"
     """Name of the dataset on the Hub, OWNER/NAME; also written into its card."""
     append: bool = False
@@ -47,6 +57,12 @@ class ExportOptions(CommonOptions):
         """How pictures are coded that cannot be taken as they are."""
         return VideoConfig(codec=self.transcode_codec, crf=self.transcode_crf)
 
+    @property
+    def spoken(self) -> tuple[Kind, ...]:
+        """The kinds of language to be written."""
+        named = self.language
+        return () if named is None else tuple(kind for kind in KINDS if not named or kind in named)
+
     def validate(self) -> None:
         """Raise ConfigError for impossible values and combinations."""
         super().validate()
@@ -54,8 +70,12 @@ class ExportOptions(CommonOptions):
             raise ConfigError("--append and --overwrite exclude each other: choose one.")
         if self.allow_duplicates and not self.append:
             raise ConfigError("--allow-duplicates belongs to --append.")
+        if self.append and self.boxes:
+            raise ConfigError("--boxes are written for a whole dataset: leave --append out and export all of it anew.")
         if self.workers < 0:
             raise OptionError("workers", f"is {self.workers}, it must be 0 (as many as pay) or more.")
+        if unknown := [kind for kind in self.language or () if kind not in KINDS]:
+            raise OptionError("language", f"names {unknown[0]!r}, its kinds are {', '.join(KINDS)}.")
         check_repo_id(self.repo_id)
         if self.data_files_mb <= 0 or self.video_files_mb <= 0 or self.files_per_chunk < 1:
             raise ConfigError("--data-files-mb, --video-files-mb and --files-per-chunk must be above 0.")

@@ -2,12 +2,31 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
 
-from demorec.export.columns import DONE, REWARD, SUCCESS, check_feature_names, feature_columns, frame_stride
+from demorec.errors import ExportError
+from demorec.export.columns import (
+    DONE,
+    REWARD,
+    SUCCESS,
+    FeatureColumns,
+    check_feature_names,
+    feature_columns,
+    frame_stride,
+)
+from demorec.language.masks import seen_objects
+from demorec.language.narration import narrate
+from demorec.language.progress import dense_runs
+from demorec.language.tries import story_of
+from demorec.lerobot.boxes import EpisodeBoxes
 from demorec.lerobot.depth import depth_info, depth_video
+from demorec.lerobot.facts import episode_facts
+from demorec.lerobot.language import COLUMNS, EpisodeLanguage, episode_language
 from demorec.lerobot.layout import AUTOMATIC_FEATURES, Feature
 from demorec.lerobot.options import ExportOptions
+from demorec.lerobot.progress import EpisodeProgress
 from demorec.lerobot.sidecar import EpisodeRecord
 from demorec.lerobot.stats import PixelHistogram, colour_levels
 from demorec.lerobot.transcode import coded_videos, dataset_settings, video_info
@@ -21,13 +40,22 @@ _SCALARS = {
     SUCCESS: Feature(dtype="bool", shape=(1,)),
 }
 
+_LANGUAGE = Feature(dtype="language", shape=(1,))
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PreparedEpisode:
-    """What came of one recording: for the dataset, and for what stands beside it."""
+    """What came of one recording: for the dataset, and for what stands beside it.
+
+    Attributes:
+        data: For the dataset.
+        record: For the sidecar.
+        boxes: Camera feature -> what it sees, if that was asked for.
+    """
 
     data: EpisodeData
     record: EpisodeRecord
+    boxes: Mapping[str, EpisodeBoxes] = field(default_factory=dict)
 
 
 def dataset_features(recording: Recording, options: ExportOptions) -> dict[str, Feature]:
@@ -52,7 +80,8 @@ def dataset_features(recording: Recording, options: ExportOptions) -> dict[str, 
             features[IMAGE_PREFIX + camera + DEPTH_SUFFIX] = _camera_feature((height, width, 1), described)
     names = action_names(info.robot, options.action)
     features[ACTION] = Feature(dtype="float32", shape=(len(names),), names=names)
-    return _chosen({**features, **_SCALARS, **AUTOMATIC_FEATURES}, options)
+    told = {} if options.language is None else dict.fromkeys(COLUMNS, _LANGUAGE)
+    return {**_chosen({**features, **_SCALARS, **AUTOMATIC_FEATURES}, options), **told}
 
 
 def _chosen(offered: dict[str, Feature], options: ExportOptions) -> dict[str, Feature]:
@@ -95,5 +124,56 @@ def prepare_episode(recording: Recording, options: ExportOptions, *, code_depth:
         videos=videos,
         video_info={key: wanted[key].info or {} for key in videos},
         pixels=pixels,
+        language=_language(recording, columns, options, fps=recording.info.fps // stride),
+        facts=_facts(recording, columns, options),
     )
-    return PreparedEpisode(data=data, record=EpisodeRecord.of(recording, columns.recorded, columns.rows))
+    return PreparedEpisode(
+        data=data,
+        record=EpisodeRecord.of(recording, columns.recorded, columns.rows),
+        boxes=_boxes(recording, columns, cameras) if options.boxes else {},
+    )
+
+
+def _language(recording: Recording, columns: FeatureColumns, options: ExportOptions, *, fps: int) -> EpisodeLanguage:
+    """What the dataset shall say about the recording; nothing unless it was asked for."""
+    if options.language is None:
+        return EpisodeLanguage()
+    cameras = [camera for camera in recording.cameras if options.takes(IMAGE_PREFIX + camera)]
+    if "vqa" in (options.language or ()) and not any(map(recording.has_segmentation, cameras)):
+        raise ExportError(
+            "Questions about pictures (vqa) need recordings with segmentation (generate --segmentation), leave them "
+            f"out: {recording.path}"
+        )
+    return episode_language(narrate(recording, columns.recorded, columns.rows, options.spoken, cameras), fps=fps)
+
+
+def _facts(recording: Recording, columns: FeatureColumns, options: ExportOptions) -> dict[str, Any]:
+    """What is known of the episode, its stages among it if they were asked for."""
+    facts = episode_facts(recording, columns.recorded)
+    if options.progress:
+        runs = dense_runs(story_of(recording, columns.recorded), columns.rows)
+        facts |= EpisodeProgress(num_goals=len(recording.info.scene.goals), dense=tuple(runs)).row()
+    return facts
+
+
+def _boxes(recording: Recording, columns: FeatureColumns, cameras: Sequence[str]) -> dict[str, EpisodeBoxes]:
+    """Camera feature -> what it sees, of the cameras that have segmentation.
+
+    Raises:
+        ExportError: None has.
+    """
+    scene = recording.info.scene
+    found = [camera for camera in scene.cameras if camera.name in cameras and recording.has_segmentation(camera.name)]
+    if not found:
+        raise ExportError(
+            f"Boxes need recordings with segmentation (generate --segmentation), leave them out: {recording.path}"
+        )
+    return {
+        IMAGE_PREFIX + camera.name: EpisodeBoxes(
+            width=camera.width,
+            height=camera.height,
+            num_frames=len(columns.rows),
+            objects=tuple(seen_objects(recording, columns.recorded, columns.rows, camera)),
+        )
+        for camera in found
+    }

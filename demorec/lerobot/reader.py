@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from demorec.errors import ExportError, in_words
 from demorec.lerobot.data_stats import column_numbers
 from demorec.lerobot.files import check_video, open_table, read_table
+from demorec.lerobot.language import column_digests
 from demorec.lerobot.layout import TASKS_PATH, VIDEO_PATH, DatasetInfo, FilePosition
 
 _MOST = 1 << 40
@@ -111,12 +112,12 @@ class RowReader:
         self._held: dict[str, NDArray[Any]] = {}
 
     def read(self, place: EpisodePlace) -> dict[str, NDArray[Any]]:
-        """Feature -> (T, D) of an episode; episodes must be asked for in order."""
+        """Feature -> (T, D) of an episode, of language columns digests; episodes must be asked for in order."""
         if place.data != self._position:
             self._position = place.data
             path = self._root / place.data.path(self._info.data_path)
             table = open_table(path, self.names)
-            has_strings = any(feature.dtype == "string" for feature in self._info.features.values())
+            has_strings = any(feature.dtype in ("string", "language") for feature in self._info.features.values())
             self._batches = table.iter_batches(batch_size=64 if has_strings else 4096, columns=self.names)
             self._held = {}
         while self._num_held() < place.length:
@@ -138,10 +139,10 @@ class RowReader:
         return rows
 
     def _column(self, name: str, column: Any) -> NDArray[Any]:
-        """(N, D) of a feature; ExportError unless it is as info.json says."""
+        """(N, D) of a feature, (N, 1) digests of language; ExportError unless it is as info.json says."""
         feature = self._info.features[name]
         try:
-            values = _column(column)
+            values = column_digests(column) if feature.dtype == "language" else _column(column)
         except (ValueError, TypeError, pa.ArrowException) as error:
             raise ExportError(f"The column {name} holds something else than numbers: {self._root}") from error
         if feature.dtype in _NUMBERS and values.shape[1:] != (math.prod(feature.shape),):

@@ -25,6 +25,7 @@ import numpy as np
 from demorec.errors import DemorecError, ExportError, in_words, resource_error
 from demorec.export.columns import frame_stride
 from demorec.lerobot.depth import code_values, quantised
+from demorec.lerobot.language import EVENTS, PERSISTENT, EpisodeLanguage
 from demorec.lerobot.options import ExportOptions
 from demorec.lerobot.prepare import prepare_episode
 from demorec.lerobot.transcode import reason_to_transcode
@@ -162,6 +163,7 @@ def _compare_episode(dataset: Any, sample: Sample, recording: Recording, options
         wrong = [
             name for name, values in expected.columns.items() if name in item and not _equal(item[name], values[moment])
         ]
+        wrong += _wrong_language(item, expected.language, moment)
         if item["task"] != expected.task:
             wrong.append("task")
         if float(item["timestamp"]) != float(np.float32(moment / dataset.meta.fps)):
@@ -179,6 +181,11 @@ def _compare_episode(dataset: Any, sample: Sample, recording: Recording, options
 def _equal(tensor: Any, values: Any) -> bool:
     found = np.asarray(tensor)
     return bool(np.array_equal(found.reshape(-1), np.asarray(values).reshape(-1)))
+
+
+def _wrong_language(item: Any, expected: EpisodeLanguage, moment: int) -> list[str]:
+    rows = {PERSISTENT: expected.persistent, EVENTS: expected.events.get(moment, ())}
+    return [name for name, told in rows.items() if name in item and item[name] != [row.to_json() for row in told]]
 
 
 def _wrong_pictures(item: Any, recording: Recording, camera: str, moment: int, stride: int) -> list[str]:

@@ -21,6 +21,8 @@ from demorec.errors import ExportError
 from demorec.export.staging import sync_file
 from demorec.lerobot.data_stats import data_statistics
 from demorec.lerobot.digest import episode_digest
+from demorec.lerobot.facts import fact_type
+from demorec.lerobot.language import REPEATING, EpisodeLanguage, language_arrays, language_digests
 from demorec.lerobot.layout import (
     AUTOMATIC_FEATURES,
     DATA_PATH,
@@ -55,6 +57,8 @@ class EpisodeData:
         videos: Camera feature -> coded pictures, T of them.
         video_info: Camera feature -> how they were coded, the `info` of the feature.
         pixels: Camera feature -> histogram, for the statistics.
+        language: What is said about it; written where the dataset has the columns for it.
+        facts: Column of the table of episodes -> value; written where the dataset has the column.
     """
 
     task: str
@@ -62,6 +66,8 @@ class EpisodeData:
     videos: Mapping[str, CodedVideo] = field(default_factory=dict)
     video_info: Mapping[str, dict[str, Any]] = field(default_factory=dict)
     pixels: Mapping[str, PixelHistogram] = field(default_factory=dict)
+    language: EpisodeLanguage = field(default_factory=EpisodeLanguage)
+    facts: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def num_frames(self) -> int:
@@ -105,24 +111,29 @@ class DatasetWriter:
         root: Folder of the dataset; for an appending writer it holds the old files already.
         info: Features and limits; its counters are taken from `start`.
         start: Where to go on.
+        facts: Which of the episodes' facts the table of episodes has (`demorec.lerobot.facts`).
     """
 
-    def __init__(self, root: Path, info: DatasetInfo, start: WriterStart | None = None) -> None:
+    def __init__(
+        self, root: Path, info: DatasetInfo, start: WriterStart | None = None, facts: Sequence[str] = ()
+    ) -> None:
         self._root = root
         self._info = info
+        self._facts = tuple(facts)
         self._start = start or WriterStart()
         self._schema = data_schema(info.features)
-        self._numeric = [name for name in self._schema.names if info.features[name].dtype != "string"]
+        self._numeric = [name for name in self._schema.names if info.features[name].is_numeric]
+        self._language = [name for name in self._schema.names if info.features[name].dtype == "language"]
         self._tasks = {task: index for index, task in enumerate(self._start.tasks)}
         self.num_episodes = self._start.num_episodes
         self.num_frames = self._start.num_frames
-        strings = [name for name in self._schema.names if name not in self._numeric]
+        strings = [name for name in self._schema.names if name not in (*self._numeric, *self._language)]
         self._data = RollingParquet(
             root,
             DATA_PATH,
             self._schema,
             start=self._start.data,
-            repeating=["episode_index", "task_index", *strings],
+            repeating=["episode_index", "task_index", *strings, *(REPEATING if self._language else ())],
             **_sizes(info),
         )
         self._episodes = RollingParquet(
@@ -150,8 +161,11 @@ class DatasetWriter:
         if frames == 0:
             raise ExportError("An episode without frames cannot be exported.")
         task_index = self._tasks.setdefault(episode.task, len(self._tasks))
+        spoken = set(self._language)
         columns = {
-            **{name: episode.columns[name] for name in self._schema.names if name not in AUTOMATIC_FEATURES},
+            **{
+                name: episode.columns[name] for name in self._schema.names if name not in {*AUTOMATIC_FEATURES, *spoken}
+            },
             "timestamp": (np.arange(frames) / self._info.fps).astype(np.float32),
             "frame_index": np.arange(frames),
             "episode_index": np.full(frames, self.num_episodes),
@@ -159,7 +173,11 @@ class DatasetWriter:
             "task_index": np.full(frames, task_index),
         }
         position = self._data.make_room(frames)
-        arrays = [vector_array(columns[item.name], item.type) for item in self._schema]
+        texts = language_arrays(episode.language, frames) if spoken else {}
+        arrays = [
+            texts[item.name] if item.name in spoken else vector_array(columns[item.name], item.type)
+            for item in self._schema
+        ]
         self._data.write(pa.Table.from_arrays(arrays, schema=self._schema))
         row: dict[str, Any] = {
             "episode_index": self.num_episodes,
@@ -169,6 +187,7 @@ class DatasetWriter:
             "data/file_index": position.file,
             "dataset_from_index": self.num_frames,
             "dataset_to_index": self.num_frames + frames,
+            **{name: episode.facts.get(name) for name in self._facts},
         }
         statistics = vector_statistics({name: columns[name] for name in self._numeric})
         digests = {}
@@ -185,6 +204,8 @@ class DatasetWriter:
             self._write_episode_rows()
         self.num_frames += frames
         self.num_episodes += 1
+        if spoken:
+            columns.update(language_digests(episode.language, frames))
         return WrittenEpisode(
             episode_index=self.num_episodes - 1, digest=episode_digest(episode.task, columns, digests)
         )
@@ -256,6 +277,7 @@ class DatasetWriter:
             if key in self._info.video_keys:
                 number = pa.list_(pa.list_(number))
             fields += [(f"stats/{key}/{name}", pa.list_(pa.int64()) if name == "count" else number) for name in NAMES]
+        fields += [(name, fact_type(name)) for name in self._facts]
         fields += [("meta/episodes/chunk_index", pa.int64()), ("meta/episodes/file_index", pa.int64())]
         return pa.schema(fields)
 

@@ -61,7 +61,7 @@ def _read_episode(root: Path, episode_index: int) -> PlayedEpisode:
     missing = {"observation.state", "action"} - described.features.keys()
     if missing:
         raise RecordingError(f"The dataset has no {' and no '.join(sorted(missing))}, so it cannot be shown: {root}")
-    columns = [name for name, feature in described.features.items() if feature.dtype not in ("video", "string")]
+    columns = [name for name, feature in described.features.items() if feature.is_numeric]
     data = _data(root, episode_index, columns)
     num_frames = len(data["action"])
     if not num_frames or data["observation.state"].shape[1] != len(info.robot.arm_joints) + 1:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
 from types import TracebackType
@@ -175,11 +175,12 @@ class RecordingReader:
 
     def events(self) -> Iterator[tuple[int, Event]]:
         """(time_ns, event) in order of time; changes of phase are in `columns().phase`."""
-        for message in self._container.messages((channels.EVENTS,)):
+        block = self._container.blocks((channels.EVENTS,))[channels.EVENTS]
+        for time_ns, data in zip(block.time_ns.tolist(), block.messages(), strict=True):
             with damage_as_recording_error(self.path):
-                event = messages.read_log(message.data)
+                event = messages.read_log(data)
             if event.name != channels.PHASE_EVENT:
-                yield message.time_ns, event
+                yield time_ns, event
 
     def packets(self, camera: str) -> Iterator[VideoPacket]:
         """The coded pictures of a camera, one a frame, in order."""
@@ -228,6 +229,17 @@ class RecordingReader:
         topic, size = channels.camera_topic(camera, "segmentation"), self._size(camera)
         for _, labels in self._pictures(topic, lambda data: decode_labels(messages.read_compressed_image(data), size)):
             yield labels
+
+    def segmentation_at(self, camera: str, frames: Collection[int]) -> Iterator[tuple[int, NDArray[np.int32]]]:
+        """(frame, segmentation picture) of some frames, in order; the other pictures are not unpacked."""
+        if not self.has_segmentation(camera):
+            raise RecordingError(f"The recording has no segmentation pictures of the camera {camera!r}: {self.path}")
+        topic, size = channels.camera_topic(camera, "segmentation"), self._size(camera)
+        for frame, (_, data) in enumerate(self._pictures(topic, messages.read_compressed_image)):
+            if frame in frames:
+                with damage_as_recording_error(self.path):
+                    labels = decode_labels(data, size)
+                yield frame, labels
 
     def _size(self, camera: str) -> tuple[int, int]:
         """(height, width) of all pictures of a camera."""

@@ -1,0 +1,11 @@
+"""What can be said about an episode, in the words that LeRobot has for it."""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+Kind = Literal["subtask", "plan", "memory", "motion", "task_aug", "vqa", "trace"]
+"""`task_aug` is another wording of the task, `vqa` a question about a picture, `trace` a way in a picture."""
+KINDS: tuple[Kind, ...] = get_args(Kind)
+STATES: tuple[Kind, ...] = ("subtask", "plan", "memory", "motion", "task_aug")
+"""Those that hold from a moment on; the others are about one moment."""

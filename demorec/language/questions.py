@@ -1,0 +1,254 @@
+"""Questions about single pictures with exact answers, and the way that the TCP is about to take in them.
+
+Answers have the shapes that LeRobot's validator knows (bbox, keypoint, count, attribute, spatial). A question is
+asked only where the answer is beyond doubt: of what is visible enough, in words that mean one thing.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.geometry import Array
+from demorec.language.grounding import MIN_PIXELS, Seen, body_values, pixel_of, project, seen_things
+from demorec.language.referring import phrases_for
+from demorec.language.situation import Situation, Thing, situation
+from demorec.recording import Recording
+from demorec.scene.episode import EpisodeColumns
+from demorec.scene.scene import Camera
+
+_CLEARLY_BESIDE = 0.05
+"""Share of the picture's width by which one thing must be farther to a side than another to be called so."""
+_SIDES = frozenset(("left", "right", "leftmost", "rightmost"))
+_TRACE_SECONDS, _TRACE_POINTS = 1.0, 5
+_TOUCHING = 0.01
+"""Metres of air above a support below which a thing is on it or in it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Question:
+    """A question about one picture, and its answer.
+
+    Attributes:
+        row: Of the dataset's episode.
+        camera: Which picture.
+        text: The question.
+        answer: JSON.
+    """
+
+    row: int
+    camera: str
+    text: str
+    answer: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trace:
+    """Where the TCP goes in one picture, as JSON; attributes as of `Question`."""
+
+    row: int
+    camera: str
+    answer: str
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _View:
+    """One picture with all that is known of it."""
+
+    camera: Camera
+    world_from_camera: Array
+    seen: dict[str, Seen]
+    positions: dict[str, Array]
+    now: Situation
+
+    @cached_property
+    def clear(self) -> dict[str, str]:
+        """Name -> phrase of each thing that is visible enough to be spoken of, in words that mean it alone."""
+        phrases = {name: self.phrases(name) for name, thing in self.seen.items() if thing.num_pixels >= MIN_PIXELS}
+        return {name: found[0] for name, found in phrases.items() if found}
+
+    def phrases(self, name: str) -> list[str]:
+        """Phrases for a thing without the robot's left and right, which the camera may see the other way round."""
+        return [phrase for phrase in phrases_for(name, self.now) if not _SIDES & set(phrase.split())]
+
+    def middle(self, name: str) -> Array:
+        """(2,) where the middle of a thing is in the picture, px."""
+        return np.asarray(project(self.camera, self.world_from_camera, self.positions[name][np.newaxis])[0])
+
+
+def asked_rows(rows: NDArray[np.intp], fps: int) -> list[int]:
+    """The rows of the dataset at which questions are asked: one a second."""
+    return list(range(0, len(rows), max(1, fps)))
+
+
+def questions(
+    recording: Recording, columns: EpisodeColumns, rows: NDArray[np.intp], cameras: Sequence[str], *, fps: int
+) -> Iterator[Question]:
+    """A question a second about each camera that has segmentation, of another kind each time, in order by camera.
+
+    Args:
+        recording, columns: The episode.
+        rows: (T,) which of its frames the dataset has.
+        cameras: Those of the dataset.
+        fps: Of the dataset.
+
+    Raises:
+        RecordingError: The recording is damaged.
+    """
+    anchors = {int(rows[row]): row for row in asked_rows(rows, fps)}
+    values = body_values(recording)
+    for number, camera in enumerate(recording.info.scene.cameras):
+        if camera.name not in cameras or not recording.has_segmentation(camera.name):
+            continue
+        for turn, (frame, labels) in enumerate(recording.segmentation_at(camera.name, anchors)):
+            view = _view(recording, columns, camera, frame, seen_things(labels, values))
+            asked = _ask(view, turn + number)
+            if asked is not None:
+                text, answer = asked
+                yield Question(row=anchors[frame], camera=camera.name, text=text, answer=json.dumps(answer))
+
+
+def _view(recording: Recording, columns: EpisodeColumns, camera: Camera, frame: int, seen: dict[str, Seen]) -> _View:
+    poses = {name: values[frame] for name, values in columns.object_poses.items()}
+    positions = {body.name: body.world_from_body.position for body in recording.info.scene.bodies}
+    positions |= {name: np.asarray(pose[:3]) for name, pose in poses.items()}
+    return _View(
+        camera=camera,
+        world_from_camera=columns.world_from_camera[camera.name][frame],
+        seen=seen,
+        positions=positions,
+        now=situation(recording.info.scene, poses),
+    )
+
+
+def _ask(view: _View, turn: int) -> tuple[str, dict[str, Any]] | None:
+    """The next kind of question that the picture has an answer to."""
+    for step in range(len(_KINDS)):
+        asked = _KINDS[(turn + step) % len(_KINDS)](view, turn // len(_KINDS))
+        if asked is not None:
+            return asked
+    return None
+
+
+def _bbox(view: _View, turn: int) -> tuple[str, dict[str, Any]] | None:
+    if not view.clear:
+        return None
+    name, phrase = list(view.clear.items())[turn % len(view.clear)]
+    found = {"label": phrase, "bbox_format": "xyxy", "bbox": list(view.seen[name].box)}
+    return f"Where is {phrase}?", {"detections": [found]}
+
+
+def _keypoint(view: _View, turn: int) -> tuple[str, dict[str, Any]] | None:
+    names = []
+    for name in view.clear:
+        pixel = pixel_of(view.camera, view.middle(name))
+        if pixel is not None and view.seen[name].mask[pixel[1], pixel[0]]:
+            names.append((name, pixel))
+    if not names:
+        return None
+    name, pixel = names[turn % len(names)]
+    phrase = view.clear[name]
+    return f"Point at the middle of {phrase}.", {"label": phrase, "point_format": "xy", "point": list(pixel)}
+
+
+def _count(view: _View, turn: int) -> tuple[str, dict[str, Any]] | None:
+    nouns: dict[str, list[int]] = {}
+    for thing in view.now.things:
+        if thing.name in view.seen:
+            for noun in thing.nouns:
+                nouns.setdefault(noun, []).append(view.seen[thing.name].num_pixels)
+    clear = sorted(noun for noun, pixels in nouns.items() if min(pixels) >= MIN_PIXELS)
+    if not clear:
+        return None
+    noun = clear[turn % len(clear)]
+    return f"How many {noun}s are visible?", {"label": noun, "count": len(nouns[noun])}
+
+
+def _attribute(view: _View, turn: int) -> tuple[str, dict[str, Any]] | None:
+    found = []
+    for name in view.clear:
+        thing = view.now.thing(name)
+        plain = [phrase for phrase in view.phrases(name) if thing.color not in phrase.split()]
+        if thing.color and plain:
+            found.append((plain[0], thing.color))
+    if not found:
+        return None
+    phrase, color = found[turn % len(found)]
+    return f"What colour is {phrase}?", {"label": phrase, "attribute": "color", "value": color}
+
+
+def _spatial(view: _View, turn: int) -> tuple[str, dict[str, Any]] | None:
+    found = []
+    for name in view.clear:
+        for other in view.clear:
+            if name != other and (relation := _relation(view, name, other)):
+                found.append((name, relation, other))
+    if not found:
+        return None
+    name, relation, other = found[turn % len(found)]
+    subject, object_ = view.clear[name], view.clear[other]
+    answer = {"subject": subject, "relation": relation, "object": object_}
+    return f"Where is {subject} relative to {object_}, as the camera sees it?", answer
+
+
+def _relation(view: _View, name: str, other: str) -> str:
+    """ "on" or "in" by where the things are, else "left_of" or "right_of" by where the picture shows their middles."""
+    lower = view.now.thing(other)
+    if rests_on(view.now.thing(name), lower):
+        return "in" if lower.noun == "tray" else "on"
+    if rests_on(lower, view.now.thing(name)):
+        return ""
+    offset = float(view.middle(name)[0] - view.middle(other)[0]) / view.camera.width
+    if not abs(offset) >= _CLEARLY_BESIDE:
+        return ""
+    return "left_of" if offset < 0 else "right_of"
+
+
+def rests_on(upper: Thing, lower: Thing) -> bool:
+    """Whether one thing's middle is above the other and no air is between them."""
+    offset = upper.position - lower.position
+    air = float(offset[2]) - upper.height / 2 - lower.height / 2
+    within = lower.size / 2 if not lower.can_be_held else lower.size * 0.7
+    return -2 * _TOUCHING < air < _TOUCHING and float(np.abs(offset[:2]).max()) < within
+
+
+_KINDS: tuple[Callable[[_View, int], tuple[str, dict[str, Any]] | None], ...] = (
+    _bbox,
+    _keypoint,
+    _count,
+    _attribute,
+    _spatial,
+)
+
+
+def traces(
+    recording: Recording, columns: EpisodeColumns, rows: NDArray[np.intp], cameras: Sequence[str], *, fps: int
+) -> Iterator[Trace]:
+    """The next second of the TCP in each camera's picture, once a second, in order by camera.
+
+    Points are where the picture of that moment would show the TCP; the trace ends where it leaves the picture, and
+    there is none where it begins outside. Arguments as of `questions`.
+    """
+    info = recording.info
+    steps = np.linspace(0.0, _TRACE_SECONDS * info.fps, _TRACE_POINTS + 1).round().astype(int)
+    for camera in info.scene.cameras:
+        if camera.name not in cameras:
+            continue
+        for row in asked_rows(rows, fps):
+            frame = int(rows[row])
+            times = np.minimum(frame + steps, columns.num_frames - 1)
+            tcp = info.scene.robot.world_from_base.apply(columns.base_from_tcp[times, :3])
+            pixels: list[list[int]] = []
+            for point in project(camera, columns.world_from_camera[camera.name][frame], tcp):
+                if (pixel := pixel_of(camera, point)) is None:
+                    break
+                pixels.append(list(pixel))
+            if pixels:
+                answer = {"label": "gripper", "point_format": "xy", "points": pixels, "seconds": _TRACE_SECONDS}
+                yield Trace(row=row, camera=camera.name, answer=json.dumps(answer))

@@ -1,0 +1,163 @@
+"""Phrases that refer to things ("the smaller red cube"), and the resolver that says what such a phrase refers to.
+
+The resolver reads words alone and looks at the scene; it knows nothing of who made a phrase and why. What cannot be
+told apart by a clear margin refers to nothing, so that no phrase leans on a millimetre. Left and right are the
+robot's: it looks along the x axis of its base frame, left is +y.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterator, Sequence
+from functools import lru_cache
+
+from demorec.language.situation import COLORS, Situation, Thing
+
+MIN_GAP = 0.04
+"""By how much, metres, one thing must be farther to a side, or nearer, than the next one to be called so."""
+MIN_SIZE_RATIO = 1.15
+"""By what factor one thing must be larger than the next one to be called so."""
+
+_IN_FRONT = ("left", "right", "leftmost", "rightmost", "middle", "smaller", "larger", "smallest", "largest")
+_BEHIND = ("nearest to the robot", "farthest from the robot")
+
+
+def resolve(phrase: str, situation: Situation) -> frozenset[str]:
+    """Names of the things that a phrase refers to: one for "the ...", all that fit for "every ...".
+
+    Nothing when the phrase is none of this grammar, or when it could mean several things: ARTICLE [ORDER] [COLOUR]
+    NOUN [nearest to the robot | farthest from the robot], where ARTICLE is "the" or "every".
+    """
+    match = _grammar(situation).fullmatch(phrase.strip().lower())
+    return frozenset() if match is None else _resolved(match, situation)
+
+
+def references(text: str, situation: Situation) -> Iterator[tuple[str, frozenset[str]]]:
+    """Each phrase of a text that refers to something, and what it refers to; nothing where that is unclear."""
+    for match in _grammar(situation).finditer(text.lower()):
+        yield match[0], _resolved(match, situation)
+
+
+def phrases_for(name: str, situation: Situation) -> list[str]:
+    """Every phrase of the grammar that refers to this thing and nothing else; the plainest with a colour come first."""
+    thing = situation.thing(name)
+    found = []
+    for noun in thing.nouns:
+        for colored in ([f"{thing.color} {noun}"] if thing.color else []) + [noun]:
+            candidates = [f"the {colored}"]
+            candidates += [f"the {order} {colored}" for order in _IN_FRONT]
+            candidates += [f"the {colored} {order}" for order in _BEHIND]
+            unique = resolve(candidates[0], situation) == {name}
+            # Where the plain words suffice, nobody says more.
+            for candidate in candidates[:1] if unique else candidates[1:]:
+                if resolve(candidate, situation) == {name}:
+                    found.append(candidate)
+    return found
+
+
+def phrase_for(name: str, situation: Situation) -> str:
+    """The plainest phrase for a thing; "a red cube" where none tells it from the others."""
+    found = phrases_for(name, situation)
+    if found:
+        return found[0]
+    thing = situation.thing(name)
+    words = f"{thing.color} {thing.noun}".strip()
+    return f"{'an' if words[0] in 'aeiou' else 'a'} {words}"
+
+
+@lru_cache(maxsize=64)
+def _grammar(situation: Situation) -> re.Pattern[str]:
+    nouns = "|".join(sorted({re.escape(noun) for thing in situation.things for noun in thing.nouns}, key=len)[::-1])
+    return re.compile(
+        rf"\b(?P<article>the|every) (?:(?P<order>{'|'.join(_IN_FRONT)}) )?(?:(?P<color>{'|'.join(COLORS)}) )?"
+        rf"(?P<noun>{nouns})\b(?: (?P<behind>{'|'.join(_BEHIND)})\b)?"
+    )
+
+
+def _resolved(match: re.Match[str], situation: Situation) -> frozenset[str]:
+    fitting = [
+        thing
+        for thing in situation.things
+        if match["noun"] in thing.nouns and (match["color"] is None or thing.color == match["color"])
+    ]
+    if match["article"] == "every":
+        return frozenset(thing.name for thing in fitting)
+    for order in (match["order"], match["behind"]):
+        if order is not None:
+            fitting = _ORDERS[order](fitting)
+    return frozenset({fitting[0].name} if len(fitting) == 1 else ())
+
+
+def _first(things: Sequence[Thing], value: Callable[[Thing], float], margin: float) -> list[Thing]:
+    """The one of the smallest value, or none when the next one is not larger by the margin; none of a single one."""
+    ordered = sorted(things, key=value)
+    if len(ordered) < 2 or value(ordered[1]) - value(ordered[0]) < margin:
+        return []
+    return ordered[:1]
+
+
+def _of_two(choose: Callable[[Sequence[Thing]], list[Thing]]) -> Callable[[Sequence[Thing]], list[Thing]]:
+    return lambda things: choose(things) if len(things) == 2 else []
+
+
+def _of_more(choose: Callable[[Sequence[Thing]], list[Thing]]) -> Callable[[Sequence[Thing]], list[Thing]]:
+    return lambda things: choose(things) if len(things) > 2 else []
+
+
+def _distance(thing: Thing) -> float:
+    return math.hypot(float(thing.position[0]), float(thing.position[1]))
+
+
+def _leftmost(things: Sequence[Thing]) -> list[Thing]:
+    return _first(things, lambda thing: -float(thing.position[1]), MIN_GAP)
+
+
+def _rightmost(things: Sequence[Thing]) -> list[Thing]:
+    return _first(things, lambda thing: float(thing.position[1]), MIN_GAP)
+
+
+def _smallest(things: Sequence[Thing]) -> list[Thing]:
+    return _first(things, lambda thing: math.log(thing.size), math.log(MIN_SIZE_RATIO))
+
+
+def _largest(things: Sequence[Thing]) -> list[Thing]:
+    return _first(things, lambda thing: -math.log(thing.size), math.log(MIN_SIZE_RATIO))
+
+
+def _nearest(things: Sequence[Thing]) -> list[Thing]:
+    return _first(things, _distance, MIN_GAP)
+
+
+def _farthest(things: Sequence[Thing]) -> list[Thing]:
+    return _first(things, lambda thing: -_distance(thing), MIN_GAP)
+
+
+def _middle(things: Sequence[Thing]) -> list[Thing]:
+    """Of three in a row: the one between the others."""
+    if len(things) != 3:
+        return []
+
+    def detour(thing: Thing) -> float:
+        """How much longer the way between the other two is by way of this one, metres."""
+        a, b = (other.position[:2].tolist() for other in things if other is not thing)
+        here = thing.position[:2].tolist()
+        return math.dist(a, here) + math.dist(here, b) - math.dist(a, b)
+
+    chosen = _first(things, detour, MIN_GAP)
+    return chosen if chosen and detour(chosen[0]) < MIN_GAP else []
+
+
+_ORDERS: dict[str, Callable[[Sequence[Thing]], list[Thing]]] = {
+    "left": _of_two(_leftmost),
+    "right": _of_two(_rightmost),
+    "leftmost": _of_more(_leftmost),
+    "rightmost": _of_more(_rightmost),
+    "middle": _middle,
+    "smaller": _of_two(_smallest),
+    "larger": _of_two(_largest),
+    "smallest": _of_more(_smallest),
+    "largest": _of_more(_largest),
+    "nearest to the robot": _nearest,
+    "farthest from the robot": _farthest,
+}

@@ -1,0 +1,117 @@
+"""The things of a scene as people speak of them: what they are called, how large they are and where they are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from demorec.geometry import Array, Pose
+from demorec.scene.scene import Body, Goal, Scene
+
+COLORS = ("red", "green", "blue", "yellow", "orange", "purple", "black", "white", "grey")
+_NOUNS = {"jenga": "wooden plank", "lego": "toy brick"}
+"""Words for things whose names say less."""
+_SYNONYMS = {
+    "target": ("target", "mark", "square"),
+    "mark": ("mark", "target", "square"),
+    "tray": ("tray",),
+}
+_AT_THE_PLACE = 0.01
+"""How far, metres, the middle of a mark may be from a goal that is meant to be on it."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Thing:
+    """One body of the scene.
+
+    Attributes:
+        name: Of the body.
+        nouns: What it may be called, the usual word first.
+        color: The word for its colour, or "".
+        size: Its largest extent, metres.
+        position: (3,) of its middle in the robot's base frame (x forward, y to the left, z up), metres.
+        height: Of its bounding box, metres.
+        can_be_held: Whether it is movable.
+    """
+
+    name: str
+    nouns: tuple[str, ...]
+    color: str
+    size: float
+    position: Array
+    height: float
+    can_be_held: bool
+
+    @property
+    def noun(self) -> str:
+        """The usual word."""
+        return self.nouns[0]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Situation:
+    """All things at one moment, the floor and what else only carries the scene left out."""
+
+    things: tuple[Thing, ...]
+
+    def thing(self, name: str) -> Thing:
+        """The thing of that name; KeyError when there is none."""
+        for thing in self.things:
+            if thing.name == name:
+                return thing
+        raise KeyError(name)
+
+
+def situation(scene: Scene, world_from_object: Mapping[str, Array] | None = None) -> Situation:
+    """The things of a scene.
+
+    Args:
+        scene: At the episode's start.
+        world_from_object: Body -> (7,) pose (xyz, quaternion xyzw) at the moment; the scene's own where left out.
+    """
+    base_from_world = scene.robot.world_from_base.inverse()
+    moved = world_from_object or {}
+    things = []
+    for body in scene.bodies:
+        if body.role == "fixture":
+            continue
+        position = np.asarray(moved[body.name][:3]) if body.name in moved else body.world_from_body.position
+        things.append(
+            Thing(
+                name=body.name,
+                nouns=nouns_of(body),
+                color=body.color_name,
+                size=max(body.shape.extents),
+                position=base_from_world.apply(position),
+                height=body.shape.extents[2],
+                can_be_held=body.movable,
+            )
+        )
+    return Situation(things=tuple(things))
+
+
+def nouns_of(body: Body) -> tuple[str, ...]:
+    """What a body may be called: by its name, less colour and number, and by its shape."""
+    words = [word for word in body.name.split("_") if not word.isdigit() and word not in (*COLORS, "other")]
+    noun = " ".join(_NOUNS.get(word, word) for word in words) or "object"
+    nouns = _SYNONYMS.get(noun, (noun,))
+    x, y, z = body.shape.extents
+    if body.movable and body.shape.kind == "box":
+        nouns += ("cube",) if max(x, y, z) < 1.05 * min(x, y, z) else ("block",)
+    elif body.movable and body.shape.kind in ("cylinder", "sphere", "capsule"):
+        nouns += (body.shape.kind,)
+    return tuple(dict.fromkeys(nouns))
+
+
+def place_of(scene: Scene, goal: Goal) -> str:
+    """Name of the body that a goal puts its object onto or into, a mark at its place, or ""."""
+    if goal.onto:
+        return goal.onto
+    wanted: Pose = scene.world_from_goal(goal)
+    for body in scene.bodies:
+        offset = np.abs(body.world_from_body.position[:2] - wanted.position[:2])
+        if body.role == "target" and bool((offset < _AT_THE_PLACE).all()):
+            return body.name
+    return ""

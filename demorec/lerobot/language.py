@@ -1,0 +1,169 @@
+"""LeRobot's language columns: what an episode's statements look like in its tables, and their digests.
+
+`language_persistent` has every statement of the episode in every row of it, each with the time from which it holds;
+`language_events` has those of one moment in the row of that moment. LeRobot's own types are in
+`lerobot/datasets/language.py`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from demorec.language.kinds import STATES
+from demorec.scene.features import IMAGE_PREFIX
+
+if TYPE_CHECKING:
+    from demorec.language.narration import Statement
+
+PERSISTENT, EVENTS = "language_persistent", "language_events"
+COLUMNS = (PERSISTENT, EVENTS)
+
+_EVENT_FIELDS = (
+    pa.field("role", pa.string()),
+    pa.field("content", pa.string()),
+    pa.field("style", pa.string()),
+    pa.field("camera", pa.string()),
+    pa.field("tool_calls", pa.list_(pa.json_())),
+)
+_EVENT = pa.struct(_EVENT_FIELDS)
+_STATE = pa.struct([*_EVENT_FIELDS[:3], pa.field("timestamp", pa.float32()), *_EVENT_FIELDS[3:]])
+TYPES: dict[str, pa.DataType] = {PERSISTENT: pa.list_(_STATE), EVENTS: pa.list_(_EVENT)}
+"""Column -> its type, as the package datasets reads LeRobot's own."""
+REPEATING = tuple(f"{name}.list.element.{item}" for name in COLUMNS for item in ("role", "content", "style", "camera"))
+"""Parquet's names of the parts whose values come again and again."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LanguageRow:
+    """One entry of a language column.
+
+    Attributes:
+        role: "user" or "assistant".
+        content: What is said.
+        style: LeRobot's word for its kind.
+        timestamp: From when on it holds, seconds; None for an event.
+        camera: Feature that the words are about, None for all but those that are about one picture.
+    """
+
+    role: str
+    content: str
+    style: str
+    timestamp: float | None = None
+    camera: str | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """The entry as LeRobot gives it."""
+        row: dict[str, Any] = {"role": self.role, "content": self.content, "style": self.style}
+        if self.timestamp is not None:
+            row["timestamp"] = self.timestamp
+        return {**row, "camera": self.camera, "tool_calls": None}
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodeLanguage:
+    """The language columns of one episode.
+
+    Attributes:
+        persistent: What stands in every row.
+        events: Row -> what stands in it alone.
+    """
+
+    persistent: tuple[LanguageRow, ...] = ()
+    events: Mapping[int, tuple[LanguageRow, ...]] = field(default_factory=dict)
+
+
+def episode_language(statements: Sequence[Statement], *, fps: int) -> EpisodeLanguage:
+    """The statements in LeRobot's form; times are those of the `timestamp` column to the bit."""
+    persistent: list[LanguageRow] = []
+    events: dict[int, list[LanguageRow]] = {}
+    for statement in statements:
+        said = LanguageRow(role=statement.role, content=statement.text, style=statement.kind)
+        if statement.kind in STATES:
+            persistent.append(replace(said, timestamp=float(np.float32(statement.row / fps))))
+        else:
+            camera = None if statement.camera is None else IMAGE_PREFIX + statement.camera
+            events.setdefault(statement.row, []).append(replace(said, camera=camera))
+    return EpisodeLanguage(persistent=tuple(persistent), events={row: tuple(told) for row, told in events.items()})
+
+
+def language_feature(name: str) -> dict[str, Any]:
+    """What the schema's metadata say of a language column, from which the package datasets takes its types."""
+    text = {"dtype": "string", "_type": "Value"}
+    row: dict[str, Any] = {"role": text, "content": text, "style": text}
+    if name == PERSISTENT:
+        row["timestamp"] = {"dtype": "float32", "_type": "Value"}
+    calls = {"feature": {"_type": "Json"}, "_type": "List"}
+    return {"feature": {**row, "camera": text, "tool_calls": calls}, "_type": "List"}
+
+
+def language_arrays(language: EpisodeLanguage, frames: int) -> dict[str, pa.Array]:
+    """Column -> array of so many rows."""
+    own = [language.events.get(row, ()) for row in range(frames)]
+    ends = np.cumsum([0, *(len(rows) for rows in own)], dtype=np.int32)
+    state = _structs(language.persistent, _STATE)
+    often = state.take(pa.array(np.tile(np.arange(len(state)), frames)))
+    steps = pa.array(np.arange(frames + 1, dtype=np.int32) * np.int32(len(state)))
+    return {
+        PERSISTENT: pa.ListArray.from_arrays(steps, often),
+        EVENTS: pa.ListArray.from_arrays(pa.array(ends), _structs([row for rows in own for row in rows], _EVENT)),
+    }
+
+
+def _structs(rows: Sequence[LanguageRow], kind: pa.StructType) -> pa.StructArray:
+    found = [row.to_json() for row in rows]
+    arrays = [
+        pa.nulls(len(found), part.type)
+        if part.name == "tool_calls"
+        else pa.array([row[part.name] for row in found], part.type)
+        for part in kind
+    ]
+    return pa.StructArray.from_arrays(arrays, fields=list(kind))
+
+
+def language_digests(language: EpisodeLanguage, frames: int) -> dict[str, NDArray[np.str_]]:
+    """Column -> (T, 1) SHA-256 (hex) of what stands in each row; equal to `column_digests` of the column read back."""
+    state = _digest([row.to_json() for row in language.persistent])
+    events = np.full((frames, 1), _digest([]))
+    for row, told in language.events.items():
+        events[row] = _digest([entry.to_json() for entry in told])
+    return {PERSISTENT: np.full((frames, 1), state), EVENTS: events}
+
+
+def is_language(kind: pa.DataType) -> bool:
+    """Whether a column of this type can hold statements; where none has any, LeRobot's tools write lists of nulls."""
+    listed = pa.types.is_list(kind) or pa.types.is_large_list(kind)
+    return bool(listed) and bool(pa.types.is_struct(kind.value_type) or pa.types.is_null(kind.value_type))
+
+
+def column_digests(column: pa.Array) -> NDArray[np.str_]:
+    """(T, 1) SHA-256 (hex) of what stands in each row of a language column, whoever wrote it.
+
+    Raises:
+        ValueError: It is no list of structures.
+    """
+    if not is_language(column.type):
+        raise ValueError(f"a language column of type {column.type}")
+    found: list[str] = []
+    before: pa.Array | None = None
+    for index in range(len(column)):
+        rows = column[index].values
+        if before is None or rows is None or not rows.equals(before):
+            found.append(_digest([] if rows is None else rows.to_pylist()))
+        else:  # what holds for an episode stands in each of its rows
+            found.append(found[-1])
+        before = rows
+    return np.array(found, dtype="<U64").reshape(-1, 1)
+
+
+def _digest(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Of the entries that are there; an empty list of tool calls is as good as none."""
+    told = [{name: value for name, value in row.items() if value is not None and value != []} for row in rows]
+    return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()

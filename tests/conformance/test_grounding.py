@@ -1,0 +1,278 @@
+"""Questions, traces and boxes against pictures of segmentation, projection and the scene, each computed anew."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from support.check import simulate_run
+from support.export import export, make_run
+from support.language import NOUNS, language_of, meant, phrases
+
+from demorec.errors import ConfigError, ExportError
+from demorec.geometry import rotation_from_quat
+from demorec.language.masks import outline_area, run_lengths
+from demorec.lerobot import dataset_digest
+from demorec.lerobot.boxes import coco_string
+from demorec.recording import Recording
+from demorec.scene.scene import Camera, Shape
+
+PREFIX = "observation.images."
+Row = dict[str, Any]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return simulate_run(
+        tmp_path_factory.mktemp("run") / "clutter", 1, task="pick_from_clutter", seed=5, cameras=("front", "wrist"),
+        width=128, height=128, segmentation=True,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def dataset(run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("dataset") / "d"
+    report = export(run, out, language=(), boxes=True)
+    assert report.digest == dataset_digest(out)
+    return out
+
+
+class Truth:
+    """The recording, and pictures of segmentation by the names of the bodies."""
+
+    def __init__(self, run: Path) -> None:
+        (path,) = (run / "episodes").glob("*.mcap")
+        self.recording = Recording(path)
+        self.columns, self.scene = self.recording.columns(), self.recording.info.scene
+        names = self.recording.segment_names()
+        self.labels = {camera: list(self.recording.segmentation(camera)) for camera in self.recording.cameras}
+        self.number = {name: value for value, name in names.items()}
+
+    def mask(self, camera: str, frame: int, body: str) -> NDArray[np.bool_]:
+        return np.asarray(self.labels[camera][frame] == self.number[body])
+
+    def pixel(self, camera: str, frame: int, point: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(2,) px: X_camera = R^T (X - t), then K; beyond all pictures for a point behind the camera."""
+        intrinsics = next(item for item in self.scene.cameras if item.name == camera).intrinsics
+        pose = self.columns.world_from_camera[camera][frame]
+        x, y, z = rotation_from_quat(pose[3:]).T @ (point - pose[:3])
+        if z <= 0:
+            return np.full(2, -np.inf)
+        return np.array([intrinsics[0, 0] * x / z + intrinsics[0, 2], intrinsics[1, 1] * y / z + intrinsics[1, 2]])
+
+    def position(self, frame: int, body: str) -> NDArray[np.float64]:
+        poses = self.columns.object_poses.get(body)
+        return self.scene.body(body).world_from_body.position if poses is None else np.asarray(poses[frame, :3])
+
+    def meant(self, phrase: str, frame: int) -> str:
+        """The one body that a phrase means at that moment."""
+        from dataclasses import replace
+
+        from demorec.geometry import Pose
+
+        moved = [
+            replace(body, world_from_body=Pose(position=self.position(frame, body.name))) for body in self.scene.bodies
+        ]
+        (found,) = phrases(phrase)
+        (name,) = meant(found, replace(self.scene, bodies=tuple(moved)))
+        return name
+
+
+@pytest.fixture(scope="module")
+def truth(run: Path) -> Truth:
+    return Truth(run)
+
+
+def answers(dataset: Path, style: str) -> list[tuple[int, str, str, Row]]:
+    """(frame, camera, question, answer) of every event of a style."""
+    found = []
+    (frames,) = language_of(dataset)
+    for frame, (_, events) in enumerate(frames):
+        for camera in ("front", "wrist"):
+            rows = [row for row in events if row["style"] == style and row["camera"] == PREFIX + camera]
+            asked = [row["content"] for row in rows if row["role"] == "user"]
+            told = [json.loads(row["content"]) for row in rows if row["role"] == "assistant"]
+            assert len(told) <= 1
+            assert len(asked) == (len(told) if style == "vqa" else 0)
+            found += [(frame, camera, asked[0] if asked else "", answer) for answer in told]
+    return found
+
+
+def test_lerobots_validator_knows_every_question(dataset: Path, tmp_path: Path) -> None:
+    from lerobot.annotations.steerable_pipeline.reader import iter_episodes
+    from lerobot.annotations.steerable_pipeline.staging import EpisodeStaging
+    from lerobot.annotations.steerable_pipeline.validator import StagingValidator, classify_vqa_answer
+
+    records = list(iter_episodes(dataset))
+    (frames,) = language_of(dataset)
+    times = records[0].frame_timestamps
+    staging = EpisodeStaging(tmp_path, 0)
+    staging.write("plan", frames[0][0])
+    events = [{**row, "timestamp": times[frame]} for frame, (_, rows) in enumerate(frames) for row in rows]
+    staging.write("vqa", events)
+    report = StagingValidator(dataset_camera_keys=(PREFIX + "front", PREFIX + "wrist")).validate(records, tmp_path)
+    assert (report.errors, report.warnings) == ([], [])
+    kinds = {classify_vqa_answer(answer) for _, _, _, answer in answers(dataset, "vqa")}
+    assert kinds == {"bbox", "keypoint", "count", "attribute", "spatial"}
+
+
+def test_answers_are_true(dataset: Path, truth: Truth) -> None:
+    found = answers(dataset, "vqa")
+    assert len(found) >= 12
+    for frame, camera, question, answer in found:
+        if "detections" in answer:
+            (thing,) = answer["detections"]
+            mask = truth.mask(camera, frame, truth.meant(thing["label"], frame))
+            rows, columns = np.nonzero(mask)
+            assert thing["bbox"] == [columns.min(), rows.min(), columns.max(), rows.max()]
+            assert thing["label"] in question
+        elif "point" in answer:
+            name = truth.meant(answer["label"], frame)
+            expected = truth.pixel(camera, frame, truth.position(frame, name))
+            assert np.abs(np.array(answer["point"]) + 0.5 - expected).max() <= 0.5
+            assert truth.mask(camera, frame, name)[answer["point"][1], answer["point"][0]]
+        elif "count" in answer:
+            fitting = [
+                body.name for body in truth.scene.bodies if NOUNS[answer["label"]](body) and body.role != "fixture"
+            ]
+            assert answer["count"] == sum(bool(truth.mask(camera, frame, name).any()) for name in fitting)
+        elif "attribute" in answer:
+            assert truth.scene.body(truth.meant(answer["label"], frame)).color_name == answer["value"]
+            assert answer["value"] not in question
+        else:
+            subject, other = (truth.meant(answer[part], frame) for part in ("subject", "object"))
+            assert truth.mask(camera, frame, subject).any()
+            x, u = (truth.pixel(camera, frame, truth.position(frame, name))[0] for name in (subject, other))
+            offset = truth.position(frame, subject) - truth.position(frame, other)
+            is_on = np.abs(offset[:2]).max() < 0.04 and 0 < offset[2] < 0.04
+            assert answer["relation"] == ("on" if is_on else "left_of" if x < u else "right_of")
+            assert is_on or abs(x - u) > 0.05 * 128
+
+
+def test_traces_are_where_the_tcp_will_be(dataset: Path, truth: Truth) -> None:
+    found = answers(dataset, "trace")
+    last = truth.columns.num_frames - 1
+    assert {camera for _, camera, _, _ in found} == {"front", "wrist"}
+    for frame, camera, _, answer in found:
+        expected = []
+        for step in range(6):
+            later = min(frame + 6 * step, last)
+            tcp = truth.scene.robot.world_from_base.apply(truth.columns.base_from_tcp[later, :3])
+            expected.append(truth.pixel(camera, frame, tcp))
+        inside = [bool(((point >= 0) & (point < 128)).all()) for point in expected]
+        length = inside.index(False) if False in inside else 6
+        assert len(answer["points"]) == length
+        assert np.abs(np.array(answer["points"]) + 0.5 - np.array(expected[:length])).max() <= 0.5
+
+
+def decoded(text: str, size: tuple[int, int]) -> NDArray[np.bool_]:
+    """A mask of COCO's compressed run lengths, by the description of the format."""
+    counts: list[int] = []
+    position = 0
+    while position < len(text):
+        value = shift = 0
+        while True:
+            bits = ord(text[position]) - 48
+            position += 1
+            value |= (bits & 0x1F) << shift
+            shift += 5
+            if not bits & 0x20:
+                break
+        if bits & 0x10:
+            value -= 1 << shift
+        counts.append(value + (counts[-2] if len(counts) > 2 else 0))
+    flat = np.repeat(np.arange(len(counts)) % 2 == 1, counts)
+    return flat.reshape(size[::-1]).T
+
+
+def test_a_thousand_boxes_are_those_of_the_segmentation(dataset: Path, truth: Truth) -> None:
+    count = 0
+    for camera in ("front", "wrist"):
+        told = json.loads((dataset / "demorec" / "boxes" / f"{PREFIX}{camera}.json").read_text())
+        nouns = {category["id"]: category["name"] for category in told["categories"]}
+        assert [image["id"] for image in told["images"]] == list(range(truth.columns.num_frames))
+        seen = {(item["image_id"], item["object"]): item for item in told["annotations"]}
+        assert len(seen) == len(told["annotations"])
+        spoken = [body for body in truth.scene.bodies if body.role not in ("fixture", "support")]
+        for frame in range(truth.columns.num_frames):
+            for body in spoken:
+                mask = truth.mask(camera, frame, body.name)
+                item = seen.pop((frame, body.name), None)
+                assert (item is not None) == bool(mask.any())
+                if item is None:
+                    continue
+                rows, columns = np.nonzero(mask)
+                x, y = columns.min(), rows.min()
+                assert item["bbox"] == [x, y, columns.max() + 1 - x, rows.max() + 1 - y]
+                assert item["area"] == mask.sum()
+                assert np.array_equal(decoded(item["segmentation"]["counts"], (128, 128)), mask)
+                assert NOUNS[nouns[item["category_id"]]](body)
+                assert item["color"] == body.color_name
+                count += 1
+        assert seen == {}
+    assert count > 1000
+
+
+def test_visible_fractions_count_what_is_hidden(dataset: Path, truth: Truth) -> None:
+    told = json.loads((dataset / "demorec" / "boxes" / f"{PREFIX}front.json").read_text())
+    name = truth.scene.goals[0].object
+    phase = truth.columns.phase
+    share = {item["image_id"]: item["visible_fraction"] for item in told["annotations"] if item["object"] == name}
+    free = [share[frame] for frame in range(len(phase)) if frame < phase.index("descend") // 2]
+    held = [share.get(frame, 0.0) for frame in range(len(phase)) if phase[frame] in ("close", "lift")]
+    assert min(free) > 0.9
+    assert max(held) < min(free)  # the fingers are around it
+
+
+@pytest.mark.filterwarnings("ignore:__array__ implementation")
+def test_pycocotools_reads_them(dataset: Path) -> None:
+    coco = pytest.importorskip("pycocotools.coco")
+    masks = pytest.importorskip("pycocotools.mask")
+    for camera in ("front", "wrist"):
+        found = coco.COCO(dataset / "demorec" / "boxes" / f"{PREFIX}{camera}.json")
+        for item in found.dataset["annotations"]:
+            assert found.annToMask(item).sum() == item["area"]
+            assert masks.toBbox(found.annToRLE(item)).tolist() == item["bbox"]
+
+
+@pytest.mark.parametrize("shape", [Shape(kind="box", size=(0.2, 0.1, 0.3)), Shape(kind="cylinder", size=(0.1, 0.3))])
+def test_outlines_of_what_faces_the_camera(shape: Shape) -> None:
+    """From far above, the outline is the face that is seen, in pixels."""
+    from demorec.geometry import look_at
+
+    eye = look_at((0.0, 0.0, 100.15), (0.0, 0.0, 0.0), up=(0.0, 1.0, 0.0))
+    camera = Camera(name="c", width=100, height=100, fov_y=0.02, mount="world", mount_from_camera=eye, far=200.0)
+    face = 0.2 * 0.1 if shape.kind == "box" else np.pi * 0.1**2
+    scale = camera.intrinsics[0, 0] / 100
+    area = outline_area(camera, eye.vector(), shape, np.array([0, 0, 0, 0, 0, 0, 1.0]))
+    assert area is not None
+    assert abs(area / (face * scale**2) - 1) < 0.01
+    mesh = Shape(kind="mesh", size=(0.1, 0.1, 0.1))
+    assert outline_area(camera, eye.vector(), mesh, np.array([0, 0, 0, 0, 0, 0, 1.0])) is None
+
+
+def test_run_lengths_go_column_by_column() -> None:
+    mask = np.array([[1, 0, 0], [1, 1, 0]], dtype=np.bool_)
+    assert run_lengths(mask) == (0, 2, 1, 1, 2)
+    assert np.array_equal(decoded(coco_string(run_lengths(mask)), (2, 3)), mask)
+    rng = np.random.default_rng(0)
+    for share in (0.0, 0.001, 0.5, 1.0):
+        mask = rng.random((70, 90)) < share
+        assert np.array_equal(decoded(coco_string(run_lengths(mask)), (70, 90)), mask)
+
+
+def test_without_segmentation_there_are_traces_and_no_questions(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "run", [8])
+    export(run, tmp_path / "told", language=())
+    (frames,) = language_of(tmp_path / "told")
+    assert {row["style"] for _, rows in frames for row in rows} <= {"trace"}
+    with pytest.raises(ExportError, match="need recordings with segmentation"):
+        export(run, tmp_path / "asked", language=("vqa",))
+    with pytest.raises(ExportError, match="need recordings with segmentation"):
+        export(run, tmp_path / "boxed", boxes=True)
+    with pytest.raises(ConfigError, match="--boxes are written for a whole dataset"):
+        export(run, tmp_path / "told", boxes=True, append=True)

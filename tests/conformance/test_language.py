@@ -1,0 +1,368 @@
+"""LeRobot's language columns of all ten tasks, judged by LeRobot, by the recordings' phases and by brute force."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import re
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from support.check import simulate_run
+from support.export import data_table, episode_rows, export, files_of
+from support.language import active, language_of, meant, phrases
+
+from demorec.errors import ConfigError, ExportError
+from demorec.geometry import Pose
+from demorec.language.kinds import STATES
+from demorec.language.situation import nouns_of, place_of
+from demorec.lerobot import dataset_digest
+from demorec.lerobot.inspect import episode_digests
+from demorec.lerobot.layout import DatasetInfo
+from demorec.recording import Recording
+from demorec.scene.scene import Body, Shape
+from demorec.scene.variation import Ranges
+from demorec.tables import TASKS
+from demorec.tasks.things import THINGS
+
+RECIPE = Path(__file__).parents[2] / "examples" / "language_recipe.yaml"
+MISSING = ("pick_place", "stack", "sort_by_color")
+"""Tasks whose episode begins with a deliberate miss."""
+PLAIN = Ranges(miss_probability=0.0)
+
+pytestmark = pytest.mark.usefixtures("hf_datasets_cache")
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """A run of one episode of every task, numbers only."""
+    folder = tmp_path_factory.mktemp("runs")
+    return [
+        simulate_run(
+            folder / task, 1, task=task, seed=3, cameras=(),
+            ranges=Ranges(miss_probability=1.0) if task in MISSING else PLAIN,
+        )
+        for task in TASKS.names()
+    ]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def dataset(runs: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """All of them in one dataset, with everything that can be said."""
+    out = tmp_path_factory.mktemp("dataset") / "all"
+    report = export(runs, out, language=(), progress=True)
+    assert report.digest == dataset_digest(out)
+    return out
+
+
+def _recording(run: Path) -> Recording:
+    (path,) = (run / "episodes").glob("*.mcap")
+    return Recording(path)
+
+
+def test_lerobots_own_validator_finds_nothing(dataset: Path, tmp_path: Path) -> None:
+    from lerobot.annotations.steerable_pipeline.reader import iter_episodes
+    from lerobot.annotations.steerable_pipeline.staging import EpisodeStaging
+    from lerobot.annotations.steerable_pipeline.validator import StagingValidator
+    from lerobot.datasets.language import column_for_style, validate_camera_field
+
+    spoken = language_of(dataset)
+    records = list(iter_episodes(dataset))
+    assert len(records) == len(spoken) == len(TASKS.names())
+    for record, frames in zip(records, spoken, strict=True):
+        persistent = frames[0][0]
+        assert all(rows == persistent and events == [] for rows, events in frames)
+        assert {row["style"] for row in persistent} == set(STATES)
+        for row in persistent:
+            assert column_for_style(row["style"]) == "language_persistent"
+            validate_camera_field(row["style"], row["camera"])
+            assert row["timestamp"] in record.frame_timestamps
+        EpisodeStaging(tmp_path, record.episode_index).write("plan", persistent)
+    report = StagingValidator().validate(records, tmp_path)
+    assert (report.errors, report.warnings, report.episodes_checked) == ([], [], len(records))
+
+
+def test_our_recipe_gives_messages_for_every_frame(dataset: Path) -> None:
+    from lerobot.configs.recipe import TrainingRecipe
+    from lerobot.datasets.language_render import render_sample
+
+    recipe = TrainingRecipe.from_yaml(RECIPE)
+    table = data_table(dataset).select(["index", "timestamp", "language_persistent", "language_events"])
+    kinds = set()
+    for row in table.slice(0, 600).to_pylist() + table.slice(table.num_rows - 200).to_pylist():
+        rendered = render_sample(
+            recipe=recipe, persistent=row["language_persistent"], events=row["language_events"],
+            t=row["timestamp"], sample_idx=row["index"],
+        )  # fmt: skip
+        assert rendered is not None
+        assert all(message["content"].strip() for message in rendered["messages"])
+        kinds.add(rendered["message_streams"][-1])
+        if len(rendered["messages"]) == 3:
+            assert rendered["messages"][1]["content"].startswith("So far: I ")
+    assert kinds == {"high_level", "low_level"}
+
+
+def test_one_subtask_holds_at_every_frame_and_changes_with_the_phase(runs: list[Path], dataset: Path) -> None:
+    for run, frames in zip(runs, language_of(dataset), strict=True):
+        with _recording(run) as recording:
+            phase, misses = recording.columns().phase, recording.columns().is_deliberate_miss
+            times = (np.arange(len(phase)) / recording.info.fps).astype(np.float32).tolist()
+        rows = [active(frames[0][0], "subtask", time) for time in times]
+        assert all(len(row) == 1 for row in rows)
+        changes = [frame for frame in range(1, len(phase)) if phase[frame] != phase[frame - 1]]
+        assert [frame for frame in range(1, len(phase)) if rows[frame] != rows[frame - 1]] == changes
+        said = np.array(
+            [bool(re.search("to miss it on purpose|missing it on purpose", row[0]["content"])) for row in rows]
+        )
+        assert np.array_equal(said, misses)
+        if misses.any():
+            retry = int(np.flatnonzero(misses)[-1]) + 1 + phase[int(np.flatnonzero(misses)[-1]) + 1 :].index("approach")
+            assert rows[retry][0]["content"].startswith("try again: ")
+            plans = [row["timestamp"] for row in frames[0][0] if row["style"] == "plan"]
+            assert plans == [0.0, times[retry]]
+
+
+def test_subtasks_name_the_thing_that_rises_and_the_place_where_it_ends(runs: list[Path], dataset: Path) -> None:
+    for run, frames in zip(runs, language_of(dataset), strict=True):
+        with _recording(run) as recording:
+            columns, scene, fps = recording.columns(), recording.info.scene, recording.info.fps
+        lifts = 0
+        subtasks = [row for row in frames[0][0] if row["style"] == "subtask"]
+        for row, after in itertools.pairwise(subtasks):
+            first, last = (round(part["timestamp"] * fps) for part in (row, after))
+            if row["content"].startswith("lift the "):
+                risen = {name: poses[last, 2] - poses[first, 2] for name, poses in columns.object_poses.items()}
+                assert max(risen, key=lambda name: risen[name]) in meant(phrases(row["content"])[0], scene)
+                lifts += 1
+            if row["content"].startswith("lower the ") and "gripper" not in row["content"]:
+                _, place = (meant(phrase, scene) for phrase in phrases(row["content"]))
+                tcp = scene.robot.world_from_base.apply(columns.base_from_tcp[last, :3])
+                bodies = {body.name: columns.object_poses.get(body.name) for body in scene.bodies if body.name in place}
+                for name, poses in bodies.items():
+                    where = scene.body(name).world_from_body.position if poses is None else poses[last]
+                    assert np.abs(tcp[:2] - where[:2]).max() < 0.5 * max(scene.body(name).shape.extents)
+        assert lifts >= len(scene.goals)
+
+
+def test_every_wording_means_the_task_and_nothing_else(runs: list[Path], dataset: Path) -> None:
+    for run, frames in zip(runs, language_of(dataset), strict=True):
+        with _recording(run) as recording:
+            scene, instruction = recording.info.scene, recording.info.instruction
+        wordings = [row["content"] for row in frames[0][0] if row["style"] == "task_aug"]
+        assert all(
+            row["role"] == "user" and row["timestamp"] == 0 for row in frames[0][0] if row["style"] == "task_aug"
+        )
+        assert len(wordings) == len(set(wordings)) >= 20
+        assert wordings[0] == instruction
+        things = {goal.object for goal in scene.goals} | {place_of(scene, goal) for goal in scene.goals}
+        for wording in wordings[1:]:
+            found = [(phrase, meant(phrase, scene)) for phrase in phrases(wording)]
+            assert all(len(names) == 1 or phrase[1] == "every" for phrase, names in found), wording
+            named = {name for _, names in found for name in names}
+            assert things <= named, wording
+            assert named - things <= {body.name for body in scene.movable}, wording
+            assert "{" not in wording
+            assert "  " not in wording
+
+
+def test_motions_are_those_of_the_tcp(runs: list[Path], dataset: Path) -> None:
+    axes = {"forward": (0, 1), "backward": (0, -1), "left": (1, 1), "right": (1, -1), "up": (2, 1), "down": (2, -1)}
+    for run, frames in zip(runs, language_of(dataset), strict=True):
+        with _recording(run) as recording:
+            columns, fps = recording.columns(), recording.info.fps
+        rows = [row for row in frames[0][0] if row["style"] == "motion"]
+        starts = [round(row["timestamp"] * fps) for row in rows]
+        for row, first, last in zip(rows, starts, [*starts[1:], len(frames) - 1], strict=True):
+            told = np.zeros(3)
+            for centimetres, direction in re.findall(r"(\d+) cm (\w+)", row["content"]):
+                axis, sign = axes[direction]
+                told[axis] = sign * int(centimetres) / 100
+            assert np.abs(told - (columns.base_from_tcp[last, :3] - columns.base_from_tcp[first, :3])).max() <= 0.005001
+            opened = columns.gripper_width[last] - columns.gripper_width[first]
+            if match := re.search(r"(open|close) the gripper by ([\d.]+) cm", row["content"]):
+                assert abs(float(match[2]) / 100 * (1 if match[1] == "open" else -1) - opened) <= 0.002501
+            else:
+                assert abs(opened) < 0.0026
+
+
+def test_memories_come_when_it_is_done(runs: list[Path], dataset: Path) -> None:
+    for run, frames in zip(runs, language_of(dataset), strict=True):
+        with _recording(run) as recording:
+            goals, tutorial = recording.info.scene.goals, recording.info.task == "tutorial"
+        memories = [row for row in frames[0][0] if row["style"] == "memory"]
+        subtasks = {row["timestamp"]: row["content"] for row in frames[0][0] if row["style"] == "subtask"}
+        assert {row["timestamp"] for row in memories} <= set(subtasks)
+        for row in memories:
+            if "picked up" in row["content"].split(". ")[-1]:
+                assert subtasks[row["timestamp"]].startswith("carry the ")
+        if not tutorial:  # which ends with the fall
+            assert len(re.findall(r"I put the", memories[-1]["content"])) == len(goals)
+
+
+def test_fewer_frames_begin_a_subtask_at_the_first_frame_that_is_left(runs: list[Path], tmp_path: Path) -> None:
+    export(runs[0], tmp_path / "slow", language=("subtask",), fps=10)
+    with _recording(runs[0]) as recording:
+        phase = recording.columns().phase[::3]
+    (frames,) = language_of(tmp_path / "slow")
+    rows = frames[0][0]
+    assert {row["style"] for row in rows} == {"subtask"}
+    starts = [0, *(frame for frame in range(1, len(phase)) if phase[frame] != phase[frame - 1])]
+    assert [row["timestamp"] for row in rows] == [float(np.float32(start / 10)) for start in starts]
+
+
+def test_the_same_seed_says_the_same_and_nothing_else_of_the_dataset_changes(
+    runs: list[Path], dataset: Path, tmp_path: Path
+) -> None:
+    export(runs, tmp_path / "again", language=(), progress=True)
+    assert files_of(tmp_path / "again") == files_of(dataset)
+    export(runs, tmp_path / "without")
+    without, spoken = data_table(tmp_path / "without"), data_table(dataset)
+    assert spoken.select(without.column_names).equals(without)
+    assert set(spoken.column_names) - set(without.column_names) == {"language_persistent", "language_events"}
+    assert dataset_digest(tmp_path / "without") != dataset_digest(dataset)
+
+
+def test_appending_needs_language_where_the_dataset_has_it(runs: list[Path], tmp_path: Path) -> None:
+    out = tmp_path / "grown"
+    export(runs[0], out, language=())
+    with pytest.raises(ExportError, match="language_persistent"):
+        export(runs[1], out, append=True)
+    report = export(runs[1], out, append=True, language=())
+    assert report.digest == dataset_digest(out)
+    first, second = language_of(out)
+    assert first[0] != second[0]
+    assert all(rows == second[0][0] for rows, _ in second)
+
+
+def test_unknown_kinds_are_refused(runs: list[Path], tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="'poem', its kinds are subtask, plan"):
+        export(runs[0], tmp_path / "out", language=("poem",))
+
+
+@pytest.mark.parametrize("kind", list(THINGS))
+def test_things_are_called_as_the_instructions_call_them(kind: str) -> None:
+    shape = Shape(kind="mesh", size=(0.03, 0.03, 0.03))
+    for name in (kind, f"red_{kind}", f"other_red_{kind}", f"red_{kind}_2"):
+        body = Body(name=name, role="object", shape=shape, world_from_body=Pose(), mass=0.1)
+        assert nouns_of(body)[0] == THINGS[kind].noun
+
+
+def test_progress_is_lerobots_own_over_the_true_stages(runs: list[Path], dataset: Path) -> None:
+    from lerobot.rewards.sarm.sarm_utils import find_stage_and_tau, normalize_stage_tau
+
+    table = pq.read_table(dataset / "sarm_progress.parquet").to_pydict()
+    rows = episode_rows(dataset)
+    assert table["index"] == list(range(sum(row["length"] for row in rows)))
+    assert table["episode_index"] == data_table(dataset).column("episode_index").to_pylist()
+    for head in ("sparse", "dense"):
+        share = json.loads((dataset / "meta" / f"temporal_proportions_{head}.json").read_text())
+        found = np.array(table[f"progress_{head}"])
+        assert 0 <= found.min() <= found.max() <= 1
+        for row, run in zip(rows, runs, strict=True):
+            names, starts, ends = (row[f"{head}_subtask_{part}"] for part in ("names", "start_frames", "end_frames"))
+            assert starts == [0, *(end + 1 for end in ends[:-1])]
+            assert ends[-1] == row["length"] - 1
+            own = found[row["dataset_from_index"] : row["dataset_to_index"]]
+            assert own[0] == 0
+            assert own[-1] == 1  # all of them succeed
+            stages = [stage for stage in share if stage in names]
+            assert all(f"goal {goal + 1}: " in " ".join(stages) for goal in range(row["num_goals"]))
+            for frame in range(row["length"]):
+                value = find_stage_and_tau(
+                    frame, row["length"], names, starts, ends, stages, share, return_combined=True
+                )
+                assert isinstance(value, float)
+                shares = {stage: share[stage] for stage in stages}
+                expected = normalize_stage_tau(value, temporal_proportions=shares, subtask_names=stages)
+                assert abs(float(expected) - own[frame]) < 2e-3, (run, frame)
+            with _recording(run) as recording:
+                misses, phase = recording.columns().is_deliberate_miss, recording.columns().phase
+            if head == "dense":
+                changes = {frame for frame in range(1, len(phase)) if phase[frame] != phase[frame - 1]}
+                assert set(starts[1:]) <= changes
+            # It rises but where a try came to nothing.
+            falls = np.flatnonzero(np.diff(own) < 0)
+            assert falls.tolist() == (np.flatnonzero(misses)[-1:].tolist() if misses.any() else [])
+
+
+def test_sample_weighting_gives_no_weight_to_a_miss(dataset: Path) -> None:
+    import torch
+    from lerobot.rewards.sarm.rabc import RABCWeights
+    from lerobot.utils.sample_weighting import SampleWeightingConfig, make_sample_weighter
+
+    policy = SimpleNamespace(config=SimpleNamespace(chunk_size=10))
+    for head in ("sparse", "dense"):
+        config = SampleWeightingConfig(head_mode=head)
+        weighter = make_sample_weighter(config, policy, torch.device("cpu"), dataset_root=str(dataset))
+        assert isinstance(weighter, RABCWeights)
+        row = next(row for row in episode_rows(dataset) if row["has_deliberate_miss"])
+        ends = row[f"{head}_subtask_end_frames"]
+        missed = ends[0] if head == "sparse" else ends[2]  # the last frame of the missed pick, or of its close
+        frames = torch.arange(row["dataset_from_index"], row["dataset_from_index"] + missed + 20)
+        weights, _ = weighter.compute_batch_weights({"index": frames})
+        assert (weights[missed - 8 : missed + 1] == 0).all()
+        assert (weights[: missed - 10] > 0).all()
+        assert (weights[missed + 1 :] > 0).all()
+
+
+def test_episodes_are_filtered_by_what_is_known_of_them(runs: list[Path], dataset: Path) -> None:
+    from lerobot.datasets import LeRobotDataset
+
+    meta = LeRobotDataset("local/all", root=dataset).meta
+    several = meta.filter_episodes(lambda e: e["num_goals"] > 1 and e["success"])
+    assert [TASKS.names()[index] for index in several] == ["stack_three", "sort_by_color", "line_up"]
+    missed = meta.filter_episodes(lambda e: e["has_deliberate_miss"] and e["num_retries"] == 1)
+    assert {TASKS.names()[index] for index in missed} == set(MISSING)
+    for run, row in zip(runs, episode_rows(dataset), strict=True):
+        with _recording(run) as recording:
+            info, outcome = recording.info, recording.outcome
+            assert row["duration_s"] == recording.num_frames / info.fps
+        assert outcome is not None
+        body = info.scene.body(info.scene.goals[0].object)
+        assert (row["task_name"], row["seed"], row["split"], row["variation"]) == (info.task, 3, "all", "mild")
+        assert (row["object_x"], row["object_y"]) == tuple(body.world_from_body.position[:2])
+        assert row["drawn/speed"] == info.behaviour["speed"]
+        assert row["drawn/object_mass"] == body.mass
+        found = [check.value for check in outcome.checks if check.name.split(":")[0] == "tilt"]
+        assert row["success_checks/tilt"] == max(found)
+        assert (row["success_checks/distance_to_goal"] is None) == (info.task == "tutorial")
+
+
+def test_lerobots_tools_keep_the_words(runs: list[Path], tmp_path: Path) -> None:
+    from lerobot.datasets import LeRobotDataset
+    from lerobot.datasets.aggregate import aggregate_datasets
+    from lerobot.datasets.dataset_tools import delete_episodes, split_dataset
+
+    parts = [tmp_path / "first", tmp_path / "second"]
+    chosen = [[runs[0], runs[2]], [runs[3]]]
+    for run, part in zip(chosen, parts, strict=True):
+        export(run, part, language=(), progress=True)
+    known = [digest for part in parts for digest in episode_digests(part, DatasetInfo.load(part))]
+    aggregate_datasets(["local/1", "local/2"], "local/all", roots=parts, aggr_root=tmp_path / "merged")
+    assert episode_digests(tmp_path / "merged", DatasetInfo.load(tmp_path / "merged")) == known
+    facts = [row["task_name"] for row in episode_rows(tmp_path / "merged")]
+    assert facts == [run.name for part in chosen for run in part]
+
+    first = LeRobotDataset("local/1", root=parts[0])
+    delete_episodes(first, [0], output_dir=tmp_path / "left", repo_id="local/left")
+    split_dataset(first, {"one": [0], "other": [1]}, output_dir=tmp_path / "split")
+    for out, digest in (("left", known[1]), ("split/one", known[0]), ("split/other", known[1])):
+        assert episode_digests(tmp_path / out, DatasetInfo.load(tmp_path / out)) == [digest]
+        assert "task_name" not in episode_rows(tmp_path / out)[0]  # LeRobot leaves out what it does not know
+        assert not (tmp_path / out / "sarm_progress.parquet").exists()
+
+
+def test_progress_goes_on_where_a_dataset_ends(runs: list[Path], tmp_path: Path) -> None:
+    out = tmp_path / "grown"
+    export(runs[0], out, progress=True)
+    with pytest.raises(ExportError, match="has the stages of --progress: export with it"):
+        export(runs[1], out, append=True)
+    export(runs[1], out, append=True, progress=True)
+    export(runs[:2], tmp_path / "at_once", progress=True)
+    assert (out / "sarm_progress.parquet").read_bytes() == (tmp_path / "at_once" / "sarm_progress.parquet").read_bytes()
+    export(runs[0], tmp_path / "plain")
+    with pytest.raises(ExportError, match="lacks the stages of --progress: export without it"):
+        export(runs[1], tmp_path / "plain", append=True, progress=True)

@@ -1,0 +1,156 @@
+"""Words for things and tries, on scenes and episodes that are made up."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.recording import make_episode
+
+from demorec.geometry import Pose
+from demorec.language.narration import narrate
+from demorec.language.referring import phrase_for, phrases_for, references, resolve
+from demorec.language.situation import Situation, situation
+from demorec.recording import EpisodeWriter, Recording
+from demorec.scene.episode import Event
+from demorec.scene.scene import Body, RobotPlacement, Scene, Shape
+
+
+def scene(*cubes: tuple[str, float, float, float], yaw: float = 0.0) -> Scene:
+    """Cubes (colour, x, y, side) in front of a robot that is turned by `yaw`."""
+    bodies = [
+        Body(
+            name=f"{color}_cube_{number}", role="object", shape=Shape(kind="box", size=(side,) * 3), mass=0.1,
+            world_from_body=Pose.from_yaw((0.0, 0.0, 0.0), yaw) @ Pose(position=np.array([x, y, side / 2])),
+            color_name=color,
+        )
+        for number, (color, x, y, side) in enumerate(cubes)
+    ]  # fmt: skip
+    return Scene(
+        robot=RobotPlacement(
+            name="panda", world_from_base=Pose.from_yaw((0.0, 0.0, 0.0), yaw), joint_position=(0.0,) * 7,
+            gripper_width=0.08,
+        ),
+        bodies=tuple(bodies),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("yaw", [0.0, 2.1])
+@pytest.mark.parametrize(
+    ("phrase", "number"),
+    [
+        ("the blue cube", 2), ("the left red cube", 0), ("the right red cube", 1), ("the rightmost cube", 2),
+        ("the leftmost cube", 0), ("the smaller red cube", 1), ("the larger red cube", 0), ("the smallest cube", 1),
+        ("the cube nearest to the robot", 0), ("the red cube farthest from the robot", 1), ("the middle cube", 1),
+    ],
+)  # fmt: skip
+def test_phrases_mean_what_they_say_from_where_the_robot_stands(phrase: str, number: int, yaw: float) -> None:
+    things = scene(("red", 0.3, 0.2, 0.05), ("red", 0.45, 0.0, 0.03), ("blue", 0.5, -0.2, 0.04), yaw=yaw)
+    assert resolve(phrase, situation(things)) == {things.bodies[number].name}
+
+
+@pytest.mark.parametrize(
+    "phrase",
+    [
+        "the cube", "the red cube", "the left cube", "the smaller cube", "the green cube", "the middle red cube",
+        "the larger blue cube", "the red one", "a red cube", "the red cube on the mat", "",
+    ],
+)  # fmt: skip
+def test_what_is_not_clear_means_nothing(phrase: str) -> None:
+    things = scene(("red", 0.4, 0.2, 0.05), ("red", 0.5, 0.02, 0.03), ("blue", 0.4, -0.2, 0.04))
+    assert resolve(phrase, situation(things)) == frozenset()
+
+
+def test_a_millimetre_makes_no_left_and_no_larger() -> None:
+    things = situation(scene(("red", 0.4, 0.1, 0.05), ("red", 0.6, 0.099, 0.0499)))
+    for phrase in ("the left red cube", "the larger red cube"):
+        assert resolve(phrase, things) == frozenset()
+    assert phrase_for("red_cube_0", things) == "the red cube nearest to the robot"
+    twins = situation(scene(("red", 0.4, 0.1, 0.05), ("red", 0.401, 0.101, 0.05)))
+    assert phrases_for("red_cube_0", twins) == []
+    assert phrase_for("red_cube_0", twins) == "a red cube"
+
+
+def test_texts_are_read_phrase_by_phrase() -> None:
+    things = situation(scene(("red", 0.4, 0.2, 0.05), ("red", 0.5, 0.02, 0.03), ("blue", 0.4, -0.2, 0.04)))
+    text = "Put the left red cube on the blue cube, then every red cube beside the red cube"
+    assert [(phrase, len(names)) for phrase, names in references(text, things)] == [
+        ("the left red cube", 1), ("the blue cube", 1), ("every red cube", 2), ("the red cube", 0),
+    ]  # fmt: skip
+
+
+PHASES = ("approach", "descend", "close", "lift", "transport", "lower", "release", "retreat")
+
+
+def told(folder: Path, script: list[tuple[str, str, str]], **arguments: object) -> list[tuple[int, str, str]]:
+    """(frame, kind, text) of an episode of two frames a phase; `script` has (phase, event, its message)."""
+    info, frames, outcome = make_episode(num_frames=2 * len(script), cameras=(), **arguments)  # type: ignore[arg-type]
+    path = folder / "episode.mcap"
+    with EpisodeWriter(path, info) as writer:
+        for number, frame in enumerate(frames):
+            phase, name, message = script[number // 2]
+            events = (Event(name=name, message=message),) if name and number % 2 == 0 else ()
+            writer.write(replace(frame, phase=phase, events=events, is_deliberate_miss=False))
+        writer.finish(outcome)
+    with Recording(path) as recording:
+        columns = recording.columns()
+        rows = np.arange(len(columns.time_ns))
+        return [
+            (statement.row, statement.kind, statement.text)
+            for statement in narrate(recording, columns, rows, ("subtask", "plan", "memory"))
+        ]
+
+
+def steps(*phases: str, **events: tuple[str, str]) -> list[tuple[str, str, str]]:
+    return [(phase, *events.get(phase, ("", ""))) for phase in phases]
+
+
+GRASP = ("grasp", "grasp cube at yaw 0.1000 rad")
+
+
+def test_a_miss_and_a_drop_are_told_and_tried_again(tmp_path: Path) -> None:
+    script = [
+        *steps("approach", "descend", "close", "recover", approach=GRASP, recover=("miss", "missed cube")),
+        *steps(*PHASES[:5], "recover", approach=GRASP, recover=("drop", "dropped cube")),
+        *steps(*PHASES, approach=GRASP),
+    ]
+    found = told(tmp_path, script)
+    starts = [2 * index for index in range(len(script))]
+    assert [row for row, kind, _ in found if kind == "subtask"] == starts
+    said = {row: text for row, kind, text in found if kind == "subtask"}
+    assert said[0] == "move above the red cube"
+    assert said[6] == "open the gripper and rise after missing the red cube"
+    assert said[8] == "try again: move above the red cube"
+    assert said[14] == "lift the red cube"
+    assert said[18] == "open the gripper and rise after dropping the red cube"
+    assert said[20] == "try again: move above the red cube"
+    assert [(row, text.splitlines()[0]) for row, kind, text in found if kind == "plan"] == [
+        (0, "1. pick up the red cube"), (8, "1. pick up the red cube again"), (20, "1. pick up the red cube again"),
+    ]  # fmt: skip
+    assert [(row, text) for row, kind, text in found if kind == "memory"][:3] == [
+        (6, "I missed the red cube."), (16, "I picked up the red cube."), (18, "I dropped the red cube."),
+    ]  # fmt: skip
+
+
+def test_a_bad_placement_is_no_placement(tmp_path: Path) -> None:
+    bad = ("misplaced_distance", "cube lies badly: distance")
+    script = [*steps(*PHASES, approach=GRASP), ("approach", *GRASP), *steps(*PHASES[1:])]
+    script[7] = ("retreat", *bad)
+    memories = [text for _, kind, text in told(tmp_path, script) if kind == "memory"]
+    assert memories[1] == "I put the red cube down in the wrong place."
+
+
+def test_phases_of_a_foreign_script_are_told_as_they_are(tmp_path: Path) -> None:
+    found = told(tmp_path, [("wiggle_about", "", ""), ("", "", ""), ("close", "", "")])
+    assert [(row, text) for row, kind, text in found if kind == "subtask"] == [
+        (0, "wiggle about"), (2, "pick up the red cube and place it on the green target"), (4, "grasp the red cube"),
+    ]  # fmt: skip
+
+
+def test_things_are_where_the_poses_say(tmp_path: Path) -> None:
+    things = scene(("red", 0.4, 0.2, 0.05), ("red", 0.5, -0.2, 0.03))
+    poses = {"red_cube_0": np.array([0.4, -0.4, 0.0, 0, 0, 0, 1.0])}
+    now: Situation = situation(things, poses)
+    assert resolve("the right red cube", now) == {"red_cube_0"}
