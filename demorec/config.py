@@ -23,18 +23,28 @@ MAX_PIXELS = 16_000_000
 MAX_PHYSICS_HZ = 10_000
 
 
+PRESETS: Mapping[str, tuple[str, ...]] = {
+    "h264": (
+        "ultrafast", "superfast", "veryfast", "faster", "fast", "medium", "slow", "slower", "veryslow", "placebo",
+    ),
+    "av1": tuple(str(number) for number in range(14)),
+    "jpeg": (),
+}  # fmt: skip
+"""Codec -> the presets of x264 and SVT-AV1, fastest first and last."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class VideoConfig:
     """How pictures are coded, once, while recording."""
 
     codec: Literal["h264", "av1", "jpeg"] = "h264"
-    """h264: plays everywhere, little CPU; av1: LeRobot's default, a third smaller; jpeg: single pictures."""
+    """h264: plays everywhere, little CPU; av1: LeRobot's default, more CPU, larger in short groups; jpeg: single pictures."""
     gop: int = 2
     """Pictures from one keyframe to the next: 2 is LeRobot's convention for fast random access."""
     crf: int | None = None
     """Constant rate factor, smaller is better (auto: 23 for h264, 30 for av1)."""
     preset: str | None = None
-    """Encoder preset (auto: veryfast for h264, 12 for av1)."""
+    """Encoder preset (auto: veryfast for h264, 12 for av1); x264's names, or a number from 0 to 13 for av1."""
     jpeg_quality: int = 90
     """Of --codec jpeg, 1 to 100, larger is better."""
 
@@ -44,6 +54,9 @@ class VideoConfig:
         if self.crf is not None:
             check_option("crf", self.crf, 0, 51 if self.codec == "h264" else 63)
         check_option("jpeg_quality", self.jpeg_quality, 1, 100)
+        if self.preset is not None and self.preset not in PRESETS[self.codec]:
+            allowed = ", ".join(PRESETS[self.codec]) or "none: leave it out"
+            raise OptionError("preset", f"is {self.preset!r}, {self.codec} has {allowed}")
 
 
 @dataclass(frozen=True, kw_only=True)

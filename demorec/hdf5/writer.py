@@ -150,11 +150,13 @@ class RobomimicWriter:
         """The attributes of `data` that robomimic makes an environment from, and what else holds for all episodes."""
         info, options = recording.info, self.options
         fps = info.fps // frame_stride(info.fps, options.fps)
+        cameras = [camera for camera in info.scene.cameras if options.takes(IMAGE_PREFIX + camera.name)]
         arguments = {
             "robot": info.scene.robot.name,
             "fps": fps,
             "physics_hz": info.physics_hz,
-            "cameras": [name for name in recording.cameras if options.takes(IMAGE_PREFIX + name)],
+            "cameras": [camera.name for camera in cameras],
+            **({"width": cameras[0].width, "height": cameras[0].height} if cameras else {}),
             "action": options.action,
             "privileged": options.privileged,
         }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from demorec.errors import ConfigError, DemorecError, MissingDependencyError, resource_error
@@ -25,13 +26,17 @@ def train(arguments: Sequence[str], *, frame_cache_bytes: int, on_replaced: Call
         on_replaced: Called when the first dataset is opened by `FastDataset`: streamed ones are not.
 
     Raises:
-        ConfigError: The limit is negative.
+        ConfigError: The limit is negative, or the file of --config_path is missing.
         TrainingError: lerobot-train ended with an error.
         MissingDependencyError: LeRobot, or what it needs for training, is not installed.
-        SystemExit: lerobot-train refused its arguments, and said why, or told its help.
+        SystemExit: lerobot-train refused its arguments (2), and said why, or told its help (0).
     """
     if frame_cache_bytes < 0:
         raise ConfigError(f"frame-cache-mb is {frame_cache_bytes / (1 << 20):g}, at least 0 is needed.")
+    for argument in arguments:
+        flag, _, path = argument.partition("=")
+        if flag == "--config_path" and path.endswith(".json") and not Path(path).exists():
+            raise ConfigError(f"There is no such file of settings: {path}")
     try:
         import accelerate  # noqa: F401  # which lerobot-train asks for late
         from lerobot.scripts import lerobot_train
@@ -40,6 +45,8 @@ def train(arguments: Sequence[str], *, frame_cache_bytes: int, on_replaced: Call
     with _reading_fast(frame_cache_bytes, on_replaced), _called_as(PROGRAM, arguments):
         try:
             lerobot_train.main()
+        except SystemExit as ended:  # its parser exits with 1 for some wrong requests and with 2 for others
+            raise SystemExit(2 if ended.code else 0) from None
         except Exception as error:  # whatever a foreign program raises
             if isinstance(error, DemorecError) or resource_error(error) is not None:
                 raise

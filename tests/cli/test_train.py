@@ -58,7 +58,7 @@ def test_flags_go_on_and_the_reader_is_replaced_meanwhile(
         seen["limit"] = opened[0]._frame_cache_bytes
 
     instead(lerobot_train)
-    words = ["--config_path=a_b.json", "--policy.type", "act", '--rename_map={"a": "b"}', "--batch_size=2"]
+    words = ["--config_path=a_b.yaml", "--policy.type", "act", '--rename_map={"a": "b"}', "--batch_size=2"]
     before = sys.argv
     assert ends(*words[:1], "--frame-cache-mb=3", *words[1:]) == 0
     assert seen == {"argv": ["lerobot-train", *words], "types": [FastDataset] * 2, "limit": 3 << 20}
@@ -144,3 +144,17 @@ def test_the_losses_are_those_of_lerobot_train(name: str, dataset: Path, tmp_pat
         told[-1].append(weights.read_bytes())
     assert len(told[0]) == 13
     assert told[0] == told[1]
+
+
+@pytest.mark.parametrize("refused", [1, 2, "wrong"])
+def test_what_its_parser_refuses_is_a_wrong_request(instead: Any, refused: object) -> None:
+    def lerobot_train() -> None:
+        raise SystemExit(refused)
+
+    instead(lerobot_train)
+    assert ends("--stepz=3") == 2
+
+
+def test_missing_settings_are_a_wrong_request(capsys: pytest.CaptureFixture[str]) -> None:
+    assert ends("--config_path=nothing.json") == 2
+    assert "There is no such file of settings: nothing.json" in capsys.readouterr().err

@@ -35,6 +35,9 @@ from demorec.scene.episode import frame_time_ns
         ({"video": VideoConfig(crf=99)}, "crf is 99"),
         ({"video": VideoConfig(gop=0)}, "gop is 0"),
         ({"video": VideoConfig(codec="jpeg", jpeg_quality=0)}, "quality is 0"),
+        ({"video": VideoConfig(preset="nope")}, "preset is 'nope', h264 has ultrafast, superfast"),
+        ({"video": VideoConfig(codec="av1", preset="medium")}, "preset is 'medium', av1 has 0, 1"),
+        ({"video": VideoConfig(codec="jpeg", preset="fast")}, "jpeg has none"),
     ],
 )
 def test_impossible_values_are_refused(change: dict[str, Any], message: str) -> None:

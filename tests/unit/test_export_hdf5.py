@@ -132,12 +132,18 @@ def test_env_args_name_an_environment(run: Path, tmp_path: Path) -> None:
 
     import demorec.gym_env  # noqa: F401  (registers the environments)
 
-    export(run, tmp_path / "d.hdf5", "hdf5", features=("observation.velocity",), action="ee")
+    # Environments have pictures of one size, the recordings of this run have two.
+    features = ("observation.velocity", "observation.images.wrist")
+    export(run, tmp_path / "d.hdf5", "hdf5", features=features, action="ee")
     with h5py.File(tmp_path / "d.hdf5") as file:
         described = json.loads(file["data"].attrs["env_args"])
+        pictures = [name for name in file["data/demo_0/obs"] if name.endswith("_image")]
+        shapes = {name.removesuffix("_image"): file[f"data/demo_0/obs/{name}"].shape[1:] for name in pictures}
     assert described["type"] == 2  # robomimic's EnvType.GYM_TYPE
     env = gymnasium.make(described["env_name"], **described["env_kwargs"])
     assert env.action_space.shape == (8,)
+    observation, _ = env.reset(seed=0)
+    assert {name: pixels.shape for name, pixels in observation["pixels"].items()} == shapes
     env.close()
 
 
