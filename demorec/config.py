@@ -38,7 +38,7 @@ class VideoConfig:
     """How pictures are coded, once, while recording."""
 
     codec: Literal["h264", "av1", "jpeg"] = "h264"
-    """h264: plays everywhere, little CPU; av1: LeRobot's default, more CPU, larger in short groups; jpeg: single pictures."""
+    """h264: plays everywhere; av1: LeRobot's default, more CPU, larger in short groups; jpeg: single pictures."""
     gop: int = 2
     """Pictures from one keyframe to the next: 2 is LeRobot's convention for fast random access."""
     crf: int | None = None
