@@ -11,20 +11,17 @@ import math
 import re
 from collections.abc import Iterator
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from demorec.check.base import Measurement, check
 from demorec.check.dataset import Dataset
-from demorec.errors import ExportError
 from demorec.language.kinds import STATES
 from demorec.language.questions import ANSWERS
 from demorec.language.referring import references
 from demorec.language.situation import COLORS, Situation, place_of, situation
-from demorec.lerobot.boxes import BOXES_DIR
-from demorec.lerobot.files import read_json
+from demorec.lerobot.boxes import BOXES_DIR, read_boxes
 from demorec.lerobot.language import COLUMNS, SpokenEpisode
 from demorec.scene.episode import EpisodeInfo
 
@@ -201,22 +198,15 @@ class _Boxes:
 
     def __init__(self, dataset: Dataset) -> None:
         self._first = [place.from_index for place in dataset.places]
-        self._found: dict[tuple[str, int], dict[str, list[int]]] = {}
-        self.cameras = set()
-        for path in sorted((dataset.path / BOXES_DIR).glob("*.json")):
-            self.cameras.add(path.stem)
-            self._read(path)
+        self._found: dict[tuple[str, int], dict[str, list[float]]] = {}
+        files = sorted((dataset.path / BOXES_DIR).glob("*.json"))
+        self.cameras = {path.stem for path in files}
+        for path in files:
+            for item in read_boxes(path):
+                x, y, width, height = item.box
+                self._found.setdefault((path.stem, item.index), {})[item.object] = [x, y, x + width - 1, y + height - 1]
 
-    def _read(self, path: Path) -> None:
-        try:
-            for item in read_json(path)["annotations"]:
-                x, y, width, height = item["bbox"]
-                seen = self._found.setdefault((path.stem, int(item["image_id"])), {})
-                seen[item["object"]] = [x, y, x + width - 1, y + height - 1]
-        except (OSError, ValueError, TypeError, KeyError) as error:
-            raise ExportError(f"The boxes cannot be read: {path}") from error
-
-    def at(self, camera: str, episode: int, frame: int) -> dict[str, list[int]]:
+    def at(self, camera: str, episode: int, frame: int) -> dict[str, list[float]]:
         """Name of the body -> (x_min, y_min, x_max, y_max), of all that a picture shows."""
         return self._found.get((camera, self._first[episode] + frame), {})
 
@@ -232,7 +222,7 @@ def _wrong_answers(episode: SpokenEpisode, number: int, start: Situation, boxes:
                 yield from (f"frame {frame}: {text}" for text in _against(answer, seen, start))
 
 
-def _against(answer: Row, seen: dict[str, list[int]], start: Situation) -> Iterator[str]:
+def _against(answer: Row, seen: dict[str, list[float]], start: Situation) -> Iterator[str]:
     """Faults of an answer, given what the picture shows."""
     if "count" in answer:
         count = sum(answer["label"] in start.thing(name).nouns for name in seen)
