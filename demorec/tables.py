@@ -161,6 +161,10 @@ CHECKS: Registry[Check] = Registry(
         "dataset_forward_kinematics": "demorec.check.dataset_motion:dataset_forward_kinematics",
         "dataset_action_lag": "demorec.check.dataset_motion:dataset_action_lag",
         "dataset_sidecar": "demorec.check.dataset_files:dataset_sidecar",
+        "dataset_facts": "demorec.check.dataset_facts:dataset_facts",
+        "dataset_progress": "demorec.check.dataset_facts:dataset_progress",
+        "dataset_language": "demorec.check.dataset_language:dataset_language",
+        "dataset_language_truth": "demorec.check.dataset_language:dataset_language_truth",
         "dataset_opens": "demorec.check.dataset_files:dataset_opens",
     },
 )

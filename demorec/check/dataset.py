@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from demorec.check.dataset_video import EpisodePictures, episode_pictures
 from demorec.errors import ExportError, in_words
 from demorec.lerobot.files import read_table
+from demorec.lerobot.language import COLUMNS, SpokenEpisode, spoken_episodes
 from demorec.lerobot.layout import AUTOMATIC_FEATURES, DatasetInfo
 from demorec.lerobot.paths import SIDECAR_DIR
 from demorec.lerobot.reader import EpisodePlace, RowReader, episode_places, read_tasks
@@ -87,11 +88,19 @@ class Dataset:
     @cached_property
     def sidecar(self) -> list[dict[str, Any]]:
         """The rows that demorec keeps beside each episode; empty for a dataset of somebody else's."""
-        names = ["episode_index", "success", "content_digest", "frame_stride", "episode_info"]
+        names = [
+            "episode_index", "success", "num_retries", "content_digest", "frame_stride", "phases", "objects", "goals",
+            "deliberate_miss_frames", "episode_info",
+        ]  # fmt: skip
         rows: list[dict[str, Any]] = []
         for path in sorted((self.path / SIDECAR_DIR / "episodes").glob("*/*.parquet")):
             rows += read_table(path, names, schema=EPISODE_SCHEMA).to_pylist()
         return rows
+
+    @cached_property
+    def spoken(self) -> list[SpokenEpisode]:
+        """What the language columns of each episode hold; empty for a dataset without them."""
+        return list(spoken_episodes(self.path)) if set(COLUMNS) <= set(self.info.features) else []
 
     @cached_property
     def infos(self) -> list[EpisodeInfo]:

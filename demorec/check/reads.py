@@ -13,7 +13,9 @@ from dataclasses import dataclass
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from demorec.geometry import Pose
+from demorec.lerobot.language import COLUMNS
 from demorec.lerobot.layout import AUTOMATIC_FEATURES
+from demorec.lerobot.progress import PROGRESS_PATH
 from demorec.recording import channels
 from demorec.recording.metadata import EPISODE, OUTCOME, RECOVERED, CameraStreams
 from demorec.recording.streams import frame_streams
@@ -147,5 +149,5 @@ def columns() -> list[str]:
     """Every column of a LeRobot dataset and the files beside them."""
     pictures = features.IMAGE_PREFIX + "{camera}"
     numbers = (features.STATE, features.VELOCITY, features.EE_POSE, features.ENVIRONMENT_STATE, features.ACTION)
-    files = ("meta/info.json", "meta/stats.json", "meta/episodes", "demorec/")
-    return [*numbers, pictures, pictures + features.DEPTH_SUFFIX, *AUTOMATIC_FEATURES, *files]
+    files = ("meta/info.json", "meta/stats.json", "meta/episodes", "demorec/", PROGRESS_PATH)
+    return [*numbers, pictures, pictures + features.DEPTH_SUFFIX, *AUTOMATIC_FEATURES, *COLUMNS, *files]

@@ -23,6 +23,14 @@ from demorec.recording import Recording
 from demorec.scene.episode import EpisodeColumns
 from demorec.scene.scene import Camera
 
+ANSWERS = {
+    "bbox": {"detections"},
+    "keypoint": {"label", "point_format", "point"},
+    "count": {"label", "count"},
+    "attribute": {"label", "attribute", "value"},
+    "spatial": {"subject", "relation", "object"},
+}
+"""Kind of question -> what its answer has at least."""
 _CLEARLY_BESIDE = 0.05
 """Share of the picture's width by which one thing must be farther to a side than another to be called so."""
 _SIDES = frozenset(("left", "right", "leftmost", "rightmost"))

@@ -9,9 +9,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
+from demorec.errors import ExportError, in_words
 from demorec.export.staging import sync_file
 from demorec.language.masks import SeenObject
 from demorec.lerobot.paths import SIDECAR_DIR
+from demorec.plain import parse_json
+from demorec.safety.files import open_regular
 
 BOXES_DIR = f"{SIDECAR_DIR}/boxes"
 
@@ -30,6 +33,36 @@ class EpisodeBoxes:
     height: int
     num_frames: int
     objects: tuple[SeenObject, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReadBox:
+    """One line of a file of boxes: `index` of the row in the dataset, name of the body, (x, y, width, height) px."""
+
+    index: int
+    object: str
+    box: tuple[float, float, float, float]
+
+
+def read_boxes(path: Path) -> Iterator[ReadBox]:
+    """What is in a file of ours, line by line, so that it may be as large as it likes.
+
+    Raises:
+        ExportError: It is missing, or no such file.
+    """
+    try:
+        with open_regular(path) as file:
+            for raw in file:
+                line = raw.decode().strip().rstrip(",")
+                if line == "]":
+                    return
+                if line.startswith('{"id"'):
+                    item = parse_json(line)
+                    x, y, width, height = (float(number) for number in item["bbox"])
+                    yield ReadBox(index=int(item["image_id"]), object=str(item["object"]), box=(x, y, width, height))
+        raise ValueError("its end is missing")
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise ExportError(f"The boxes cannot be read ({in_words(error)}): {path}") from error
 
 
 class BoxWriter:

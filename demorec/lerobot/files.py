@@ -25,6 +25,9 @@ _FLOOR_BYTES = 128 << 20
 _RATIO = 16
 """A table may unpack to so much, or so many times its size; rows of a robot that moves hardly compress."""
 _ROWS_AT_ONCE = 64
+_REPEATED = "language_"
+_MOST_SAID = 4096
+"""Values of the language columns in a row; what holds for an episode stands in each of its rows and compresses well."""
 _BYTES_PER_VALUE = 8
 _PARENT_BOXES = frozenset((b"moov", b"trak", b"mdia", b"minf", b"stbl", b"moof", b"traf"))
 _MAX_BOXES = 100_000
@@ -51,11 +54,15 @@ def open_table(path: Path, columns: Sequence[str] | None = None) -> pq.ParquetFi
             size = os.fstat(file.fileno()).st_size
         table = pq.ParquetFile(path)
         groups = [table.metadata.row_group(number) for number in range(table.metadata.num_row_groups)]
-        values = sum(group.column(number).num_values for group in groups for number in range(group.num_columns))
+        parts = [group.column(number) for group in groups for number in range(group.num_columns)]
+        said = sum(part.num_values for part in parts if part.path_in_schema.startswith(_REPEATED))
+        values = sum(part.num_values for part in parts) - said
     except (OSError, ValueError, pa.ArrowException) as error:
         raise ExportError(f"The table cannot be read ({in_words(error)}): {path}") from error
     if _BYTES_PER_VALUE * max(values, table.metadata.num_rows) > _most_bytes(size):
         raise ExportError(f"The table claims {values:,} values in {size / 1000:,.0f} kB, so it is not read: {path}")
+    if said > _MOST_SAID * table.metadata.num_rows:
+        raise ExportError(f"The table claims {said:,} values of language in so few rows, so it is not read: {path}")
     missing = set(columns or ()) - set(table.schema_arrow.names)
     if missing:
         raise ExportError(f"The table has no column {', '.join(sorted(missing))}: {path}")

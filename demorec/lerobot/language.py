@@ -9,15 +9,18 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from demorec.errors import ExportError, in_words
 from demorec.language.kinds import STATES
+from demorec.lerobot.files import open_table
 from demorec.scene.features import IMAGE_PREFIX
 
 if TYPE_CHECKING:
@@ -167,3 +170,52 @@ def _digest(rows: Sequence[Mapping[str, Any]]) -> str:
     """Of the entries that are there; an empty list of tool calls is as good as none."""
     told = [{name: value for name, value in row.items() if value is not None and value != []} for row in rows]
     return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
+
+
+@dataclass(kw_only=True)
+class SpokenEpisode:
+    """What the language columns of one episode hold, whoever wrote them.
+
+    Attributes:
+        persistent: What stands in its first row.
+        events: Row -> what stands in it, of rows in which anything does.
+        num_rows: Of the episode.
+        differing: Rows in which `language_persistent` holds something else than in the first.
+    """
+
+    persistent: list[dict[str, Any]]
+    events: dict[int, list[dict[str, Any]]] = field(default_factory=dict)
+    num_rows: int = 0
+    differing: list[int] = field(default_factory=list)
+
+
+def spoken_episodes(root: Path) -> Iterator[SpokenEpisode]:
+    """The language of every episode in order, from the data files of a dataset that has both columns.
+
+    Raises:
+        ExportError: They cannot be read.
+    """
+    current: tuple[int, SpokenEpisode, pa.Array] | None = None
+    names = ["episode_index", *COLUMNS]
+    for path in sorted((root / "data").glob("*/*.parquet")):
+        try:
+            for batch in open_table(path, names).iter_batches(batch_size=64, columns=names):
+                indices, persistent, events = (batch.column(name) for name in names)
+                if not is_language(persistent.type) or not is_language(events.type):
+                    raise ValueError("language columns of another type")
+                for row, index in enumerate(indices.to_pylist()):
+                    state = persistent[row].values
+                    if current is None or current[0] != index:
+                        if current is not None:
+                            yield current[1]
+                        current = index, SpokenEpisode(persistent=persistent[row].as_py() or []), state
+                    _, episode, first = current
+                    if not (first is state or (first is not None and state is not None and state.equals(first))):
+                        episode.differing.append(episode.num_rows)
+                    if told := events[row].as_py():
+                        episode.events[episode.num_rows] = told
+                    episode.num_rows += 1
+        except (OSError, ValueError, pa.ArrowException) as error:
+            raise ExportError(f"The language of the dataset cannot be read ({in_words(error)}): {path}") from error
+    if current is not None:
+        yield current[1]

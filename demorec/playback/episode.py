@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from demorec.geometry import Array
 from demorec.scene.episode import EpisodeInfo, Event, Outcome
+
+Box = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -77,6 +79,8 @@ class PlayedEpisode:
         depth: Camera -> reads (H, W) metres of every frame.
         segmentation: Camera -> reads (H, W) segment numbers of every frame.
         segment_names: Segment number -> name.
+        statements: What is said of it: (time_ns, kind, sentence), each holds until the next one of its kind.
+        boxes: Camera -> frame -> (name, (x, y, width, height) px) of what it sees.
     """
 
     name: str
@@ -100,6 +104,8 @@ class PlayedEpisode:
     depth: Mapping[str, Callable[[], Iterator[NDArray[np.float32]]]] = field(default_factory=dict)
     segmentation: Mapping[str, Callable[[], Iterator[NDArray[np.int32]]]] = field(default_factory=dict)
     segment_names: Mapping[int, str] = field(default_factory=dict)
+    statements: tuple[tuple[int, str, str], ...] = ()
+    boxes: Mapping[str, Mapping[int, Sequence[tuple[str, Box]]]] = field(default_factory=dict)
 
     @property
     def num_frames(self) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +15,12 @@ from rerun.experimental import LeRobotReader
 
 from demorec.errors import RecordingError, in_words, resource_error
 from demorec.geometry import Array, Pose
+from demorec.lerobot.boxes import BOXES_DIR, read_boxes
 from demorec.lerobot.files import check_video, read_json, read_table
+from demorec.lerobot.language import COLUMNS, spoken_episodes
 from demorec.lerobot.layout import DatasetInfo, Feature
 from demorec.lerobot.paths import SIDECAR_DIR
-from demorec.playback.episode import Curves, PlayedEpisode, Video, VideoBatch
+from demorec.playback.episode import Box, Curves, PlayedEpisode, Video, VideoBatch
 from demorec.playback.held_objects import held_object_poses
 from demorec.scene.assets import asset_path
 from demorec.scene.episode import EpisodeInfo, Outcome, SuccessCheck, frame_time_ns
@@ -90,6 +93,8 @@ def _read_episode(root: Path, episode_index: int) -> PlayedEpisode:
         phase=_phases(row, num_frames),
         curves=_curves(info, data, base_from_tcp, time_ns, with_targets=export.get("action") == "joint"),
         videos=_videos(root, episode_index, time_ns, described.features),
+        statements=_statements(root, episode_index, described, time_ns),
+        boxes=_boxes(root, described, data["index"][:, 0]),
     )
 
 
@@ -260,3 +265,32 @@ def _video_batches(root: Path, episode_index: int, key: str, time_ns: NDArray[np
             samples=[data for _, data in part],
             is_keyframe=np.array([frame in keyframes for frame, _ in part]),
         )
+
+
+def _statements(
+    root: Path, episode_index: int, described: DatasetInfo, time_ns: NDArray[np.int64]
+) -> tuple[tuple[int, str, str], ...]:
+    """(time_ns, style, sentence) of what the language columns say of an episode."""
+    if not set(COLUMNS) <= described.features.keys():
+        return ()
+    (episode,) = islice(spoken_episodes(root), episode_index, episode_index + 1)
+    frames = [min(round(row["timestamp"] * described.fps), len(time_ns) - 1) for row in episode.persistent]
+    return tuple(
+        (int(time_ns[frame]), str(row["style"]), str(row["content"]))
+        for frame, row in zip(frames, episode.persistent, strict=True)
+    )
+
+
+def _boxes(root: Path, described: DatasetInfo, index: Array) -> dict[str, dict[int, list[tuple[str, Box]]]]:
+    """Camera -> frame -> what it sees, of a dataset with boxes beside it; `index` (T,) is that of the rows."""
+    frame_of = {int(value): frame for frame, value in enumerate(index.tolist())}
+    found: dict[str, dict[int, list[tuple[str, Box]]]] = {}
+    for key in described.video_keys:
+        path = root / BOXES_DIR / f"{key}.json"
+        if not path.exists():
+            continue
+        seen = found.setdefault(key.removeprefix(IMAGE_PREFIX), {})
+        for item in read_boxes(path):
+            if item.index in frame_of:
+                seen.setdefault(frame_of[item.index], []).append((item.object, item.box))
+    return found

@@ -29,6 +29,7 @@ def episode_layout(episode: PlayedEpisode, *, is_alone: bool = False) -> rrb.Blu
         curves=_curve_views([paths], episode),
         states=[rrb.StateTimelineView(origin=paths.phase, name="phases")] if any(episode.phase) else [],
         texts=[
+            *([rrb.TextDocumentView(origin=paths.words, name="in words")] if episode.statements else []),
             rrb.TextDocumentView(origin=paths.summary, name="episode"),
             rrb.TextLogView(origin=paths.events, name="events"),
         ],
@@ -100,7 +101,8 @@ def _view_3d(episode: PlayedEpisode, roots: list[Paths], name: str) -> rrb.Spati
     for paths in roots:
         contents.append(f"+ {paths.world}/**")
         for camera in episode.info.scene.cameras:
-            contents += [f"- {paths.depth(camera.name)}", f"- {paths.segmentation(camera.name)}"]
+            hidden = (paths.depth(camera.name), paths.segmentation(camera.name), paths.boxes(camera.name))
+            contents += [f"- {entity}" for entity in hidden]
         for body in episode.info.scene.bodies:
             if max(body.shape.extents) > _FLOOR:
                 contents.append(f"- {paths.body(body.name)}")
@@ -147,8 +149,9 @@ def _camera_views(episode: PlayedEpisode, paths: Paths) -> list[rrb.View | rrb.C
     for camera in episode.info.scene.cameras:
         tabs: list[rrb.View] = []
         if camera.name in episode.videos:
+            contents = ["$origin", *([paths.boxes(camera.name)] if camera.name in episode.boxes else [])]
             tabs.append(
-                rrb.Spatial2DView(origin=paths.camera(camera.name), contents=["$origin"], name=f"{camera.name} camera")
+                rrb.Spatial2DView(origin=paths.camera(camera.name), contents=contents, name=f"{camera.name} camera")
             )
         if camera.name in episode.depth:
             tabs.append(rrb.Spatial2DView(origin=paths.depth(camera.name), name=f"{camera.name} depth"))

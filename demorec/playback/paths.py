@@ -64,6 +64,15 @@ class Paths:
         """What happened, as a log."""
         return f"{self.root}/events"
 
+    def boxes(self, name: str) -> str:
+        """Boxes around what a camera sees."""
+        return f"{self.camera(name)}/boxes"
+
+    @property
+    def words(self) -> str:
+        """What is being done, planned and remembered, in words."""
+        return f"{self.root}/words"
+
     @property
     def summary(self) -> str:
         """The episode in words."""

@@ -13,6 +13,7 @@ from demorec.playback.motion import log_curves, log_ee_path, log_events, log_pha
 from demorec.playback.paths import Paths
 from demorec.playback.robot import log_robot
 from demorec.playback.summary import entry, properties, summary
+from demorec.playback.words import log_boxes, log_words
 from demorec.scene.scene import Rgba
 
 
@@ -33,6 +34,8 @@ def log_episode(
     log_curves(recording, paths, episode, label, is_second=tint is not None)
     log_phases(recording, paths, episode)
     log_events(recording, paths, episode)
+    log_words(recording, paths, episode)
+    log_boxes(recording, paths, episode)
     recording.log(paths.summary, rr.TextDocument(summary(episode), media_type="text/markdown"), static=True)
 
 

@@ -276,3 +276,33 @@ def test_without_segmentation_there_are_traces_and_no_questions(tmp_path: Path) 
         export(run, tmp_path / "boxed", boxes=True)
     with pytest.raises(ConfigError, match="--boxes are written for a whole dataset"):
         export(run, tmp_path / "told", boxes=True, append=True)
+
+
+def test_playback_has_the_words_and_the_boxes(dataset: Path, tmp_path: Path) -> None:
+    from rerun.chunk import RrdReader
+
+    from demorec.playback.from_dataset import open_dataset_episode
+    from demorec.playback.save import save
+    from demorec.playback.sources import find_episodes
+
+    (frames,) = language_of(dataset)
+    subtasks = {row["timestamp"]: row["content"] for row in frames[0][0] if row["style"] == "subtask"}
+    with open_dataset_episode(dataset, 0) as episode:
+        shown = {time_ns: text for time_ns, kind, text in episode.statements if kind == "subtask"}
+        assert [round(time_ns / 1e9, 3) for time_ns in shown] == [round(time, 3) for time in subtasks]
+        assert list(shown.values()) == list(subtasks.values())
+        assert set(episode.boxes) == {"front", "wrist"}
+    save(find_episodes([dataset])[0], tmp_path / "x.rrd")
+    pages: list[str] = []
+    counts: list[int] = []
+    for chunk in RrdReader(tmp_path / "x.rrd").stream():
+        batch = chunk.to_record_batch()
+        if chunk.entity_path == "/words":
+            pages += [page[0] for page in batch.column("TextDocument:text").to_pylist()]
+        if chunk.entity_path == "/world/cameras/front/boxes" and not chunk.is_static:
+            counts += [len(boxes or ()) for boxes in batch.column("Boxes2D:half_sizes").to_pylist()]
+    assert len(pages) == len(subtasks)
+    assert all(text in page for text, page in zip(subtasks.values(), pages, strict=True))
+    assert pages[-1].endswith("on the green target.")
+    told = json.loads((dataset / "demorec" / "boxes" / f"{PREFIX}front.json").read_text())
+    assert counts == [sum(item["image_id"] == frame for item in told["annotations"]) for frame in range(len(frames))]

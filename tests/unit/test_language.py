@@ -6,13 +6,18 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from support.recording import make_episode
 
+from demorec.errors import ExportError
 from demorec.geometry import Pose
 from demorec.language.narration import narrate
 from demorec.language.referring import phrase_for, phrases_for, references, resolve
 from demorec.language.situation import Situation, situation
+from demorec.lerobot import files
+from demorec.lerobot.language import EpisodeLanguage, LanguageRow, language_arrays
 from demorec.recording import EpisodeWriter, Recording
 from demorec.scene.episode import Event
 from demorec.scene.scene import Body, RobotPlacement, Scene, Shape
@@ -154,3 +159,21 @@ def test_things_are_where_the_poses_say(tmp_path: Path) -> None:
     poses = {"red_cube_0": np.array([0.4, -0.4, 0.0, 0, 0, 0, 1.0])}
     now: Situation = situation(things, poses)
     assert resolve("the right red cube", now) == {"red_cube_0"}
+
+
+@pytest.mark.parametrize(("statements", "is_read"), [(200, True), (1000, False)])
+def test_words_that_stand_in_every_row_are_no_bomb(
+    statements: int, is_read: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Tables of words unpack to hundreds of times their size; above all bounds are only more than any episode has."""
+    monkeypatch.setattr(files, "_FLOOR_BYTES", 1 << 20)
+    said = LanguageRow(role="assistant", content="grasp the red cube", style="subtask", timestamp=0.0)
+    arrays = language_arrays(EpisodeLanguage(persistent=(said,) * statements), 600)
+    path = tmp_path / "words.parquet"
+    pq.write_table(pa.table({"index": np.arange(600), **arrays}), path)
+    assert 8 * 600 * statements * 6 > 16 * path.stat().st_size
+    if is_read:
+        assert files.open_table(path, ["index"]).metadata.num_rows == 600
+    else:
+        with pytest.raises(ExportError, match="values of language in so few rows"):
+            files.open_table(path)

@@ -1,0 +1,78 @@
+"""Do the columns that episodes are chosen by, and the progress of each frame, agree with what is kept beside them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from demorec.check.base import Measurement, check
+from demorec.check.dataset import Dataset
+from demorec.lerobot.facts import facts_of
+from demorec.lerobot.files import open_table, read_table
+from demorec.lerobot.progress import PROGRESS_PATH, STAGE_COLUMNS, progress_table, read_progress
+
+
+@check(
+    group="dataset",
+    scope="dataset",
+    measures="columns of the table of episodes that the sidecar contradicts",
+    warn=0,
+    reads=("meta/episodes", "demorec/"),
+)
+def dataset_facts(dataset: Dataset) -> Measurement | None:
+    """Outcome, retries, task, seed and length of each episode are those that the sidecar keeps."""
+    known = set(facts_of(dataset.path))
+    if not dataset.sidecar or not known:
+        return None
+    names = [name for name in ("success", "num_retries", "task_name", "seed", "attempt", "num_goals") if name in known]
+    rows: dict[int, dict[str, Any]] = {}
+    for path in sorted((dataset.path / "meta" / "episodes").glob("*/*.parquet")):
+        if set(names) <= set(open_table(path).schema_arrow.names):  # LeRobot's own recordings have none of them
+            rows.update({row["episode_index"]: row for row in read_table(path, ["episode_index", *names]).to_pylist()})
+    wrong = []
+    for kept, info in zip(dataset.sidecar, dataset.infos, strict=True):
+        number = kept["episode_index"]
+        if (row := rows.get(number)) is None:
+            wrong.append(f"episode {number} has none")
+            continue
+        expected = {
+            "success": kept["success"],
+            "num_retries": kept["num_retries"],
+            "task_name": info.task,
+            "seed": info.root_seed,
+            "attempt": info.attempt,
+            "num_goals": len(info.scene.goals),
+        }
+        wrong += [f"episode {number}: {name} is {row[name]}" for name in names if row[name] != expected[name]]
+    return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{len(rows)} episodes")
+
+
+@check(
+    group="dataset",
+    scope="dataset",
+    measures="rows of sarm_progress.parquet that the episodes' stages contradict",
+    warn=0,
+    reads=(PROGRESS_PATH, "meta/episodes"),
+)
+def dataset_progress(dataset: Dataset) -> Measurement | None:
+    """Every row of the dataset has a progress in 0 to 1, which is that of its stage; stages leave no gap."""
+    path = dataset.path / PROGRESS_PATH
+    if not set(STAGE_COLUMNS) <= set(facts_of(dataset.path)) and not path.exists():
+        return None
+    episodes = read_progress(dataset.path)
+    lengths = [
+        (episode.dense[-1].last + 1, place.length) for episode, place in zip(episodes, dataset.places, strict=True)
+    ]
+    if wrong := [number for number, (found, length) in enumerate(lengths) if found != length]:
+        return Measurement(value=len(wrong), detail=f"the stages of episode {wrong[0]} do not cover it")
+    expected = progress_table(episodes)
+    found = read_table(path, expected.column_names)
+    if found.num_rows != expected.num_rows:
+        return Measurement(value=abs(found.num_rows - expected.num_rows), detail=f"{found.num_rows} rows")
+    off = np.zeros(found.num_rows, dtype=np.bool_)
+    for name in expected.column_names:
+        difference = found.column(name).to_numpy() - expected.column(name).to_numpy()
+        off |= ~(np.abs(difference) < 1e-5)
+    first = f"row {int(np.argmax(off))}" if off.any() else f"{found.num_rows} rows"
+    return Measurement(value=int(off.sum()), detail=first)

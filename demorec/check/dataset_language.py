@@ -1,0 +1,246 @@
+"""Do the language columns of a dataset say what they must, in LeRobot's form, and is it true of the episode.
+
+The first check needs the columns alone, the second one what demorec keeps beside the dataset: phases, the scene, and
+with `--boxes` what each picture shows.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from demorec.check.base import Measurement, check
+from demorec.check.dataset import Dataset
+from demorec.language.kinds import STATES
+from demorec.language.questions import ANSWERS
+from demorec.language.referring import references
+from demorec.language.situation import COLORS, Situation, place_of, situation
+from demorec.lerobot.boxes import BOXES_DIR, read_boxes
+from demorec.lerobot.language import COLUMNS, SpokenEpisode
+from demorec.scene.episode import EpisodeInfo
+
+Row = dict[str, Any]
+_ABOUT_PICTURES = ("vqa", "trace")
+_EVENTS = {*_ABOUT_PICTURES, "interjection", None}
+_ROLES = ("user", "assistant", "system", "tool")
+
+
+@check(
+    group="dataset",
+    scope="dataset",
+    measures="entries of the language columns that are not as LeRobot has them",
+    warn=0,
+    reads=COLUMNS,
+)
+def dataset_language(dataset: Dataset) -> Measurement | None:
+    """Styles, roles and cameras; one subtask at every frame; times of frames; answers that can be read."""
+    if not dataset.spoken:
+        return None
+    wrong = [
+        f"episode {number}: {text}"
+        for number, episode in enumerate(dataset.spoken)
+        for text in _malformed(dataset, episode)
+    ]
+    entries = sum(len(episode.persistent) + sum(map(len, episode.events.values())) for episode in dataset.spoken)
+    return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{entries} entries")
+
+
+def _malformed(dataset: Dataset, episode: SpokenEpisode) -> Iterator[str]:
+    if episode.differing:
+        yield f"language_persistent is another in row {episode.differing[0]}"
+    times = (np.arange(episode.num_rows) / dataset.info.fps).astype(np.float32).tolist()
+    for row in episode.persistent:
+        yield from _entry_faults(row, set(STATES), dataset)
+        if row.get("timestamp") not in times:
+            yield f"a {row.get('style')} begins at {row.get('timestamp')} s, where no frame is"
+    subtasks = sorted(row["timestamp"] for row in episode.persistent if row.get("style") == "subtask")
+    if subtasks and subtasks[0] != 0:
+        yield "no subtask holds at the first frame"
+    if len(set(subtasks)) < len(subtasks):
+        yield "two subtasks begin at one frame"
+    for frame, rows in episode.events.items():
+        asked = [(row.get("style"), row.get("role"), row.get("camera")) for row in rows]
+        if len(set(asked)) < len(asked):
+            yield f"frame {frame} has two entries of one style, role and camera"
+        for row in rows:
+            yield from (f"frame {frame}: {text}" for text in _entry_faults(row, _EVENTS, dataset))
+            if row.get("style") in _ABOUT_PICTURES and row.get("role") == "assistant":
+                yield from (f"frame {frame}: {text}" for text in _answer_faults(row, dataset))
+
+
+def _entry_faults(row: Row, styles: set[Any], dataset: Dataset) -> Iterator[str]:
+    style, camera = row.get("style"), row.get("camera")
+    if style not in styles:
+        yield f"{style!r} stands in the wrong column, or is no style"
+    if row.get("role") not in _ROLES:
+        yield f"a {style} by {row.get('role')!r}"
+    if not (row.get("content") or row.get("tool_calls")):
+        yield f"a {style} that says nothing"
+    if style in _ABOUT_PICTURES and camera not in dataset.info.video_keys:
+        yield f"a {style} about the camera {camera!r}, which the dataset does not have"
+    if style not in _ABOUT_PICTURES and camera is not None:
+        yield f"a {style} about a camera"
+
+
+def _answer_faults(row: Row, dataset: Dataset) -> Iterator[str]:
+    answer = _answer(row)
+    if answer is None:
+        yield "an answer that is no JSON object"
+        return
+    if row.get("style") == "vqa" and not any(keys <= set(answer) for keys in ANSWERS.values()):
+        yield f"an answer of no known kind ({', '.join(answer)})"
+    feature = dataset.info.features.get(str(row.get("camera")))
+    if feature is None:
+        return
+    height, width = feature.shape[:2]
+    for x, y in _points(answer):
+        if not (0 <= x < width and 0 <= y < height):
+            yield f"a point at ({x:g}, {y:g}), outside of the picture"
+            return
+
+
+def _answer(row: Row) -> dict[str, Any] | None:
+    try:
+        found = json.loads(row.get("content") or "")
+    except ValueError:
+        return None
+    return found if isinstance(found, dict) else None
+
+
+def _points(answer: Row) -> Iterator[tuple[float, float]]:
+    """All points that an answer names; (NaN, NaN) for what is none."""
+    points = [answer["point"]] if "point" in answer else list(answer.get("points", ()))
+    for thing in answer.get("detections", ()):
+        box = thing.get("bbox") if isinstance(thing, dict) else None
+        points += [box[:2], box[2:]] if isinstance(box, list) and len(box) == 4 else [None]
+    for point in points:
+        numbers = isinstance(point, list) and len(point) == 2 and all(isinstance(x, int | float) for x in point)
+        yield (float(point[0]), float(point[1])) if numbers else (math.nan, math.nan)
+
+
+@check(
+    group="dataset",
+    scope="dataset",
+    measures="statements that the phases, the scene or the boxes beside the dataset contradict",
+    warn=0,
+    reads=(*COLUMNS, "demorec/"),
+)
+def dataset_language_truth(dataset: Dataset) -> Measurement | None:
+    """Subtasks change with the phases, words refer to things of the task, boxes and counts are those of the masks."""
+    if not dataset.spoken or not dataset.sidecar:
+        return None
+    wrong = []
+    boxes = _Boxes(dataset)
+    for number, (episode, row, info) in enumerate(zip(dataset.spoken, dataset.sidecar, dataset.infos, strict=False)):
+        start = situation(info.scene)
+        faults = [
+            *_wrong_phases(episode, row, dataset.info.fps),
+            *_wrong_words(episode, row, info, start),
+            *_wrong_answers(episode, number, start, boxes),
+        ]
+        wrong += [f"episode {number}: {text}" for text in faults]
+    return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{len(dataset.spoken)} episodes")
+
+
+def _wrong_phases(episode: SpokenEpisode, row: Row, fps: int) -> Iterator[str]:
+    """Subtasks begin where phases do, and those that speak of a deliberate miss are those of one."""
+    subtasks = [entry for entry in episode.persistent if entry.get("style") == "subtask"]
+    if not subtasks:
+        return
+    starts = [round(entry["timestamp"] * fps) for entry in subtasks]
+    phases = [phase["from"] for phase in row["phases"]]
+    if starts != phases:
+        wrong = sorted(set(starts) ^ set(phases))
+        yield f"subtasks and phases change at other frames ({wrong[:3]})"
+    missed = set(row["deliberate_miss_frames"])
+    for entry, (first, end) in zip(subtasks, pairwise([*starts, episode.num_rows]), strict=True):
+        is_miss = bool(missed & set(range(first, end)))
+        if is_miss != ("on purpose" in entry["content"] and "after missing" not in entry["content"]):
+            yield f"frame {first}: {entry['content'][:60]!r} {'hides' if is_miss else 'invents'} a deliberate miss"
+
+
+def _wrong_words(episode: SpokenEpisode, row: Row, info: EpisodeInfo, start: Situation) -> Iterator[str]:
+    """Wordings mean the things of the task; subtasks name things of a goal, by kind and colour."""
+    scene = info.scene
+    objects = {goal.object for goal in scene.goals}
+    things = objects | {place_of(scene, goal) for goal in scene.goals} - {""}
+    movable = {body.name for body in scene.movable}
+    for entry in episode.persistent:
+        text = entry.get("content") or ""
+        if entry.get("style") == "task_aug" and text != info.instruction:
+            found = [names for _, names in references(text, start)]
+            named = set().union(*found)
+            if not all(found) or not things <= named or not named <= things | movable:
+                yield f"{text[:60]!r} is not the task, or could mean something else"
+        elif entry.get("style") in ("subtask", "plan", "memory") and objects:
+            kinds = {(start.thing(name).color, noun) for name in things for noun in start.thing(name).nouns}
+            for words in _colored(text, start):
+                if words not in kinds:
+                    yield f"{text[:60]!r} speaks of a {' '.join(words)}, which is not part of the task"
+
+
+def _colored(text: str, start: Situation) -> Iterator[tuple[str, str]]:
+    """(colour, noun) of each phrase of a text that has both."""
+    nouns = sorted({noun for thing in start.things for noun in thing.nouns}, key=len, reverse=True)
+    pattern = re.compile(rf"\b({'|'.join(COLORS)}) ({'|'.join(map(re.escape, nouns))})\b")
+    for match in pattern.finditer(text.lower()):
+        yield match[1], match[2]
+
+
+class _Boxes:
+    """What the files of `--boxes` say: (camera, index) -> object -> box; nothing without them."""
+
+    def __init__(self, dataset: Dataset) -> None:
+        self._first = [place.from_index for place in dataset.places]
+        self._found: dict[tuple[str, int], dict[str, list[float]]] = {}
+        files = sorted((dataset.path / BOXES_DIR).glob("*.json"))
+        self.cameras = {path.stem for path in files}
+        for path in files:
+            for item in read_boxes(path):
+                x, y, width, height = item.box
+                self._found.setdefault((path.stem, item.index), {})[item.object] = [x, y, x + width - 1, y + height - 1]
+
+    def at(self, camera: str, episode: int, frame: int) -> dict[str, list[float]]:
+        """Name of the body -> (x_min, y_min, x_max, y_max), of all that a picture shows."""
+        return self._found.get((camera, self._first[episode] + frame), {})
+
+
+def _wrong_answers(episode: SpokenEpisode, number: int, start: Situation, boxes: _Boxes) -> Iterator[str]:
+    for frame, rows in episode.events.items():
+        for row in rows:
+            answer, camera = _answer(row), str(row.get("camera"))
+            if answer is None or row.get("style") != "vqa" or row.get("role") != "assistant":
+                continue
+            if camera in boxes.cameras:
+                seen = boxes.at(camera, number, frame)
+                yield from (f"frame {frame}: {text}" for text in _against(answer, seen, start))
+
+
+def _against(answer: Row, seen: dict[str, list[float]], start: Situation) -> Iterator[str]:
+    """Faults of an answer, given what the picture shows."""
+    if "count" in answer:
+        count = sum(answer["label"] in start.thing(name).nouns for name in seen)
+        if answer["count"] != count:
+            yield f"{answer['count']} {answer['label']}s are counted, {count} are seen"
+    for thing in answer.get("detections", ()):
+        fitting = [box for name, box in seen.items() if _may_be(thing["label"], name, start)]
+        if thing["bbox"] not in fitting:
+            yield f"the box of {thing['label']} is that of something else"
+    if "point" in answer:
+        x, y = answer["point"]
+        fitting = [box for name, box in seen.items() if _may_be(answer["label"], name, start)]
+        if not any(box[0] <= x <= box[2] and box[1] <= y <= box[3] for box in fitting):
+            yield f"the point is not on {answer['label']}"
+
+
+def _may_be(phrase: str, name: str, start: Situation) -> bool:
+    """Whether kind and colour of a thing are those of a phrase, wherever it is by now."""
+    thing = start.thing(name)
+    colors = [word for word in phrase.split() if word in {other.color for other in start.things}]
+    return any(noun in phrase for noun in thing.nouns) and (not colors or thing.color in colors)
