@@ -21,6 +21,8 @@ from demorec.tables import CHECKS
 
 _OF_THE_FILE: tuple[Group, ...] = ("file", "time")
 """Groups of the checks that look at the file itself, not at what was recorded."""
+_WORTH_PROCESSES = {"with pictures": 4, "without": 50}
+"""Recordings from which on several processes check faster than one: each takes seconds to start."""
 _SEVERITY: dict[Level, int] = {"skip": 0, "pass": 0, "warn": 1, "fail": 2}
 
 
@@ -129,6 +131,12 @@ def find_subjects(paths: Sequence[Path]) -> list[Subject]:
             expect_recordings(there, there.recordings)
             found += [Subject(path=file, kind="recording") for file in there.recordings]
     return list(dict.fromkeys(found))
+
+
+def useful_workers(subjects: Sequence[Subject], *, pictures: bool, cores: int) -> int:
+    """How many processes check fastest: one for each core, or one where that many do not pay."""
+    count = sum(subject.kind == "recording" for subject in subjects)
+    return cores if count >= _WORTH_PROCESSES["with pictures" if pictures else "without"] else 1
 
 
 def check_subjects(subjects: Sequence[Subject], options: CheckOptions) -> Iterator[SubjectReport]:
