@@ -147,7 +147,14 @@ def check_subjects(subjects: Sequence[Subject], options: CheckOptions) -> Iterat
         return
     # Spawned: forked children would share decoders and libraries in the middle of something.
     with ProcessPoolExecutor(max_workers=min(options.workers, len(subjects)), mp_context=SPAWN) as pool:
-        yield from pool.map(check_subject, subjects, [options] * len(subjects))
+        # Datasets take longest, since LeRobot has to load for them: they begin first.
+        order = sorted(subjects, key=lambda subject: subject.kind != "dataset")
+        begun = {subject: pool.submit(check_subject, subject, options) for subject in order}
+        try:
+            for subject in subjects:
+                yield begun[subject].result()
+        finally:
+            pool.shutdown(cancel_futures=True)
 
 
 def check_subject(subject: Subject, options: CheckOptions) -> SubjectReport:
