@@ -40,20 +40,32 @@ def draw_all(
     Raises:
         SceneError, RenderError: A model is not there, or cannot be drawn.
     """
-    cameras = tuple(_small(camera) for camera in info.scene.cameras)
-    wanted = {kind for of_camera in kinds.values() for kind in of_camera}
     world = RecordedWorld(
         info.robot, info.scene, joint_position=columns.joint_position, object_poses=columns.object_poses
     )
     # The recorded pictures' grid: the small ones' own may have a row more or less.
-    grids = {
-        small.name: CellGrid(small.width, small.height, cell_counts(camera.width, camera.height))
-        for camera, small in zip(info.scene.cameras, cameras, strict=True)
-    }
-    found: dict[tuple[str, Kind], list[Cells]] = {(name, kind): [] for name in kinds for kind in kinds[name]}
+    counts = {camera.name: cell_counts(camera.width, camera.height) for camera in info.scene.cameras}
+    return draw(world, columns.num_frames, kinds, counts)
+
+
+def draw(
+    world: RecordedWorld,
+    num_frames: int,
+    kinds: Mapping[str, Iterable[Kind]],
+    counts: Mapping[str, tuple[int, int]],
+) -> dict[tuple[str, Kind], Cells]:
+    """(camera, kind) -> cells of the first frames of a world, in a grid of (columns, rows) for each camera.
+
+    Raises:
+        SceneError, RenderError: It cannot be drawn.
+    """
+    cameras = tuple(_small(camera) for camera in world.scene.cameras if camera.name in kinds)
+    wanted = {kind for of_camera in kinds.values() for kind in of_camera}
+    grids = {camera.name: CellGrid(camera.width, camera.height, counts[camera.name]) for camera in cameras}
+    found: dict[tuple[str, Kind], list[Cells]] = {(name, kind): [] for name in grids for kind in kinds[name]}
     painter = Painter(_renderer(), cameras, depth="depth" in wanted, segmentation="labels" in wanted)
     painter.setup(world)
-    for frame in range(columns.num_frames):
+    for frame in range(num_frames):
         world.frame = frame
         images = painter.images()
         for name, kind in found:
