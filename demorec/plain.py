@@ -111,6 +111,12 @@ def write_flat(owner: type, name: str, part: type, keys: Mapping[str, str]) -> N
     _converter.register_unstructure_hook(owner, to_flat)
 
 
+def leave_out_default(owner: type, name: str) -> None:
+    """Write a field of a dataclass only where it differs from its default, which is what files from before it mean."""
+    kept: Any = {name: override(omit_if_default=True)}
+    _converter.register_unstructure_hook(owner, make_dict_unstructure_fn(owner, _converter, **kept))
+
+
 def _in_words(error: BaseException, type_: type | None) -> str:
     words = str(error)
     return words if isinstance(error, ValueError) and " is no " in words else format_exception(error, type_)

@@ -154,6 +154,8 @@ CHECKS: Registry[Check] = Registry(
         "dataset_episode_statistics": "demorec.check.dataset_statistics:dataset_episode_statistics",
         "dataset_pictures": "demorec.check.dataset_pictures:dataset_pictures",
         "dataset_picture_statistics": "demorec.check.dataset_pictures:dataset_picture_statistics",
+        "dataset_pictures_as_drawn": "demorec.check.dataset_pictures:dataset_pictures_as_drawn",
+        "dataset_picture_lag": "demorec.check.dataset_pictures:dataset_picture_lag",
         "dataset_duplicates": "demorec.check.dataset_motion:dataset_duplicates",
         "dataset_coverage": "demorec.check.dataset_motion:dataset_coverage",
         "dataset_joint_limits": "demorec.check.dataset_motion:dataset_joint_limits",

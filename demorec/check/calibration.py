@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from demorec.check.base import COLOR_TOPICS, Found, Measurement, NotMeasured, check, worst
-from demorec.check.drawn import Kind
+from demorec.check.cells import Kind
 from demorec.check.episode import RecordedEpisode
 from demorec.check.rows import displacement, matrices
 from demorec.errors import RecordingError

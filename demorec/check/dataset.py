@@ -10,7 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from demorec.check.base import NotMeasured
+from demorec.check.dataset_drawn import compare_beginning
 from demorec.check.dataset_video import EpisodePictures, episode_pictures
+from demorec.check.drawn import Comparison
 from demorec.errors import ExportError, in_words
 from demorec.lerobot.files import read_table
 from demorec.lerobot.language import COLUMNS, SpokenEpisode, spoken_episodes
@@ -19,7 +22,7 @@ from demorec.lerobot.paths import SIDECAR_DIR
 from demorec.lerobot.reader import EpisodePlace, RowReader, episode_places, read_tasks
 from demorec.lerobot.sidecar import EPISODE_SCHEMA
 from demorec.scene.episode import EpisodeInfo
-from demorec.scene.features import ACTION, ActionKind, action_names
+from demorec.scene.features import ACTION, IMAGE_PREFIX, STATE, ActionKind, action_names
 from demorec.scene.validity import read_episode_info
 
 Rows = Mapping[str, NDArray[Any]]
@@ -84,6 +87,17 @@ class Dataset:
         if key not in self._pictures:
             self._pictures[key] = episode_pictures(self.path, self.info, self.places, key)
         return self._pictures[key]
+
+    @cached_property
+    def compared(self) -> list[Mapping[str, Comparison] | NotMeasured]:
+        """Camera -> how each episode begins in its pictures, against states and scene; only with a sidecar."""
+        keys = {key.removeprefix(IMAGE_PREFIX): key for key in self.colour_keys}
+        found = []
+        for number, (rows, info) in enumerate(self.described()):
+            names = [camera.name for camera in info.scene.cameras if camera.name in keys]
+            seen = {name: self.pictures(keys[name])[number].cells.astype(np.float32) for name in names}
+            found.append(compare_beginning(info, rows[STATE].astype(np.float64), self.info.fps, seen))
+        return found
 
     @cached_property
     def sidecar(self) -> list[dict[str, Any]]:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from demorec.check.base import Measurement, check, worst
+from demorec.check.base import Found, Measurement, NotMeasured, check, worst
 from demorec.check.dataset import Dataset
 from demorec.check.dataset_statistics import episode_column, numbers_of, read_statistics
 from demorec.geometry import Array
@@ -73,3 +73,58 @@ def _off_colour(said: Any, mean: Array, detail: str) -> Measurement:
     told = numbers_of(said)
     value = float(np.abs(told - mean).max()) if told.shape == (3,) else math.inf
     return Measurement(value=value, detail=detail)
+
+
+@check(
+    group="dataset",
+    scope="dataset",
+    measures="difference of an episode's first pictures from what its states and scene make of them, median of 255",
+    warn=13.0,
+    fail=16.0,
+    needs_pictures=True,
+    reads=(
+        "observation.images.{camera}",
+        "observation.state",
+        "demorec/",
+    ),
+)
+def dataset_pictures_as_drawn(dataset: Dataset) -> Found:
+    """Each video shows its own episode by its own camera, drawn anew until the fingers close, for 3 s at most."""
+    found: list[Found] = []
+    for number, compared in enumerate(dataset.compared):
+        if isinstance(compared, NotMeasured):
+            found.append(compared)
+            continue
+        for camera, pictures in compared.items():
+            detail = f"camera {camera}, episode {number}"
+            found.append(Measurement(value=float(np.median(pictures.unlike)), detail=detail))
+    return worst(*found)
+
+
+@check(
+    group="dataset",
+    scope="dataset",
+    measures="lag between an episode's first pictures and its states, frames",
+    warn=0.4,
+    fail=0.7,
+    needs_pictures=True,
+    reads=(
+        "observation.images.{camera}",
+        "observation.state",
+        "demorec/",
+    ),
+)
+def dataset_picture_lag(dataset: Dataset) -> Found:
+    """Picture t shows state t, in each episode and camera, until the fingers close, for 3 s at most."""
+    found: list[Found] = []
+    for number, compared in enumerate(dataset.compared):
+        if isinstance(compared, NotMeasured):
+            found.append(compared)
+            continue
+        for camera, pictures in compared.items():
+            if pictures.lag is None:
+                found.append(NotMeasured(why=f"too little moves before camera {camera} in episode {number}"))
+                continue
+            detail = f"camera {camera}, episode {number}: {pictures.lag:+.2f} frames late"
+            found.append(Measurement(value=abs(pictures.lag), detail=detail))
+    return worst(*found)

@@ -6,8 +6,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
+from typing import cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from demorec.errors import ExportError, in_words
 from demorec.geometry import Array
@@ -32,12 +34,14 @@ class EpisodePictures:
         mean: (3,) mean red, green and blue, of 1.
         flat: Frames whose picture is of one colour.
         alien: Frames whose picture is unlike both of its neighbours, which are like each other.
+        cells: (count, 16, 16, 3) mean colours of the parts of each picture, 0 to 255.
     """
 
     count: int
     mean: Array
     flat: tuple[int, ...]
     alien: tuple[int, ...]
+    cells: NDArray[np.uint8]
 
 
 def episode_pictures(root: Path, info: DatasetInfo, places: Sequence[EpisodePlace], key: str) -> list[EpisodePictures]:
@@ -46,7 +50,7 @@ def episode_pictures(root: Path, info: DatasetInfo, places: Sequence[EpisodePlac
     Raises:
         ExportError: A video cannot be decoded, or has too few pictures.
     """
-    files: dict[Path, Iterator[Array]] = {}
+    files: dict[Path, Iterator[NDArray[np.uint8]]] = {}
     found = []
     for place in places:
         position, _ = place.videos[key]
@@ -62,7 +66,7 @@ def episode_pictures(root: Path, info: DatasetInfo, places: Sequence[EpisodePlac
     return found
 
 
-def _decoded(path: Path, shape: tuple[int, ...]) -> Iterator[Array]:
+def _decoded(path: Path, shape: tuple[int, ...]) -> Iterator[NDArray[np.uint8]]:
     """(16, 16, 3) mean colours of the parts of every picture, 0 to 255."""
     import av
 
@@ -74,13 +78,14 @@ def _decoded(path: Path, shape: tuple[int, ...]) -> Iterator[Array]:
                 stream.codec_context.options = {"max_pixels": str((height + 128) * (width + 128))}
             for frame in container.decode(video=0):
                 small = frame.reformat(width=_PARTS, height=_PARTS, format="rgb24", interpolation="AREA")
-                yield small.to_ndarray().astype(np.float64)
+                yield cast("NDArray[np.uint8]", small.to_ndarray())
     except (OSError, av.FFmpegError) as error:
         raise ExportError(f"The video cannot be decoded ({in_words(error)}): {path}") from error
 
 
-def _summary(parts: Array) -> EpisodePictures:
+def _summary(cells: NDArray[np.uint8]) -> EpisodePictures:
     """Of the parts (T, 16, 16, 3) of an episode's pictures."""
+    parts = cells.astype(np.float64)
     flat = parts.std(axis=(1, 2)).max(axis=1) < _FLAT_LEVELS
     alien = np.zeros(len(parts), dtype=np.bool_)
     if len(parts) > 2:
@@ -93,4 +98,5 @@ def _summary(parts: Array) -> EpisodePictures:
         mean=parts.mean(axis=(0, 1, 2)) / 255,
         flat=tuple(np.flatnonzero(flat).tolist()),
         alien=tuple(np.flatnonzero(alien).tolist()),
+        cells=cells,
     )

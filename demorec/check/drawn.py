@@ -8,14 +8,14 @@ brightness, labels as colours of a palette.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from demorec.check.cells import CellGrid, Cells, Kind, cell_counts
 from demorec.errors import RenderError, SceneError
 from demorec.geometry import Array
 from demorec.render import Renderer
@@ -24,61 +24,8 @@ from demorec.render.recorded import RecordedWorld
 from demorec.scene.episode import EpisodeColumns, EpisodeInfo
 from demorec.scene.scene import Camera
 
-Cells = NDArray[np.float32]
-"""(T, h, w, channels), 0..255."""
-Kind = Literal["color", "depth", "labels"]
-
 LONGER_SIDE = 112
 """Pixels that are drawn along the longer side, at most."""
-CELLS = 28
-"""Cells along the longer side."""
-DEPTH_RANGE = 3.0
-"""Metres that are brightness 255; what is farther is not told apart."""
-
-
-class CellGrid:
-    """Means over a grid of (nearly) equal areas, for pictures of one size.
-
-    Args:
-        width, height: Of the pictures, pixels.
-    """
-
-    def __init__(self, width: int, height: int) -> None:
-        columns, rows = cell_counts(width, height)
-        x, y = (np.arange(count + 1) * size // count for count, size in ((columns, width), (rows, height)))
-        self._columns, self._rows = x[:-1], y[:-1]
-        self._areas = np.outer(np.diff(y), np.diff(x)).astype(np.float32)
-
-    def means(self, planes: Sequence[NDArray[np.float32]]) -> Cells:
-        """(N, h, w, channels) of so many planes (N, H, W)."""
-        # No matrix product: its threads wait for each other on a busy machine.
-        sums = (np.add.reduceat(np.add.reduceat(p, self._rows, axis=1), self._columns, axis=2) for p in planes)
-        return np.stack([part / self._areas for part in sums], axis=-1)
-
-
-def cell_counts(width: int, height: int) -> tuple[int, int]:
-    """(columns, rows) of the grid for pictures of a size."""
-    longer = max(width, height)
-    count = min(CELLS, longer // 2)
-    return max(round(count * width / longer), 2), max(round(count * height / longer), 2)
-
-
-def planes_of(kind: Kind, pictures: NDArray[Any]) -> list[NDArray[np.float32]]:
-    """Pictures (N, H, W[, 3]) as brightnesses 0..255, a plane (N, H, W) each."""
-    if kind == "color":
-        # Channel by channel: NumPy is slow over a last axis of three.
-        return [np.ascontiguousarray(pictures[..., c]).astype(np.float32) for c in range(3)]
-    if kind == "depth":
-        metres = np.asarray(pictures, dtype=np.float32)
-        return [np.where(metres > 0, np.minimum(metres, DEPTH_RANGE), DEPTH_RANGE) * np.float32(255 / DEPTH_RANGE)]
-    values = np.asarray(pictures, dtype=np.int64)
-    return [_scattered(values, multiplier).astype(np.float32) for multiplier in (2654435761, 2246822519)]
-
-
-def _scattered(values: NDArray[np.int64], multiplier: int) -> NDArray[np.int64]:
-    """A brightness for each label, far apart for neighbours: the upper bits of a product (Knuth's hash)."""
-    body_and_link = (values & 0xFFFFFF) + 1009 * (values >> 24)
-    return (((body_and_link + 2) * multiplier) >> 16) & 255
 
 
 def draw_all(
@@ -93,23 +40,39 @@ def draw_all(
     Raises:
         SceneError, RenderError: A model is not there, or cannot be drawn.
     """
-    cameras = tuple(_small(camera) for camera in info.scene.cameras)
-    wanted = {kind for of_camera in kinds.values() for kind in of_camera}
     world = RecordedWorld(
         info.robot, info.scene, joint_position=columns.joint_position, object_poses=columns.object_poses
     )
-    grids = {camera.name: CellGrid(camera.width, camera.height) for camera in cameras}
-    found: dict[tuple[str, Kind], list[Cells]] = {(name, kind): [] for name in kinds for kind in kinds[name]}
+    # The recorded pictures' grid: the small ones' own may have a row more or less.
+    counts = {camera.name: cell_counts(camera.width, camera.height) for camera in info.scene.cameras}
+    return draw(world, columns.num_frames, kinds, counts)
+
+
+def draw(
+    world: RecordedWorld,
+    num_frames: int,
+    kinds: Mapping[str, Iterable[Kind]],
+    counts: Mapping[str, tuple[int, int]],
+) -> dict[tuple[str, Kind], Cells]:
+    """(camera, kind) -> cells of the first frames of a world, in a grid of (columns, rows) for each camera.
+
+    Raises:
+        SceneError, RenderError: It cannot be drawn.
+    """
+    cameras = tuple(_small(camera) for camera in world.scene.cameras if camera.name in kinds)
+    wanted = {kind for of_camera in kinds.values() for kind in of_camera}
+    grids = {camera.name: CellGrid(camera.width, camera.height, counts[camera.name]) for camera in cameras}
+    found: dict[tuple[str, Kind], list[Cells]] = {(name, kind): [] for name in grids for kind in kinds[name]}
     painter = Painter(_renderer(), cameras, depth="depth" in wanted, segmentation="labels" in wanted)
     painter.setup(world)
-    for frame in range(columns.num_frames):
+    for frame in range(num_frames):
         world.frame = frame
         images = painter.images()
         for name, kind in found:
             image = images[name]
             pictures = {"color": image.color, "depth": image.depth, "labels": image.segmentation}[kind]
             assert pictures is not None
-            found[name, kind].append(grids[name].means(planes_of(kind, pictures[None]))[0])
+            found[name, kind].append(grids[name].read(kind, pictures).cells)
     return {key: np.stack(cells) for key, cells in found.items()}
 
 
@@ -157,33 +120,30 @@ _MIN_MOVING = 12
 
 def compare(seen: Cells, drawn: Cells) -> Comparison:
     """Least squares over all frames: seen = drawn, but shifted, scaled and turned by one amount each."""
+    from demorec.check import kernels
+
     drawn = drawn[: len(seen)]
-    error = seen - drawn
-    height, width = drawn.shape[1:3]
-    x = (np.arange(width, dtype=np.float32) - (width - 1) / 2)[:, None]
-    y = (np.arange(height, dtype=np.float32) - (height - 1) / 2)[:, None, None]
-    down, right = np.gradient(drawn, axis=(1, 2))
-    # A picture that is shifted to the right by one cell is drawn(x - 1) = drawn - slope; and so on.
-    bases = np.stack([-right, -down, -(x * right + y * down), -(x * down - y * right)])
     # Frames that are something else altogether must not decide how far the others are shifted.
-    size = _rms(error)
-    usual = size <= 3 * np.median(size) + 1e-6 if len(size) else np.zeros(0, dtype=bool)
-    a = bases[:, usual].reshape(4, -1).astype(np.float64)
-    gram = a @ a.T
+    size = _rms(seen - drawn)
+    usual = np.flatnonzero(size <= 3 * np.median(size) + 1e-6)
+    gram, right = np.zeros((4, 4)), np.zeros(4)
+    kernels.normal_equations(seen, drawn, usual, gram, right)
     # Enough that a direction in which nothing can be told gets nothing.
     gram += np.eye(4) * max(1e-3 * float(np.trace(gram)) / 4, 1e-9)
-    found = np.linalg.solve(gram, a @ error[usual].reshape(-1))
-    fitted = drawn + np.tensordot(found.astype(np.float32), bases, axes=1)
+    found = np.linalg.solve(gram, right)
+    fitted = np.empty_like(drawn)
+    kernels.add_bases(drawn, found, fitted)
     step, observed = np.zeros_like(drawn), np.zeros_like(drawn)
-    step[1:], observed[1:] = np.diff(drawn, axis=0), np.diff(seen, axis=0)
+    np.subtract(drawn[1:], drawn[:-1], out=step[1:])
+    np.subtract(seen[1:], seen[:-1], out=observed[1:])
     motion = _rms(step)
     return Comparison(
-        shift=found[:2] / height,
+        shift=found[:2] / drawn.shape[1],
         scale=float(found[2]),
         lag=_lag(seen, fitted, motion > _MOVING),
         unlike=_rms(seen - fitted),
         motion=motion,
-        shown=(observed * step).sum(axis=(1, 2, 3)) / np.maximum((step**2).sum(axis=(1, 2, 3)), 1e-6),
+        shown=_products(observed, step) / np.maximum(_products(step, step), 1e-6),
     )
 
 
@@ -206,8 +166,12 @@ def strays(seen: Cells, drawn: Cells) -> Array:
 
 def _rms(cells: Cells) -> Array:
     """(T,) root mean square over each frame's cells."""
-    flat = cells.reshape(len(cells), -1)
-    return np.asarray(np.sqrt(np.einsum("ti,ti->t", flat, flat) / max(flat.shape[1], 1)), dtype=np.float64)
+    return np.asarray(np.sqrt(_products(cells, cells) / max(cells[0].size, 1)), dtype=np.float64)
+
+
+def _products(a: Cells, b: Cells) -> Array:
+    """(T,) sum of the products of each frame's cells."""
+    return np.asarray(np.einsum("ti,ti->t", a.reshape(len(a), -1), b.reshape(len(b), -1)), dtype=np.float64)
 
 
 def _lag(seen: Cells, drawn: Cells, moving: NDArray[np.bool_]) -> float | None:

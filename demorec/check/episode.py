@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.check.base import NotMeasured
-from demorec.check.drawn import NOT_DRAWABLE, Cells, Comparison, Kind, compare, draw_all, strays
+from demorec.check.cells import Cells, Kind
+from demorec.check.drawn import NOT_DRAWABLE, Comparison, compare, draw_all, strays
 from demorec.check.pictures_summary import PictureSummary, summarise
 from demorec.check.rows import link_matrices, matrices
 from demorec.errors import RecordingError

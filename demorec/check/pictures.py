@@ -223,9 +223,13 @@ def _same_place(episode: RecordedEpisode, camera: Camera, other: Camera) -> bool
 
 
 def _correlation(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
-    x, y = a.astype(np.float64) - a.mean(), b.astype(np.float64) - b.mean()
-    size = float(np.sqrt((x * x).sum() * (y * y).sum()))
-    return float((x * y).sum() / size) if size > 0 else 0.0
+    x, y = (a - a.mean()).reshape(-1), (b - b.mean()).reshape(-1)
+    size = math.sqrt(_dot(x, x) * _dot(y, y))
+    return _dot(x, y) / size if size > 0 else 0.0
+
+
+def _dot(x: NDArray[np.float32], y: NDArray[np.float32]) -> float:
+    return float(np.einsum("i,i->", x, y))  # no BLAS: its threads wait for each other on a busy machine
 
 
 @check(

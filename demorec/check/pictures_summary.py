@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.check.drawn import CellGrid, Cells, Kind, planes_of
+from demorec.check.cells import CellGrid, Cells, Kind, PictureCells
 from demorec.errors import RecordingError
 from demorec.geometry import Array
 from demorec.recording import Recording
 from demorec.scene.scene import Camera
-
-_BATCH = 16
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -24,7 +22,7 @@ class PictureSummary:
 
     Attributes:
         error: Why decoding ended early, or "".
-        mean: (N, 3) mean colour, 0..255; empty rows for depth and labels.
+        mean: (N, 3) mean colour, 0..255; of the brightnesses that stand for depth and labels, (N, channels).
         dark, bright: (N,) share of pixels that are nearly black or nearly white.
         cells: (N, h, w, channels) means over small areas, 0..255.
     """
@@ -49,38 +47,17 @@ def summarise(recording: Recording, camera: Camera, kind: Kind) -> PictureSummar
         "labels": recording.segmentation,
     }
     grid = CellGrid(camera.width, camera.height)
-    means, dark, bright, cells = [], [], [], []
+    found: list[PictureCells] = []
     error = ""
     try:
-        for batch in _batches(read[kind](camera.name)):
-            planes = planes_of(kind, batch)
-            cells.append(grid.means(planes))
-            means.append(np.stack([plane.mean(axis=(1, 2)) for plane in planes], axis=1))
-            grey = sum(planes[1:], planes[0]) * np.float32(1 / len(planes))
-            dark.append((grey < 12).mean(axis=(1, 2)))
-            bright.append((grey > 250).mean(axis=(1, 2)))
+        for picture in read[kind](camera.name):
+            found.append(grid.read(kind, picture))  # what came before the damage counts
     except RecordingError as problem:
         error = str(problem)
     return PictureSummary(
         error=error,
-        mean=np.concatenate(means) if means else np.empty((0, 3)),
-        dark=np.concatenate(dark) if dark else np.empty(0),
-        bright=np.concatenate(bright) if bright else np.empty(0),
-        cells=np.concatenate(cells) if cells else np.empty((0, 2, 2, 1), dtype=np.float32),
+        mean=np.array([picture.mean for picture in found]),
+        dark=np.array([picture.dark for picture in found]),
+        bright=np.array([picture.bright for picture in found]),
+        cells=np.array([picture.cells for picture in found]) if found else np.empty((0, 2, 2, 1), dtype=np.float32),
     )
-
-
-def _batches(pictures: Iterable[NDArray[Any]]) -> Iterator[NDArray[Any]]:
-    batch: list[NDArray[Any]] = []
-    try:
-        for picture in pictures:
-            batch.append(picture)
-            if len(batch) == _BATCH:
-                yield np.stack(batch)
-                batch = []
-    except Exception:
-        if batch:  # what came before the damage counts
-            yield np.stack(batch)
-        raise
-    if batch:
-        yield np.stack(batch)

@@ -21,6 +21,8 @@ from demorec.tables import CHECKS
 
 _OF_THE_FILE: tuple[Group, ...] = ("file", "time")
 """Groups of the checks that look at the file itself, not at what was recorded."""
+_WORTH_PROCESSES = {"with pictures": 4, "without": 50}
+"""Recordings from which on several processes check faster than one: each takes seconds to start."""
 _SEVERITY: dict[Level, int] = {"skip": 0, "pass": 0, "warn": 1, "fail": 2}
 
 
@@ -132,6 +134,12 @@ def find_subjects(paths: Sequence[Path]) -> list[Subject]:
     return list(dict.fromkeys(found))
 
 
+def useful_workers(subjects: Sequence[Subject], *, pictures: bool, cores: int) -> int:
+    """How many processes check fastest: one for each core, or one where that many do not pay."""
+    count = sum(subject.kind == "recording" for subject in subjects)
+    return cores if count >= _WORTH_PROCESSES["with pictures" if pictures else "without"] else 1
+
+
 def check_subjects(subjects: Sequence[Subject], options: CheckOptions) -> Iterator[SubjectReport]:
     """One report for each subject, in order."""
     if options.workers == 1 or len(subjects) < 2:
@@ -140,7 +148,14 @@ def check_subjects(subjects: Sequence[Subject], options: CheckOptions) -> Iterat
         return
     # Spawned: forked children would share decoders and libraries in the middle of something.
     with ProcessPoolExecutor(max_workers=min(options.workers, len(subjects)), mp_context=SPAWN) as pool:
-        yield from pool.map(check_subject, subjects, [options] * len(subjects))
+        # Datasets take longest, since LeRobot has to load for them: they begin first.
+        order = sorted(subjects, key=lambda subject: subject.kind != "dataset")
+        begun = {subject: pool.submit(check_subject, subject, options) for subject in order}
+        try:
+            for subject in subjects:
+                yield begun[subject].result()
+        finally:
+            pool.shutdown(cancel_futures=True)
 
 
 def check_subject(subject: Subject, options: CheckOptions) -> SubjectReport:

@@ -19,7 +19,7 @@ from demorec.safety.replacing import PICTURE, check_replaceable
 
 if TYPE_CHECKING:
     from demorec.check.base import Level, Result
-    from demorec.check.report import Subject, SubjectReport
+    from demorec.check.report import CheckOptions, Subject, SubjectReport
     from demorec.replay import ReplayReport
     from demorec.replay.deep import DeepReport
     from demorec.scene.episode import EpisodeInfo
@@ -58,8 +58,8 @@ class Check:
     """Draw start places, goals and ranges of all episodes into this PNG file."""
     overwrite: bool = False
     """Replace the picture of --coverage-picture, if it is there."""
-    workers: int = 1
-    """Processes."""
+    workers: int | None = None
+    """Processes (auto: one for each core, or one alone where starting them would take longer than the checks)."""
     verbose: bool = False
     """Print the checks that pass, too."""
     allow: Allow = ()
@@ -75,12 +75,16 @@ class Check:
             raise OptionError("replay", f"is {self.replay}, it must be 0 or more.")
         if self.coverage_picture is not None:
             self._check_picture(self.coverage_picture)
-        from demorec.check.report import CheckOptions, check_subjects, find_subjects
+        from demorec.check.report import CheckOptions, check_subjects, find_subjects, useful_workers
+        from demorec.generate.options import available_cores
 
         allowed = allowed_modules(self.allow)
-        options = CheckOptions(pictures=self.pictures, only=self.only, workers=self.workers, allowed=allowed)
-        options.validate()
         subjects = find_subjects(self.paths)
+        workers = self.workers
+        if workers is None:
+            workers = useful_workers(subjects, pictures=self.pictures, cores=available_cores())
+        options = CheckOptions(pictures=self.pictures, only=self.only, workers=workers, allowed=allowed)
+        options.validate()
         reports, replays = [], []
         with ProgressBar("checking", total=len(subjects), unit="item") as bar:
             for report in check_subjects(subjects, options):
@@ -95,7 +99,7 @@ class Check:
                     from demorec.cli.replay import told
 
                     say(told(replayed))
-        remade = list(self._remade(subjects, allowed)) if self.deep else []
+        remade = list(self._remade(subjects, options)) if self.deep else []
         if self.coverage_picture is not None:
             self._draw(self.coverage_picture)
         failed = [report for report in reports if report.is_bad(strict=self.strict)]
@@ -111,7 +115,7 @@ class Check:
             say(summary + (f" {len(remade)} made again, {len(different)} not as recorded." if remade else ""))
         return 1 if failed or diverged or different else 0
 
-    def _remade(self, subjects: Sequence[Subject], allowed: tuple[str, ...]) -> Iterator[DeepReport]:
+    def _remade(self, subjects: Sequence[Subject], options: CheckOptions) -> Iterator[DeepReport]:
         from demorec.cli.deep import deep_lines
         from demorec.replay.deep import deep_checks, deep_dataset_checks
 
@@ -119,8 +123,8 @@ class Check:
         runs = [subject.path for subject in subjects if subject.kind == "run"]
         # The dataset of a run is compared with the run's recordings already.
         datasets = [s.path for s in subjects if s.kind == "dataset" and s.path.parent not in runs]
-        found = [deep_checks(paths, workers=self.workers, allowed=allowed)]
-        found += [deep_dataset_checks(path, allowed=allowed) for path in datasets]
+        found = [deep_checks(paths, workers=options.workers, allowed=options.allowed)]
+        found += [deep_dataset_checks(path, allowed=options.allowed) for path in datasets]
         with ProgressBar("making again", total=0 if datasets else len(paths)) as bar:
             for report in chain.from_iterable(found):
                 bar.advance()

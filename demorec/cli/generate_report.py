@@ -19,9 +19,6 @@ from demorec.generate.observer import RunResult
 from demorec.generate.options import RunOptions, available_cores
 from demorec.runs.run_file import DATASET, EPISODES, STARTING, UNFINISHED, Attempt, ExportRecord, RunFile
 
-_WORTH_PROCESSES = 50
-"""Recordings from which on several processes check faster than one."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class CheckSummary:
@@ -51,14 +48,14 @@ def check_run(result: RunResult, *, deep_every: int = 0, progress: Callable[[int
         deep_every: One of so many episodes is made again; 0 for none.
         progress: Is told how many things of how many are done.
     """
-    from demorec.check.report import CheckOptions, check_subjects, find_subjects
+    from demorec.check.report import CheckOptions, check_subjects, find_subjects, useful_workers
     from demorec.replay.deep import deep_checks
 
     beyond = {result.folder / attempt.file for attempt in result.run.beyond}
     subjects = [subject for subject in find_subjects([result.folder]) if subject.path not in beyond]
     sample = [a.file for a in result.run.successes[deep_every - 1 :: deep_every]] if deep_every else []
     total = len(subjects) + len(sample)
-    workers = available_cores() if len(subjects) > _WORTH_PROCESSES else 1
+    workers = useful_workers(subjects, pictures=False, cores=available_cores())
     warnings = 0
     failures: list[str] = []
     failed_attempts = 0

@@ -54,15 +54,16 @@ def fit_primitives(
     points = surface_points(vertices, faces)
     parts = [points]
     fits = [_fit(points)]
+    cuts = [_best_cut(points, fits[0])]
     threshold = min_saving * fits[0].volume
     while len(parts) < max_parts:
-        cuts = [_best_cut(part, fit) for part, fit in zip(parts, fits, strict=True)]
         best = max(range(len(parts)), key=lambda index: cuts[index][0])
         saving, left, right = cuts[best]
         if saving < threshold:
             break
         parts[best : best + 1] = [left, right]
         fits[best : best + 1] = [_fit(left), _fit(right)]
+        cuts[best : best + 1] = [_best_cut(left, fits[best]), _best_cut(right, fits[best + 1])]
     return fits
 
 

@@ -14,6 +14,7 @@ from typing import Literal
 import numpy as np
 
 from demorec.geometry import Array, Pose, intrinsic_matrix
+from demorec.plain import leave_out_default
 
 Rgba = tuple[float, float, float, float]
 Vector3 = tuple[float, float, float]
@@ -165,11 +166,27 @@ POSITION_GAIN = 0.2
 
 @dataclass(frozen=True, kw_only=True)
 class Physics:
-    """Engine parameters, all set at every reset (PyBullet leaks some into later clients)."""
+    """Engine parameters, all set at every reset (PyBullet leaks some into later clients).
+
+    Attributes:
+        hz: Steps a second.
+        solver_iterations: Of each step, at most.
+        gravity: m/s^2.
+        contact_breaking_threshold: How far two bodies may move along each other until Bullet forgets a contact point
+            that it found before, as a share of the smaller one's radius.
+    """
 
     hz: int = 240
     solver_iterations: int = 50
     gravity: Vector3 = (0.0, 0.0, -9.81)
+    contact_breaking_threshold: float = 0.02
+
+
+leave_out_default(Physics, "contact_breaking_threshold")
+
+CONTACT_BREAKING_THRESHOLD = 0.05
+"""Of new episodes; recordings that do not say it have 0.02. With that, a small, light, slippery cube could rock between
+fingers that touched it in one point each, and they sank into it (docs/simulation.md)."""
 
 
 @dataclass(frozen=True, kw_only=True)

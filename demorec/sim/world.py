@@ -266,7 +266,7 @@ def _set_engine(client: Any, physics: Physics) -> None:
         numSubSteps=0,
         deterministicOverlappingPairs=1,
         enableConeFriction=1,
-        contactBreakingThreshold=0.02,
+        contactBreakingThreshold=physics.contact_breaking_threshold,
         collisionFilterMode=1,
         enableFileCaching=1,
         restitutionVelocityThreshold=0.2,

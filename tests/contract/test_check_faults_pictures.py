@@ -13,7 +13,7 @@ from PIL import Image, ImageFilter
 from support.check import checked, simulate
 from support.faults import Good, Rows
 
-from demorec.check.drawn import Kind
+from demorec.check.cells import Kind
 from demorec.tables import CHECKS
 
 Fault = Callable[[Rows], Rows]

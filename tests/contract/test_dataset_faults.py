@@ -12,6 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from support.check import checked, edit_column, edit_json, level_of, simulate, simulate_run
+from support.export import rewrite_video
 from support.mcap import rewritten
 
 from demorec.cli import main
@@ -167,24 +168,6 @@ def test_the_files_alone_give_it_away(name: str, dataset: Path) -> None:
     assert level_of(dataset, check, "dataset") == "fail"
 
 
-def rewrite_video(dataset: Path, change: Callable[[list[Any]], list[Any]]) -> None:
-    """The pictures of the camera's only file, changed and coded anew."""
-    import av
-
-    path = next(dataset.glob(f"videos/{CAMERA}/*/*.mp4"))
-    with av.open(str(path)) as container:
-        pictures = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
-    before = np.stack(pictures)
-    changed = change(pictures)
-    assert len(changed) != len(before) or not np.array_equal(np.stack(changed), before)
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=10, options={"crf": "18", "g": "2", "bf": "0"})
-        stream.width, stream.height, stream.pix_fmt = 64, 64, "yuv420p"
-        for picture in changed:
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")))
-        container.mux(stream.encode(None))
-
-
 def at(frame: int, change: Callable[[Any], Any]) -> Callable[[list[Any]], list[Any]]:
     return lambda pictures: [change(p) if number == frame else p for number, p in enumerate(pictures)]
 
@@ -201,12 +184,12 @@ PICTURES: dict[str, Callable[[list[Any]], list[Any]]] = {
 @pytest.mark.parametrize("name", PICTURES)
 def test_a_single_picture(name: str, dataset: Path) -> None:
     shutil.rmtree(dataset / "demorec")
-    rewrite_video(dataset, PICTURES[name])
+    rewrite_video(dataset, CAMERA, PICTURES[name])
     assert level_of(dataset, "dataset_pictures", "dataset") == "fail"
 
 
 def test_pictures_coded_anew_are_no_fault(dataset: Path) -> None:
-    rewrite_video(dataset, lambda pictures: [*pictures[:-1], pictures[-2]])
+    rewrite_video(dataset, CAMERA, lambda pictures: [*pictures[:-1], pictures[-2]])
     assert level_of(dataset, "dataset_pictures", "dataset") == "pass"
     assert level_of(dataset, "dataset_picture_statistics", "dataset") == "pass"
 

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.check.base import Result
-from demorec.check.drawn import CellGrid, Comparison, Kind, planes_of
+from demorec.check.cells import CellGrid, Kind
+from demorec.check.drawn import Comparison
 from demorec.check.episode import RecordedEpisode
 from demorec.check.pictures_summary import PictureSummary
 from demorec.scene.episode import EpisodeColumns, EpisodeInfo, Outcome
@@ -63,10 +64,10 @@ class Good:
             spoilt._comparisons[key] = compared
         for (name, kind), pictures in changed.items():
             grid = CellGrid(pictures.shape[2], pictures.shape[1])
-            planes = planes_of(kind, pictures)
+            cells = np.stack([grid.read(kind, picture).cells for picture in pictures])
             nothing = np.zeros(len(pictures))
             spoilt._pictures[name, kind] = PictureSummary(
-                error="", mean=np.zeros((len(pictures), 3)), dark=nothing, bright=nothing, cells=grid.means(planes)
+                error="", mean=np.zeros((len(pictures), 3)), dark=nothing, bright=nothing, cells=cells
             )
         return spoilt
 

@@ -9,8 +9,17 @@ import pytest
 
 from demorec.config import GenerateConfig
 from demorec.geometry import Pose, look_at
-from demorec.plain import digest, from_json, from_plain, to_json
-from demorec.scene.scene import Body, Camera, RobotPlacement, Scene, Shape, Texture
+from demorec.plain import digest, from_json, from_plain, to_json, to_plain
+from demorec.scene.scene import (
+    CONTACT_BREAKING_THRESHOLD,
+    Body,
+    Camera,
+    Physics,
+    RobotPlacement,
+    Scene,
+    Shape,
+    Texture,
+)
 
 
 def _scene() -> Scene:
@@ -65,3 +74,12 @@ def test_nan_is_no_json() -> None:
 def test_the_digest_depends_on_content_only() -> None:
     assert digest(GenerateConfig(seed=1)) == digest(GenerateConfig(seed=1))
     assert digest(GenerateConfig(seed=1)) != digest(GenerateConfig(seed=2))
+
+
+def test_physics_says_its_contact_threshold_only_where_it_is_not_that_of_older_recordings() -> None:
+    """Recordings from before the field keep their digests, and are simulated as they were."""
+    assert "contact_breaking_threshold" not in to_plain(Physics())
+    assert from_plain(to_plain(Physics()), Physics).contact_breaking_threshold == 0.02
+    new = Physics(contact_breaking_threshold=CONTACT_BREAKING_THRESHOLD)
+    assert to_plain(new)["contact_breaking_threshold"] == 0.05
+    assert from_plain(to_plain(new), Physics) == new

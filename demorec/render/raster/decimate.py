@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from demorec.render.raster.mesh import Floats, RasterMesh, face_normals, make_mesh, unit, weld
 from demorec.render.raster.mesh_cache import cached_mesh
@@ -44,6 +43,8 @@ def decimate(mesh: RasterMesh, target: int) -> RasterMesh:
 
 def _take_over_looks(mesh: RasterMesh, points: Floats, faces: NDArray[np.int32]) -> RasterMesh:
     """Give the faces the looks of the original's nearest surface that looks the same way."""
+    from scipy.spatial import cKDTree  # takes a third of a second to load, and is needed once for each mesh
+
     extent = float(np.ptp(mesh.points, axis=0).max())
     turn = 0.05 * extent  # how far away a surface may be, to be preferred to one that looks another way
     source_normals = face_normals(mesh.points, mesh.faces)

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
 
 Floats = NDArray[np.float64]
 Faces = NDArray[np.int32]
@@ -98,6 +97,8 @@ def crease_normals(points: Floats, faces: Faces, angle: float = CREASE_ANGLE) ->
     """(f, 3, 3) corner normals: the area-weighted mean of the faces around a point that lie within `angle`."""
     if len(faces) == 0:
         return np.zeros((0, 3, 3))
+    from scipy.sparse import coo_matrix  # takes a third of a second to load, and is needed once for each mesh
+
     _, inverse = weld(points)
     normals = face_normals(points, faces)
     units = unit(normals)

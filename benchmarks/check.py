@@ -1,0 +1,114 @@
+"""What `demorec check` costs, in CPU time, and what it did in another version of the program.
+
+    python benchmarks/check.py --episodes 5
+    git worktree add /tmp/before HEAD~1 && python benchmarks/check.py --against /tmp/before
+
+Three runs are made: without cameras, with two, and with depth and labels as well. A process for each version checks
+the same recordings, run folder and dataset by turns, so that both meet the same load. The first recording and dataset
+of a process are told apart: libraries are loaded and models prepared for them. LeRobot, which opens each dataset in a
+process of its own, is not counted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections import defaultdict
+from pathlib import Path
+
+CASES = {
+    "no cameras": ("--cameras", "none"),
+    "two cameras": (),
+    "two cameras, depth, labels": ("--depth", "--segmentation"),
+}
+
+
+def serve() -> None:
+    """Check every path that comes, and say what it took."""
+    from demorec.check.report import CheckOptions, check_subject, find_subjects
+
+    for line in sys.stdin:
+        path = Path(line.strip())
+        subject = find_subjects([path])[0]
+        start = time.process_time()
+        report = check_subject(subject, CheckOptions())
+        print(time.process_time() - start, report.level, flush=True)
+
+
+class Checker:
+    """A process that checks, with the program of a folder.
+
+    Args:
+        folder: That holds demorec/.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._process = subprocess.Popen(
+            [sys.executable, __file__, "--serve"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "PYTHONPATH": str(folder)},
+        )
+
+    def seconds(self, path: Path) -> float:
+        """CPU time of checking a recording, a run's folder or a dataset."""
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        print(path, file=self._process.stdin, flush=True)
+        seconds, level = self._process.stdout.readline().split()
+        if level != "pass":
+            raise SystemExit(f"{path} did not pass: {level}")
+        return float(seconds)
+
+    def close(self) -> None:
+        """End the process."""
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+        self._process.wait()
+
+
+def main() -> None:
+    """Make runs, check them, tell."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--episodes", type=int, default=5)
+    parser.add_argument("--size", type=int, default=224)
+    parser.add_argument("--task", default="pick_place")
+    parser.add_argument("--against", type=Path, help="a folder with another version of demorec/")
+    parser.add_argument("--serve", action="store_true", help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.serve:
+        serve()
+        return
+    versions = {"now": Path(__file__).resolve().parents[1]}
+    if options.against is not None:
+        versions = {"before": options.against.resolve(), **versions}
+    print(f"{'CPU ms':<42}" + "".join(f"{name:>10}" for name in versions))
+    with tempfile.TemporaryDirectory() as folder:
+        for case, flags in CASES.items():
+            run = Path(folder) / case.replace(", ", "_").replace(" ", "_")
+            command = [str(Path(sys.executable).with_name("generate-dataset")), "--task", options.task, "--seed", "3"]
+            command += ["--num-episodes", str(options.episodes + 1), "--width", str(options.size)]
+            command += ["--height", str(options.size), "--out", str(run), "--workers", "1", *flags]
+            subprocess.run(command, check=True, capture_output=True)
+            checkers = {name: Checker(place) for name, place in versions.items()}
+            cpu: dict[tuple[str, str], float] = defaultdict(float)
+            first, *others = sorted((run / "episodes").glob("*.mcap"))
+            subjects = {"first recording": [first], "recording": others, "run's folder": [run]}
+            subjects |= {"first dataset": [run / "dataset"], "dataset": [run / "dataset"]}
+            for what, paths in subjects.items():
+                for path in paths:
+                    for name, checker in checkers.items():
+                        cpu[what, name] += checker.seconds(path) / len(paths)
+                told = "".join(f"{1e3 * cpu[what, name]:10.0f}" for name in versions)
+                print(f"{f'{case}: {what}':<42}{told}", flush=True)
+            for checker in checkers.values():
+                checker.close()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,54 @@
+"""What is held is held at its faces: no finger sinks in, whatever the object's mass, friction and size."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from support.sim import episode
+
+from demorec.loop import Episode, ScriptAgent, Session, make_world
+from demorec.scene.scene import Shape
+from demorec.tables import ROBOTS
+
+SINKING = 1e-3
+"""Of each finger, metres, that is too much."""
+
+
+def smallest_opening(made: Episode) -> float:
+    """The gripper's smallest opening, metres, while something is lifted and carried."""
+    with make_world(made.info) as world:
+        frames = Session.of_episode(world, made).run(ScriptAgent(made))
+        return min(frame.observation.gripper_width for frame in frames if frame.phase in ("lift", "transport"))
+
+
+def with_cube(made: Episode, *, side: float, mass: float, friction: float) -> Episode:
+    """The same episode with another cube."""
+    scene = made.info.scene
+    cube = scene.body("red_cube")
+    pose = replace(cube.world_from_body, position=cube.world_from_body.position * [1, 1, side / cube.shape.size[2]])
+    cube = replace(
+        cube,
+        shape=Shape(kind="box", size=(side, side, side)),
+        world_from_body=pose,
+        mass=mass,
+        lateral_friction=friction,
+    )
+    bodies = tuple(cube if body.name == cube.name else body for body in scene.bodies)
+    return replace(made, info=replace(made.info, scene=replace(scene, bodies=bodies)))
+
+
+@pytest.mark.parametrize("robot", ROBOTS.names())
+@pytest.mark.parametrize(
+    ("side", "mass", "friction"), [(0.0328, 0.030, 0.42), (0.0318, 0.038, 0.42), (0.0328, 0.102, 0.456)]
+)
+def test_fingers_stand_as_far_apart_as_the_cube_is_wide(robot: str, side: float, mass: float, friction: float) -> None:
+    """Small, light, slippery cubes: with fingers of one corner each they rock, and the fingers go in by up to 13 mm."""
+    made = episode(957, robot=robot, seed=2718, split="train")
+    assert smallest_opening(with_cube(made, side=side, mass=mass, friction=friction)) > side - 2 * SINKING
+
+
+def test_fingers_stay_outside_of_cubes_that_are_sorted() -> None:
+    made = episode(10, task="sort_by_color", seed=4)
+    side = min(min(body.shape.size) for body in made.info.scene.movable)
+    assert smallest_opening(made) > side - 2 * SINKING

@@ -1,0 +1,95 @@
+"""Pictures in cells: the compiled loops give what NumPy gives, drawn pictures have the grid of the recorded ones."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from support.recording import write_episode
+
+from demorec.check.cells import DEPTH_RANGE, CellGrid, Cells, cell_counts
+from demorec.check.drawn import compare, draw_all
+from demorec.errors import RecordingError
+from demorec.geometry import Array
+from demorec.recording import Recording
+
+
+def parts(picture: NDArray[Any], width: int, height: int) -> list[list[NDArray[Any]]]:
+    """The picture cut into its cells."""
+    columns, rows = cell_counts(width, height)
+    x, y = np.arange(columns + 1) * width // columns, np.arange(rows + 1) * height // rows
+    return [[picture[y[i] : y[i + 1], x[j] : x[j + 1]] for j in range(columns)] for i in range(rows)]
+
+
+@given(width=st.integers(4, 90), height=st.integers(4, 90), seed=st.integers(0, 9))
+@settings(max_examples=25, deadline=None)
+def test_colours_are_means_of_the_cells_and_of_all(width: int, height: int, seed: int) -> None:
+    picture = np.random.default_rng(seed).choice([0, 11, 12, 90, 250, 251, 255], (height, width, 3)).astype(np.uint8)
+    read = CellGrid(width, height).read("color", picture)
+    expected = [[cell.mean(axis=(0, 1)) for cell in row] for row in parts(picture, width, height)]
+    np.testing.assert_allclose(read.cells, expected, rtol=1e-6)
+    np.testing.assert_allclose(read.mean, picture.mean(axis=(0, 1)), rtol=1e-12)
+    grey = picture.astype(np.float64).mean(axis=2)
+    assert read.dark == pytest.approx((grey < 12 - 1e-9).mean())
+    assert read.bright == pytest.approx((grey > 250 + 1e-9).mean())
+
+
+def test_depth_is_a_brightness_and_what_was_not_hit_is_far() -> None:
+    metres = np.random.default_rng(0).uniform(0.2, 2 * DEPTH_RANGE, (48, 64)).astype(np.float32)
+    metres[::3, ::2], metres[1, 1], metres[2, 2] = 0.0, np.nan, np.inf
+    read = CellGrid(64, 48).read("depth", metres)
+    near = np.where((metres > 0) & (metres < DEPTH_RANGE), metres, DEPTH_RANGE) * (255 / DEPTH_RANGE)
+    expected = [[[cell.mean()] for cell in row] for row in parts(near, 64, 48)]
+    np.testing.assert_allclose(read.cells, expected, rtol=1e-5)
+
+
+def test_neighbouring_labels_are_far_apart() -> None:
+    """Every two of 20 bodies with 12 links differ by more than four of 255 in one of their two brightnesses."""
+    grid = CellGrid(2, 2)
+    labels = [body + (link << 24) for body in range(-1, 20) for link in range(12)]
+    seen = np.array([grid.read("labels", np.full((2, 2), label, dtype=np.int32)).mean for label in labels])
+    apart = np.abs(seen[:, None] - seen[None]).max(axis=2) + 255 * np.eye(len(labels))
+    assert (apart > 4).mean() > 0.995
+    assert (apart > 0).all()
+
+
+def test_a_picture_of_another_size_is_refused() -> None:
+    """The compiled loops would read beyond its end."""
+    with pytest.raises(RecordingError, match=r"\(40, 64, 3\).*\(48, 64, 3\)"):
+        CellGrid(64, 48).read("color", np.zeros((40, 64, 3), dtype=np.uint8))
+
+
+def test_drawn_pictures_have_the_grid_of_the_recorded_ones(tmp_path: Path) -> None:
+    """500x224 is drawn as 112x50: by itself that would have 12 rows of cells, and not 13."""
+    path = write_episode(tmp_path / "e.mcap", num_frames=2, cameras=("front",), width=500, height=224)
+    with Recording(path) as recording:
+        drawn = draw_all(recording.info, recording.columns(), {"front": ("color",)})
+    assert drawn["front", "color"].shape == (2, 13, 28, 3)
+
+
+def waves(x: Array, y: Array, t: Array) -> Cells:
+    """Smooth pictures as cells (T, h, w, 3), of standing waves: what changes in them is no shift."""
+    channels = [np.sin(0.31 * x + 0.2 * y + k) * np.sin(0.2 * t + 2 * k) + np.cos(0.2 * x - 0.3 * y) for k in range(3)]
+    return np.asarray(np.stack(channels, axis=-1) * 50 + 127, dtype=np.float32)
+
+
+T, Y, X = np.meshgrid(np.arange(60.0), np.arange(28.0), np.arange(28.0), indexing="ij")
+MIDDLE = 13.5
+
+
+def test_a_known_shift_and_size_are_measured() -> None:
+    """The pictures are shifted by 0.1 cells to the right and 0.05 up, and things in them are 2 % larger."""
+    seen = waves((X - 0.1 - MIDDLE) / 1.02 + MIDDLE, (Y + 0.05 - MIDDLE) / 1.02 + MIDDLE, T)
+    found = compare(seen, waves(X, Y, T))
+    assert found.shift * 28 == pytest.approx([0.1, -0.05], abs=0.02)
+    assert found.scale == pytest.approx(0.02, abs=0.004)
+
+
+def test_a_known_lag_is_measured() -> None:
+    found = compare(waves(X, Y, T - 2.3), waves(X, Y, T))
+    assert found.lag == pytest.approx(2.3, abs=0.1)
