@@ -17,7 +17,7 @@ from demorec.lerobot.language import COLUMNS
 from demorec.lerobot.layout import AUTOMATIC_FEATURES
 from demorec.lerobot.progress import PROGRESS_PATH
 from demorec.recording import channels
-from demorec.recording.metadata import EPISODE, OUTCOME, RECOVERED, CameraStreams
+from demorec.recording.metadata import COLLECTED, EPISODE, OUTCOME, RECOVERED, CameraStreams
 from demorec.recording.streams import frame_streams
 from demorec.recording.transforms import FrameTree
 from demorec.runs.run_file import RunFile
@@ -94,6 +94,9 @@ def everything() -> Iterator[tuple[Kind, str]]:
     for name, kind in (("info", EpisodeInfo), ("cameras", CameraStreams), ("outcome", Outcome), ("run", RunFile)):
         for field in _leaves(kind, name):
             yield "field", field
+    yield "field", f"metadata {COLLECTED}"
+    for topic in ("/frames", "/{feature}"):
+        yield "topic", topic
     for column in columns():
         yield "column", column
 

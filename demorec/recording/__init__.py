@@ -10,6 +10,9 @@ with Recording(path) as recording:
     recording.images("front")      # decoded pictures
 """
 
+from demorec.recording.collected.reader import CollectedRecording
+from demorec.recording.collected.writer import CollectedWriter
+from demorec.recording.opening import AnyRecording, open_recording
 from demorec.recording.pixels import PixelStatistics
 from demorec.recording.recording import Recording
 from demorec.recording.recover import Recovered, recover
@@ -17,6 +20,9 @@ from demorec.recording.video import VideoPacket, VideoSettings
 from demorec.recording.writer import EpisodeWriter, WriteStats
 
 __all__ = [
+    "AnyRecording",
+    "CollectedRecording",
+    "CollectedWriter",
     "EpisodeWriter",
     "PixelStatistics",
     "Recording",
@@ -24,5 +30,6 @@ __all__ = [
     "VideoPacket",
     "VideoSettings",
     "WriteStats",
+    "open_recording",
     "recover",
 ]
