@@ -83,9 +83,8 @@ class Timelines:
 
     def __init__(self, streams: BagStreams, mapping: BagMapping) -> None:
         self.mapping = mapping
-        self.streams: dict[Key, Stream] = {}
-        self.streams.update(streams.sources)
-        self.streams.update(streams.cameras)
+        pairs: tuple[tuple[Key, Stream], ...] = (*streams.sources.items(), *streams.cameras.items())
+        self.streams = dict(pairs)
         self.lines: dict[Key, Timeline] = {key: timeline(stream, mapping) for key, stream in self.streams.items()}
         self._by_topic = {stream.topic: self.lines[key] for key, stream in self.streams.items()}
 
