@@ -22,7 +22,7 @@ def reason_to_transcode(settings: VideoSettings, stride: int) -> str:
     """
     if settings.codec == "jpeg":
         return "jpeg pictures are no video"
-    if stride % settings.gop and stride > 1:
+    if stride > 1 and (settings.gop == 0 or stride % settings.gop):
         return f"every {_ordinal(stride)} frame is taken and every {_ordinal(settings.gop)} is a keyframe"
     return ""
 

@@ -10,6 +10,8 @@ with Recording(path) as recording:
     recording.images("front")      # decoded pictures
 """
 
+from demorec.recording.collected.reader import CollectedRecording
+from demorec.recording.collected.writer import CollectedWriter
 from demorec.recording.pixels import PixelStatistics
 from demorec.recording.recording import Recording
 from demorec.recording.recover import Recovered, recover
@@ -17,6 +19,8 @@ from demorec.recording.video import VideoPacket, VideoSettings
 from demorec.recording.writer import EpisodeWriter, WriteStats
 
 __all__ = [
+    "CollectedRecording",
+    "CollectedWriter",
     "EpisodeWriter",
     "PixelStatistics",
     "Recording",

@@ -1,8 +1,9 @@
 """CDR, the wire format of ROS 2 messages (OMG DDS-XTypes, plain XCDR1, little endian).
 
 A recording consists of many messages with the same names and lengths and other numbers. So a message is laid out
-once, as a `Layout`: constant bytes with slots for time stamps and float64 values. Writing or reading a batch is then
-a copy into or out of the slots of all its messages at once, instead of a walk through every field of each.
+once, as a `Layout`: constant bytes with slots for time stamps and float64 (or int64) values. Writing or reading a
+batch is then a copy into or out of the slots of all its messages at once, instead of a walk through every field of
+each.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,7 +93,7 @@ class CdrWriter:
         self.time_slots.append(len(self._data) - 8)
 
     def value_slot(self, count: int = 1) -> None:
-        """float64 values that `Layout.encode` fills in."""
+        """Values of eight bytes that `Layout.encode` fills in."""
         for _ in range(count):
             self.f64(0.0)
             self.value_slots.append(len(self._data) - 8)
@@ -100,9 +102,10 @@ class CdrWriter:
         """The message."""
         return bytes(self._data)
 
-    def layout(self) -> Layout:
-        """The message as a layout."""
+    def layout(self, dtype: Literal["<f8", "<i8"] = "<f8") -> Layout:
+        """The message as a layout, whose values are all of one type."""
         return Layout(
+            dtype=dtype,
             constant=np.frombuffer(bytes(self._data), dtype=np.uint8),
             time_bytes=_slot_bytes(self.time_slots),
             value_bytes=_slot_bytes(self.value_slots),
@@ -124,14 +127,16 @@ def _runs(positions: NDArray[np.intp]) -> list[tuple[int, int]]:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Layout:
-    """A message of constant length whose stamps and float64 values change.
+    """A message of constant length whose stamps and values change.
 
     Attributes:
+        dtype: Of the values: float64 or int64.
         constant: (L,) uint8, the message with zeros in the slots.
         time_bytes: (8 S,) positions of the bytes of the S time stamps, which are all set to the message's time.
         value_bytes: (8 K,) positions of the bytes of the K values.
     """
 
+    dtype: Literal["<f8", "<i8"] = "<f8"
     constant: NDArray[np.uint8]
     time_bytes: NDArray[np.intp]
     value_bytes: NDArray[np.intp]
@@ -149,7 +154,7 @@ class Layout:
     def _time_runs(self) -> list[tuple[int, int]]:
         return _runs(self.time_bytes)
 
-    def encode(self, time_ns: NDArray[np.int64], values: Array) -> list[bytes]:
+    def encode(self, time_ns: NDArray[np.int64], values: NDArray[Any]) -> list[bytes]:
         """One message for each row of `values` (N, K), stamped with `time_ns` (N,)."""
         count, length = len(time_ns), len(self.constant)
         # Four bytes in front of each message put its float64 values on multiples of eight.
@@ -160,11 +165,11 @@ class Layout:
         words = rows.view("<u4")
         words[:, (self.time_bytes[::8] + 4) // 4] = seconds[:, None]
         words[:, (self.time_bytes[::8] + 8) // 4] = nanoseconds[:, None]
-        rows.view("<f8")[:, (self.value_bytes[::8] + 4) // 8] = values
+        rows.view(self.dtype)[:, (self.value_bytes[::8] + 4) // 8] = values
         data = rows.tobytes()
         return [data[start : start + length] for start in range(4, count * width, width)]
 
-    def decode(self, messages: Sequence[bytes]) -> Array:
+    def decode(self, messages: Sequence[bytes]) -> NDArray[Any]:
         """(N, K) values; ValueError unless every message has this layout in all its constant bytes."""
         length = len(self.constant)
         if any(len(message) != length for message in messages):
@@ -172,14 +177,14 @@ class Layout:
             raise ValueError(f"a message of {found} bytes where {length} were expected")
         return self.decode_rows(np.frombuffer(b"".join(messages), dtype=np.uint8).reshape(len(messages), length))
 
-    def decode_rows(self, rows: NDArray[np.uint8]) -> Array:
+    def decode_rows(self, rows: NDArray[np.uint8]) -> NDArray[Any]:
         """(N, K) values of messages of the right length, given as (N, L) bytes; ValueError as `decode`."""
-        values = np.empty((len(rows), self.num_values))
+        values = np.empty((len(rows), self.num_values), dtype=self.dtype)
         rest = rows.copy()
         column = 0
         for first, last in self._value_runs:
             count = (last - first) // 8
-            values[:, column : column + count] = np.ascontiguousarray(rows[:, first:last]).view("<f8")
+            values[:, column : column + count] = np.ascontiguousarray(rows[:, first:last]).view(self.dtype)
             rest[:, first:last] = 0
             column += count
         for first, last in self._time_runs:

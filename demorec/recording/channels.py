@@ -57,7 +57,8 @@ def latched_messages(info: EpisodeInfo, frames: FrameTree, *, has_labels: bool) 
             continue
         yield description_topic(body.name), messages.STRING, messages.string(body_description(body))
     for camera in info.scene.cameras:
-        data = messages.camera_info(camera, camera_frame(camera.name))
+        calibration = messages.Calibration(width=camera.width, height=camera.height, intrinsics=camera.intrinsics)
+        data = messages.camera_info(calibration, camera_frame(camera.name))
         yield camera_topic(camera.name, "camera_info"), messages.CAMERA_INFO, data
     if has_labels:
         values, names = zip(*segment_names(info), strict=True)
@@ -68,9 +69,14 @@ def latched_messages(info: EpisodeInfo, frames: FrameTree, *, has_labels: bool) 
 PHASE_EVENT = "phase"
 """Name of the events that the writer adds at each change of phase, so that a log shows them too."""
 
-_VIDEO_STREAMS = {"h264": "h264", "av1": "video", "jpeg": "image/compressed"}
-PICTURE_STREAMS = (*_VIDEO_STREAMS.values(), "depth", "segmentation", "histogram")
-"""Streams of a camera that come from its pictures."""
+_VIDEO_STREAMS = {"h264": "h264", "h265": "h265", "av1": "video", "jpeg": "image/compressed"}
+PICTURE_STREAMS = (
+    *(stream for codec, stream in _VIDEO_STREAMS.items() if codec != "h265"),
+    "depth",
+    "segmentation",
+    "histogram",
+)
+"""Streams of a camera that come from its pictures; H.265 is only kept, in collected episodes."""
 
 
 def video_topic(camera: str, codec: str) -> str:

@@ -13,7 +13,6 @@ from demorec.recording.cdr import CdrReader, CdrWriter
 from demorec.recording.chunks import Block
 from demorec.recording.pixels import PixelStatistics
 from demorec.scene.episode import Event
-from demorec.scene.scene import Camera
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 POSE = "geometry_msgs/msg/PoseStamped"
@@ -21,6 +20,7 @@ WRENCH = "geometry_msgs/msg/WrenchStamped"
 STRING = "std_msgs/msg/String"
 BOOL = "std_msgs/msg/Bool"
 LOG = "rcl_interfaces/msg/Log"
+FLOAT64_ARRAY = "std_msgs/msg/Float64MultiArray"
 INT64_ARRAY = "std_msgs/msg/Int64MultiArray"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 PROTOBUF_VIDEO = "foxglove.CompressedVideo"
@@ -241,16 +241,25 @@ def read_pixel_statistics(data: bytes) -> PixelStatistics:
     return PixelStatistics(num_images=int(values[0]), counts=values[1:].reshape(3, 256))
 
 
-def camera_info(camera: Camera, frame_id: str) -> bytes:
-    """sensor_msgs/CameraInfo of a camera without distortion."""
-    k = camera.intrinsics
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Calibration:
+    """What a `camera_info` message says: picture size in pixels and K (3, 3)."""
+
+    width: int
+    height: int
+    intrinsics: Array
+
+
+def camera_info(calibration: Calibration, frame_id: str, distortion: Sequence[float] = (0.0,) * 5) -> bytes:
+    """sensor_msgs/CameraInfo, with the distortion of the plumb bob model."""
+    k = calibration.intrinsics
     message = CdrWriter()
     message.header(frame_id)
-    message.u32(camera.height)
-    message.u32(camera.width)
+    message.u32(calibration.height)
+    message.u32(calibration.width)
     message.text("plumb_bob")
-    message.u32(5)
-    message.floats([0.0] * 5)
+    message.u32(len(distortion))
+    message.floats(distortion)
     message.floats(k.reshape(-1).tolist())
     message.floats(np.eye(3).reshape(-1).tolist())
     message.floats(np.hstack((k, np.zeros((3, 1)))).reshape(-1).tolist())
@@ -260,15 +269,6 @@ def camera_info(camera: Camera, frame_id: str) -> bytes:
         message.u32(0)
     message.u8(False)
     return message.finish()
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Calibration:
-    """What a `camera_info` message says: picture size in pixels and K (3, 3)."""
-
-    width: int
-    height: int
-    intrinsics: Array
 
 
 def read_camera_info(data: bytes) -> Calibration:

@@ -17,6 +17,8 @@ from demorec.scene.episode import FORMAT_VERSION, EpisodeInfo, Outcome
 from demorec.scene.validity import from_description, read_episode_info
 
 EPISODE = "demorec.episode"
+COLLECTED = "demorec.collected"
+"""In place of EPISODE in the recordings of `demorec.recording.collected`."""
 OUTCOME = "demorec.outcome"
 RECOVERED = "demorec.recovered"
 _CHECKSUM = "crc32"
@@ -39,7 +41,7 @@ class CameraStreams:
 
 def episode_metadata(info: EpisodeInfo, cameras: Mapping[str, CameraStreams]) -> dict[str, str]:
     """The record that makes an MCAP file a recording; the first few values are for people."""
-    return _sealed(
+    return sealed(
         {
             "task": info.task,
             "instruction": info.instruction,
@@ -55,12 +57,12 @@ def episode_metadata(info: EpisodeInfo, cameras: Mapping[str, CameraStreams]) ->
 
 def outcome_metadata(outcome: Outcome) -> dict[str, str]:
     """The record that ends a complete recording."""
-    return _sealed({"success": str(outcome.success).lower(), "outcome": to_json(outcome)})
+    return sealed({"success": str(outcome.success).lower(), "outcome": to_json(outcome)})
 
 
 def recovered_metadata(*, kept_frames: int) -> dict[str, str]:
     """The record of a recording that a crash cut off."""
-    return _sealed({"kept_frames": str(kept_frames)})
+    return sealed({"kept_frames": str(kept_frames)})
 
 
 def read_episode_metadata(metadata: Mapping[str, str]) -> tuple[EpisodeInfo, dict[str, CameraStreams]]:
@@ -109,7 +111,8 @@ def read_outcome_metadata(metadata: Mapping[str, str]) -> Outcome:
     return outcome
 
 
-def _sealed(metadata: dict[str, str]) -> dict[str, str]:
+def sealed(metadata: dict[str, str]) -> dict[str, str]:
+    """The metadata with their checksum, which `check_seal` looks at."""
     return {**metadata, _CHECKSUM: _checksum(metadata)}
 
 

@@ -26,6 +26,32 @@ Message = tuple[str, str, bytes]
 """Topic, type, bytes."""
 
 
+class ColorMessages:
+    """The messages of the coded colour pictures of one camera, and of their statistics."""
+
+    def __init__(self, camera: str, codec: str) -> None:
+        self._camera, self._codec = camera, codec
+        self._topic, self._again_topic = video_topic(camera, codec), camera_topic(camera, "video")
+        self._layout = messages.PictureMessages(camera_frame(camera), codec)
+
+    def of(self, time_ns: int, packet: bytes) -> list[Message]:
+        """Those of one picture."""
+        if self._codec == "av1":
+            data = messages.protobuf_video(time_ns, camera_frame(self._camera), self._codec, packet)
+            return [(self._topic, messages.PROTOBUF_VIDEO, data)]
+        result = [(self._topic, messages.COMPRESSED_IMAGE, self._layout.compressed_image(time_ns, packet))]
+        if self._codec != "jpeg":
+            # The same bytes once more, as Foxglove wants them; next to the first, compression folds them.
+            again = self._layout.compressed_video(time_ns, packet)
+            result.append((self._again_topic, messages.COMPRESSED_VIDEO, again))
+        return result
+
+    def statistics(self, pixels: PixelCounter) -> Message:
+        """What was counted of all pictures."""
+        data = messages.pixel_statistics(pixels.statistics())
+        return camera_topic(self._camera, "histogram"), messages.INT64_ARRAY, data
+
+
 class CameraRecorder:
     """Codes what a camera sees and keeps it until it is written.
 
@@ -43,7 +69,7 @@ class CameraRecorder:
         )
         self._pixels = PixelCounter()
         frame_id = camera_frame(camera.name)
-        self._color = messages.PictureMessages(frame_id, video.codec)
+        self._color = ColorMessages(camera.name, video.codec)
         self._depth = messages.PictureMessages(frame_id, DEPTH_FORMAT)
         self._labels = messages.PictureMessages(frame_id, LABELS_FORMAT)
         self._packets: list[bytes] = []
@@ -97,24 +123,12 @@ class CameraRecorder:
 
     def take_messages(self, time_ns: list[int]) -> Iterator[list[Message]]:
         """The messages of the oldest frames that are not yet written, one list a frame."""
-        name, codec = self._camera.name, self.streams.video.codec
-        topic, again_topic = video_topic(name, codec), camera_topic(name, "video")
         count = len(time_ns)
         for time, packet, others in zip(time_ns, self._packets[:count], self._others[:count], strict=True):
-            if codec == "av1":
-                message = messages.protobuf_video(time, camera_frame(name), codec, packet)
-                yield [(topic, messages.PROTOBUF_VIDEO, message), *others]
-                continue
-            result = [(topic, messages.COMPRESSED_IMAGE, self._color.compressed_image(time, packet))]
-            if codec == "h264":
-                # The same bytes once more, as Foxglove wants them; next to the first, compression folds them.
-                again = self._color.compressed_video(time, packet)
-                result.append((again_topic, messages.COMPRESSED_VIDEO, again))
-            yield result + others
+            yield self._color.of(time, packet) + others
         del self._packets[:count]
         del self._others[:count]
 
     def statistics(self) -> Message:
         """What `pixels` counted."""
-        data = messages.pixel_statistics(self._pixels.statistics())
-        return camera_topic(self._camera.name, "histogram"), messages.INT64_ARRAY, data
+        return self._color.statistics(self._pixels)

@@ -6,10 +6,6 @@ import dataclasses
 import hashlib
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from itertools import islice
-from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,17 +14,17 @@ from demorec.errors import RecordingError
 from demorec.plain import to_json, to_plain
 from demorec.recording import channels, messages, metadata
 from demorec.recording.chunks import Block
-from demorec.recording.container import Container, damage_as_recording_error
+from demorec.recording.container import damage_as_recording_error
 from demorec.recording.depth import decode_depth
+from demorec.recording.episode_file import EpisodeFile
 from demorec.recording.labels import decode_labels, from_labels
-from demorec.recording.pixels import PixelCounter, PixelStatistics
 from demorec.recording.streams import Columns, FrameStream, frame_streams, merged_columns
-from demorec.recording.video import Rgb, VideoPacket, VideoSettings, decode, is_keyframe
+from demorec.recording.video import Rgb, VideoPacket, VideoSettings, is_keyframe
 from demorec.scene.episode import EpisodeColumns, Event, JointSample, frame_time_ns
 from demorec.scene.urdf import check_primitives
 
 
-class RecordingReader:
+class RecordingReader(EpisodeFile):
     """What one file holds: numbers as columns, pictures as packets or decoded, labels; a context manager.
 
     Attributes:
@@ -41,65 +37,30 @@ class RecordingReader:
         RecordingError: No recording, cut off, damaged, or of an unknown format version; so do all methods.
     """
 
-    def __init__(self, path: str | Path) -> None:
-        self.path = Path(path)
-        self._container = Container(self.path)
-        try:
-            self._read_metadata()
-        except BaseException:
-            self.close()
-            raise
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Close the file; harmless when called twice."""
-        self._container.close()
-
     def _read_metadata(self) -> None:
         found = self._container.metadata(metadata.EPISODE)
+        if found is None and metadata.COLLECTED in self._container.metadata_names:
+            raise RecordingError(
+                "This needs an episode that demorec simulated; this one was collected from another robot or program "
+                f"and has no scene: {self.path}"
+            )
         if found is None:
             raise RecordingError(f"The MCAP file is no demorec recording, it has no episode metadata: {self.path}")
         try:
             self.info, self._cameras = metadata.read_episode_metadata(found)
             outcome = self._container.metadata(metadata.OUTCOME)
             self.outcome = None if outcome is None else metadata.read_outcome_metadata(outcome)
-            recovered = self._container.metadata(metadata.RECOVERED)
-            if recovered is not None:
-                metadata.check_seal(metadata.RECOVERED, recovered)
+            self.num_frames = self._container.counts.get(channels.GRIPPER, 0)
+            self._check_end(self.num_frames, None if self.outcome is None else self.outcome.num_frames)
+            if self.num_frames and len(self._cameras) != len(self.info.scene.cameras):
+                raise RecordingError("The recording has frames, but none of its scene's cameras was recorded")
         except RecordingError as error:
             raise RecordingError(f"{error}: {self.path}") from error
-        self.is_recovered = recovered is not None
-        self.num_frames = self._container.counts.get(channels.GRIPPER, 0)
-        if self.outcome is None and not self.is_recovered:
-            raise RecordingError(f"The recording was never finished: demorec recover makes a readable one: {self.path}")
-        if self.num_frames and len(self._cameras) != len(self.info.scene.cameras):
-            raise RecordingError(f"The recording has frames, but none of its scene's cameras was recorded: {self.path}")
-        if self.outcome is not None and self.outcome.num_frames != self.num_frames:
-            raise RecordingError(
-                f"The recording has {self.num_frames} frames, but its outcome says {self.outcome.num_frames}: "
-                f"{self.path}"
-            )
 
     @property
     def cameras(self) -> tuple[str, ...]:
         """Names of the recorded cameras, in the scene's order."""
         return tuple(camera.name for camera in self.info.scene.cameras if camera.name in self._cameras)
-
-    @property
-    def topics(self) -> dict[str, tuple[str, int]]:
-        """topic -> (type, number of messages), sorted by topic."""
-        container = self._container
-        return {
-            topic: (container.schemas[container.channels[topic].schema_id].name, container.counts[topic])
-            for topic in sorted(container.channels)
-        }
 
     def video_settings(self, camera: str) -> VideoSettings:
         """How the pictures of a camera were coded."""
@@ -260,21 +221,13 @@ class RecordingReader:
                 f"The recording has {self.num_frames} frames, but {count} pictures on {topic}: {self.path}"
             )
 
-    def images(self, camera: str) -> Iterator[Rgb]:
-        """The decoded pictures of a camera, (H, W, 3) uint8 RGB, one a frame, in order."""
-        return decode(self.video_settings(camera), self.packets(camera))
-
     def image(self, camera: str, frame: int) -> Rgb:
         """The decoded picture of one frame, (H, W, 3) uint8 RGB, decoded from the keyframe before it on.
 
         Raises:
             IndexError: There is no such frame; negative ones count from the end.
         """
-        number = range(self.num_frames)[frame]
-        packets = list(islice(self.packets(camera), number + 1))
-        keyframe = max(index for index, packet in enumerate(packets) if packet.is_keyframe)
-        *_, picture = decode(self.video_settings(camera), packets[keyframe:])
-        return picture
+        return self._image(camera, range(self.num_frames)[frame])
 
     def calibration(self, camera: str) -> messages.Calibration:
         """What the calibration message of a camera says, which is what other programs go by."""
@@ -283,18 +236,6 @@ class RecordingReader:
             with damage_as_recording_error(self.path):
                 return messages.read_camera_info(message.data)
         raise RecordingError(f"The recording has no calibration of the camera {camera!r}: {self.path}")
-
-    def pixel_statistics(self, camera: str) -> PixelStatistics:
-        """Histograms of a camera's pictures: as written, or counted now in a recording that a crash cut off."""
-        self._camera(camera)
-        topic = channels.camera_topic(camera, "histogram")
-        for message in self._container.messages((topic,)):
-            with damage_as_recording_error(self.path):
-                return messages.read_pixel_statistics(message.data)
-        counter = PixelCounter()
-        for picture in self.images(camera):
-            counter.add(picture)
-        return counter.statistics()
 
     def digest(self) -> str:
         """SHA-256 (hex) of the content: metadata, numbers, phases, events, coded pictures.

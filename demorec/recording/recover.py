@@ -7,17 +7,21 @@ front until one is cut off or damaged; what all streams have in common up to the
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from demorec.errors import ConfigError, RecordingError, resource_error, without_path
 from demorec.recording import channels, messages, metadata
+from demorec.recording.collected.metadata import read_collected_metadata, read_collected_outcome
+from demorec.recording.collected.reader import CollectedRecording
+from demorec.recording.collected.streams import FRAMES, feature_streams
 from demorec.recording.container import SalvagedMessage, SalvagedMetadata, salvage
 from demorec.recording.part_file import PartFile
 from demorec.recording.recording import Recording
 from demorec.recording.ros2 import DEFINITIONS
 from demorec.recording.streams import frame_streams
+from demorec.scene.collected import Origin
 from demorec.scene.episode import frame_time_ns
 
 
@@ -53,22 +57,24 @@ def recover(source: Path, target: Path, *, overwrite: bool = False) -> Recovered
         survey = _survey(source)
     except RecordingError as error:
         raise RecordingError(f"{without_path(error, source)}: {source}") from error
-    if survey.episode is None or survey.num_frames == 0:
+    if survey.num_frames == 0:
         raise RecordingError(f"Nothing can be recovered, the file holds no whole frame ({survey.reason}): {source}")
-    info, _ = metadata.read_episode_metadata(survey.episode)
-    last_ns = frame_time_ns(survey.num_frames - 1, info.fps)
     num_messages = 0
+    seen: Counter[str] = Counter()
     # The usual place for an unfinished file is where the source may lie.
     part = target.with_name(f"{target.name}.recovering")
     file = PartFile(target, part=part, overwrite=overwrite, is_worthless=lambda part: True)
     try:
-        file.metadata(metadata.EPISODE, survey.episode)
+        for name, values in survey.episode.items():
+            file.metadata(name, values)
         for item in _items(source):
             if isinstance(item, str):
                 break
-            if isinstance(item, SalvagedMessage) and item.time_ns <= last_ns and _is_known(item.schema):
-                file.log(item.topic, item.schema, item.data, item.time_ns, latched=item.is_latched)
-                num_messages += 1
+            if isinstance(item, SalvagedMessage):
+                seen[item.topic] += 1
+                if survey.keeps(item, seen[item.topic]) and _is_known(item.schema):
+                    file.log(item.topic, item.schema, item.data, item.time_ns, latched=item.is_latched)
+                    num_messages += 1
             elif item is None:
                 file.flush()
         if survey.outcome is not None:
@@ -76,7 +82,7 @@ def recover(source: Path, target: Path, *, overwrite: bool = False) -> Recovered
         else:
             file.metadata(metadata.RECOVERED, metadata.recovered_metadata(kept_frames=survey.num_frames))
         file.end()
-        with Recording(part) as recording:
+        with survey.reader(part) as recording:
             recording.columns()  # a recovered file that cannot be read would be worse than none
         file.publish()
     except BaseException:
@@ -91,17 +97,20 @@ def recover(source: Path, target: Path, *, overwrite: bool = False) -> Recovered
     )
 
 
-def can_be_made_again(part: Path, *, origin: str) -> bool:
-    """Whether an unfinished recording holds nothing yet, or was derived from the same recording in the same way.
+def can_be_made_again(part: Path, *, origin: str | Origin) -> bool:
+    """Whether an unfinished recording holds nothing yet, or was derived from the same thing in the same way.
 
     Args:
         part: What a crash left.
-        origin: `EpisodeInfo.origin` of the recording that is about to be written in its place.
+        origin: That of the recording that is about to be written in its place, as its info has it.
     """
     for item in _items(part):
         if isinstance(item, SalvagedMetadata) and item.name == metadata.EPISODE:
             info, _ = metadata.read_episode_metadata(item.values)
             return bool(origin) and info.origin == origin
+        if isinstance(item, SalvagedMetadata) and item.name == metadata.COLLECTED:
+            collected, _, _ = read_collected_metadata(item.values)
+            return collected.origin.kind == "import" and collected.origin == origin
         if isinstance(item, str):
             return item == "the end is missing"  # after nothing: the writer was killed before the first frame
         if item is not None:
@@ -111,10 +120,23 @@ def can_be_made_again(part: Path, *, origin: str) -> bool:
 
 @dataclass(frozen=True, kw_only=True)
 class _Survey:
-    episode: dict[str, str] | None
+    """What is whole in a file.
+
+    Attributes:
+        episode: Name and values of the metadata that say what is recorded.
+        outcome: How it ended, where all of it is there.
+        num_frames: That all streams have in common.
+        reason: Why reading stopped.
+        keeps: Whether a message belongs to these frames, given which message of its topic it is, from 1.
+        reader: Of such recordings.
+    """
+
+    episode: dict[str, dict[str, str]]
     outcome: dict[str, str] | None
     num_frames: int
     reason: str
+    keeps: Callable[[SalvagedMessage, int], bool] = lambda message, count: True
+    reader: type[Recording] | type[CollectedRecording] = Recording
 
 
 def _items(source: Path) -> Iterator[SalvagedMessage | SalvagedMetadata | str | None]:
@@ -127,7 +149,7 @@ def _items(source: Path) -> Iterator[SalvagedMessage | SalvagedMetadata | str | 
 
 def _survey(source: Path) -> _Survey:
     """Read everything once to learn how many frames all streams have in common."""
-    episode = outcome = None
+    found: dict[str, dict[str, str]] = {}
     reason = ""
     counts: Counter[str] = Counter()
     for item in _items(source):
@@ -135,14 +157,19 @@ def _survey(source: Path) -> _Survey:
             reason = item
         elif isinstance(item, SalvagedMetadata):
             metadata.check_seal(item.name, item.values)
-            if item.name == metadata.EPISODE:
-                episode = item.values
-            elif item.name == metadata.OUTCOME:
-                outcome = item.values
+            found[item.name] = item.values
         elif item is not None:
             counts[item.topic] += 1
-    if episode is None:
-        return _Survey(episode=None, outcome=None, num_frames=0, reason=reason or "no episode metadata")
+    outcome = found.get(metadata.OUTCOME)
+    for name, survey in ((metadata.EPISODE, _survey_of_episode), (metadata.COLLECTED, _survey_of_collected)):
+        if name in found:
+            return survey(found[name], outcome, counts, reason or "the end is missing")
+    return _Survey(episode={}, outcome=None, num_frames=0, reason=reason or "no episode metadata")
+
+
+def _survey_of_episode(
+    episode: dict[str, str], outcome: dict[str, str] | None, counts: Counter[str], reason: str
+) -> _Survey:
     info, cameras = metadata.read_episode_metadata(episode)
     topics = [stream.topic for stream in frame_streams(info) if stream.topic != channels.JOINT_STATES]
     for camera, streams in cameras.items():
@@ -151,7 +178,33 @@ def _survey(source: Path) -> _Survey:
     num_frames = min(counts[topic] for topic in topics)
     if outcome is not None and metadata.read_outcome_metadata(outcome).num_frames != num_frames:
         outcome = None
-    return _Survey(episode=episode, outcome=outcome, num_frames=num_frames, reason=reason or "the end is missing")
+    last_ns = frame_time_ns(max(num_frames - 1, 0), info.fps)
+    return _Survey(
+        episode={metadata.EPISODE: episode},
+        outcome=outcome,
+        num_frames=num_frames,
+        reason=reason,
+        keeps=lambda message, count: message.time_ns <= last_ns,
+    )
+
+
+def _survey_of_collected(
+    episode: dict[str, str], outcome: dict[str, str] | None, counts: Counter[str], reason: str
+) -> _Survey:
+    """Pictures come before the frames that hold them, so what is there of the frames has its pictures."""
+    info, _, _ = read_collected_metadata(episode)
+    topics = {FRAMES, *(stream.topic for stream in feature_streams(info).values())}
+    num_frames = min(counts[topic] for topic in topics)
+    if outcome is not None and read_collected_outcome(outcome).num_frames != num_frames:
+        outcome = None
+    return _Survey(
+        episode={metadata.COLLECTED: episode},
+        outcome=outcome,
+        num_frames=num_frames,
+        reason=reason,
+        keeps=lambda message, count: message.topic not in topics | {channels.TF} or count <= num_frames,
+        reader=CollectedRecording,
+    )
 
 
 def _is_known(schema: str) -> bool:

@@ -36,6 +36,9 @@ DEFINITIONS: dict[str, str] = {
     "std_msgs/msg/Int64MultiArray": _definition(
         "std_msgs/MultiArrayLayout layout\nint64[] data\n", _ARRAY_LAYOUT, _ARRAY_DIMENSION
     ),
+    "std_msgs/msg/Float64MultiArray": _definition(
+        "std_msgs/MultiArrayLayout layout\nfloat64[] data\n", _ARRAY_LAYOUT, _ARRAY_DIMENSION
+    ),
     "sensor_msgs/msg/JointState": _definition(
         "std_msgs/Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort\n",
         _HEADER,

@@ -43,7 +43,7 @@ class FrameTree:
         moving = [joint for joint in urdf.joints if joint.kind != "fixed" and joint.name in recorded]
         self._num_joints = len(recorded)
         self._objects = [body.name for body in info.scene.movable]
-        self._joints = _MovingJoints(moving, [recorded[joint.name] for joint in moving])
+        self._joints = MovingJoints(moving, [recorded[joint.name] for joint in moving])
         self.moving = tuple((joint.parent, joint.child) for joint in moving) + tuple(
             (WORLD, name) for name in self._objects
         )
@@ -73,7 +73,7 @@ class FrameTree:
         return np.concatenate((joints.reshape(len(parts), -1), parts[:, self._num_joints :]), axis=1)
 
 
-class _MovingJoints:
+class MovingJoints:
     """parent_from_child of all moving joints at once.
 
     A turning joint about axis a from the fixed rotation q0: q0 * (a sin(t/2), cos(t/2)), linear in sine and cosine.

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Literal, Protocol, cast
@@ -42,18 +42,18 @@ class VideoSettings:
 
     Attributes:
         codec: Of the bit stream.
-        encoder: FFmpeg's name of the encoder, "" for jpeg.
+        encoder: FFmpeg's name of the encoder, "" for jpeg and for packets that came coded.
         width, height: Pixels.
         fps: Pictures per second.
         pix_fmt: FFmpeg's name of the pixel format.
-        gop: Pictures from one keyframe to the next.
+        gop: Pictures from one keyframe to the next; 0 when unknown, of packets that came coded.
         crf: Constant rate factor; None for jpeg.
         preset: Encoder preset; "" for jpeg.
         options: Further encoder options, as given to FFmpeg.
         jpeg_quality: 1..100; None unless the codec is jpeg.
     """
 
-    codec: Literal["h264", "av1", "jpeg"]
+    codec: Literal["h264", "h265", "av1", "jpeg"]
     encoder: str
     width: int
     height: int
@@ -68,7 +68,7 @@ class VideoSettings:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class VideoPacket:
-    """One coded picture: an H.264 access unit (Annex B), an AV1 temporal unit (OBUs) or a JPEG file.
+    """One coded picture: an H.264 or H.265 access unit (Annex B), an AV1 temporal unit (OBUs) or a JPEG file.
 
     Attributes:
         frame_index: Which frame it shows.
@@ -251,28 +251,32 @@ def _decode_stream(settings: VideoSettings, packets: Iterable[VideoPacket]) -> I
 
 
 def _decoder_name(codec: str) -> str:
-    return "libdav1d" if codec == "av1" else codec
+    return {"av1": "libdav1d", "h265": "hevc"}.get(codec, codec)
 
 
 def is_keyframe(codec: str, data: bytes) -> bool:
     """Whether a coded picture can be decoded without those before it.
 
-    H.264 (ITU-T H.264, table 7-1): an access unit with a slice of type 5 (IDR). AV1: our encoder puts a sequence
-    header (OBU type 1) in front of keyframes and nowhere else.
+    H.264 (ITU-T H.264, table 7-1): an access unit with a slice of type 5 (IDR). H.265 (ITU-T H.265, table 7-1): one
+    with a slice of the types 16 to 21 (IRAP). AV1: our encoder puts a sequence header (OBU type 1) in front of
+    keyframes and nowhere else.
     """
     if codec == "h264":
-        return any(kind == 5 for kind in _nal_types(data))
+        return any(head & 31 == 5 for head in _nal_heads(data, lambda head: head & 31 in (1, 5)))
+    if codec == "h265":
+        return any(16 <= head >> 1 <= 21 for head in _nal_heads(data, lambda head: head >> 1 < 32))
     if codec == "av1":
         return any(kind == 1 for kind in _obu_types(data))
     return True
 
 
-def _nal_types(data: bytes) -> Iterator[int]:
+def _nal_heads(data: bytes, is_slice: Callable[[int], bool]) -> Iterator[int]:
+    """First byte of each NAL unit, up to the first slice: the parameter sets are in front of it."""
     position = data.find(b"\x00\x00\x01")
     while 0 <= position < len(data) - 3:
-        kind = data[position + 3] & 31
-        yield kind
-        if kind in (1, 5):  # a slice: the parameter sets are in front of it
+        head = data[position + 3]
+        yield head
+        if is_slice(head):
             return
         position = data.find(b"\x00\x00\x01", position + 3)
 

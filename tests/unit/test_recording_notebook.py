@@ -19,7 +19,7 @@ from support.recording import Codec, frame_number, make_episode, write_episode
 
 from demorec.config import VideoConfig
 from demorec.errors import MissingDependencyError, RecordingError
-from demorec.recording import Recording, reader, video
+from demorec.recording import Recording, episode_file, video
 from demorec.recording.video import VideoPacket, VideoSettings
 from demorec.scene.episode import Frame
 
@@ -104,7 +104,7 @@ def test_only_pictures_from_the_keyframe_on_are_decoded(path: Path, monkeypatch:
         return real(settings, iter(given))
 
     real = video.decode
-    monkeypatch.setattr(reader, "decode", decode)
+    monkeypatch.setattr(episode_file, "decode", decode)
     with Recording(path) as recording:
         recording.image("front", 33)
     assert [packet.frame_index for packet in given] == [30, 31, 32, 33]  # a keyframe every ten

@@ -132,7 +132,7 @@ def test_a_description_of_another_version_than_its_record_is_refused(tmp_path: P
         if name != metadata.EPISODE:
             return values
         content = {key: value for key, value in values.items() if key != "crc32"}
-        return metadata._sealed({**content, "format_version": "1"})
+        return metadata.sealed({**content, "format_version": "1"})
 
     path = rewrite_messages(tmp_path / "a.mcap", tmp_path / "b.mcap", lambda m: [m], metadata=relabelled)
     with pytest.raises(

@@ -1,0 +1,90 @@
+"""The records of a collected episode that are not messages: what is known before the first frame, and how it ended."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from collections.abc import Mapping
+
+from demorec.errors import RecordingError, in_words
+from demorec.plain import to_json
+from demorec.recording.collected.validity import what_is_wrong
+from demorec.recording.metadata import COLLECTED, OUTCOME, check_seal, sealed
+from demorec.recording.video import VideoSettings
+from demorec.scene.collected import COLLECTED_VERSION, CollectedInfo, CollectedOutcome
+from demorec.scene.validity import from_description
+
+_MOST_TOLD = 5
+
+
+def collected_metadata(info: CollectedInfo, cameras: Mapping[str, VideoSettings]) -> dict[str, str]:
+    """The record that makes an MCAP file a recording of a collected episode; the first few values are for people.
+
+    The URDF is not in it but a message of its own; its SHA-256 is.
+    """
+    return sealed(
+        {
+            "instruction": info.instruction,
+            "robot": info.robot,
+            "episode_index": str(info.episode_index),
+            "format_version": str(info.format_version),
+            "urdf_sha256": urdf_sha256(info.urdf),
+            "info": to_json(dataclasses.replace(info, urdf="")),
+            "cameras": to_json(dict(cameras)),
+        }
+    )
+
+
+def urdf_sha256(urdf: str) -> str:
+    """SHA-256 (hex) of a URDF, "" of none."""
+    return hashlib.sha256(urdf.encode()).hexdigest() if urdf else ""
+
+
+def read_collected_metadata(metadata: Mapping[str, str]) -> tuple[CollectedInfo, dict[str, VideoSettings], str]:
+    """Inverse of `collected_metadata`, with the SHA-256 of the URDF, which `info` lacks.
+
+    Raises:
+        RecordingError: It is damaged, or of an unknown format version.
+    """
+    check_seal(COLLECTED, metadata)
+    version = metadata.get("format_version", "")
+    if version not in map(str, range(1, COLLECTED_VERSION + 1)):
+        raise RecordingError(
+            f"The recording of a collected episode has format version {version[:20] or 'none'}, this demorec reads 1 "
+            f"to {COLLECTED_VERSION}: use the demorec that wrote it, or a newer one"
+        )
+    try:
+        info = from_description(metadata["info"], CollectedInfo)
+        cameras = from_description(metadata["cameras"], dict[str, VideoSettings])
+        wrong = what_is_wrong(info)
+        for camera in info.cameras:
+            video = cameras.get(camera.name)
+            if video is None or (video.width, video.height) != (camera.width, camera.height):
+                wrong.append(f"the video of the camera {camera.name!r} has another size")
+            elif camera.kept and video.codec != camera.kept:
+                wrong.append(f"the video of the camera {camera.name!r} is {video.codec}, not {camera.kept}")
+        if wrong:
+            raise ValueError("; ".join(wrong[:_MOST_TOLD]))
+        return info, cameras, metadata["urdf_sha256"]
+    except (KeyError, ValueError) as error:
+        raise RecordingError(
+            f"The recording's metadata is not that of a collected episode ({in_words(error)})"
+        ) from error
+
+
+def collected_outcome_metadata(outcome: CollectedOutcome) -> dict[str, str]:
+    """The record that ends a complete recording."""
+    success = "unknown" if outcome.success is None else str(outcome.success).lower()
+    return sealed({"success": success, "outcome": to_json(outcome)})
+
+
+def read_collected_outcome(metadata: Mapping[str, str]) -> CollectedOutcome:
+    """Inverse of `collected_outcome_metadata`; RecordingError on damage."""
+    check_seal(OUTCOME, metadata)
+    try:
+        outcome = from_description(metadata["outcome"], CollectedOutcome)
+        if min(outcome.num_frames, *outcome.drops.values(), 0) < 0:
+            raise ValueError("a number of frames or drops below 0")
+    except (KeyError, ValueError) as error:
+        raise RecordingError(f"The recording's outcome cannot be read ({in_words(error)})") from error
+    return outcome

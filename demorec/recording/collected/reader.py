@@ -1,0 +1,170 @@
+"""Reads the recording of a collected episode: numbers as columns, pictures as packets."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.errors import RecordingError
+from demorec.plain import to_json, to_plain
+from demorec.recording import messages
+from demorec.recording.channels import description_topic, video_topic
+from demorec.recording.chunks import Block
+from demorec.recording.collected import metadata
+from demorec.recording.collected.streams import FRAMES, FeatureStream, feature_streams, frames_layout
+from demorec.recording.collected.validity import what_is_wrong
+from demorec.recording.container import damage_as_recording_error
+from demorec.recording.episode_file import EpisodeFile
+from demorec.recording.metadata import COLLECTED, OUTCOME
+from demorec.recording.video import Rgb, VideoPacket, VideoSettings, is_keyframe
+from demorec.scene.collected import NO_PICTURE, CollectedColumns, CollectedInfo, CollectedOutcome
+
+
+class CollectedRecording(EpisodeFile):
+    """What one file holds of a collected episode; a context manager.
+
+    Attributes:
+        path: Of the file.
+        info: What was known before the first frame.
+        outcome: How the episode ended; None when a crash cut it off (`is_recovered`).
+        num_frames: Length.
+
+    Raises:
+        RecordingError: No recording of a collected episode, cut off, damaged, or of an unknown format version; so do
+            all methods.
+    """
+
+    info: CollectedInfo
+    outcome: CollectedOutcome | None
+    num_frames: int
+
+    def _read_metadata(self) -> None:
+        found = self._container.metadata(COLLECTED)
+        if found is None:
+            raise RecordingError(f"The file holds no collected episode: {self.path}")
+        try:
+            info, self._cameras, urdf_sha256 = metadata.read_collected_metadata(found)
+            outcome = self._container.metadata(OUTCOME)
+            self.outcome = None if outcome is None else metadata.read_collected_outcome(outcome)
+            self.num_frames = self._container.counts.get(FRAMES, 0)
+            self._check_end(self.num_frames, None if self.outcome is None else self.outcome.num_frames)
+            self.info = self._with_urdf(info, urdf_sha256)
+        except RecordingError as error:
+            text = str(error).removesuffix(f": {self.path}")
+            raise RecordingError(f"{text}: {self.path}") from error
+
+    def _with_urdf(self, info: CollectedInfo, sha256: str) -> CollectedInfo:
+        if not sha256:
+            return info
+        urdf = ""
+        for message in self._container.messages((description_topic(),)):
+            with damage_as_recording_error(self.path):
+                urdf = messages.read_string(message.data)
+        if metadata.urdf_sha256(urdf) != sha256:
+            raise RecordingError("The URDF of the recording is not the one that its metadata tells of")
+        described = dataclasses.replace(info, urdf=urdf)
+        if wrong := what_is_wrong(described):
+            raise RecordingError(f"The URDF of the recording does not fit its metadata ({wrong[0]})")
+        return described
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Names of the cameras."""
+        return tuple(camera.name for camera in self.info.cameras)
+
+    def video_settings(self, camera: str) -> VideoSettings:
+        """How the pictures of a camera were coded."""
+        if camera not in self._cameras:
+            raise RecordingError(
+                f"The recording has no camera {camera!r}, its cameras are {', '.join(self._cameras) or 'none'}: "
+                f"{self.path}"
+            )
+        return self._cameras[camera]
+
+    def columns(self) -> CollectedColumns:
+        """All numbers, one row a frame, to the bit as they were written, and which pictures the frames hold."""
+        streams = feature_streams(self.info)
+        picture_topics = {camera: self._picture_topic(camera) for camera in self.cameras}
+        blocks = self._container.blocks((FRAMES, *(stream.topic for stream in streams.values())))
+        layout = frames_layout(self.info)
+        with damage_as_recording_error(self.path):
+            rows: NDArray[np.int64] = layout.decode_rows(blocks[FRAMES].rows(len(layout.constant)))
+        time_ns = blocks[FRAMES].time_ns
+        if len(time_ns) > 1 and int(np.diff(time_ns).min()) <= 0:
+            raise RecordingError(f"The frames of the recording are not in the order of their times: {self.path}")
+        features = {name: self._feature(stream, blocks[stream.topic], time_ns) for name, stream in streams.items()}
+        stamps = {name: rows[:, index].copy() for index, name in enumerate(streams)}
+        pictures = {name: rows[:, len(streams) + index].copy() for index, name in enumerate(self.cameras)}
+        # One camera after the other: all their pictures need not be in memory together.
+        picture_stamps = {
+            name: self._container.blocks((topic,))[topic].time_ns for name, topic in picture_topics.items()
+        }
+        for name, numbers in pictures.items():
+            count = len(picture_stamps[name])
+            if len(numbers) and not NO_PICTURE <= int(numbers.min()) <= int(numbers.max()) < count:
+                raise RecordingError(
+                    f"A frame holds a picture of the camera {name!r} that is none of its {count}: {self.path}"
+                )
+        return CollectedColumns(
+            time_ns=time_ns, features=features, stamps=stamps, pictures=pictures, picture_stamps=picture_stamps
+        )
+
+    def _feature(self, stream: FeatureStream, block: Block, time_ns: NDArray[np.int64]) -> NDArray[np.generic]:
+        if not np.array_equal(block.time_ns, time_ns):
+            raise RecordingError(
+                f"The recording has {len(block)} messages on {stream.topic} at other times than its {len(time_ns)} "
+                f"frames: {self.path}"
+            )
+        with damage_as_recording_error(self.path):
+            return stream.decode_rows(block.rows(len(stream.layout.constant)))
+
+    def _picture_topic(self, camera: str) -> str:
+        return video_topic(camera, self.video_settings(camera).codec)
+
+    def packets(self, camera: str) -> Iterator[VideoPacket]:
+        """The coded pictures of a camera in order; `frame_index` is their number, by which frames hold them."""
+        codec = self.video_settings(camera).codec
+        read = messages.read_protobuf_video if codec == "av1" else messages.read_compressed_image
+        for number, message in enumerate(self._container.messages((self._picture_topic(camera),))):
+            with damage_as_recording_error(self.path):
+                data = read(message.data)
+            yield VideoPacket(
+                frame_index=number, time_ns=message.time_ns, data=data, is_keyframe=is_keyframe(codec, data)
+            )
+
+    def coded_pictures(self, camera: str) -> Block:
+        """All coded pictures of a camera, in memory together."""
+        topic = self._picture_topic(camera)
+        block = self._container.blocks((topic,))[topic]
+        with damage_as_recording_error(self.path):
+            return messages.coded_pictures(block, self.video_settings(camera).codec)
+
+    def image(self, camera: str, frame: int) -> Rgb | None:
+        """The decoded picture that a frame holds, (H, W, 3) uint8 RGB; None where it has none of this camera.
+
+        Raises:
+            IndexError: There is no such frame; negative ones count from the end.
+        """
+        number = int(self.columns().pictures[camera][range(self.num_frames)[frame]])
+        return None if number == NO_PICTURE else self._image(camera, number)
+
+    def digest(self) -> str:
+        """SHA-256 (hex) of the content: metadata, numbers, stamps, coded pictures; not of what versions wrote it."""
+        described = to_plain(self.info)
+        del described["versions"], described["format_version"]
+        result = hashlib.sha256(json.dumps(described, sort_keys=True).encode())
+        result.update(b"no outcome" if self.outcome is None else to_json(self.outcome).encode())
+        columns = self.columns()
+        result.update(columns.time_ns.tobytes())
+        for mapping in (columns.features, columns.stamps, columns.pictures, columns.picture_stamps):
+            for name in sorted(mapping):
+                result.update(name.encode() + mapping[name].tobytes())
+        for camera in self.cameras:
+            for packet in self.packets(camera):
+                result.update(hashlib.sha256(packet.data).digest())
+        return result.hexdigest()

@@ -1,0 +1,99 @@
+"""The streams of a collected episode that have one message a frame: a topic for each feature, and `/frames`.
+
+`/frames` says which sample of every feature and which picture of every camera a frame holds: the features' stamps, then
+the cameras' picture numbers. Messages of features are stored with the frame's time; those that begin with a header have
+the sample's stamp there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.recording import messages
+from demorec.recording.cdr import CdrWriter, Layout
+from demorec.scene.collected import CollectedFeature, CollectedInfo
+
+FRAMES = "/frames"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FeatureStream:
+    """The messages of a feature, one a frame.
+
+    Attributes:
+        topic: Where.
+        schema: ROS 2 type.
+        layout: Of its messages, which hold D values.
+        dtype: Of the feature.
+    """
+
+    topic: str
+    schema: str
+    layout: Layout
+    dtype: str
+
+    def encode(self, stamps: Sequence[int], vectors: Sequence[NDArray[Any]]) -> list[bytes]:
+        """One message for each sample; float64 holds every bit of a float32."""
+        return self.layout.encode(np.array(stamps, dtype=np.int64), np.array(vectors, dtype=np.float64))
+
+    def decode_rows(self, rows: NDArray[np.uint8]) -> NDArray[Any]:
+        """(T, D) in the feature's dtype, of T messages; ValueError for messages of another layout."""
+        return self.layout.decode_rows(rows).astype(self.dtype)
+
+
+def feature_topic(name: str) -> str:
+    """Where the vectors of a feature are: "/observation/state"."""
+    return "/" + name.replace(".", "/")
+
+
+def feature_streams(info: CollectedInfo) -> dict[str, FeatureStream]:
+    """Feature -> its messages: sensor_msgs/JointState where there are joints, else std_msgs/Float64MultiArray."""
+    streams = {}
+    for feature in info.features:
+        has_joints = any(feature.joints)
+        streams[feature.name] = FeatureStream(
+            topic=feature_topic(feature.name),
+            schema=messages.JOINT_STATE if has_joints else messages.FLOAT64_ARRAY,
+            layout=_joints_layout(feature)
+            if has_joints
+            else _array_layout(",".join(feature.names), len(feature.names)),
+            dtype=feature.dtype,
+        )
+    return streams
+
+
+def frames_layout(info: CollectedInfo) -> Layout:
+    """Of `/frames`: std_msgs/Int64MultiArray, whose label names the columns."""
+    columns = [feature.name for feature in info.features] + [camera.name for camera in info.cameras]
+    return _array_layout(",".join(columns), len(columns), is_integer=True)
+
+
+def _joints_layout(feature: CollectedFeature) -> Layout:
+    """Velocity and effort are empty: they are not known, and zeros would be invented."""
+    message = CdrWriter()
+    message.header("")
+    message.u32(len(feature.names))
+    for name, joint in zip(feature.names, feature.joints, strict=True):
+        message.text(joint or name)
+    message.u32(len(feature.names))
+    message.value_slot(len(feature.names))
+    for _ in range(2):  # velocity, effort
+        message.u32(0)
+    return message.layout()
+
+
+def _array_layout(label: str, count: int, *, is_integer: bool = False) -> Layout:
+    message = CdrWriter()
+    message.u32(1)  # dimensions
+    message.text(label)
+    message.u32(count)
+    message.u32(count)  # stride
+    message.u32(0)  # data_offset
+    message.u32(count)
+    message.value_slot(count)
+    return message.layout("<i8" if is_integer else "<f8")

@@ -1,0 +1,284 @@
+"""Writes a collected episode as it comes into NAME.mcap.part, which becomes NAME.mcap when it is complete.
+
+As in `demorec.recording.writer`, a second is gathered and written at once. The pictures of it go in front of the frames
+that hold them, so that whatever a crash leaves of the frames has its pictures.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.config import VideoConfig
+from demorec.errors import ConfigError, RecordingError
+from demorec.recording import messages
+from demorec.recording.channels import TF, TF_STATIC, camera_topic, description_topic
+from demorec.recording.collected import metadata
+from demorec.recording.collected.frame_check import CollectedCheck
+from demorec.recording.collected.streams import FRAMES, feature_streams, frames_layout
+from demorec.recording.collected.transforms import CollectedTree
+from demorec.recording.collected.validity import what_is_wrong
+from demorec.recording.metadata import COLLECTED, OUTCOME
+from demorec.recording.part_file import PartFile
+from demorec.recording.pictures import ColorMessages
+from demorec.recording.pixels import PixelCounter
+from demorec.recording.recover import can_be_made_again
+from demorec.recording.transforms import camera_frame
+from demorec.recording.video import VideoSettings, make_encoder
+from demorec.recording.writer import WriteStats
+from demorec.scene.collected import NO_PICTURE, CollectedCamera, CollectedFrame, CollectedInfo, CollectedOutcome
+
+_SECOND_NS = 1_000_000_000
+
+
+class CollectedWriter:
+    """Context manager that writes one collected episode; left without `finish`, NAME.mcap.part stays for `recover`.
+
+    Frames must not be changed after they were given.
+
+    Args:
+        path: The file to be made; its folder must exist.
+        info: Written first.
+        video: How pictures are coded that come as pixels.
+        overwrite: Whether a recording of that name may be replaced.
+
+    Raises:
+        ConfigError: The description is impossible, or the file, or an unfinished one of that name, is there already and
+            not to be replaced. What a killed import of the same files by the same mapping left is replaced.
+        RecordingError: It cannot be written.
+    """
+
+    def __init__(
+        self, path: Path, info: CollectedInfo, *, video: VideoConfig | None = None, overwrite: bool = False
+    ) -> None:
+        if wrong := what_is_wrong(info):
+            raise ConfigError(f"The episode cannot be recorded: {'; '.join(wrong)}.")
+        self._check = CollectedCheck(info)
+        self._streams = feature_streams(info)
+        self._frames_layout = frames_layout(info)
+        self._tree = CollectedTree(info) if info.urdf else None
+        self._info = info
+        self._cameras = {camera.name: _Pictures(camera, video or VideoConfig(), info.fps) for camera in info.cameras}
+        self._pending: list[CollectedFrame] = []
+        self._num_frames = 0
+        self._file = PartFile(
+            path, overwrite=overwrite, is_worthless=lambda part: can_be_made_again(part, origin=info.origin)
+        )
+        try:
+            self._begin()
+        except BaseException:
+            self._file.discard()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._file.close()
+
+    @property
+    def num_frames(self) -> int:
+        """Frames so far."""
+        return self._num_frames
+
+    def _begin(self) -> None:
+        """Write what is said once."""
+        settings = {name: camera.settings for name, camera in self._cameras.items()}
+        self._file.metadata(COLLECTED, metadata.collected_metadata(self._info, settings))
+        if self._tree is not None:
+            self._file.log(description_topic(), messages.STRING, messages.string(self._info.urdf), 0, latched=True)
+            static = messages.transforms(self._tree.static)
+            self._file.log(TF_STATIC, messages.TRANSFORMS, static, 0, latched=True)
+        for camera in self._info.cameras:
+            if camera.intrinsics is not None:
+                calibration = messages.Calibration(
+                    width=camera.width, height=camera.height, intrinsics=np.array(camera.intrinsics).reshape(3, 3)
+                )
+                distortion = camera.distortion or (0.0,) * 5
+                data = messages.camera_info(calibration, camera_frame(camera.name), distortion)
+                topic = camera_topic(camera.name, "camera_info")
+                self._file.log(topic, messages.CAMERA_INFO, data, 0, latched=True)
+        self._file.flush()
+
+    def picture(self, camera: str, stamp_ns: int, data: NDArray[np.uint8] | bytes) -> int:
+        """Add the next picture of a camera, and return its number, by which frames hold it.
+
+        Args:
+            camera: One of the episode's.
+            stamp_ns: When it was taken, by the camera's clock; later than the one before.
+            data: (H, W, 3) uint8 RGB; for a camera whose pictures are kept an access unit (H.264 and H.265 with start
+                codes), a temporal unit (AV1) or a JPEG file, which stays as it is.
+
+        Raises:
+            RecordingError: An unknown camera, another size or type, or a stamp that goes backwards.
+        """
+        self._check.picture(camera, stamp_ns, data)
+        return self._cameras[camera].add(int(stamp_ns), data)
+
+    def write(self, frame: CollectedFrame) -> None:
+        """Add the next frame.
+
+        Raises:
+            RecordingError: Features missing or unknown, of another length or type, numbers that are not finite, stamps
+                that go backwards, a picture that is not there, or a full disk.
+        """
+        self._check.frame(frame)
+        self._pending.append(frame)
+        self._num_frames += 1
+        if frame.time_ns - self._pending[0].time_ns >= _SECOND_NS or len(self._pending) > self._info.fps:
+            self.flush()
+
+    def flush(self) -> None:
+        """Write what is complete: when this returns, it survives the end of this process.
+
+        Raises:
+            RecordingError: The disk is full or gone.
+        """
+        logged = [self._write_pictures(name, camera) for name, camera in self._cameras.items()]
+        if any(logged):
+            self._file.flush()
+        frames = self._pending[: self._count_ready()]
+        if not frames:
+            return
+        times = [frame.time_ns for frame in frames]
+        encoded = []
+        for name, stream in self._streams.items():
+            samples = [frame.samples[name] for frame in frames]
+            data = stream.encode([sample.stamp_ns for sample in samples], [sample.vector for sample in samples])
+            encoded.append((self._file.logger(stream.topic, stream.schema), data))
+        if self._tree is not None and not self._tree.is_still:
+            encoded.append((self._file.logger(TF, messages.TRANSFORMS), self._tree.encode(frames)))
+        rows = np.array([self._row(frame) for frame in frames], dtype=np.int64)
+        rows_data = self._frames_layout.encode(np.array(times, dtype=np.int64), rows)
+        encoded.append((self._file.logger(FRAMES, messages.INT64_ARRAY), rows_data))
+        for index, time in enumerate(times):
+            for log, data in encoded:
+                log(data[index], log_time=time)
+        self._file.flush()
+        del self._pending[: len(frames)]
+
+    def _write_pictures(self, name: str, camera: _Pictures) -> bool:
+        taken = camera.take()
+        for stamp, packet in taken:
+            for topic, schema, data in camera.messages.of(stamp, packet):
+                self._file.log(topic, schema, data, stamp)
+        return bool(taken)
+
+    def _count_ready(self) -> int:
+        """Of the pending frames, how many have all their pictures written: an encoder may hold some back."""
+        for index, frame in enumerate(self._pending):
+            if any(number >= self._cameras[name].num_taken for name, number in frame.pictures.items()):
+                return index
+        return len(self._pending)
+
+    def _row(self, frame: CollectedFrame) -> list[int]:
+        stamps = [int(frame.samples[name].stamp_ns) for name in self._streams]
+        return stamps + [int(frame.pictures.get(name, NO_PICTURE)) for name in self._cameras]
+
+    def finish(self, outcome: CollectedOutcome) -> WriteStats:
+        """Write the rest, make the file durable and give it its name.
+
+        Raises:
+            ConfigError: A file of that name has appeared meanwhile.
+            RecordingError: The outcome speaks of another number of frames, or the disk is full.
+        """
+        if outcome.num_frames != self._num_frames:
+            raise RecordingError(f"The outcome has {outcome.num_frames} frames, the recording {self._num_frames}.")
+        for camera in self._cameras.values():
+            camera.end()
+        self.flush()
+        if self._pending:
+            raise RecordingError(f"The video encoder kept pictures of the last {len(self._pending)} frames to itself.")
+        for camera in self._cameras.values():
+            if camera.pixels is not None and camera.num_taken:
+                topic, schema, data = camera.messages.statistics(camera.pixels)
+                self._file.log(topic, schema, data, camera.last_stamp)
+        self._file.metadata(OUTCOME, metadata.collected_outcome_metadata(outcome))
+        self._file.publish()
+        return WriteStats(
+            path=self._file.path,
+            num_frames=self._num_frames,
+            num_bytes=self._file.path.stat().st_size,
+            video_bytes={name: camera.num_bytes for name, camera in self._cameras.items()},
+        )
+
+    def discard(self) -> None:
+        """Give the episode up and remove what was written of it."""
+        self._file.discard()
+
+
+class _Pictures:
+    """The pictures of one camera on their way into the file.
+
+    Attributes:
+        settings: How they are coded.
+        messages: What becomes of them.
+        pixels: What is counted of those that come as pixels; None for those that come coded.
+        num_taken: How many have been taken to be written.
+        num_bytes: Of them, coded.
+        last_stamp: Of the last one taken.
+    """
+
+    def __init__(self, camera: CollectedCamera, video: VideoConfig, fps: int) -> None:
+        self._encoder = None
+        self.pixels = None
+        if camera.kept:
+            self.settings = _kept_settings(camera, fps)
+        else:
+            self._encoder = make_encoder(video=video, width=camera.width, height=camera.height, fps=fps)
+            self.pixels = PixelCounter()
+            self.settings = self._encoder.settings
+        self.messages = ColorMessages(camera.name, self.settings.codec)
+        self.num_taken = self.num_bytes = self.last_stamp = 0
+        self._num_pictures = 0
+        self._stamps: list[int] = []
+        self._packets: list[bytes] = []
+
+    def add(self, stamp_ns: int, data: NDArray[np.uint8] | bytes) -> int:
+        """Take the next picture; return its number."""
+        self._stamps.append(stamp_ns)
+        if self._encoder is None or self.pixels is None or isinstance(data, bytes):
+            self._packets.append(bytes(data))
+        else:
+            self.pixels.add(data)
+            self._packets += self._encoder.encode(data)
+        self._num_pictures += 1
+        return self._num_pictures - 1
+
+    def end(self) -> None:
+        """Take what the encoder held back."""
+        if self._encoder is not None:
+            self._packets += self._encoder.finish()
+
+    def take(self) -> list[tuple[int, bytes]]:
+        """Stamp and bytes of the pictures that have left the encoder, each once."""
+        packets, self._packets = self._packets, []
+        taken = list(zip(self._stamps, packets, strict=False))
+        del self._stamps[: len(packets)]
+        self.num_taken += len(packets)
+        self.num_bytes += sum(map(len, packets))
+        self.last_stamp = taken[-1][0] if taken else self.last_stamp
+        return taken
+
+
+def _kept_settings(camera: CollectedCamera, fps: int) -> VideoSettings:
+    """Of packets that came coded, nobody knows how."""
+    assert camera.kept
+    return VideoSettings(
+        codec=camera.kept,
+        encoder="",
+        width=camera.width,
+        height=camera.height,
+        fps=fps,
+        pix_fmt="yuvj420p" if camera.kept == "jpeg" else "yuv420p",
+        gop=1 if camera.kept == "jpeg" else 0,
+        crf=None,
+        preset="",
+        options={},
+    )

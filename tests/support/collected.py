@@ -1,0 +1,139 @@
+"""Made-up collected episodes: a two-jointed arm with a gripper, of which two cameras send pictures at their own pace.
+
+Nothing here needs a simulator. The time is uneven and the streams have stamps of their own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.config import VideoConfig
+from demorec.recording import CollectedWriter
+from demorec.scene.collected import (
+    CollectedCamera,
+    CollectedFeature,
+    CollectedFrame,
+    CollectedInfo,
+    CollectedOutcome,
+    Sample,
+)
+
+URDF = """<robot name="two_joints">
+ <link name="base"><visual><geometry><box size="0.1 0.1 0.1"/></geometry></visual></link>
+ <link name="upper"><visual><geometry><cylinder radius="0.02" length="0.3"/></geometry></visual></link>
+ <link name="lower"><visual><geometry><cylinder radius="0.02" length="0.2"/></geometry></visual></link>
+ <joint name="shoulder" type="revolute"><parent link="base"/><child link="upper"/>
+  <origin xyz="0 0 0.05"/><axis xyz="0 0 1"/><limit lower="-2" upper="2" effort="1" velocity="3"/></joint>
+ <joint name="elbow" type="revolute"><parent link="upper"/><child link="lower"/>
+  <origin xyz="0.3 0 0"/><axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="1" velocity="3"/></joint>
+</robot>
+"""
+STATE = CollectedFeature(
+    name="observation.state",
+    dtype="float32",
+    names=("shoulder.pos", "elbow.pos", "gripper.pos"),
+    units=("rad", "rad", ""),
+    joints=("shoulder", "elbow", ""),
+)
+ACTION = CollectedFeature(name="action", names=("shoulder.pos", "elbow.pos", "gripper.pos"), joints=STATE.joints)
+FORCE = CollectedFeature(name="observation.force", names=("x", "y", "z"), units=("N", "N", "N"))
+TOP = CollectedCamera(name="top", width=64, height=48, intrinsics=(60.0, 0.0, 32.0, 0.0, 60.0, 24.0, 0.0, 0.0, 1.0))
+WRIST = CollectedCamera(name="wrist", width=32, height=32)
+START_NS = 1_700_000_000_123_456_789
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Episode:
+    """What is written.
+
+    Attributes:
+        info, frames, outcome: As the writer takes them.
+        pictures: Camera -> (stamp, pixels) in order.
+    """
+
+    info: CollectedInfo
+    frames: list[CollectedFrame]
+    pictures: dict[str, list[tuple[int, NDArray[np.uint8]]]]
+    outcome: CollectedOutcome
+
+
+def make_collected(
+    *,
+    num_frames: int = 45,
+    cameras: tuple[CollectedCamera, ...] = (TOP, WRIST),
+    urdf: str = URDF,
+    episode_index: int = 0,
+    success: bool | None = True,
+) -> Episode:
+    """An episode: frames 20 to 45 ms apart; the camera `wrist` sends every second frame a picture, held by two."""
+    random = np.random.default_rng(episode_index)
+    info = CollectedInfo(
+        episode_index=episode_index,
+        instruction="stack the cups",
+        robot="two_joints",
+        urdf=urdf,
+        fps=30,
+        features=(STATE, ACTION, FORCE),
+        cameras=cameras,
+        versions={"demorec": "0"},
+    )
+    times = START_NS + np.cumsum(random.integers(20_000_000, 45_000_000, num_frames))
+    pictures: dict[str, list[tuple[int, NDArray[np.uint8]]]] = {camera.name: [] for camera in cameras}
+    frames = []
+    for index, time_ns in enumerate(times.tolist()):
+        held = {}
+        for camera in cameras:
+            if camera.name == "top" or index % 2 == 1:
+                pixels = _picture(camera, index)
+                pictures[camera.name].append((time_ns - 7_000_000, pixels))
+            if pictures[camera.name]:  # the wrist has none at the first frame
+                held[camera.name] = len(pictures[camera.name]) - 1
+        frames.append(
+            CollectedFrame(
+                time_ns=time_ns,
+                samples={
+                    STATE.name: Sample(
+                        stamp_ns=time_ns - 1_000_000, vector=random.uniform(-1, 1, 3).astype(np.float32)
+                    ),
+                    ACTION.name: Sample(stamp_ns=time_ns, vector=random.uniform(-1, 1, 3)),
+                    FORCE.name: Sample(stamp_ns=time_ns - 12_345_678, vector=random.normal(size=3)),
+                },
+                pictures=held,
+            )
+        )
+    outcome = CollectedOutcome(success=success, num_frames=num_frames, drops={"wrist": 2})
+    return Episode(info=info, frames=frames, pictures=pictures, outcome=outcome)
+
+
+def _picture(camera: CollectedCamera, index: int) -> NDArray[np.uint8]:
+    """A ramp whose brightness tells the frame."""
+    pixels = np.zeros((camera.height, camera.width, 3), dtype=np.uint8)
+    pixels[..., 0] = np.linspace(0, 200, camera.width).astype(np.uint8)
+    pixels[..., 1] = 5 * (index % 50)
+    pixels[: camera.height // 2, :, 2] = 255 if camera.name == "top" else 0
+    return pixels
+
+
+def write_pictures_and_frames(writer: CollectedWriter, episode: Episode) -> None:
+    """Everything but the end."""
+    given = dict.fromkeys(episode.pictures, 0)
+    for frame in episode.frames:
+        for name, number in frame.pictures.items():
+            while given[name] <= number:
+                stamp_ns, pixels = episode.pictures[name][given[name]]
+                assert writer.picture(name, stamp_ns, pixels) == given[name]
+                given[name] += 1
+        writer.write(frame)
+
+
+def write_collected(path: Path, episode: Episode | None = None, *, video: VideoConfig | None = None) -> Path:
+    """A recording of a collected episode."""
+    episode = episode or make_collected()
+    with CollectedWriter(path, episode.info, video=video) as writer:
+        write_pictures_and_frames(writer, episode)
+        writer.finish(episode.outcome)
+    return path

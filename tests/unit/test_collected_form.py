@@ -1,0 +1,303 @@
+"""The form of collected episodes: what is written is what is read, to the bit; what cannot be written is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, Literal, cast
+
+import av
+import numpy as np
+import pytest
+from support.collected import (
+    ACTION,
+    FORCE,
+    STATE,
+    TOP,
+    WRIST,
+    make_collected,
+    write_collected,
+    write_pictures_and_frames,
+)
+
+from demorec.config import VideoConfig
+from demorec.errors import ConfigError, DemorecError, RecordingError
+from demorec.recording import CollectedRecording, CollectedWriter, Recording, recover
+from demorec.recording.collected.transforms import JointPositions
+from demorec.recording.collected.validity import what_is_wrong
+from demorec.scene.collected import (
+    NO_PICTURE,
+    CollectedCamera,
+    CollectedFrame,
+    CollectedInfo,
+    CollectedOutcome,
+    Origin,
+    Sample,
+    SourceFile,
+)
+
+
+@pytest.mark.parametrize("num_frames", [0, 1, 45, 100])
+@pytest.mark.parametrize("cameras", [(), (TOP, WRIST)])
+def test_numbers_stamps_and_dtypes_are_read_as_they_were_written(
+    tmp_path: Path, num_frames: int, cameras: tuple[CollectedCamera, ...]
+) -> None:
+    episode = make_collected(num_frames=num_frames, cameras=cameras)
+    path = write_collected(tmp_path / "a.mcap", episode)
+    with CollectedRecording(path) as recording:
+        assert recording.info == episode.info
+        assert recording.outcome == episode.outcome
+        assert recording.num_frames == num_frames
+        columns = recording.columns()
+    assert columns.time_ns.tolist() == [frame.time_ns for frame in episode.frames]
+    for feature in (STATE, ACTION, FORCE):
+        values = columns.features[feature.name]
+        assert values.dtype == feature.dtype
+        assert values.shape == (num_frames, 3)
+        assert values.tobytes() == b"".join(frame.samples[feature.name].vector.tobytes() for frame in episode.frames)
+        assert columns.stamps[feature.name].tolist() == [f.samples[feature.name].stamp_ns for f in episode.frames]
+    for camera in cameras:
+        expected = [frame.pictures.get(camera.name, NO_PICTURE) for frame in episode.frames]
+        assert columns.pictures[camera.name].tolist() == expected
+        assert columns.picture_stamps[camera.name].tolist() == [stamp for stamp, _ in episode.pictures[camera.name]]
+    if num_frames > 1 and cameras:
+        assert columns.pictures["wrist"][:3].tolist() == [NO_PICTURE, 0, 0]
+        assert columns.age_ns("observation.state").tolist() == [1_000_000] * num_frames
+        assert columns.picture_age_ns("top").tolist() == [7_000_000] * num_frames
+
+
+@pytest.mark.parametrize("codec", ["h264", "av1", "jpeg"])
+def test_pixels_are_coded_once_and_found_by_their_frame(tmp_path: Path, codec: Literal["h264", "av1", "jpeg"]) -> None:
+    episode = make_collected()
+    path = write_collected(tmp_path / "a.mcap", episode, video=VideoConfig(codec=codec))
+    with CollectedRecording(path) as recording:
+        images = list(recording.images("top"))
+        assert len(images) == 45
+        for picture, (_, pixels) in zip(images, episode.pictures["top"], strict=True):
+            assert np.abs(picture.astype(int) - pixels).mean() < 8
+        assert recording.image("wrist", 0) is None
+        third, last = recording.image("wrist", 2), recording.image("wrist", -1)
+        assert third is not None
+        assert last is not None
+        assert abs(int(third[4, 4, 1]) - 5 * 1) < 8  # the picture of frame 1
+        assert abs(int(last[4, 4, 1]) - 5 * 43) < 8
+        assert recording.pixel_statistics("top").num_images == 23  # every other one
+
+
+def _packets(codec: str, count: int) -> list[bytes]:
+    context = cast(av.VideoCodecContext, av.CodecContext.create({"h264": "libx264", "h265": "libx265"}[codec], "w"))
+    context.width, context.height, context.pix_fmt = 64, 48, "yuv420p"
+    context.time_base = Fraction(1, 30)
+    context.gop_size = 10
+    context.options = {"tune": "zerolatency", "x265-params": "log-level=none:bframes=0"}
+    packets = []
+    for index in range(count):
+        frame = av.VideoFrame.from_ndarray(np.full((48, 64, 3), 4 * index, dtype=np.uint8), format="rgb24")
+        frame.pts = index
+        packets += [bytes(packet) for packet in context.encode(frame)]
+    return packets + [bytes(packet) for packet in context.encode(None)]
+
+
+@pytest.mark.parametrize("codec", ["h264", "h265"])
+def test_packets_that_came_coded_stay_byte_for_byte(tmp_path: Path, codec: Literal["h264", "h265"]) -> None:
+    packets = _packets(codec, 25)
+    assert len(packets) == 25
+    camera = replace(TOP, kept=codec)
+    episode = make_collected(num_frames=25, cameras=(camera,))
+    with CollectedWriter(tmp_path / "a.mcap", episode.info) as writer:
+        for frame, packet in zip(episode.frames, packets, strict=True):
+            writer.picture("top", frame.time_ns, packet)
+            writer.write(frame)
+        writer.finish(episode.outcome)
+    with CollectedRecording(tmp_path / "a.mcap") as recording:
+        assert [packet.data for packet in recording.packets("top")] == packets
+        assert bytes(recording.coded_pictures("top").joined()) == b"".join(packets)
+        assert [packet.frame_index for packet in recording.packets("top") if packet.is_keyframe] == [0, 10, 20]
+        pictures = list(recording.images("top"))
+        assert recording.video_settings("top").codec == codec
+        assert recording.pixel_statistics("top").num_images == 13
+    assert all(abs(int(picture.mean()) - 4 * index) < 6 for index, picture in enumerate(pictures))
+
+
+def test_pictures_need_not_be_held(tmp_path: Path) -> None:
+    """A camera may be quicker than the frames."""
+    episode = make_collected(num_frames=2, cameras=(WRIST,))
+    with CollectedWriter(tmp_path / "a.mcap", episode.info) as writer:
+        for index in range(9):
+            writer.picture("wrist", index, episode.pictures["wrist"][0][1])
+        for number, frame in zip((3, 8), episode.frames, strict=True):
+            writer.write(replace(frame, pictures={"wrist": number}))
+        writer.finish(episode.outcome)
+    with CollectedRecording(tmp_path / "a.mcap") as recording:
+        columns = recording.columns()
+        assert columns.pictures["wrist"].tolist() == [3, 8]
+        assert columns.picture_stamps["wrist"].tolist() == list(range(9))
+
+
+def test_a_digest_is_of_the_content(tmp_path: Path) -> None:
+    def digest(name: str, **changes: Any) -> str:
+        with CollectedRecording(write_collected(tmp_path / name, make_collected(num_frames=5, **changes))) as recording:
+            return recording.digest()
+
+    assert digest("a.mcap") == digest("b.mcap")
+    assert len({digest("c.mcap"), digest("d.mcap", success=None), digest("e.mcap", urdf="")}) == 3
+
+
+def test_the_description_says_where_it_came_from(tmp_path: Path) -> None:
+    origin = Origin(kind="import", files=(SourceFile(name="a.mcap", sha256="00"),), mapping_digest="11")
+    episode = make_collected(num_frames=3)
+    path = write_collected(tmp_path / "a.mcap", replace(episode, info=replace(episode.info, origin=origin)))
+    with CollectedRecording(path) as recording:
+        assert recording.info.origin == origin
+
+
+def test_what_needs_a_scene_says_why_it_cannot_be(tmp_path: Path) -> None:
+    path = write_collected(tmp_path / "a.mcap")
+    with pytest.raises(RecordingError, match="collected from another robot or program and has no scene"):
+        Recording(path)
+
+
+def _frame(**changes: Any) -> Callable[[CollectedWriter, CollectedFrame], object]:
+    return lambda writer, frame: writer.write(replace(frame, **changes))
+
+
+def _sample(feature: str, vector: object, stamp_ns: object = 5) -> Callable[[CollectedWriter, CollectedFrame], object]:
+    sample = Sample(stamp_ns=cast(int, stamp_ns), vector=cast(Any, vector))
+    return lambda writer, frame: writer.write(replace(frame, samples={**frame.samples, feature: sample}))
+
+
+def _picture(*arguments: Any) -> Callable[[CollectedWriter, CollectedFrame], object]:
+    return lambda writer, frame: writer.picture(*arguments)
+
+
+PIXELS = np.zeros((48, 64, 3), dtype=np.uint8)
+BAD: dict[str, tuple[Callable[[CollectedWriter, CollectedFrame], object], str]] = {
+    "length": (
+        _sample("action", np.zeros(2)),
+        r"'action' of frame 1 is float64 of shape \(2,\), it must be float64 of",
+    ),
+    "dtype": (_sample("observation.state", np.zeros(3)), "float64 of shape .* it must be float32"),
+    "object": (_sample("action", np.array([None] * 3)), "is object of shape"),
+    "list": (_sample("action", [0.0, 0.0, 0.0]), "is list of shape"),
+    "nan": (_sample("action", np.array([0, np.nan, 0]), 10**18 * 2), "is nan in its element 'elbow.pos'"),
+    "unknown feature": (_sample("acton", np.zeros(3)), "unknown feature 'acton'.*'action'"),
+    "missing feature": (_frame(samples={}), "Frame 1 lacks the feature observation.state, action, observation.force"),
+    "same time": (_frame(time_ns=10**18), "stamps must not go backwards"),
+    "negative time": (_frame(time_ns=-1), "allowed are 0 to"),
+    "float time": (_frame(time_ns=1.5), "must be a whole number of nanoseconds"),
+    "feature goes back": (_sample("action", np.zeros(3), 7), "The feature 'action' of frame 1 has the stamp 7 ns"),
+    "no such picture": (_frame(pictures={"top": 9}), "has no picture 9 for frame 1, it has 1 so far"),
+    "no such camera": (_frame(pictures={"front": 0}), "camera 'front' has no picture 0"),
+    "unknown camera": (_picture("tip", 5, PIXELS), "Unknown camera 'tip'.*'top'"),
+    "size": (_picture("top", 2 * 10**18, PIXELS[:-1]), r"uint8 of shape \(47, 64, 3\), it must be uint8 of shape"),
+    "float picture": (_picture("top", 2 * 10**18, PIXELS / 255), "is float64 of shape"),
+    "bytes for pixels": (_picture("top", 2 * 10**18, b"x"), "is bytes, it must be uint8"),
+    "picture goes back": (_picture("top", 5, PIXELS), "picture of the camera 'top' has the stamp 5 ns, the one before"),
+}
+
+
+@pytest.mark.parametrize("what", BAD)
+def test_what_cannot_be_recorded_is_refused_in_one_sentence(tmp_path: Path, what: str) -> None:
+    act, words = BAD[what]
+    episode = make_collected(num_frames=2, cameras=(TOP,))
+    with CollectedWriter(tmp_path / "a.mcap", episode.info) as writer:
+        writer.picture("top", *episode.pictures["top"][0])
+        writer.write(episode.frames[0])
+        with pytest.raises(RecordingError, match=words) as error:
+            act(writer, replace(episode.frames[1], pictures={}))
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"fps": 0}, "fps is 0"),
+        ({"instruction": " "}, "task text is empty"),
+        ({"features": ()}, "0 features"),
+        ({"features": (STATE, STATE)}, "2 features are called 'observation.state'"),
+        ({"features": (replace(STATE, name="tf.x"),)}, "reserved"),
+        ({"features": (replace(STATE, name="timestamp"),)}, "reserved"),
+        ({"features": (replace(STATE, name="a/b"),)}, "allowed are words"),
+        ({"features": (replace(STATE, units=("rad",)),)}, "3 elements, but 1 units"),
+        ({"features": (replace(STATE, joints=("shoulder", "wrist", "")),)}, "URDF does not have: wrist"),
+        ({"features": (replace(STATE, names=("a", "a", "b")),)}, "are called 'a'"),
+        ({"cameras": (replace(TOP, name="my top"),)}, "allowed are letters"),
+        ({"cameras": (replace(TOP, width=0),)}, "0x48 pixels"),
+        ({"cameras": (replace(TOP, mount="nowhere"),)}, "no link of the URDF"),
+        ({"urdf": "<robot"}, "no XML"),
+    ],
+)
+def test_an_impossible_description_is_refused(tmp_path: Path, changes: dict[str, Any], words: str) -> None:
+    info: CollectedInfo = replace(make_collected(num_frames=1).info, **changes)
+    with pytest.raises(ConfigError, match=words):
+        CollectedWriter(tmp_path / "a.mcap", info)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_good_description_has_nothing_wrong() -> None:
+    assert what_is_wrong(make_collected().info) == []
+
+
+def test_what_a_crash_left_is_recovered_up_to_the_last_second(tmp_path: Path) -> None:
+    episode = make_collected(num_frames=100)
+    with CollectedWriter(tmp_path / "a.mcap", episode.info) as writer:
+        write_pictures_and_frames(writer, episode)
+        data = (tmp_path / "a.mcap.part").read_bytes()
+    (tmp_path / "b.mcap.part").write_bytes(data)
+    with pytest.raises(DemorecError, match="cut off"):
+        CollectedRecording(tmp_path / "b.mcap.part")
+    result = recover(tmp_path / "b.mcap.part", tmp_path / "b.mcap")
+    assert not result.is_complete
+    assert 100 - 31 <= result.num_frames < 100
+    with CollectedRecording(tmp_path / "b.mcap") as recording:
+        assert recording.is_recovered
+        assert recording.outcome is None
+        columns = recording.columns()
+        assert columns.time_ns.tolist() == [frame.time_ns for frame in episode.frames[: result.num_frames]]
+        assert int(columns.pictures["top"].max()) == result.num_frames - 1
+        assert len(list(recording.images("top"))) >= result.num_frames
+
+
+@pytest.mark.parametrize("share", [0.3, 0.6, 0.9, 0.999])
+def test_a_file_that_was_cut_anywhere_gives_whole_frames(tmp_path: Path, share: float) -> None:
+    episode = make_collected(num_frames=100)
+    data = write_collected(tmp_path / "a.mcap", episode).read_bytes()
+    (tmp_path / "b.mcap").write_bytes(data[: int(share * len(data))])
+    result = recover(tmp_path / "b.mcap", tmp_path / "c.mcap")
+    with CollectedRecording(tmp_path / "c.mcap") as recording:
+        columns = recording.columns()
+    assert 0 < columns.num_frames == result.num_frames <= 100
+    for index in range(result.num_frames):
+        assert columns.features["action"][index].tolist() == episode.frames[index].samples["action"].vector.tolist()
+
+
+def test_what_a_killed_import_left_is_made_again(tmp_path: Path) -> None:
+    origin = Origin(kind="import", files=(SourceFile(name="a.mcap", sha256="00"),))
+    episode = make_collected(num_frames=3)
+    imported = replace(episode, info=replace(episode.info, origin=origin))
+    with CollectedWriter(tmp_path / "a.mcap", imported.info) as writer:
+        write_pictures_and_frames(writer, imported)
+    write_collected(tmp_path / "a.mcap", imported)
+    (tmp_path / "a.mcap").unlink()
+    with CollectedWriter(tmp_path / "a.mcap", episode.info) as writer:
+        write_pictures_and_frames(writer, episode)
+    with pytest.raises(ConfigError, match="unfinished recording"):  # of the Recorder: nobody can make it again
+        write_collected(tmp_path / "a.mcap", episode)
+
+
+def test_joints_are_told_in_radians() -> None:
+    state = replace(STATE, units=("deg", "rad", ""))
+    positions = JointPositions((ACTION, state))
+    assert positions.joints == ("shoulder", "elbow")
+    found = positions.of({"observation.state": np.array([[180.0, 1.0, 7.0]]), "action": np.zeros((1, 3))})
+    assert found.tolist() == [[np.pi, 1.0]]
+
+
+def test_an_outcome_of_another_length_is_refused(tmp_path: Path) -> None:
+    episode = make_collected(num_frames=3)
+    with CollectedWriter(tmp_path / "a.mcap", episode.info) as writer:
+        write_pictures_and_frames(writer, episode)
+        with pytest.raises(RecordingError, match="The outcome has 4 frames, the recording 3"):
+            writer.finish(CollectedOutcome(num_frames=4))
