@@ -18,7 +18,7 @@ from typing import Any
 
 import zstandard
 
-from demorec.errors import resource_error
+from demorec.errors import ConfigError, resource_error
 from demorec.ingest.channel import BagError, BagMessage
 from demorec.ingest.mcap_bag import read_mcap
 from demorec.ingest.sqlite_bag import SQLITE_MAGIC, read_sqlite
@@ -57,14 +57,16 @@ class Bag:
         """Of its files."""
         return sum(file.stat().st_size for file in self.files)
 
-    def sha256(self) -> str:
-        """Of the bytes of its files, one behind the other: hex digits."""
-        sha = hashlib.sha256()
+    def sha256s(self) -> dict[str, str]:
+        """Name of each of its files -> SHA-256 of its bytes, hex digits."""
+        found = {}
         for path in self.files:
+            sha = hashlib.sha256()
             with open_regular(path) as file:
                 while block := file.read(_COPY_BYTES):
                     sha.update(block)
-        return sha.hexdigest()
+            found[path.name] = sha.hexdigest()
+        return found
 
     def messages(self, problems: list[str], topics: Collection[str] | None = None) -> Iterator[BagMessage]:
         """Its messages in the order in which they were written.
@@ -99,12 +101,15 @@ def open_bag(path: Path) -> Bag:
     """The bag at a path; nothing of its messages is read.
 
     Raises:
-        BagError: There is none, or it is of no kind that is read.
+        ConfigError: There is none.
+        BagError: It is of no kind that is read.
     """
     try:
         mode = path.stat().st_mode
     except OSError as error:
-        raise BagError(f"The bag cannot be read ({error.strerror}): {path}") from error
+        raise resource_error(error, path) or ConfigError(
+            f"There is no bag that could be read ({error.strerror}): {path}"
+        ) from error
     if stat.S_ISDIR(mode):
         return _folder(path)
     _kind_of(path)

@@ -74,12 +74,14 @@ class Chosen:
     Attributes:
         index: (R,) the message in its timeline; of two, the earlier one; -1 for none.
         fraction: (R,) how far the row is between that and the next one, 0 to 1; None unless they are mixed.
-        age_ns: (R,) row minus message, below 0 where the message is later; of two, to the one farther off.
+        age_ns: (R,) row minus message, below 0 where the message is later; of two, the earlier one's.
+        reach_ns: (R,) how far off the message is; of two, the farther one. MISSING where there is none.
     """
 
     index: Int
     fraction: NDArray[np.float64] | None
     age_ns: Int
+    reach_ns: Int
 
 
 def choose(times_ns: Int, rows_ns: Int, sample: Sampling) -> Chosen:
@@ -93,23 +95,25 @@ def choose(times_ns: Int, rows_ns: Int, sample: Sampling) -> Chosen:
     """
     count = len(times_ns)
     if not count:
-        return Chosen(index=np.full(len(rows_ns), -1), fraction=None, age_ns=np.full(len(rows_ns), MISSING))
+        nothing = np.full(len(rows_ns), MISSING)
+        return Chosen(index=np.full(len(rows_ns), -1), fraction=None, age_ns=nothing, reach_ns=nothing)
     before = np.searchsorted(times_ns, rows_ns, side="right") - 1
     after = np.minimum(before + 1, count - 1)
     since = np.where(before >= 0, rows_ns - times_ns[np.maximum(before, 0)], MISSING)
     until = np.where(before + 1 < count, times_ns[after] - rows_ns, MISSING)
     if sample == "latest":
-        return Chosen(index=before, fraction=None, age_ns=since)
+        return Chosen(index=before, fraction=None, age_ns=since, reach_ns=since)
     if sample == "nearest":
         later = until < since
-        return Chosen(index=np.where(later, after, before), fraction=None, age_ns=np.where(later, -until, since))
+        age = np.where(later, -until, since)
+        return Chosen(index=np.where(later, after, before), fraction=None, age_ns=age, reach_ns=np.abs(age))
     exact = since == 0
-    age = np.where(exact, 0, np.where(since >= until, since, -until))
     # A row outside of the stream has a neighbour on one side only, and no line to be on.
-    age = np.where(~exact & ((before < 0) | (before + 1 >= count)), MISSING, age)
-    width = np.where(exact | (before < 0) | (after == before), 1, times_ns[after] - times_ns[np.maximum(before, 0)])
+    is_outside = ~exact & ((before < 0) | (before + 1 >= count))
+    reach = np.where(is_outside, MISSING, np.where(exact, 0, np.maximum(since, until)))
+    width = np.where(exact | is_outside, 1, times_ns[after] - times_ns[np.maximum(before, 0)])
     fraction = np.where(exact, 0.0, np.clip(since / width, 0.0, 1.0))
-    return Chosen(index=before, fraction=fraction, age_ns=age)
+    return Chosen(index=before, fraction=fraction, age_ns=np.where(is_outside, MISSING, since), reach_ns=reach)
 
 
 def sampled(values: Numbers, chosen: Chosen, *, unit: str, quaternions: tuple[int, ...]) -> Numbers:

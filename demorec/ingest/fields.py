@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import binascii
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -125,6 +127,21 @@ def frame_id_of(values: Values) -> str:
     header = values.get("header")
     found = header.get("frame_id") if isinstance(header, Mapping) else values.get("frame_id")
     return found if isinstance(found, str) else ""
+
+
+def picture_bytes(values: Mapping[str, Any]) -> bytes:
+    """The bytes of a picture; JSON has them in base64."""
+    data = values["data"]
+    if isinstance(data, str):
+        try:
+            return base64.b64decode(data, validate=True)
+        except binascii.Error as error:
+            raise FieldError("its picture is no base64") from error
+    if isinstance(data, np.ndarray):
+        return data.tobytes()
+    if isinstance(data, bytes):
+        return data
+    raise FieldError("it holds no picture")
 
 
 def numbers_in(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:

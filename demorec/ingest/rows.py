@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -85,7 +85,9 @@ class Timelines:
         self.mapping = mapping
         pairs: tuple[tuple[Key, Stream], ...] = (*streams.sources.items(), *streams.cameras.items())
         self.streams = dict(pairs)
-        self.lines: dict[Key, Timeline] = {key: timeline(stream, mapping) for key, stream in self.streams.items()}
+        self.lines: dict[Key, Timeline] = {
+            key: _from_keyframe(stream, timeline(stream, mapping)) for key, stream in self.streams.items()
+        }
         self._by_topic = {stream.topic: self.lines[key] for key, stream in self.streams.items()}
 
     def rule(self, key: Key) -> tuple[Sampling, int]:
@@ -108,8 +110,9 @@ class Timelines:
         times = self._times(begin, end)
         if len(times) < 2:
             raise NoRowsError(f"only {len(times)} rows have all streams")
-        chosen = {key: choose(line.times_ns, times, self.rule(key)[0]) for key, line in self.lines.items()}
-        if problems := [text for key, rows in chosen.items() if (text := self._too_old(key, rows, times))]:
+        chosen = {key: self.chosen(key, times) for key in self.lines}
+        problems = [text for key, rows in chosen.items() if (text := self._too_old(key, rows, times))]
+        if problems := problems or [text for key, rows in chosen.items() if (text := self._unfit(key, rows, times))]:
             raise NoRowsError("; ".join(problems))
         features = {
             name: self._feature(name, sources, chosen)
@@ -136,6 +139,10 @@ class Timelines:
             cameras=cameras,
             trimmed_ns=(begin - window.begin_ns, max(0, window.end_ns - end)),
         )
+
+    def chosen(self, key: Key, times: Int) -> Chosen:
+        """What rows of these times take from a stream."""
+        return choose(self.lines[key].times_ns, times, self.rule(key)[0])
 
     def _extent(self, window: Window) -> tuple[int, int]:
         """From where on and until when all streams have something, within a window."""
@@ -185,7 +192,7 @@ class Timelines:
 
     def _too_old(self, key: Key, chosen: Chosen, times: Int) -> str:
         limit = self.rule(key)[1]
-        ages = np.abs(chosen.age_ns)
+        ages = chosen.reach_ns
         bad = np.flatnonzero((ages > limit) | (chosen.index < 0))
         if not len(bad):
             return ""
@@ -196,6 +203,27 @@ class Timelines:
             f"{self._label(key)} {what} at {len(bad)} of {len(times)} rows, from {first:.2f} s on, allowed are "
             f"{limit / NS:g} s"
         )
+
+    def _unfit(self, key: Key, chosen: Chosen, times: Int) -> str:
+        """Why what the rows take cannot be recorded; "" when it can."""
+        stream, line = self.streams[key], self.lines[key]
+        if stream.values is not None:
+            used = stream.values[line.order[chosen.index]]
+            if chosen.fraction is not None:
+                after = np.minimum(chosen.index + 1, len(line.order) - 1)
+                used = np.where(chosen.fraction[:, np.newaxis] > 0, used + stream.values[line.order[after]], used)
+            bad = np.flatnonzero(~np.isfinite(used).all(axis=1))
+            if len(bad):
+                at = (times[bad[0]] - times[0]) / NS
+                return f"{self._label(key)} holds no finite number at {len(bad)} rows, from {at:.2f} s on"
+            return ""
+        first, last = int(chosen.index.min()), int(chosen.index.max())
+        heads = [stream.heads[index] for index in line.order[first : last + 1]]
+        sizes = sorted({(head.width, head.height) for head in heads if head.width})
+        formats = sorted({head.format for head in heads})
+        if len(sizes) > 1:
+            return f"{self._label(key)} changes its size ({', '.join(f'{w}x{h}' for w, h in sizes)})"
+        return f"{self._label(key)} has pictures of several kinds ({', '.join(formats)})" if len(formats) > 1 else ""
 
     def _feature(self, name: str, sources: tuple[Source, ...], chosen: Mapping[Key, Chosen]) -> FeatureRows:
         parts, ages = [], []
@@ -211,9 +239,20 @@ class Timelines:
             names += stream.layout.names
             units += [unit] * len(stream.layout.names)
             ages.append(rows.age_ns)
-        all_ages = np.stack(ages)
-        oldest = np.take_along_axis(all_ages, np.abs(all_ages).argmax(axis=0)[np.newaxis], axis=0)[0]
-        return FeatureRows(values=np.concatenate(parts, axis=1), names=tuple(names), units=tuple(units), ages_ns=oldest)
+        return FeatureRows(
+            values=np.concatenate(parts, axis=1),
+            names=tuple(names),
+            units=tuple(units),
+            ages_ns=np.max(np.stack(ages), axis=0),
+        )
+
+
+def _from_keyframe(stream: Stream, line: Timeline) -> Timeline:
+    """Of video only what can be decoded: from the first keyframe on."""
+    if not stream.heads:
+        return line
+    first = next((k for k, index in enumerate(line.order) if stream.heads[index].is_keyframe), len(line.order))
+    return replace(line, times_ns=line.times_ns[first:], order=line.order[first:]) if first else line
 
 
 def _first_rows(feature: FeatureRows, count: int) -> FeatureRows:

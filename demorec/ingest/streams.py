@@ -27,6 +27,7 @@ from demorec.ingest.fields import (
     frame_id_of,
     layout_of,
     parse_path,
+    picture_bytes,
     stamp_of,
 )
 from demorec.ingest.mapping import BagMapping, CameraSource, Source
@@ -53,6 +54,7 @@ class Stream:
         layout: Of the values; None for cameras.
         heads: (N,) what is known of each picture; empty for others.
         checksums: (N,) CRC-32 of each message's bytes.
+        picture_sums: (N,) CRC-32 of each picture's bytes; empty for others.
         frame_ids: Coordinate frames that messages name, in the order of their first occurrence.
         num_malformed: Messages that cannot be read or lack something.
         first_problem: What is wrong with the first of them.
@@ -68,6 +70,7 @@ class Stream:
     layout: SourceLayout | None
     heads: Sequence[PictureHead]
     checksums: NDArray[np.uint32]
+    picture_sums: NDArray[np.uint32]
     frame_ids: tuple[str, ...]
     num_malformed: int
     first_problem: str
@@ -128,6 +131,7 @@ class _Growing:
     header_ns: array[int] = field(default_factory=lambda: array("q"))
     numbers: array[int] = field(default_factory=lambda: array("q"))
     checksums: array[int] = field(default_factory=lambda: array("I"))
+    picture_sums: array[int] = field(default_factory=lambda: array("I"))
     vectors: list[NDArray[np.floating[Any]]] = field(default_factory=list)
     blocks: list[NDArray[np.floating[Any]]] = field(default_factory=list)
     heads: list[PictureHead] = field(default_factory=list)
@@ -149,6 +153,7 @@ class _Growing:
                     self._pack()
             else:
                 self.heads.append(picture_head(values))
+                self.picture_sums.append(zlib.crc32(picture_bytes(values)))
         except OtherPublisherError as error:
             self.first_refusal = self.first_refusal or str(error)
             return
@@ -190,6 +195,7 @@ class _Growing:
             layout=self.layout,
             heads=self.heads,
             checksums=np.array(self.checksums, dtype=np.uint32),
+            picture_sums=np.array(self.picture_sums, dtype=np.uint32),
             frame_ids=tuple(self.frame_ids),
             num_malformed=self.num_malformed,
             first_problem=self.first_problem,
