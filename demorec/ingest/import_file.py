@@ -11,9 +11,9 @@ from demorec.ingest.channel import BagError
 from demorec.ingest.mapping import BagMapping
 from demorec.ingest.report import BagReport
 from demorec.plain import from_json, to_json
+from demorec.runs.run_file import IMPORT_NAME
 from demorec.safety.files import read_text_limited
 
-IMPORT_NAME = "import.json"
 FORMAT = 1
 _MAX_BYTES = 256 << 20
 

@@ -25,9 +25,7 @@ from demorec.ingest.report import BagReport, EpisodeReport, all_findings, stream
 from demorec.ingest.rows import EpisodeRows, NoRowsError, Timelines
 from demorec.ingest.streams import BagDecoder, BagStreams, read_streams
 from demorec.recording import CollectedRecording
-from demorec.runs.lock import run_lock
-from demorec.runs.run_file import EPISODES, recording_name
-from demorec.safety.files import make_folder
+from demorec.runs.collected import CollectedFolder, differences, open_collected_run
 from demorec.scene.collected import CollectedInfo
 
 
@@ -72,21 +70,19 @@ def import_bags(
     known = load_import_file(out) or ImportFile(mapping=mapping, mapping_digest=mapping.digest)
     if known.mapping_digest != mapping.digest:
         raise ConfigError(f"The run was imported by another mapping: choose another --out: {out}")
-    make_folder(out / EPISODES)
-    reports, num_new = [], 0
-    with run_lock(out):
-        for bag in bags:
-            files = bag.sha256s()
-            report = next((row for row in known.bags if row.files == tuple(files.items())), None)
-            if report is None:
+    hashes = [tuple(bag.sha256s().items()) for bag in bags]
+    reports = {report.files: report for report in known.bags}
+    new = {files: bag for files, bag in zip(hashes, bags, strict=True) if files not in reports}
+    if new:
+        with open_collected_run(out, recovers=False) as folder:
+            for files, bag in new.items():
                 first = sum(episode.episode_index is not None for row in known.bags for episode in row.episodes)
-                report = _Import(bag, files, mapping, urdf, out, video or VideoConfig()).run(first)
+                report = _Import(bag, dict(files), mapping, urdf, folder, video or VideoConfig()).run(first)
                 known = replace(known, bags=(*known.bags, report))
                 save_import_file(known, out)
-                num_new += 1
+                reports[files] = report
                 tell(report)
-            reports.append(report)
-    return ImportResult(reports=tuple(reports), num_new=num_new)
+    return ImportResult(reports=tuple(reports[files] for files in dict.fromkeys(hashes)), num_new=len(new))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -103,10 +99,16 @@ class _Import:
     """The import of one bag."""
 
     def __init__(
-        self, bag: Bag, files: dict[str, str], mapping: BagMapping, urdf: str, out: Path, video: VideoConfig
+        self,
+        bag: Bag,
+        files: dict[str, str],
+        mapping: BagMapping,
+        urdf: str,
+        folder: CollectedFolder,
+        video: VideoConfig,
     ) -> None:
         self._bag, self._files, self._mapping = bag, files, mapping
-        self._urdf, self._out, self._video = urdf, out, video
+        self._urdf, self._folder, self._video = urdf, folder, video
 
     def run(self, first_index: int) -> BagReport:
         """Read, judge and write it."""
@@ -132,6 +134,7 @@ class _Import:
             episode = self._episode(streams, lines, rows, first_index + len(episodes))
             episodes.append(episode)
             reports.append(_made(episode, begin))
+        self._check_alike(episodes)
         self._write([episode for episode in episodes if not _is_there(episode)])
         return BagReport(
             name=self._bag.path.name,
@@ -157,15 +160,22 @@ class _Import:
             instruction=task_text(self._bag, streams, rows.window, self._mapping),
             origin=origin_of(self._files, self._mapping),
         )
-        path = self._out / EPISODES / recording_name(index, 0, success=True)
-        return _Episode(info=info, rows=rows, plans=plans, path=path)
+        return _Episode(info=info, rows=rows, plans=plans, path=self._folder.path_of(index))
+
+    def _check_alike(self, episodes: Sequence[_Episode]) -> None:
+        """ConfigError unless the episodes are of the kind that the run holds, and of one kind."""
+        for episode in episodes[:1]:
+            self._folder.check_fits(episode.info)
+        for episode in episodes[1:]:
+            if different := differences(episodes[0].info, episode.info):
+                raise ConfigError(f"The bag's episodes differ ({'; '.join(different)}): {self._bag.path}")
 
     def _write(self, episodes: list[_Episode]) -> None:
         """Read the bag's pictures once more, and write each episode while they pass."""
         waiting = sorted(episodes, key=lambda episode: int(episode.rows.times_ns[0]))
         for episode in (episode for episode in waiting if not episode.plans):
             with self._writer(episode) as writer:
-                writer.finish(success=episode.rows.window.success)
+                self._finish(episode, writer)
         waiting = [episode for episode in waiting if episode.plans]
         if not waiting:
             return
@@ -182,10 +192,14 @@ class _Import:
                     except FieldError as error:
                         raise self._unusable(topic, error) from error
                     if writer.is_complete:
-                        writer.finish(success=episode.rows.window.success)
+                        self._finish(episode, writer)
                         under_way.remove(pair)
             for episode, writer in under_way:
-                writer.finish(success=episode.rows.window.success)
+                self._finish(episode, writer)
+
+    def _finish(self, episode: _Episode, writer: EpisodeWriter) -> None:
+        writer.finish(success=episode.rows.window.success)
+        self._folder.add(episode.path)
 
     def _writer(self, episode: _Episode) -> EpisodeWriter:
         return EpisodeWriter(episode.path, episode.info, episode.rows, episode.plans, video=self._video)

@@ -23,6 +23,10 @@ RUN_NAME = "run.json"
 RUN_FORMAT = 1
 MAX_EPISODES = 10_000_000
 EPISODES, FAILED, UNFINISHED, DATASET = "episodes", "failed", "unfinished", "dataset"
+COLLECTED = "collected"
+"""The "kind" that run.json has where the run's episodes were collected; see `demorec.runs.collected`."""
+IMPORT_NAME = "import.json"
+"""Beside run.json: what `demorec import` read, and what it found in it (`demorec.ingest.import_file`)."""
 STARTING = "starting"
 """What a worker does before its first frame, once: it compiles, or loads, and fills caches that later episodes find."""
 
@@ -176,9 +180,14 @@ def save_run_file(run: RunFile, folder: Path) -> None:
         "complete": run.is_complete,
         **plain,
     }
+    replace_run_file(folder, head, _episode_lines(run, attempts))
+
+
+def replace_run_file(folder: Path, head: Mapping[str, Any], lines: Iterable[Mapping[str, Any]]) -> None:
+    """Write run.json anew: `head`, and "episodes" with one line each."""
     text = json.dumps(head, indent=2, allow_nan=False)[:-2]
-    lines = ",\n".join("    " + json.dumps(line, allow_nan=False) for line in _episode_lines(run, attempts))
-    text += ',\n  "episodes": [\n' + lines + "\n  ]\n}\n"
+    text += ',\n  "episodes": [\n' + ",\n".join("    " + json.dumps(line, allow_nan=False) for line in lines)
+    text += "\n  ]\n}\n"
     part = folder / f"{RUN_NAME}.part"
     part.unlink(missing_ok=True)  # of a crash; whatever else has that name must not be written through
     with part.open("x") as file:
@@ -201,6 +210,10 @@ def load_run_file(folder: Path) -> RunFile:
         plain = read_json_limited(path, MAX_RUN_FILE_BYTES)
         if not isinstance(plain, dict):
             raise ValueError("no JSON object")
+        if plain.get("kind") == COLLECTED:
+            raise ConfigError(
+                f"The episodes of this run were collected from another robot or program, not generated: {folder}"
+            )
         if plain.get("format", 0) > RUN_FORMAT:
             raise ConfigError(
                 f"run.json has format {str(plain['format'])[:40]}, this demorec knows up to {RUN_FORMAT}: {path}"

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
 
 from support.bags import NS, Note, Notes, changed, in_order, jpeg, with_body
 
@@ -36,14 +39,14 @@ def _later(note: Note, seconds: float) -> Note:
     return replace(note, header_ns=note.header_ns + round(seconds * NS))
 
 
-def _position(note: Note, change: Callable[[np.ndarray[tuple[int], np.dtype[np.float64]]], None]) -> Note:
+def _position(note: Note, change: Callable[[NDArray[np.float64]], None]) -> Note:
     position = note.body["position"].copy()
     change(position)
     return with_body(note, position=position)
 
 
-def _set(index: int, value: float) -> Callable[[np.ndarray[tuple[int], np.dtype[np.float64]]], None]:
-    def change(position: np.ndarray[tuple[int], np.dtype[np.float64]]) -> None:
+def _set(index: int, value: float) -> Callable[[NDArray[np.float64]], None]:
+    def change(position: NDArray[np.float64]) -> None:
         position[index] = value
 
     return change
@@ -56,7 +59,7 @@ def _held(topic: str, first: int, last: int, columns: slice) -> Callable[[Notes]
         (kept,) = [note.body["position"] for k, note in enumerate(n for n in notes if n.topic == topic) if k == first]
 
         def change(number: int, note: Note) -> Note:
-            def hold(position: np.ndarray[tuple[int], np.dtype[np.float64]]) -> None:
+            def hold(position: NDArray[np.float64]) -> None:
                 position[columns] = kept[columns]
 
             return _position(note, hold) if first <= number < last else note
@@ -186,11 +189,7 @@ FAULTS: dict[str, Fault] = {
 }
 
 
-def _png() -> np.ndarray[tuple[int], np.dtype[np.uint8]]:
-    import io
-
-    from PIL import Image
-
+def _png() -> NDArray[np.uint8]:
     buffer = io.BytesIO()
     Image.fromarray(np.zeros((48, 64, 3), np.uint8)).save(buffer, format="PNG")
     return np.frombuffer(buffer.getvalue(), np.uint8)

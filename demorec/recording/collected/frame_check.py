@@ -16,7 +16,7 @@ MAX_STAMP_NS = 2**31 * 1_000_000_000 - 1
 
 
 class CollectedCheck:
-    """Looks at pictures and frames in the order in which they come."""
+    """Looks at pictures and frames in the order in which they come, and is told of those that were taken."""
 
     def __init__(self, info: CollectedInfo) -> None:
         self._features = {feature.name: feature for feature in info.features}
@@ -25,7 +25,7 @@ class CollectedCheck:
         self._num_pictures = dict.fromkeys(self._cameras, 0)
         self._num_frames = 0
 
-    def picture(self, camera: str, stamp_ns: int, data: NDArray[np.uint8] | bytes) -> None:
+    def check_picture(self, camera: str, stamp_ns: int, data: NDArray[np.uint8] | bytes) -> None:
         """Raise RecordingError unless it can be the next picture of the camera."""
         known = self._cameras.get(camera)
         if known is None:
@@ -35,9 +35,13 @@ class CollectedCheck:
             )
         _check_picture(known, data)
         self._check_stamp(f"the picture of the camera {camera!r}", "camera " + camera, stamp_ns, may_repeat=False)
+
+    def note_picture(self, camera: str, stamp_ns: int) -> None:
+        """The camera's next picture was taken."""
+        self._last["camera " + camera] = int(stamp_ns)
         self._num_pictures[camera] += 1
 
-    def frame(self, frame: CollectedFrame) -> None:
+    def check_frame(self, frame: CollectedFrame) -> None:
         """Raise RecordingError unless it can be the next frame."""
         what = f"frame {self._num_frames}"
         _check_names(what, "feature", frame.samples, self._features)
@@ -64,6 +68,12 @@ class CollectedCheck:
             stamp = frame.samples[name].stamp_ns
             self._check_stamp(f"the feature {name!r} of {what}", "feature " + name, stamp, may_repeat=True)
         self._check_stamp(what, "frames", frame.time_ns, may_repeat=False)
+
+    def note_frame(self, frame: CollectedFrame) -> None:
+        """The next frame was taken."""
+        for name in self._features:
+            self._last["feature " + name] = int(frame.samples[name].stamp_ns)
+        self._last["frames"] = int(frame.time_ns)
         self._num_frames += 1
 
     def _check_stamp(self, what: str, key: str, stamp_ns: int, *, may_repeat: bool) -> None:
@@ -78,7 +88,6 @@ class CollectedCheck:
                 f"{what} has the stamp {stamp_ns} ns, the one before it {last} ns: stamps must not "
                 f"{'go backwards' if stamp_ns < last else 'stand still'}."
             )
-        self._last[key] = int(stamp_ns)
 
 
 def _check_picture(camera: CollectedCamera, data: NDArray[np.uint8] | bytes) -> None:

@@ -80,6 +80,10 @@ class CollectedWriter:
     def __exit__(
         self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
     ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End it and leave NAME.mcap.part as it is; harmless when called twice, and after `finish`."""
         self._file.close()
 
     @property
@@ -118,7 +122,8 @@ class CollectedWriter:
         Raises:
             RecordingError: An unknown camera, another size or type, or a stamp that goes backwards.
         """
-        self._check.picture(camera, stamp_ns, data)
+        self._check.check_picture(camera, stamp_ns, data)
+        self._check.note_picture(camera, stamp_ns)
         return self._cameras[camera].add(int(stamp_ns), data)
 
     def write(self, frame: CollectedFrame) -> None:
@@ -128,7 +133,8 @@ class CollectedWriter:
             RecordingError: Features missing or unknown, of another length or type, numbers that are not finite, stamps
                 that go backwards, a picture that is not there, or a full disk.
         """
-        self._check.frame(frame)
+        self._check.check_frame(frame)
+        self._check.note_frame(frame)
         self._pending.append(frame)
         self._num_frames += 1
         if frame.time_ns - self._pending[0].time_ns >= _SECOND_NS or len(self._pending) > self._info.fps:

@@ -1,0 +1,180 @@
+"""The thread that codes pictures and writes frames, so that the program that gives them need not wait.
+
+Libraries that code pictures and write files release Python's lock, so a thread is enough, and nothing has to be carried
+to another process. What waits is bounded: a queue that grew without end would hide that the machine cannot keep up.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from queue import Empty, Full, Queue
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.recording import CollectedWriter, WriteStats
+from demorec.recording.pixels import PixelCounter
+from demorec.scene.collected import CollectedCamera, CollectedFrame, CollectedOutcome, Sample
+
+WhenFull = Literal["error", "drop", "wait"]
+
+_FLUSH_SECONDS = 0.5
+"""After which what has come is written: with the time that it takes, a crash loses less than a second."""
+_WAIT_SECONDS = 0.001
+_MAX_WAITING_BYTES = 256 << 20
+_MIN_WAITING_FRAMES = 8
+
+WaitingPictures = Mapping[str, tuple[int, NDArray[np.uint8] | None]]
+"""Camera -> stamp and pixels of a new picture, or its stamp and None for the same one again."""
+
+
+def warm_up() -> None:
+    """Load and compile what the first picture would have to wait for."""
+    PixelCounter().add(np.zeros((2, 2, 3), dtype=np.uint8))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class WaitingFrame:
+    """A frame on its way to the file.
+
+    Attributes:
+        time_ns: Its stamp.
+        samples: Feature -> what it holds.
+        pictures: That it holds.
+    """
+
+    time_ns: int
+    samples: Mapping[str, Sample]
+    pictures: WaitingPictures
+
+
+class Buffers:
+    """Memory for pictures that wait, used again and again: fresh memory costs as much as copying into it."""
+
+    def __init__(self, cameras: Sequence[CollectedCamera]) -> None:
+        self._free: dict[tuple[int, ...], deque[NDArray[np.uint8]]] = {
+            (camera.height, camera.width, 3): deque() for camera in cameras
+        }
+
+    def copy(self, pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """A copy that belongs to nobody else until `give_back`."""
+        free = self._free[pixels.shape]
+        try:
+            buffer = free.popleft()
+        except IndexError:
+            buffer = np.empty(pixels.shape, dtype=np.uint8)
+        np.copyto(buffer, pixels)
+        return buffer
+
+    def give_back(self, buffer: NDArray[np.uint8]) -> None:
+        """Let the copy's memory be used again."""
+        self._free[buffer.shape].append(buffer)
+
+
+class Coder:
+    """Feeds a writer from a queue in a thread of its own.
+
+    Args:
+        writer: Of the episode; used by the thread alone until `end` returns.
+        buffers: Where pictures are given back to.
+        cameras: Of the episode; they decide how many frames may wait.
+        fps: Frames a second, nominal: as many may wait as come in a second, if memory allows.
+        waits: Whether `put` waits for room.
+
+    Attributes:
+        error: What ended the thread, if anything did.
+        capacity: How many frames may wait.
+    """
+
+    def __init__(
+        self,
+        writer: CollectedWriter,
+        buffers: Buffers,
+        *,
+        cameras: Sequence[CollectedCamera],
+        fps: int,
+        waits: bool = False,
+    ) -> None:
+        self._writer, self._buffers, self._waits = writer, buffers, waits
+        self.error: BaseException | None = None
+        frame_bytes = sum(3 * camera.width * camera.height for camera in cameras)
+        self.capacity = max(_MIN_WAITING_FRAMES, min(fps, _MAX_WAITING_BYTES // max(frame_bytes, 1)))
+        self._queue: Queue[WaitingFrame | None] = Queue(self.capacity)
+        self._last: dict[str, int] = {}
+        self._flushed_at = time.monotonic()
+        self._thread = threading.Thread(target=self._run, name="demorec-coder", daemon=True)
+        self._thread.start()
+
+    def put(self, frame: WaitingFrame) -> bool:
+        """Copy the pictures of a frame and queue it; False when the queue is full and is not waited for.
+
+        Only one thread may put frames.
+        """
+        while self._queue.full():
+            if not self._waits:
+                return False
+            if self.error is not None:
+                raise self.error
+            time.sleep(_WAIT_SECONDS)
+        copies = {
+            camera: (stamp_ns, None if pixels is None else self._buffers.copy(pixels))
+            for camera, (stamp_ns, pixels) in frame.pictures.items()
+        }
+        self._queue.put_nowait(replace(frame, pictures=copies))
+        return True
+
+    def end(self) -> None:
+        """Wait until all that was queued is with the writer, or the thread has died; harmless when called twice."""
+        while self._thread.is_alive():
+            try:
+                self._queue.put(None, timeout=0.1)
+                break
+            except Full:
+                continue
+        self._thread.join()
+
+    def finish(self, outcome: CollectedOutcome) -> WriteStats:
+        """Complete the recording, after `end`."""
+        return self._writer.finish(outcome)
+
+    def close(self) -> None:
+        """Leave the recording as it is, after `end`."""
+        self._writer.close()
+
+    def discard(self) -> None:
+        """Remove the recording, after `end`."""
+        self._writer.discard()
+
+    def _run(self) -> None:
+        try:
+            while True:
+                wait = self._flushed_at + _FLUSH_SECONDS - time.monotonic()
+                try:
+                    frame = self._queue.get(timeout=wait) if wait > 0 else self._queue.get_nowait()
+                except Empty:
+                    self._flush()
+                    continue
+                if frame is None:
+                    return
+                self._write(frame)
+                if time.monotonic() - self._flushed_at >= _FLUSH_SECONDS:
+                    self._flush()
+        except BaseException as error:
+            self.error = error
+
+    def _flush(self) -> None:
+        self._writer.flush()
+        self._flushed_at = time.monotonic()
+
+    def _write(self, frame: WaitingFrame) -> None:
+        for camera, (stamp_ns, pixels) in frame.pictures.items():
+            if pixels is not None:
+                self._last[camera] = self._writer.picture(camera, stamp_ns, pixels)
+                self._buffers.give_back(pixels)
+        held = {camera: self._last[camera] for camera in frame.pictures}
+        self._writer.write(CollectedFrame(time_ns=frame.time_ns, samples=frame.samples, pictures=held))

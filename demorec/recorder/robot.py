@@ -1,0 +1,71 @@
+"""What a person may name as the robot: a name, a URDF as a file or as text, an arm of demorec's, or joint names."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from demorec.errors import ConfigError, in_words
+from demorec.safety.files import read_text_limited
+from demorec.scene.assets import asset_path
+from demorec.scene.robot import RobotSpec
+from demorec.scene.urdf import MAX_BYTES, Urdf, parse_xml
+
+RobotLike = str | Path | RobotSpec | Sequence[str]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobotFacts:
+    """What is known of the robot.
+
+    Attributes:
+        name: Of it.
+        urdf: Its description as text, "" when unknown.
+        joints: Names in the order in which vectors have them, where that is known.
+        known_joints: Names of all joints that move.
+    """
+
+    name: str
+    urdf: str = ""
+    joints: tuple[str, ...] = ()
+    known_joints: frozenset[str] = frozenset()
+
+
+def robot_facts(robot: RobotLike) -> RobotFacts:
+    """What can be known of a robot that is named so.
+
+    Raises:
+        ConfigError: The URDF cannot be read, or is none; or the joint names are no names.
+    """
+    if isinstance(robot, RobotSpec):
+        joints = robot.joint_names
+        urdf = asset_path(robot.urdf).read_text()
+        return RobotFacts(name=robot.name, urdf=urdf, joints=joints, known_joints=frozenset(joints))
+    if isinstance(robot, Path) or (isinstance(robot, str) and robot.endswith(".urdf")):
+        path = Path(robot)
+        try:
+            return _described(read_text_limited(path, MAX_BYTES), path)
+        except (OSError, UnicodeDecodeError) as error:
+            raise ConfigError(f"The robot's URDF cannot be read ({in_words(error)}): {path}") from error
+    if isinstance(robot, str):
+        if robot.lstrip().startswith("<"):
+            return _described(robot, None)
+        if not robot.strip():
+            raise ConfigError("The robot's name is empty: give a name, a URDF, or the names of its joints.")
+        return RobotFacts(name=robot)
+    joints = tuple(robot)
+    if not joints or not all(isinstance(joint, str) and joint for joint in joints):
+        raise ConfigError(f"The robot is {joints!r}: give a name, a URDF, or the names of its joints.")
+    return RobotFacts(name="robot", joints=joints, known_joints=frozenset(joints))
+
+
+def _described(text: str, path: Path | None) -> RobotFacts:
+    where = "" if path is None else f": {path}"
+    try:
+        urdf = Urdf.parse(text)
+        name = parse_xml(text).get("name") or "robot"
+    except ValueError as error:
+        raise ConfigError(f"The robot's URDF cannot be used ({in_words(error)}){where}") from error
+    moving = tuple(joint.name for joint in urdf.joints if joint.kind != "fixed")
+    return RobotFacts(name=name, urdf=text, joints=moving, known_joints=frozenset(moving))

@@ -1,0 +1,325 @@
+"""The folder of a run whose episodes were collected: numbered recordings in episodes/, run.json, a lock.
+
+The recordings are the truth; run.json has a line for each and can be made again from them. An episode that a crash cut
+off is made whole when the folder is opened again, and nothing that is there is ever written over.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from hashlib import sha256
+from pathlib import Path
+
+from demorec.errors import ConfigError, RecordingError, in_words, resource_error
+from demorec.plain import from_plain, to_plain
+from demorec.recording import CollectedRecording, recover
+from demorec.runs.lock import LOCK_NAME, run_lock
+from demorec.runs.run_file import (
+    COLLECTED,
+    DATASET,
+    EPISODES,
+    IMPORT_NAME,
+    MAX_RUN_FILE_BYTES,
+    RUN_FORMAT,
+    RUN_NAME,
+    DamagedRunFileError,
+    free_name,
+    recording_name,
+    replace_run_file,
+    sha256_of,
+)
+from demorec.safety.files import make_folder, read_json_limited
+from demorec.safety.replacing import shown
+from demorec.scene.collected import CollectedInfo
+
+
+@dataclass(frozen=True, kw_only=True)
+class CollectedEpisode:
+    """One episode: a line of run.json.
+
+    Attributes:
+        episode_index: Which.
+        instruction: In words.
+        success: None when nobody said.
+        file: Recording, relative to the run's folder.
+        sha256: Of the file.
+        digest: Of its content.
+        num_frames, num_bytes: Of the recording.
+        drops: "frames" or camera -> how many of them could not be taken.
+        reason: Why it is no success.
+    """
+
+    episode_index: int
+    instruction: str
+    success: bool | None
+    file: str
+    sha256: str
+    digest: str
+    num_frames: int
+    num_bytes: int
+    drops: Mapping[str, int] = field(default_factory=dict)
+    reason: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CollectedSession:
+    """One program that added episodes to the run. Wall-clock times in UTC, ISO 8601."""
+
+    started: str
+    ended: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CollectedRun:
+    """The content of run.json.
+
+    Attributes:
+        robot: Its name.
+        fps: Nominal frames per second.
+        episodes: Every one, in order.
+        sessions: Who added them.
+    """
+
+    robot: str
+    fps: int
+    episodes: tuple[CollectedEpisode, ...] = ()
+    sessions: tuple[CollectedSession, ...] = ()
+
+    @property
+    def digest(self) -> str:
+        """Content digest of the run: of its episodes in order; not of times."""
+        lines = [f"{line.episode_index} {line.success} {line.digest}" for line in self.episodes]
+        return sha256("\n".join(lines).encode()).hexdigest()[:16]
+
+
+def is_collected_run(folder: Path) -> bool:
+    """Whether the folder has a run.json of a run whose episodes were collected."""
+    try:
+        plain = read_json_limited(folder / RUN_NAME, MAX_RUN_FILE_BYTES)
+    except (OSError, ValueError):
+        return False
+    return isinstance(plain, dict) and plain.get("kind") == COLLECTED
+
+
+def load_collected_run(folder: Path) -> CollectedRun:
+    """Read run.json.
+
+    Raises:
+        ConfigError: It is of another kind of run, or of a newer format.
+        DamagedRunFileError: It is no run file.
+    """
+    path = folder / RUN_NAME
+    try:
+        plain = read_json_limited(path, MAX_RUN_FILE_BYTES)
+        if not isinstance(plain, dict):
+            raise ValueError("no JSON object")
+        if plain.get("kind") != COLLECTED or plain.get("format", 0) > RUN_FORMAT:
+            raise ConfigError(f"The folder holds a run of another kind: choose another folder: {folder}")
+        for derived in ("format", "kind", "digest"):
+            plain.pop(derived)
+        return from_plain(plain, CollectedRun)
+    except OSError as error:
+        damaged = DamagedRunFileError(f"run.json is damaged ({in_words(error)}): {path}")
+        raise resource_error(error, path) or damaged from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise DamagedRunFileError(f"run.json is damaged ({in_words(error)}): {path}") from error
+
+
+class CollectedFolder:
+    """An opened run.
+
+    Attributes:
+        path: Of the folder.
+        episodes: What is there, in order.
+        recovered: Recordings that were made whole when it was opened.
+
+    Args:
+        path: Of the folder.
+        recovers: Whether what a crash left of an episode is made whole; an import makes it again.
+    """
+
+    def __init__(self, path: Path, *, recovers: bool = True) -> None:
+        self.path = path
+        self.recovered: list[Path] = []
+        self._session = CollectedSession(started=_now())
+        known, is_damaged = self._known()
+        if recovers:
+            self._recover_parts()
+        self._sessions = known.sessions
+        lines = {line.file: line for line in known.episodes}
+        self.episodes = [self._line(file, lines) for file in self._recordings()]
+        if is_damaged:
+            (path / RUN_NAME).rename(free_name(path / f"{RUN_NAME}.damaged"))
+
+    def _known(self) -> tuple[CollectedRun, bool]:
+        """What run.json says, and whether it is there but cannot be read: the recordings know what it said."""
+        nothing = CollectedRun(robot="", fps=1)
+        if not os.path.lexists(self.path / RUN_NAME):
+            return nothing, False
+        try:
+            return load_collected_run(self.path), False
+        except DamagedRunFileError:
+            return nothing, True
+
+    def _recordings(self) -> list[Path]:
+        return sorted((self.path / EPISODES).glob("episode_*.mcap"))
+
+    def _recover_parts(self) -> None:
+        for part in sorted((self.path / EPISODES).glob("episode_*.mcap.part")):
+            target = part.with_suffix("")
+            if os.path.lexists(target):
+                continue
+            try:
+                recover(part, target)
+            except RecordingError:  # not one whole frame: it stays as it is, and its number is not used again
+                continue
+            part.rename(free_name(part.with_name(f"{part.name}.recovered")))
+            self.recovered.append(target)
+
+    def _line(self, file: Path, known: Mapping[str, CollectedEpisode]) -> CollectedEpisode:
+        """What run.json says of a recording, or what it says itself where that is not the same file."""
+        line = known.get(f"{EPISODES}/{file.name}")
+        if line is not None and line.num_bytes == file.stat().st_size:
+            return line
+        return collected_line(file)
+
+    @property
+    def next_index(self) -> int:
+        """The number of the next episode: above all that are there, finished or not."""
+        numbers = [line.episode_index for line in self.episodes]
+        for path in (self.path / EPISODES).glob("episode_*"):
+            digits = path.name.removeprefix("episode_").partition(".")[0]
+            numbers.append(int(digits) if digits.isdecimal() else -1)
+        return max(numbers, default=-1) + 1
+
+    def path_of(self, episode_index: int) -> Path:
+        """Where the recording of an episode goes."""
+        return self.path / EPISODES / recording_name(episode_index, 0, success=True)
+
+    def check_fits(self, info: CollectedInfo) -> None:
+        """Raise ConfigError with everything in which a new episode differs from the last one that is there."""
+        if not self.episodes:
+            return
+        with CollectedRecording(self.path / self.episodes[-1].file) as recording:
+            different = differences(recording.info, info)
+        if different:
+            raise ConfigError(
+                f"The run holds episodes of another kind ({'; '.join(different)}): record into another folder: "
+                f"{self.path}"
+            )
+
+    def add(self, recording: Path) -> CollectedEpisode:
+        """Take a finished recording into run.json."""
+        line = collected_line(recording)
+        self.episodes.append(line)
+        self.save()
+        return line
+
+    def save(self, *, ended: bool = False) -> None:
+        """Write run.json, if there is anything to tell."""
+        if not self.episodes:
+            return
+        with CollectedRecording(self.path / self.episodes[-1].file) as recording:
+            info = recording.info
+        session = replace(self._session, ended=_now()) if ended else self._session
+        run = CollectedRun(
+            robot=info.robot, fps=info.fps, episodes=tuple(self.episodes), sessions=(*self._sessions, session)
+        )
+        plain = to_plain(run)
+        lines = plain.pop("episodes")
+        try:
+            head = {"format": RUN_FORMAT, "kind": COLLECTED, "digest": run.digest, **plain}
+            replace_run_file(self.path, head, lines)
+        except OSError as error:
+            unwritable = RecordingError(
+                f"run.json cannot be written ({error.strerror}), the recordings are all there: {self.path}"
+            )
+            raise resource_error(error) or unwritable from error
+
+
+@contextmanager
+def open_collected_run(path: Path, *, recovers: bool = True) -> Iterator[CollectedFolder]:
+    """Open, continue or begin a run, locked until the context ends; arguments as of `CollectedFolder`.
+
+    Raises:
+        ConfigError: The folder is in use, holds another kind of run or somebody's files, or cannot be written to.
+        RecordingError: One of its recordings is damaged.
+    """
+    path = path.absolute()
+    if path.exists() and not path.is_dir():
+        raise ConfigError(f"This is a file, no folder for a run: choose another: {path}")
+    if path.is_dir() and not is_collected_run(path):
+        _refuse_strangers(path)
+    make_folder(path / EPISODES)
+    with run_lock(path):
+        folder = CollectedFolder(path, recovers=recovers)
+        folder.save()
+        try:
+            yield folder
+        finally:
+            folder.save(ended=True)
+
+
+def _refuse_strangers(path: Path) -> None:
+    """Raise ConfigError for a folder without a readable run.json that holds other things than collected episodes."""
+    if (path / RUN_NAME).exists():
+        with suppress(DamagedRunFileError):
+            load_collected_run(path)
+    strangers = [
+        entry.name
+        for entry in sorted(path.iterdir())
+        if entry.name not in (EPISODES, DATASET, IMPORT_NAME, LOCK_NAME) and not entry.name.startswith(RUN_NAME)
+    ]
+    if strangers:
+        raise ConfigError(f"The folder holds files that are of no run ({shown(strangers)}): choose another: {path}")
+
+
+def collected_line(file: Path) -> CollectedEpisode:
+    """The line of run.json that a recording speaks for; RecordingError when it is damaged."""
+    with CollectedRecording(file) as recording:
+        info, outcome = recording.info, recording.outcome
+        return CollectedEpisode(
+            episode_index=info.episode_index,
+            instruction=info.instruction,
+            success=None if outcome is None else outcome.success,
+            file=f"{EPISODES}/{file.name}",
+            sha256=sha256_of(file),
+            digest=recording.digest(),
+            num_frames=recording.num_frames,
+            num_bytes=file.stat().st_size,
+            drops={} if outcome is None else outcome.drops,
+            reason="cut off by a crash" if outcome is None else outcome.reason,
+        )
+
+
+def differences(there: CollectedInfo, new: CollectedInfo) -> list[str]:
+    """In what two episodes differ that one run or dataset must have in common, in words."""
+    traits = [("robot", there.robot, new.robot), ("fps", str(there.fps), str(new.fps))]
+    for kind, old_ones, new_ones in (
+        ("feature", _features(there), _features(new)),
+        ("camera", _cameras(there), _cameras(new)),
+    ):
+        for name in dict.fromkeys([*old_ones, *new_ones]):
+            traits.append((f"{kind} {name}", old_ones.get(name, "missing"), new_ones.get(name, "missing")))
+    traits.append(("URDF", _short(there.urdf), _short(new.urdf)))
+    return [f"{what} is {asked} instead of {found}" for what, found, asked in traits if found != asked]
+
+
+def _features(info: CollectedInfo) -> dict[str, str]:
+    return {one.name: f"{one.dtype} of {', '.join(one.names)}" for one in info.features}
+
+
+def _cameras(info: CollectedInfo) -> dict[str, str]:
+    return {one.name: f"{one.width}x{one.height} {one.kept}".strip() for one in info.cameras}
+
+
+def _short(urdf: str) -> str:
+    return f"one of digest {sha256(urdf.encode()).hexdigest()[:8]}" if urdf else "none"
+
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="milliseconds")

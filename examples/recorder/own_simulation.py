@@ -1,0 +1,75 @@
+"""Records a PyBullet simulation of one's own: python examples/recorder/own_simulation.py runs/kuka.
+
+Nothing of demorec's simulator is used: the program loads a URDF from pybullet_data, steps its own world, takes pictures
+with two cameras of its own and hands everything to the recorder. The URDF goes with it, so that a viewer shows the arm.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+import pybullet
+import pybullet_data
+from numpy.typing import NDArray
+
+from demorec import Recorder
+from demorec.scene.collected import CollectedCamera
+
+URDF = Path(pybullet_data.getDataPath()) / "kuka_iiwa" / "model.urdf"
+FPS, PHYSICS_HZ = 30, 240
+SIDE = 128
+FOV_DEGREES = 60.0
+FOCAL = SIDE / 2 / math.tan(math.radians(FOV_DEGREES) / 2)
+INTRINSICS = (FOCAL, 0.0, SIDE / 2, 0.0, FOCAL, SIDE / 2, 0.0, 0.0, 1.0)
+EYES = {"front": (1.5, 0.0, 0.9), "side": (0.0, 1.5, 0.9)}
+
+
+def picture(client: int, eye: tuple[float, float, float]) -> NDArray[np.uint8]:
+    """(H, W, 3) RGB of the arm, seen from `eye` (world frame, metres)."""
+    view = pybullet.computeViewMatrix(eye, (0.0, 0.0, 0.5), (0.0, 0.0, 1.0), physicsClientId=client)
+    projection = pybullet.computeProjectionMatrixFOV(FOV_DEGREES, 1.0, 0.1, 5.0, physicsClientId=client)
+    _, _, rgba, _, _ = pybullet.getCameraImage(
+        SIDE, SIDE, view, projection, renderer=pybullet.ER_TINY_RENDERER, physicsClientId=client
+    )
+    return np.ascontiguousarray(np.asarray(rgba, dtype=np.uint8).reshape(SIDE, SIDE, 4)[..., :3])
+
+
+def main(folder: str, num_episodes: int = 2, num_frames: int = 45) -> None:
+    """Record an arm that moves to random targets."""
+    random = np.random.default_rng(0)
+    client = pybullet.connect(pybullet.DIRECT)
+    try:
+        arm = pybullet.loadURDF(str(URDF), useFixedBase=True, physicsClientId=client)
+        joints = list(range(pybullet.getNumJoints(arm, physicsClientId=client)))
+        cameras = {name: CollectedCamera(name=name, width=SIDE, height=SIDE, intrinsics=INTRINSICS) for name in EYES}
+        # A simulator can wait for the coder, which a robot cannot.
+        with Recorder(folder, robot=URDF, cameras=cameras, fps=FPS, task="reach out", when_full="wait") as recorder:
+            for _ in range(num_episodes):
+                goal = random.uniform(-0.8, 0.8, len(joints))
+                with recorder.episode() as episode:
+                    for frame in range(num_frames):
+                        states = pybullet.getJointStates(arm, joints, physicsClientId=client)
+                        position = np.array([state[0] for state in states])
+                        pybullet.setJointMotorControlArray(
+                            arm,
+                            joints,
+                            pybullet.POSITION_CONTROL,
+                            targetPositions=goal.tolist(),
+                            physicsClientId=client,
+                        )
+                        images = {name: picture(client, eye) for name, eye in EYES.items()}
+                        # Simulated time, exact: the clock on the wall says nothing about a simulation.
+                        episode.write(position, goal, images, time_ns=frame * 1_000_000_000 // FPS)
+                        for _ in range(PHYSICS_HZ // FPS):
+                            pybullet.stepSimulation(physicsClientId=client)
+                    episode.success = bool(np.abs(position - goal).max() < 0.1)
+            print(f"{recorder.num_episodes} episodes in {recorder.path}")
+    finally:
+        pybullet.disconnect(physicsClientId=client)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

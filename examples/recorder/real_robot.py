@@ -1,0 +1,78 @@
+"""Records a real robot's own control loop: python examples/recorder/real_robot.py runs/mine.
+
+`MyArm` and `MyCamera` stand in for the drivers of your arm and camera. The loop reads what there is, sends a command
+and hands all of it to the recorder, which never holds it up: pictures are coded by another thread.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec import Recorder
+
+JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
+FPS = 30
+
+
+class MyArm:
+    """An arm whose joints follow what they are told."""
+
+    def __init__(self) -> None:
+        self._position = np.zeros(len(JOINTS))
+
+    def read(self) -> NDArray[np.float64]:
+        """(6,) rad."""
+        return self._position.copy()
+
+    def send(self, target: NDArray[np.float64]) -> None:
+        """(6,) rad."""
+        self._position += 0.5 * (target - self._position)
+
+
+class MyCamera:
+    """A camera that has a new picture now and then, and tells when it was taken."""
+
+    def __init__(self) -> None:
+        self._count = 0
+
+    def latest(self) -> tuple[NDArray[np.uint8], int]:
+        """(480, 640, 3) RGB and its stamp in nanoseconds, of the clock that the loop uses, too."""
+        self._count += 1
+        picture = np.zeros((480, 640, 3), dtype=np.uint8)
+        picture[:, (4 * self._count) % 600 :][:, :40] = (200, 120, 0)
+        return picture, time.monotonic_ns()
+
+
+def every(seconds: float, count: int) -> Iterator[int]:
+    """Numbers, one each time that so many seconds have passed."""
+    start = time.monotonic()
+    for number in range(count):
+        time.sleep(max(0.0, start + number * seconds - time.monotonic()))
+        yield number
+
+
+def main(folder: str, num_episodes: int = 2, seconds: float = 2.0) -> None:
+    """Record some episodes; Ctrl-C ends the one that is being recorded, and keeps it."""
+    arm, camera = MyArm(), MyCamera()
+    with Recorder(
+        folder, robot=JOINTS, cameras={"top": (480, 640)}, fps=FPS, task="wave the gripper", clock=time.monotonic_ns
+    ) as recorder:
+        for _ in range(num_episodes):
+            with recorder.episode() as episode:
+                for step in every(1 / FPS, round(seconds * FPS)):
+                    position = arm.read()
+                    target = np.full(len(JOINTS), np.sin(step / 10))
+                    arm.send(target)
+                    images = {"top": camera.latest()} if step % 3 else {}  # sometimes there is none
+                    episode.write(position, target, images)
+                episode.success = True
+        print(f"{recorder.num_episodes} episodes in {recorder.path}")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

@@ -1,0 +1,86 @@
+"""The examples of examples/recorder work as programs, and record what their loops did."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from demorec.recording import CollectedRecording
+from demorec.runs.collected import load_collected_run
+
+EXAMPLES = Path(__file__).parents[2] / "examples" / "recorder"
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the run of each example."""
+    folder = tmp_path_factory.mktemp("examples")
+    programs = [
+        subprocess.Popen(
+            [sys.executable, str(EXAMPLES / f"{name}.py"), str(folder / name)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for name in ("real_robot", "own_simulation", "gym_wrapper")
+    ]
+    for program in programs:
+        out, err = program.communicate(timeout=120)
+        assert program.returncode == 0, err
+        assert str(folder) in out
+    return folder
+
+
+def first_of(run: Path) -> CollectedRecording:
+    return CollectedRecording(run / "episodes" / "episode_000000.mcap")
+
+
+def test_a_robots_loop(runs: Path) -> None:
+    assert [line.success for line in load_collected_run(runs / "real_robot").episodes] == [True, True]
+    with first_of(runs / "real_robot") as recording:
+        columns = recording.columns()
+    targets = np.sin(np.arange(60) / 10)
+    assert columns.features["action"].tolist() == [[target] * 6 for target in targets.tolist()]
+    position = 0.0
+    for row, target in zip(columns.features["observation.state"], targets.tolist(), strict=True):
+        assert row.tolist() == [position] * 6
+        position += 0.5 * (target - position)
+    held = columns.pictures["top"]
+    assert [int(number) for number in held] == [-1 if step % 3 == 0 else step - 1 - step // 3 for step in range(60)]
+    assert (columns.picture_age_ns("top") >= 0).all()  # taken before the frame was written
+
+
+def test_a_simulation_of_ones_own(runs: Path) -> None:
+    with first_of(runs / "own_simulation") as recording:
+        columns = recording.columns()
+        state, action = recording.info.features
+        assert state.joints == action.joints == tuple(f"lbr_iiwa_joint_{n}" for n in range(1, 8))
+        assert "lbr_iiwa_link_7" in recording.info.urdf
+        assert recording.info.cameras[0].intrinsics is not None
+        assert math.isclose(recording.info.cameras[0].intrinsics[0], 64 / math.tan(math.pi / 6))
+        front, side = (next(recording.images(name)) for name in ("front", "side"))
+    assert columns.time_ns.tolist() == [frame * 1_000_000_000 // 30 for frame in range(45)]
+    last, goal = columns.features["observation.state"][-1], columns.features["action"][0]
+    assert np.abs(last - goal).max() < np.abs(columns.features["observation.state"][0] - goal).max()
+    assert front.std() > 5
+    assert np.abs(front.astype(int) - side).mean() > 1
+
+
+def test_a_gymnasium_environment(runs: Path) -> None:
+    lines = load_collected_run(runs / "gym_wrapper").episodes
+    assert [line.num_frames for line in lines] == [40, 40, 40]
+    with first_of(runs / "gym_wrapper") as recording:
+        columns = recording.columns()
+    state = columns.features["observation.state"]  # cosine, sine, angular velocity
+    assert state.dtype == np.float32
+    assert np.allclose(state[:, 0] ** 2 + state[:, 1] ** 2, 1, atol=1e-6)
+    # The pendulum's own equation: frame t's action leads from its observation to the next one.
+    angle = np.arctan2(state[:, 1], state[:, 0])
+    torque = np.clip(columns.features["action"][:, 0], -2, 2)
+    velocity = np.clip(state[:, 2] + (15 * np.sin(angle) + 3 * torque) * 0.05, -8, 8)
+    assert np.allclose(state[1:, 2], velocity[:-1], atol=1e-4)

@@ -1,0 +1,358 @@
+"""The recorder of somebody's own loop: what was given is what is recorded, in real time, whatever ends it."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.collected import URDF
+
+from demorec import Recorder
+from demorec.errors import ConfigError, DemorecError, RecordingError
+from demorec.recorder.coder import Coder
+from demorec.recording import CollectedRecording
+from demorec.recording.collected.writer import CollectedWriter
+from demorec.runs.collected import load_collected_run
+from demorec.scene.collected import NO_PICTURE, CollectedCamera, CollectedFeature
+from demorec.sim.robots.panda import PANDA
+
+TOP = {"top": (48, 64)}
+PIXELS = np.zeros((48, 64, 3), dtype=np.uint8)
+
+
+def recorder(folder: Path, **changes: Any) -> Recorder:
+    clock: Iterator[int] = iter(range(1_000_000_000, 10**12, 33_000_000))
+    given: dict[str, Any] = {"robot": "so101", "fps": 30, "task": "stack", "clock": lambda: next(clock)}
+    return Recorder(folder, **{**given, "when_full": "wait", **changes})
+
+
+def recording_of(folder: Path, index: int = 0) -> CollectedRecording:
+    return CollectedRecording(folder / "episodes" / f"episode_{index:06d}.mcap")
+
+
+def test_what_was_given_is_recorded_to_the_bit(tmp_path: Path) -> None:
+    random = np.random.default_rng(0)
+    states = random.normal(size=(40, 6)).astype(np.float32)
+    actions, forces = random.normal(size=(40, 2)), random.normal(size=(40, 3))
+    buffer = PIXELS.copy()
+    with recorder(tmp_path / "run", cameras=TOP) as run, run.episode() as episode:
+        for index in range(40):
+            buffer[:] = 5 * index  # the program's own memory may be used again at once
+            episode.write({"state": states[index], "force": forces[index]}, actions[index], {"top": buffer})
+        episode.success = True
+    with recording_of(tmp_path / "run") as found:
+        columns = found.columns()
+        assert columns.features["observation.state"].tobytes() == states.tobytes()
+        assert columns.features["observation.force"].tobytes() == forces.tobytes()
+        assert columns.features["action"].tobytes() == actions.tobytes()
+        assert columns.time_ns.tolist() == [1_000_000_000 + 33_000_000 * index for index in range(40)]
+        assert (found.info.robot, found.info.instruction, found.info.fps) == ("so101", "stack", 30)
+        assert found.outcome is not None
+        assert (found.outcome.success, found.outcome.num_frames, found.outcome.drops) == (True, 40, {})
+        for index, picture in enumerate(found.images("top")):
+            assert abs(int(picture.mean()) - 5 * index) < 4
+
+
+def test_stamps_of_the_caller_and_missing_or_repeated_pictures(tmp_path: Path) -> None:
+    with recorder(tmp_path / "run", cameras=TOP) as run, run.episode() as episode:
+        episode.write([0.0], [0.0], {"top": None}, time_ns=100, stamps={"observation.state": 90})
+        episode.write([1.0], [0.0], {"top": (PIXELS, 150)}, time_ns=200)
+        episode.write([2.0], [0.0], {"top": (PIXELS, 150)}, time_ns=300)  # the camera has nothing newer
+        episode.write([3.0], [0.0], {"top": (PIXELS, 350)}, time_ns=400)
+    with recording_of(tmp_path / "run") as found:
+        columns = found.columns()
+        assert columns.time_ns.tolist() == [100, 200, 300, 400]
+        assert columns.stamps["observation.state"].tolist() == [90, 200, 300, 400]
+        assert columns.pictures["top"].tolist() == [NO_PICTURE, 0, 0, 1]
+        assert columns.picture_stamps["top"].tolist() == [150, 350]
+        assert found.outcome is not None
+        assert found.outcome.success is None
+
+
+def feature_of(folder: Path, name: str) -> CollectedFeature:
+    with recording_of(folder) as found:
+        return next(feature for feature in found.info.features if feature.name == name)
+
+
+@pytest.mark.parametrize(
+    ("robot", "observation", "names", "joints"),
+    [
+        ("arm", [1.0, 2.0], ("0", "1"), ()),
+        (["a", "b"], [1.0, 2.0], ("a", "b"), ("a", "b")),
+        (["a", "b"], [1.0, 2.0, 3.0], ("a", "b", "gripper"), ("a", "b", "")),
+        (["a", "b"], [1, 2, 3, 4], ("0", "1", "2", "3"), ()),
+        ("arm", {"x": 1, "y": np.float32(2)}, ("x", "y"), ()),
+        (URDF, {"shoulder.pos": 1.0, "elbow.pos": 2.0, "jaw": 3.0}, ("shoulder.pos", "elbow.pos", "jaw"),
+         ("shoulder", "elbow", "")),
+        (URDF, [1.0, 2.0], ("shoulder", "elbow"), ("shoulder", "elbow")),
+        (PANDA, [0.0] * 9, PANDA.joint_names, PANDA.joint_names),
+    ],
+)  # fmt: skip
+def test_elements_are_named_by_what_is_known(
+    tmp_path: Path, robot: Any, observation: Any, names: tuple[str, ...], joints: tuple[str, ...]
+) -> None:
+    with recorder(tmp_path / "run", robot=robot) as run, run.episode() as episode:
+        episode.write(observation)
+    state = feature_of(tmp_path / "run", "observation.state")
+    assert (state.names, state.joints, state.dtype) == (names, joints, "float64")
+    with recording_of(tmp_path / "run") as found:
+        assert found.info.urdf == (URDF if robot == URDF else found.info.urdf if robot is PANDA else "")
+        values = list(observation.values()) if isinstance(observation, dict) else observation
+        assert found.columns().features["observation.state"][0].tolist() == values
+
+
+def test_features_may_be_described(tmp_path: Path) -> None:
+    described = CollectedFeature(name="observation.state", names=("a", "b"), units=("deg", "m"))
+    with recorder(tmp_path / "run", features=[described]) as run, run.episode() as episode:
+        episode.write({"b": 2.0, "a": 1.0})  # in whatever order
+        episode.write(np.array([3, 4], dtype=np.float32))  # a wider type loses nothing
+    assert feature_of(tmp_path / "run", "observation.state") == described
+    with recording_of(tmp_path / "run") as found:
+        assert found.columns().features["observation.state"].tolist() == [[1.0, 2.0], [3.0, 4.0]]
+
+
+def test_the_run_goes_on_where_it_ended(tmp_path: Path) -> None:
+    for _ in range(2):
+        with recorder(tmp_path / "run") as run:
+            for task in ("", "another"):
+                with run.episode(task) as episode:
+                    episode.write([0.0])
+            with run.episode():
+                pass  # nothing came, so there is no episode
+            with run.episode() as episode:
+                episode.write([0.0])
+                episode.discard()
+    found = load_collected_run(tmp_path / "run")
+    assert [line.episode_index for line in found.episodes] == [0, 1, 2, 3]
+    assert [line.instruction for line in found.episodes] == ["stack", "another"] * 2
+    assert len(found.sessions) == 2
+    assert sorted(path.name for path in (tmp_path / "run" / "episodes").iterdir()) == [
+        f"episode_00000{n}.mcap" for n in range(4)
+    ]
+
+
+def test_a_lost_run_json_is_made_again(tmp_path: Path) -> None:
+    with recorder(tmp_path / "run") as run, run.episode() as episode:
+        episode.write([0.0])
+    before = load_collected_run(tmp_path / "run")
+    for damage in (None, "{"):
+        (tmp_path / "run" / "run.json").unlink()
+        if damage is not None:
+            (tmp_path / "run" / "run.json").write_text(damage)
+        with recorder(tmp_path / "run"):
+            pass
+        assert load_collected_run(tmp_path / "run").episodes == before.episodes
+    assert (tmp_path / "run" / "run.json.damaged").read_text() == "{"
+
+
+def test_what_ends_an_episode_is_told(tmp_path: Path) -> None:
+    with recorder(tmp_path / "run") as run:
+        with pytest.raises(ZeroDivisionError), run.episode() as episode:  # noqa: PT012
+            episode.write([0.0])
+            episode.success = True
+            raise ZeroDivisionError("the gripper is stuck")
+        with pytest.raises(KeyboardInterrupt), run.episode() as episode:  # noqa: PT012
+            episode.write([0.0])
+            episode.success = True
+            raise KeyboardInterrupt
+    failed, interrupted = load_collected_run(tmp_path / "run").episodes
+    assert failed.success is False
+    assert interrupted.success is True
+    assert interrupted.reason == "interrupted"
+    with recording_of(tmp_path / "run") as found:
+        assert found.outcome is not None
+        assert (found.outcome.success, found.outcome.num_frames) == (False, 1)
+
+
+Act = Callable[[Any], object]
+BAD: dict[str, tuple[Act, str]] = {
+    "length": (lambda e: e.write([0.0]), r"of shape \(1,\), it must be float64 of shape \(2,\)"),
+    "object": (lambda e: e.write([None, 0]), "'observation.state' is object of shape"),
+    "text": (lambda e: e.write("hand"), "is <U4 of shape"),
+    "ragged": (lambda e: e.write([[0.0], [1.0, 2.0]]), "different lengths"),
+    "matrix": (lambda e: e.write(np.zeros((2, 2))), r"float64 of shape \(2, 2\)"),
+    "nan": (lambda e: e.write([0.0, float("nan")]), "is nan in its element 'b'"),
+    "feature": (lambda e: e.write({"stat": [0.0, 1.0]}), "unknown feature 'observation.stat'.*'observation.state'"),
+    "mixture": (lambda e: e.write({"a": 0.0, "force": [1.0]}), "single numbers \\('a'\\) and of others \\('force'\\)"),
+    "element": (lambda e: e.write({"a": 0.0, "c": 1.0}), "no element 'c'"),
+    "missing element": (lambda e: e.write({"a": 0.0}), "lacks the element 'b'"),
+    "action": (lambda e: e.write([0.0, 1.0], [0.0]), "unknown feature 'action'"),
+    "camera": (lambda e: e.write([0.0, 1.0], images={"tip": PIXELS}), "Unknown camera 'tip'"),
+    "size": (lambda e: e.write([0.0, 1.0], images={"top": PIXELS[1:]}), r"uint8 of shape \(47, 64, 3\)"),
+    "floats": (lambda e: e.write([0.0, 1.0], images={"top": PIXELS / 255.0}), "is float64 of shape"),
+    "list": (lambda e: e.write([0.0, 1.0], images={"top": [0]}), "is list, it must be uint8"),
+    "tuple": (lambda e: e.write([0.0, 1.0], images={"top": (PIXELS,)}), "must be .pixels, stamp in ns"),
+    "backwards": (lambda e: e.write([0.0, 1.0], time_ns=5), "stamps must not go backwards"),
+    "still": (lambda e: e.write([0.0, 1.0], time_ns=1_000_000_000), "stamps must not stand still"),
+    "stamp": (lambda e: e.write([0.0, 1.0], stamps={"acton": 5}), "unknown feature 'acton'"),
+    "after the end": (lambda e: (e.finish(), e.write([0.0, 1.0])), "The episode has ended"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", BAD)
+def test_bad_input_is_told_in_one_sentence_and_costs_one_frame(tmp_path: Path, what: str) -> None:
+    act, words = BAD[what]
+    with recorder(tmp_path / "run", robot=["a", "b"], cameras=TOP) as run:
+        episode = run.episode()
+        episode.write([0.0, 1.0], images={"top": (PIXELS, 900_000_000)})
+        with pytest.raises(RecordingError, match=words) as error:
+            act(episode)
+        assert "\n" not in str(error.value)
+        if what != "after the end":
+            episode.write([2.0, 3.0], images={"top": PIXELS})
+        episode.finish()
+    with recording_of(tmp_path / "run") as found:
+        expected = [[0.0, 1.0]] if what == "after the end" else [[0.0, 1.0], [2.0, 3.0]]
+        assert found.columns().features["observation.state"].tolist() == expected
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"fps": 0}, "fps is 0"),
+        ({"robot": ""}, "name is empty"),
+        ({"robot": []}, "give a name, a URDF"),
+        ({"robot": "<robot"}, "no XML"),
+        ({"robot": "nothing.urdf"}, "No such file"),
+        ({"cameras": {"top": 480}}, "must be \\(height, width\\)"),
+        ({"cameras": {"to/p": (48, 64)}}, "called 'to/p'"),
+        ({"cameras": {"top": CollectedCamera(name="tip", width=1, height=1)}}, "described as 'tip'"),
+        ({"when_full": "panic"}, "allowed are error, drop, wait"),
+    ],
+)
+def test_what_cannot_be_recorded_is_refused_before_a_folder_is_made(
+    tmp_path: Path, changes: dict[str, Any], words: str
+) -> None:
+    with pytest.raises(ConfigError, match=words):
+        recorder(tmp_path / "run", **changes)
+    assert not (tmp_path / "run").exists()
+
+
+def test_folders_of_others_are_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "cat.jpg").write_text("")
+    (tmp_path / "file").write_text("")
+    (tmp_path / "generated").mkdir()
+    (tmp_path / "generated" / "run.json").write_text('{"format": 1, "config": {}}')
+    for name, words in (("photos", "cat.jpg"), ("file", "is a file"), ("generated", "run of another kind")):
+        with pytest.raises(ConfigError, match=words):
+            recorder(tmp_path / name)
+    with recorder(tmp_path / "run") as run, run.episode() as episode:
+        episode.write([0.0])
+        with pytest.raises(ConfigError, match="Another run is writing here"):
+            recorder(tmp_path / "run")
+        with pytest.raises(RecordingError, match="An episode is being recorded already"):
+            run.episode()
+    with recorder(tmp_path / "run", robot="ur5", fps=20) as run:
+        episode = run.episode()
+        with pytest.raises(ConfigError, match=r"robot is ur5 instead of so101; fps is 20 instead of 30; feature"):
+            episode.write([0.0, 1.0])
+    with recorder(tmp_path / "run", task="") as run, pytest.raises(ConfigError, match="no task text"):
+        run.episode()
+
+
+def held_up(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
+    """The coder waits for this."""
+    go_on, write = threading.Event(), Coder._write
+    monkeypatch.setattr(Coder, "_write", lambda self, frame: (go_on.wait(30), write(self, frame)))
+    return go_on
+
+
+def test_frames_that_the_coder_cannot_take_are_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    go_on = held_up(monkeypatch)
+    with recorder(tmp_path / "run", when_full="error") as run, run.episode() as episode:
+        with pytest.raises(RecordingError, match="cannot keep up, 30 frames wait for it: give a quicker"):  # noqa: PT012
+            for _ in range(40):
+                episode.write([0.0])
+        go_on.set()
+    assert 30 <= load_collected_run(tmp_path / "run").episodes[0].num_frames <= 31
+
+
+def test_frames_that_the_coder_cannot_take_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    go_on = held_up(monkeypatch)
+    with recorder(tmp_path / "run", when_full="drop") as run, run.episode() as episode:
+        taken = [episode.write([float(index)]) for index in range(50)]
+        go_on.set()
+    line = load_collected_run(tmp_path / "run").episodes[0]
+    assert line.num_frames == sum(taken)
+    assert line.drops == {"frames": 50 - sum(taken)}
+    with recording_of(tmp_path / "run") as found:
+        values = found.columns().features["observation.state"][:, 0].tolist()
+    assert values == [index for index, there in enumerate(taken) if there]
+
+
+def test_an_error_of_the_coder_reaches_the_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(self: CollectedWriter) -> None:
+        raise RecordingError("The recording cannot be written (No space left on device)")
+
+    with recorder(tmp_path / "run") as run:
+        episode = run.episode()
+        episode.write([0.0])
+        monkeypatch.setattr(CollectedWriter, "flush", fail)
+        with pytest.raises(RecordingError, match="No space left"):  # noqa: PT012
+            for _ in range(2000):
+                episode.write([0.0])
+                time.sleep(0.005)
+        with pytest.raises(RecordingError, match="No space left"):
+            episode.finish()
+        monkeypatch.undo()
+    assert [path.name for path in (tmp_path / "run" / "episodes").iterdir()] == ["episode_000000.mcap.part"]
+
+
+KILLED = """
+import sys, time
+import numpy as np
+from demorec import Recorder
+with Recorder(sys.argv[1], robot="arm", cameras={"top": (48, 64)}, fps=50, task="wait") as recorder:
+    with recorder.episode() as episode:
+        for index in range(10**6):
+            episode.write([float(index)], [0.0], {"top": np.full((48, 64, 3), index % 200, dtype=np.uint8)})
+            print(index, flush=True)
+            time.sleep(0.02)
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
+def test_what_ends_the_program_loses_at_most_a_second(tmp_path: Path, number: signal.Signals) -> None:
+    command = [sys.executable, "-c", KILLED, str(tmp_path / "run")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as program:
+        assert program.stdout is not None
+        last = 0
+        for line in program.stdout:
+            last = int(line)
+            if last == 120:
+                program.send_signal(number)
+                break
+        last = max([last, *(int(line) for line in program.stdout)])
+    with recorder(tmp_path / "run", robot="arm", cameras=TOP, fps=50) as run:
+        assert len(run.recovered) == (1 if number == signal.SIGKILL else 0)
+        with run.episode() as episode:
+            episode.write([0.0], [0.0])
+    first, second = load_collected_run(tmp_path / "run").episodes
+    assert (first.success, second.episode_index) == (None, 1)
+    assert last - 50 <= first.num_frames - 1 <= last
+    if number == signal.SIGINT:
+        assert first.num_frames - 1 == last
+        assert first.reason == "interrupted"
+    with recording_of(tmp_path / "run") as found:
+        columns = found.columns()
+        assert columns.features["observation.state"][:, 0].tolist() == list(range(first.num_frames))
+        assert columns.pictures["top"].tolist() == list(range(first.num_frames))
+        assert found.is_recovered == (number == signal.SIGKILL)
+
+
+def test_every_error_is_ours(tmp_path: Path) -> None:
+    """So that a program can tell what the recorder says from what else went wrong."""
+    assert issubclass(RecordingError, DemorecError)
+    with recorder(tmp_path / "run") as run, run.episode() as episode:
+        episode.write([0.0])
+    assert json.loads((tmp_path / "run" / "run.json").read_text())["kind"] == "collected"
