@@ -23,15 +23,15 @@ class Import:
 
     Examples:
       demorec import --suggest monday.mcap > robot.toml
-      demorec import monday.mcap tuesday/ --mapping robot.toml --out recordings/robot
+      demorec import monday.mcap tuesday/ --mapping robot.toml --out runs/robot
     """
 
     bags: Positional[tuple[Path, ...]]
     """Bags; each is an episode, or several, as the mapping says."""
     mapping: Path | None = None
-    """What of the bags becomes what (auto: needed, unless --suggest)."""
+    """What of the bags becomes what; an import needs it."""
     out: Path | None = None
-    """The run to make or to continue (auto: needed, unless --suggest)."""
+    """The run to make or to continue; an import needs it."""
     suggest: bool = False
     """Write a mapping for the first bag to standard output instead of importing."""
     video: Annotated[VideoConfig, arg(name="")] = field(default_factory=VideoConfig)
