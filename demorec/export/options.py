@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from demorec.errors import OptionError
+from demorec.errors import OptionError, check_option
 from demorec.scene.features import ACTION, STATE, ActionKind
 
 ProgressCallback = Callable[[int, int], None]
@@ -34,6 +34,9 @@ class CommonOptions:
     """Add depth pictures of recordings that have depth: LeRobot's 12-bit videos, or float32 metres in HDF5."""
     fps: int | None = None
     """Frames per second of the dataset; divides that of the recordings, the frames between are left out."""
+    hold_pictures: float = 0.0
+    """Of collected episodes: seconds for which a frame without a picture of a camera shows the camera's last one, as a
+    policy would see it; 0: such a frame is an error."""
     overwrite: bool = False
     """Replace the dataset that is there already; anything else than a dataset, or with anything else in it, is not."""
 
@@ -44,6 +47,7 @@ class CommonOptions:
     def validate(self) -> None:
         """Raise ConfigError for impossible values and combinations."""
         parse_episodes(self.episodes)
+        check_option("hold_pictures", self.hold_pictures, 0, 3600, "s")
         if self.fps is not None and self.fps < 1:
             raise OptionError("fps", f"is {self.fps}, it must be at least 1.")
 

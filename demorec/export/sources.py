@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from demorec.errors import ConfigError, ExportError
 from demorec.export.options import CommonOptions, parse_episodes
 from demorec.plain import digest
-from demorec.recording import Recording
+from demorec.recording import AnyRecording, CollectedRecording, open_recording
 from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings
 from demorec.scene.features import ENVIRONMENT_STATE, IMAGE_PREFIX, observation_names
 
@@ -49,14 +49,19 @@ def find_recordings(paths: Sequence[Path], *, include_failures: bool) -> list[Ex
     return found
 
 
-def is_among_episodes(recording: Recording, options: CommonOptions) -> bool:
+def is_among_episodes(recording: AnyRecording, options: CommonOptions) -> bool:
     """Whether the number of its episode is wanted (`--episodes`)."""
     return parse_episodes(options.episodes)(recording.info.episode_index)
 
 
-def goes_in(source: ExportSource, recording: Recording, options: CommonOptions) -> bool:
-    """Whether a recording of a wanted episode goes into the dataset, and is no failed attempt to be left out."""
+def goes_in(source: ExportSource, recording: AnyRecording, options: CommonOptions) -> bool:
+    """Whether a recording of a wanted episode goes into the dataset, and is no failed attempt to be left out.
+
+    A collected episode of which nobody said whether it succeeded is no failure.
+    """
     success = recording.outcome is not None and recording.outcome.success
+    if isinstance(recording, CollectedRecording):
+        success = recording.outcome is None or recording.outcome.success is not False
     return source.is_chosen and (success or options.include_failures)
 
 
@@ -83,18 +88,20 @@ class Profile:
     traits: tuple[tuple[str, str], ...]
 
     @classmethod
-    def of(cls, recording: Recording, options: CommonOptions) -> Profile:
+    def of(cls, recording: AnyRecording, options: CommonOptions) -> Profile:
         """That of a recording, as far as it matters for these options."""
+        if isinstance(recording, CollectedRecording):
+            return cls(traits=_collected_traits(recording, options))
         info = recording.info
         # A scaled arm (the tutorial's) has the same joints and limits; its lengths stay with each episode's sidecar.
         robot = info.robot.scaled(0.0)
-        traits = [("fps", str(info.fps)), ("robot", f"{info.robot.name} ({digest(robot)})")]
+        traits = [
+            ("kind of episode", "simulated"),
+            ("fps", str(info.fps)),
+            ("robot", f"{info.robot.name} ({digest(robot)})"),
+        ]
         cameras = [name for name in recording.cameras if options.takes(IMAGE_PREFIX + name)]
-        traits.append(("cameras", " ".join(cameras) or "none"))
-        for camera in cameras:
-            settings = recording.video_settings(camera)
-            traits.append((f"size of camera {camera}", f"{settings.width}x{settings.height}"))
-            traits.append((f"codec of camera {camera}", settings.codec))
+        traits += _camera_traits(recording, cameras)
         if options.privileged and options.takes(ENVIRONMENT_STATE):
             names = observation_names(info.robot, info.scene, privileged=True)[ENVIRONMENT_STATE]
             traits.append(("objects and goals", " ".join(dict.fromkeys(name.partition(".")[0] for name in names))))
@@ -109,6 +116,30 @@ class Profile:
             for what in mine
             if what in theirs and theirs[what] != mine[what]
         )
+
+
+def _camera_traits(recording: AnyRecording, cameras: Sequence[str]) -> Iterator[tuple[str, str]]:
+    yield "cameras", " ".join(cameras) or "none"
+    for camera in cameras:
+        settings = recording.video_settings(camera)
+        yield f"size of camera {camera}", f"{settings.width}x{settings.height}"
+        yield f"codec of camera {camera}", settings.codec
+
+
+def _collected_traits(recording: CollectedRecording, options: CommonOptions) -> tuple[tuple[str, str], ...]:
+    info = recording.info
+    wanted = [feature for feature in info.features if options.takes(feature.name)]
+    features = [(f"feature {feature.name}", ", ".join(feature.names)) for feature in wanted]
+    cameras = [name for name in recording.cameras if options.takes(IMAGE_PREFIX + name)]
+    names = ("features", " ".join(feature.name for feature in wanted))
+    return (
+        ("kind of episode", "collected"),
+        ("fps", str(info.fps)),
+        ("robot", info.robot),
+        names,
+        *features,
+        *_camera_traits(recording, cameras),
+    )
 
 
 class Intake:
@@ -159,7 +190,7 @@ def _refuse_differences(profile: Profile, reference: Path, paths: Iterable[Path]
     """
     files_by_difference: dict[str, list[str]] = {}
     for path in paths:
-        with Recording(path) as recording:
+        with open_recording(path) as recording:
             for difference in profile.differences(Profile.of(recording, options)):
                 files_by_difference.setdefault(difference, []).append(path.name)
     if files_by_difference:

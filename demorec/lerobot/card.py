@@ -12,11 +12,12 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from demorec.lerobot.commands import making_commands
 from demorec.lerobot.files import read_table
-from demorec.lerobot.layout import DatasetInfo, Feature
+from demorec.lerobot.layout import AUTOMATIC_FEATURES, DatasetInfo, Feature
 from demorec.lerobot.options import ExportOptions
 from demorec.lerobot.paths import SIDECAR_DIR
 from demorec.lerobot.reader import read_tasks
@@ -38,11 +39,13 @@ class CardFacts:
         options: Of the export.
         configs: Config digest -> configuration of the runs.
         is_transcoded: Whether any pictures were coded anew.
+        is_collected: Whether the episodes were collected, not simulated.
     """
 
     options: ExportOptions
     configs: Mapping[str, Any]
     is_transcoded: bool
+    is_collected: bool
 
 
 _MARK = "<!-- written by demorec, renewed at every export -->"
@@ -88,11 +91,16 @@ def _card(root: Path, info: DatasetInfo, about: CardFacts, has_sheet: bool) -> I
         "some pictures were coded anew" if about.is_transcoded else "every video packet is the one that was recorded"
     )
     yield from ("---", f"license: {options.license}", "task_categories:", "- robotics")
-    yield from ("tags:", "- LeRobot", "- demorec", "- simulation")
+    yield from ("tags:", "- LeRobot", "- demorec", *([] if about.is_collected else ["- simulation"]))
     yield from ("configs:", "- config_name: default", "  data_files: data/*/*.parquet", "---", _MARK)
     yield from (f"# {options.repo_id}", "")
+    whose = (
+        f"demonstrations of {info.robot_type}, collected"
+        if about.is_collected
+        else f"scripted demonstrations by a simulated {info.robot_type} arm in PyBullet"
+    )
     yield (
-        f"{info.total_episodes} scripted demonstrations by a simulated {info.robot_type} arm in PyBullet, "
+        f"{info.total_episodes} {whose}, "
         f"{info.total_frames} frames at {info.fps} Hz ({minutes:.1f} minutes), in the LeRobot v3.0 format. Recorded "
         f"and exported by demorec; {pictures}."
     )
@@ -106,8 +114,19 @@ def _card(root: Path, info: DatasetInfo, about: CardFacts, has_sheet: bool) -> I
     yield from (f'dataset = LeRobotDataset("{options.repo_id}", video_backend="pyav")', "```", "")
     yield from ("## Features", "", "| feature | type | shape | meaning |", "|---|---|---|---|")
     for key, item in info.features.items():
-        yield f"| `{key}` | {item.dtype} | {list(item.shape)} | {_meaning(key, item, options)} |"
+        yield f"| `{key}` | {item.dtype} | {list(item.shape)} | {_meaning(key, item, about)} |"
     yield from ("", "Names of all components are in `meta/info.json`.", "", "## Contract", "")
+    if about.is_collected:
+        yield (
+            "Row t holds what was recorded at frame t, as it came. LeRobot's timestamps are multiples of the nominal "
+            "period; the frames' own stamps, and how old each sample was, are in the recordings."
+        )
+        yield ""
+        yield from _success_section(_read_attempts(root))
+        yield from ("## What stands beside", "")
+        yield f"`{SIDECAR_DIR}/episodes/` says where each episode comes from, how it ended and what its cameras were."
+        yield ""
+        return
     yield (
         "Row t holds the observation at time t, taken before the action of row t is applied; the action is what the "
         "expert wanted to be reached at the next frame. Where exploration noise was added to what the motors got, the "
@@ -126,9 +145,11 @@ def _card(root: Path, info: DatasetInfo, about: CardFacts, has_sheet: bool) -> I
     yield from _origin_section(root, about)
 
 
-def _meaning(key: str, item: Feature, options: ExportOptions) -> str:
+def _meaning(key: str, item: Feature, about: CardFacts) -> str:
+    if about.is_collected and not key.startswith(IMAGE_PREFIX) and key not in AUTOMATIC_FEATURES and key != "next.done":
+        return "as it was collected"
     if key == ACTION:
-        return _ACTION_MEANING[options.action]
+        return _ACTION_MEANING[about.options.action]
     if item.is_depth:
         return "distance along the optical axis, 12-bit logarithmic codes of 0.01 to 10 m; 0.01 m: nothing was hit"
     if key.startswith(IMAGE_PREFIX):
@@ -157,6 +178,7 @@ def _origin_section(root: Path, about: CardFacts) -> Iterable[str]:
 class _Attempts:
     success: NDArray[np.bool_]  # (N,)
     reasons: list[str]
+    num_unknown: int
     positions: Mapping[str, NDArray[np.float64]]  # what -> (N, 2), nan where unknown
 
 
@@ -164,6 +186,9 @@ def _read_attempts(root: Path) -> _Attempts:
     columns = ["success", "failure_phase", "failure_reason", "object_x", "object_y", "goal_x", "goal_y"]
     files = sorted((root / SIDECAR_DIR / "attempts").glob("*/*.parquet"))
     table = pa.concat_tables([read_table(file, columns, schema=ATTEMPT_SCHEMA) for file in files])
+    is_known = pc.is_valid(table.column("success"))
+    num_unknown = len(table) - int(pc.sum(is_known).as_py() or 0)
+    table = table.filter(is_known)
     coordinates = {name: table.column(name).to_numpy().astype(np.float64) for name in columns[3:]}
     reasons = [
         f"{reason} in phase {phase}" if phase else reason
@@ -174,6 +199,7 @@ def _read_attempts(root: Path) -> _Attempts:
     return _Attempts(
         success=table.column("success").to_numpy().astype(np.bool_),
         reasons=reasons,
+        num_unknown=num_unknown,
         positions={
             "object": np.stack([coordinates["object_x"], coordinates["object_y"]], axis=1),
             "goal": np.stack([coordinates["goal_x"], coordinates["goal_y"]], axis=1),
@@ -185,6 +211,11 @@ def _success_section(attempts: _Attempts) -> Iterable[str]:
     total, good = len(attempts.success), int(attempts.success.sum())
     yield "## Success"
     yield ""
+    if attempts.num_unknown:
+        yield f"Of {attempts.num_unknown} episodes nobody said whether they succeeded."
+        yield ""
+    if not total:
+        return
     yield f"{good} of {total} attempts that were made for this dataset succeeded ({100 * good / total:.1f} %)."
     counts: dict[str, int] = {}
     for reason, success in zip(attempts.reasons, attempts.success, strict=True):

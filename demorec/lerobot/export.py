@@ -87,6 +87,7 @@ class _Export:
         self._digests: list[str] = []
         self._recordings: list[Path] = []
         self._intake = Intake(found, options)
+        self._is_collected = False
 
     def run(self, progress: ProgressCallback | None) -> ExportReport:
         aside = self._folder.with_name(CODED)  # is removed with everything beside the new folder
@@ -99,6 +100,7 @@ class _Export:
                 break
         self._intake.check()
         info = self._dataset_info(begun[-1])
+        self._is_collected = begun[-1].is_collected
         start = self._existing.writer if self._existing else WriterStart()
         sidecar_start = self._existing.sidecar if self._existing else SidecarStart()
         limits: dict[str, Any] = {"limit_mb": info.data_files_size_in_mb, "chunks_size": info.chunks_size}
@@ -111,7 +113,12 @@ class _Export:
             self._refuse_duplicates()
             finished = writer.finish()
             configs = sidecar.finish(self._about_this_export())
-        facts = CardFacts(options=self._options, configs=configs, is_transcoded=bool(self._transcoded))
+        facts = CardFacts(
+            options=self._options,
+            configs=configs,
+            is_transcoded=bool(self._transcoded),
+            is_collected=self._is_collected,
+        )
         write_card(self._folder, finished, facts)
         return ExportReport(
             path=self._folder,
@@ -177,7 +184,9 @@ class _Export:
 
     def _about_this_export(self) -> dict[str, Any]:
         options = self._options
+        held = {"hold_pictures": options.hold_pictures} if self._is_collected else {}
         return {
+            **held,
             "demorec": version("demorec"),
             "action": options.action,
             "privileged": options.privileged,

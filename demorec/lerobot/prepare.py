@@ -5,14 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from demorec.export.columns import DONE, REWARD, SUCCESS, check_feature_names, feature_columns, frame_stride
+from demorec.lerobot.collected import collected_features, prepare_collected, reasons_to_transcode
 from demorec.lerobot.depth import depth_info, depth_video
 from demorec.lerobot.layout import AUTOMATIC_FEATURES, Feature
 from demorec.lerobot.options import ExportOptions
-from demorec.lerobot.sidecar import EpisodeRecord
+from demorec.lerobot.sidecar import AttemptRecord, EpisodeRecord
 from demorec.lerobot.stats import PixelHistogram, colour_levels
-from demorec.lerobot.transcode import coded_videos, dataset_settings, video_info
+from demorec.lerobot.transcode import coded_videos, dataset_settings, reason_to_transcode, video_info
 from demorec.lerobot.writer import EpisodeData
-from demorec.recording import Recording
+from demorec.recording import AnyRecording, CollectedRecording
 from demorec.scene.features import ACTION, DEPTH_SUFFIX, IMAGE_PREFIX, action_names, observation_names
 
 _SCALARS = {
@@ -30,13 +31,15 @@ class PreparedEpisode:
     record: EpisodeRecord
 
 
-def dataset_features(recording: Recording, options: ExportOptions) -> dict[str, Feature]:
+def dataset_features(recording: AnyRecording, options: ExportOptions) -> dict[str, Feature]:
     """The features that recordings like this one give with these options, in the order of the dataset.
 
     Raises:
         ConfigError: `options.features` names one that they do not give.
         ConfigError: The wanted fps does not divide that of the recording.
     """
+    if isinstance(recording, CollectedRecording):
+        return collected_features(recording, options)
     info = recording.info
     stride = frame_stride(info.fps, options.fps)
     features = {
@@ -65,13 +68,28 @@ def _camera_feature(shape: tuple[int, int, int], info: dict[str, object]) -> Fea
     return Feature(dtype="video", shape=shape, names=("height", "width", "channels"), info=info)
 
 
-def prepare_episode(recording: Recording, options: ExportOptions, *, code_depth: bool = True) -> PreparedEpisode:
+def transcoded_cameras(recording: AnyRecording, options: ExportOptions) -> tuple[str, ...]:
+    """Cameras whose pictures have to be coded anew, with the reason."""
+    if isinstance(recording, CollectedRecording):
+        reasons = reasons_to_transcode(recording, options)
+    else:
+        stride = frame_stride(recording.info.fps, options.fps)
+        features = dataset_features(recording, options)
+        cameras = [name for name in recording.cameras if IMAGE_PREFIX + name in features]
+        reasons = {name: reason_to_transcode(recording.video_settings(name), stride) for name in cameras}
+    return tuple(f"{camera}, {reason}" for camera, reason in reasons.items() if reason)
+
+
+def prepare_episode(recording: AnyRecording, options: ExportOptions, *, code_depth: bool = True) -> PreparedEpisode:
     """Read a recording into memory, as the dataset wants it; depth videos, which must be coded, only with `code_depth`.
 
     Raises:
         ExportError: It has no frames, or a kind of picture is missing that was asked for.
         RecordingError: It is damaged.
     """
+    if isinstance(recording, CollectedRecording):
+        episode, row = prepare_collected(recording, options)
+        return PreparedEpisode(data=episode, record=EpisodeRecord.of_collected(row, AttemptRecord.of(recording)))
     stride = frame_stride(recording.info.fps, options.fps)
     wanted = dataset_features(recording, options)
     columns = feature_columns(recording, options)

@@ -14,12 +14,10 @@ from demorec.export.options import ProgressCallback
 from demorec.export.sources import ExportSource, Profile, goes_in, is_among_episodes
 from demorec.lerobot.layout import Feature
 from demorec.lerobot.options import ExportOptions
-from demorec.lerobot.prepare import PreparedEpisode, dataset_features, prepare_episode
+from demorec.lerobot.prepare import PreparedEpisode, dataset_features, prepare_episode, transcoded_cameras
 from demorec.lerobot.sidecar import AttemptRecord
-from demorec.lerobot.transcode import reason_to_transcode
 from demorec.processes import SPAWN
-from demorec.recording import Recording
-from demorec.scene.features import IMAGE_PREFIX
+from demorec.recording import CollectedRecording, open_recording
 
 _BYTES_THAT_PAY = 1 << 30
 """Reading is so quick that starting processes pays from about a gigabyte of recordings on (benchmarks/export.py)."""
@@ -37,6 +35,7 @@ class Reading:
         profile: What must agree with all the others.
         features, fps, robot: Of a dataset made from it.
         transcoded: Cameras whose pictures had to be coded anew, with the reason.
+        is_collected: Whether the episode was collected, not simulated.
         prepared: The episode; None for a failed attempt that is left out.
     """
 
@@ -47,6 +46,7 @@ class Reading:
     fps: int
     robot: str
     transcoded: tuple[str, ...]
+    is_collected: bool
     prepared: PreparedEpisode | None
 
 
@@ -57,23 +57,21 @@ def read(source: ExportSource, options: ExportOptions) -> Reading | None:
         RecordingError: It is damaged.
         ExportError: It has no frames, or its fps is no multiple of the wanted one.
     """
-    with Recording(source.path) as recording:
+    with open_recording(source.path) as recording:
         info = recording.info
         if not is_among_episodes(recording, options):
             return None
         attempt = AttemptRecord.of(recording)
-        stride = frame_stride(info.fps, options.fps)
         features = dataset_features(recording, options)
-        cameras = [name for name in recording.cameras if IMAGE_PREFIX + name in features]
-        reasons = {name: reason_to_transcode(recording.video_settings(name), stride) for name in cameras}
         return Reading(
             path=source.path,
             attempt=attempt,
             profile=Profile.of(recording, options),
             features=features,
-            fps=info.fps // stride,
-            robot=info.robot.name,
-            transcoded=tuple(f"{camera}, {reason}" for camera, reason in reasons.items() if reason),
+            fps=info.fps // frame_stride(info.fps, options.fps),
+            robot=info.robot if isinstance(info.robot, str) else info.robot.name,
+            transcoded=transcoded_cameras(recording, options),
+            is_collected=isinstance(recording, CollectedRecording),
             prepared=prepare_episode(recording, options) if goes_in(source, recording, options) else None,
         )
 

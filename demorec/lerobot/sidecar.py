@@ -28,7 +28,7 @@ from demorec.lerobot.parquet import RollingParquet, vector_array
 from demorec.lerobot.paths import SIDECAR_DIR
 from demorec.lerobot.writer import WrittenEpisode, write_text
 from demorec.plain import to_json, to_plain
-from demorec.recording import Recording
+from demorec.recording import AnyRecording, CollectedRecording, Recording
 from demorec.scene.episode import EpisodeColumns, Outcome
 from demorec.scene.scene import Scene
 
@@ -111,12 +111,15 @@ ATTEMPT_SCHEMA = pa.schema(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class AttemptRecord:
-    """One attempt, as far as success rates need it; positions in the world frame, metres, at the start."""
+    """One attempt, as far as success rates need it; positions in the world frame, metres, at the start.
+
+    `success` is None where nobody said: of a collected episode.
+    """
 
     source: str
     run_episode_index: int
     attempt: int
-    success: bool
+    success: bool | None
     failure_phase: str
     failure_reason: str
     object: str
@@ -126,8 +129,10 @@ class AttemptRecord:
     goal_y: float | None
 
     @classmethod
-    def of(cls, recording: Recording) -> AttemptRecord:
+    def of(cls, recording: AnyRecording) -> AttemptRecord:
         """From the recording's metadata alone."""
+        if isinstance(recording, CollectedRecording):
+            return cls._of_collected(recording)
         info, outcome = recording.info, _outcome(recording)
         name, object_position, goal_position = "", (None, None), (None, None)
         if info.scene.goals:
@@ -151,6 +156,23 @@ class AttemptRecord:
             goal_y=goal_position[1],
         )
 
+    @classmethod
+    def _of_collected(cls, recording: CollectedRecording) -> AttemptRecord:
+        outcome = recording.outcome
+        return cls(
+            source=recording.path.name,
+            run_episode_index=recording.info.episode_index,
+            attempt=0,
+            success=None if outcome is None else outcome.success,
+            failure_phase="",
+            failure_reason="cut off by a crash" if outcome is None else outcome.reason,
+            object="",
+            object_x=None,
+            object_y=None,
+            goal_x=None,
+            goal_y=None,
+        )
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class EpisodeRecord:
@@ -168,6 +190,11 @@ class EpisodeRecord:
     moving_cameras: Mapping[str, Array]
     config_digest: str
     config: Mapping[str, Any]
+
+    @classmethod
+    def of_collected(cls, row: Mapping[str, Any], attempt: AttemptRecord) -> EpisodeRecord:
+        """Of a collected episode, of which there is no config and no pose."""
+        return cls(row=row, attempt=attempt, moving_cameras={}, config_digest="", config={})
 
     @classmethod
     def of(cls, recording: Recording, columns: EpisodeColumns, rows: NDArray[np.intp]) -> EpisodeRecord:
@@ -308,7 +335,8 @@ class SidecarWriter:
         """What belongs to an episode of the dataset."""
         episode_index = written.episode_index
         self._episode_rows.append({"episode_index": episode_index, "content_digest": written.digest, **record.row})
-        self._configs.setdefault(record.config_digest, record.config)
+        if record.config_digest or record.config:
+            self._configs.setdefault(record.config_digest, record.config)
         self.add_attempt(record.attempt, in_dataset=True)
         if record.moving_cameras:
             self._add_camera_poses(episode_index, record.moving_cameras)

@@ -23,13 +23,15 @@ from typing import Any
 import numpy as np
 
 from demorec.errors import DemorecError, ExportError, in_words, resource_error
+from demorec.export.collected import shown_pictures
 from demorec.export.columns import frame_stride
+from demorec.lerobot.collected import reasons_to_transcode
 from demorec.lerobot.depth import code_values, quantised
 from demorec.lerobot.options import ExportOptions
 from demorec.lerobot.prepare import prepare_episode
 from demorec.lerobot.transcode import reason_to_transcode
 from demorec.processes import SPAWN
-from demorec.recording import Recording
+from demorec.recording import AnyRecording, CollectedRecording, open_recording
 from demorec.scene.features import DEPTH_SUFFIX, IMAGE_PREFIX
 
 LEROBOT = "lerobot[dataset]>=0.6.1,<0.7"
@@ -140,14 +142,13 @@ def _verify(root: Path, samples: tuple[Sample, ...], options: ExportOptions) -> 
         ) from error
     frames = 0
     for number, sample in enumerate(samples):
-        with Recording(sample.recording) as recording:
+        with open_recording(sample.recording) as recording:
             frames += _compare_episode(dataset, sample, recording, options, number)
     return frames
 
 
-def _compare_episode(dataset: Any, sample: Sample, recording: Recording, options: ExportOptions, number: int) -> int:
+def _compare_episode(dataset: Any, sample: Sample, recording: AnyRecording, options: ExportOptions, number: int) -> int:
     expected = prepare_episode(recording, options, code_depth=False).data
-    stride = frame_stride(recording.info.fps, options.fps)
     first = int(dataset.meta.episodes[sample.episode_index]["dataset_from_index"])
     # The last frame, where offsets add up, and one more that differs from episode to episode.
     moments = sorted({(number * 37) % expected.num_frames, expected.num_frames - 1})
@@ -167,7 +168,7 @@ def _compare_episode(dataset: Any, sample: Sample, recording: Recording, options
         if float(item["timestamp"]) != float(np.float32(moment / dataset.meta.fps)):
             wrong.append("timestamp")
         for camera in recording.cameras:
-            wrong += _wrong_pictures(item, recording, camera, moment, stride)
+            wrong += _wrong_pictures(item, recording, camera, moment, options)
         if wrong:
             raise ExportError(
                 f"The new dataset was dropped: read through LeRobot, {', '.join(wrong)} of frame {moment} of episode "
@@ -181,9 +182,23 @@ def _equal(tensor: Any, values: Any) -> bool:
     return bool(np.array_equal(found.reshape(-1), np.asarray(values).reshape(-1)))
 
 
-def _wrong_pictures(item: Any, recording: Recording, camera: str, moment: int, stride: int) -> list[str]:
-    wrong = []
+def _is_wrong_collected(
+    tensor: Any, recording: CollectedRecording, camera: str, moment: int, options: ExportOptions
+) -> bool:
+    """Whether a picture differs from the one that the frame shows."""
+    shown = shown_pictures(recording, recording.columns(), camera, options)
+    expected = recording.picture(camera, int(shown[moment]))
+    limit = _TRANSCODED_TOLERANCE if reasons_to_transcode(recording, options)[camera] else 0.0
+    found = tensor.numpy().transpose(1, 2, 0).astype(np.float64)
+    return bool(np.abs(found - expected).mean() > limit)
+
+
+def _wrong_pictures(item: Any, recording: AnyRecording, camera: str, moment: int, options: ExportOptions) -> list[str]:
+    wrong: list[str] = []
     key = IMAGE_PREFIX + camera
+    if isinstance(recording, CollectedRecording):
+        return [key] if key in item and _is_wrong_collected(item[key], recording, camera, moment, options) else []
+    stride = frame_stride(recording.info.fps, options.fps)
     if key in item:
         settings = recording.video_settings(camera)
         found = item[key].numpy().transpose(1, 2, 0).astype(np.float64)

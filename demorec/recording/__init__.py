@@ -12,6 +12,7 @@ with Recording(path) as recording:
 
 from demorec.recording.collected.reader import CollectedRecording
 from demorec.recording.collected.writer import CollectedWriter
+from demorec.recording.opening import AnyRecording, open_recording
 from demorec.recording.pixels import PixelStatistics
 from demorec.recording.recording import Recording
 from demorec.recording.recover import Recovered, recover
@@ -19,6 +20,7 @@ from demorec.recording.video import VideoPacket, VideoSettings
 from demorec.recording.writer import EpisodeWriter, WriteStats
 
 __all__ = [
+    "AnyRecording",
     "CollectedRecording",
     "CollectedWriter",
     "EpisodeWriter",
@@ -28,5 +30,6 @@ __all__ = [
     "VideoPacket",
     "VideoSettings",
     "WriteStats",
+    "open_recording",
     "recover",
 ]

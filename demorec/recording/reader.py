@@ -24,6 +24,10 @@ from demorec.scene.episode import EpisodeColumns, Event, JointSample, frame_time
 from demorec.scene.urdf import check_primitives
 
 
+class CollectedEpisodeError(RecordingError):
+    """The recording is one of a collected episode, which `CollectedRecording` reads."""
+
+
 class RecordingReader(EpisodeFile):
     """What one file holds: numbers as columns, pictures as packets or decoded, labels; a context manager.
 
@@ -40,7 +44,7 @@ class RecordingReader(EpisodeFile):
     def _read_metadata(self) -> None:
         found = self._container.metadata(metadata.EPISODE)
         if found is None and metadata.COLLECTED in self._container.metadata_names:
-            raise RecordingError(
+            raise CollectedEpisodeError(
                 "This needs an episode that demorec simulated; this one was collected from another robot or program "
                 f"and has no scene: {self.path}"
             )

@@ -263,7 +263,7 @@ def is_keyframe(codec: str, data: bytes) -> bool:
     """
     if codec == "h264":
         return any(head & 31 == 5 for head in _nal_heads(data, lambda head: head & 31 in (1, 5)))
-    if codec == "h265":
+    if codec in ("h265", "hevc"):
         return any(16 <= head >> 1 <= 21 for head in _nal_heads(data, lambda head: head >> 1 < 32))
     if codec == "av1":
         return any(kind == 1 for kind in _obu_types(data))

@@ -68,7 +68,7 @@ def main(folder: str, num_episodes: int = 2, seconds: float = 2.0) -> None:
                     position = arm.read()
                     target = np.full(len(JOINTS), np.sin(step / 10))
                     arm.send(target)
-                    images = {"top": camera.latest()} if step % 3 else {}  # sometimes there is none
+                    images = {"top": camera.latest()} if step % 3 < 2 else {}  # sometimes there is none
                     episode.write(position, target, images)
                 episode.success = True
         print(f"{recorder.num_episodes} episodes in {recorder.path}")

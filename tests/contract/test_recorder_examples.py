@@ -51,7 +51,7 @@ def test_a_robots_loop(runs: Path) -> None:
         assert row.tolist() == [position] * 6
         position += 0.5 * (target - position)
     held = columns.pictures["top"]
-    assert [int(number) for number in held] == [-1 if step % 3 == 0 else step - 1 - step // 3 for step in range(60)]
+    assert [int(number) for number in held] == [-1 if step % 3 == 2 else step - step // 3 for step in range(60)]
     assert (columns.picture_age_ns("top") >= 0).all()  # taken before the frame was written
 
 

@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 import json
 from collections.abc import Iterator
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,6 +89,11 @@ class CollectedRecording(EpisodeFile):
 
     def columns(self) -> CollectedColumns:
         """All numbers, one row a frame, to the bit as they were written, and which pictures the frames hold."""
+        return self._columns
+
+    @cached_property
+    def _columns(self) -> CollectedColumns:
+        """Read once: an export and a check look at them from several sides."""
         streams = feature_streams(self.info)
         picture_topics = {camera: self._picture_topic(camera) for camera in self.cameras}
         blocks = self._container.blocks((FRAMES, *(stream.topic for stream in streams.values())))
@@ -151,7 +157,11 @@ class CollectedRecording(EpisodeFile):
             IndexError: There is no such frame; negative ones count from the end.
         """
         number = int(self.columns().pictures[camera][range(self.num_frames)[frame]])
-        return None if number == NO_PICTURE else self._image(camera, number)
+        return None if number == NO_PICTURE else self.picture(camera, number)
+
+    def picture(self, camera: str, number: int) -> Rgb:
+        """One decoded picture of a camera, (H, W, 3) uint8 RGB, by its own number."""
+        return self._image(camera, number)
 
     def digest(self) -> str:
         """SHA-256 (hex) of the content: metadata, numbers, stamps, coded pictures; not of what versions wrote it."""

@@ -1,0 +1,169 @@
+"""The recording of a collected episode to an episode of a dataset: its packets as they are, where that is possible."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.config import VideoConfig
+from demorec.errors import ExportError
+from demorec.export.collected import check_options, collected_data, shown_pictures, wanted_cameras
+from demorec.export.columns import DONE
+from demorec.lerobot.layout import AUTOMATIC_FEATURES, Feature
+from demorec.lerobot.mp4 import CodedVideo
+from demorec.lerobot.options import ExportOptions
+from demorec.lerobot.stats import PixelHistogram, colour_levels
+from demorec.lerobot.transcode import video_info
+from demorec.lerobot.writer import EpisodeData
+from demorec.plain import to_json
+from demorec.recording import CollectedRecording, VideoSettings
+from demorec.recording.video import Rgb, make_encoder
+from demorec.scene.features import IMAGE_PREFIX
+
+_MP4_CODECS = {"h265": "hevc"}
+"""Names that mp4 files and LeRobot have for codecs."""
+
+
+def collected_features(recording: CollectedRecording, options: ExportOptions) -> dict[str, Feature]:
+    """The features that recordings like this one give with these options; ConfigError as `check_options`."""
+    check_options(recording, options)
+    features = {
+        feature.name: Feature(dtype="float32", shape=(len(feature.names),), names=feature.names)
+        for feature in recording.info.features
+        if options.takes(feature.name)
+    }
+    reasons = reasons_to_transcode(recording, options)
+    for camera in wanted_cameras(recording, options):
+        settings = _dataset_settings(recording, camera, options.transcode, reasons[camera])
+        info = video_info(settings)
+        info["video.codec"] = _MP4_CODECS.get(settings.codec, settings.codec)
+        shape = (settings.height, settings.width, 3)
+        features[IMAGE_PREFIX + camera] = Feature(
+            dtype="video", shape=shape, names=("height", "width", "channels"), info=info
+        )
+    return {**features, DONE: Feature(dtype="bool", shape=(1,)), **AUTOMATIC_FEATURES}
+
+
+def reasons_to_transcode(recording: CollectedRecording, options: ExportOptions) -> dict[str, str]:
+    """Camera -> why its pictures cannot be taken over, in words; "" if they can."""
+    columns = recording.columns()
+    reasons = {}
+    for camera in wanted_cameras(recording, options):
+        numbers = shown_pictures(recording, columns, camera, options)
+        if recording.video_settings(camera).codec == "jpeg":
+            reasons[camera] = "jpeg pictures are no video"
+        elif len(numbers) and (np.diff(numbers) != 1).any():
+            reasons[camera] = "frames show pictures again, or leave some out"
+        elif len(numbers) and not _is_keyframe(recording, camera, int(numbers[0])):
+            reasons[camera] = "the first frame's picture is no keyframe"
+        else:
+            reasons[camera] = ""
+    return reasons
+
+
+def _is_keyframe(recording: CollectedRecording, camera: str, number: int) -> bool:
+    return next(packet.is_keyframe for packet in recording.packets(camera) if packet.frame_index == number)
+
+
+def _dataset_settings(recording: CollectedRecording, camera: str, video: VideoConfig, reason: str) -> VideoSettings:
+    settings = recording.video_settings(camera)
+    if not reason:
+        return settings
+    return make_encoder(video=video, width=settings.width, height=settings.height, fps=recording.info.fps).settings
+
+
+def prepare_collected(recording: CollectedRecording, options: ExportOptions) -> tuple[EpisodeData, dict[str, Any]]:
+    """Read a recording into memory, as the dataset wants it, and as its row in the sidecar says it.
+
+    Raises:
+        ExportError: It has no frames, or frames without pictures.
+        RecordingError: It is damaged.
+    """
+    wanted = collected_features(recording, options)
+    data = collected_data(recording, options)
+    reasons = reasons_to_transcode(recording, options)
+    videos, pixels = {}, {}
+    for camera, numbers in data.pictures.items():
+        key = IMAGE_PREFIX + camera
+        videos[key] = (
+            _transcoded(recording, camera, options.transcode, numbers)
+            if reasons[camera]
+            else _kept(recording, camera, numbers)
+        )
+        statistics = recording.pixel_statistics(camera)
+        pixels[key] = PixelHistogram(
+            counts=statistics.counts, level_values=colour_levels(), num_pictures=statistics.num_images
+        )
+    episode = EpisodeData(
+        task=recording.info.instruction,
+        columns=data.features,
+        videos=videos,
+        video_info={key: wanted[key].info or {} for key in videos},
+        pixels=pixels,
+    )
+    return episode, _sidecar_row(recording)
+
+
+def _kept(recording: CollectedRecording, camera: str, numbers: NDArray[np.int64]) -> CodedVideo:
+    settings = recording.video_settings(camera)
+    block = recording.coded_pictures(camera).select(numbers.astype(np.intp))
+    codec = _MP4_CODECS.get(settings.codec, settings.codec)
+    return CodedVideo.of_access_units(codec, settings.width, settings.height, block.joined(), block.lengths)
+
+
+def _transcoded(
+    recording: CollectedRecording, camera: str, video: VideoConfig, numbers: NDArray[np.int64]
+) -> CodedVideo:
+    settings = recording.video_settings(camera)
+    encoder = make_encoder(video=video, width=settings.width, height=settings.height, fps=recording.info.fps)
+    units = [unit for picture in shown_images(recording, camera, numbers) for unit in encoder.encode(picture)]
+    units += encoder.finish()
+    lengths = [len(unit) for unit in units]
+    return CodedVideo.of_access_units(encoder.settings.codec, settings.width, settings.height, b"".join(units), lengths)
+
+
+def shown_images(recording: CollectedRecording, camera: str, numbers: NDArray[np.int64]) -> Iterator[Rgb]:
+    """The decoded pictures that frames show, one a frame, of which `numbers` never decrease.
+
+    Raises:
+        ExportError: They do.
+    """
+    if (np.diff(numbers) < 0).any():
+        raise ExportError(f"The pictures of the camera {camera} are not in the order of the frames: {recording.path}")
+    images = enumerate(recording.images(camera))
+    number, picture = next(images)
+    for wanted in numbers.tolist():
+        while number < wanted:
+            number, picture = next(images)
+        yield picture
+
+
+def _sidecar_row(recording: CollectedRecording) -> dict[str, Any]:
+    """What is known of the episode beside LeRobot's columns; what a simulated one has more is null."""
+    info, outcome = recording.info, recording.outcome
+    return {
+        "source": recording.path.name,
+        "run_episode_index": info.episode_index,
+        "attempt": 0,
+        "origin": to_json(info.origin),
+        "frame_stride": 1,
+        "success": None if outcome is None else outcome.success,
+        "failure_reason": "cut off by a crash" if outcome is None else outcome.reason,
+        "cameras": [
+            {
+                "name": camera.name,
+                "width": camera.width,
+                "height": camera.height,
+                "intrinsics": None if camera.intrinsics is None else list(camera.intrinsics),
+                "mount": camera.mount or None,
+                "mount_from_camera": (
+                    None if camera.mount_from_camera is None else camera.mount_from_camera.vector().tolist()
+                ),
+            }
+            for camera in info.cameras
+        ],
+        "episode_info": to_json(info),
+    }

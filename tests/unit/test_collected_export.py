@@ -1,0 +1,152 @@
+"""Collected episodes as datasets: numbers and packets are those of the recordings, nothing is filled in."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from support.collected import TOP, Episode, make_collected, write_collected
+from support.export import data_table, export
+from support.recording import write_episode
+
+from demorec.errors import ConfigError, ExportError
+from demorec.recording import CollectedRecording
+
+
+def run_of(folder: Path, *episodes: Episode) -> Path:
+    (folder / "episodes").mkdir(parents=True)
+    for number, episode in enumerate(episodes):
+        write_collected(folder / "episodes" / f"episode_{number:06d}.mcap", episode)
+    return folder
+
+
+def complete(**arguments: Any) -> Episode:
+    """An episode in which every frame has its picture."""
+    return make_collected(cameras=(TOP,), **arguments)
+
+
+def test_numbers_are_those_of_the_recordings(tmp_path: Path) -> None:
+    episodes = [complete(num_frames=length, episode_index=index) for index, length in enumerate((20, 33))]
+    report = export(run_of(tmp_path / "run", *episodes), tmp_path / "d")
+    assert (report.num_episodes, report.num_frames, report.transcoded) == (2, 53, ())
+    table = data_table(tmp_path / "d")
+    for name in ("observation.state", "observation.force", "action"):
+        expected = [frame.samples[name].vector.astype(np.float32) for episode in episodes for frame in episode.frames]
+        assert np.array_equal(np.array(table.column(name).to_pylist(), dtype=np.float32), np.array(expected)), name
+    assert [index for index, done in enumerate(table.column("next.done").to_pylist()) if done] == [19, 52]
+    info = json.loads((tmp_path / "d" / "meta" / "info.json").read_text())
+    assert info["features"]["observation.state"]["names"] == ["shoulder.pos", "elbow.pos", "gripper.pos"]
+    assert "next.success" not in info["features"]
+    card = (tmp_path / "d" / "README.md").read_text()
+    assert "2 demonstrations of two_joints, collected" in card
+    assert "scripted" not in card
+
+
+def test_packets_go_into_the_dataset_as_they_are(tmp_path: Path) -> None:
+    run = run_of(tmp_path / "run", complete())
+    export(run, tmp_path / "d")
+    with CollectedRecording(run / "episodes" / "episode_000000.mcap") as recording:
+        recorded = list(recording.images("top"))
+    with av.open(str(next((tmp_path / "d" / "videos").rglob("*.mp4")))) as file:
+        shown = [frame.to_ndarray(format="rgb24") for frame in file.decode(video=0)]
+    assert len(shown) == len(recorded) == 45
+    assert all(np.array_equal(a, b) for a, b in zip(shown, recorded, strict=True))
+
+
+def test_a_missing_picture_is_an_error_unless_the_last_may_be_held(tmp_path: Path) -> None:
+    episode = complete(num_frames=30)
+    gap = [replace(frame, pictures={}) if index in (7, 8) else frame for index, frame in enumerate(episode.frames)]
+    run = run_of(tmp_path / "run", replace(episode, frames=gap))
+    age = episode.frames[8].time_ns - episode.pictures["top"][6][0]
+    with pytest.raises(ExportError, match="Frame 7 has no picture of the camera top, as 2 of 30 frames"):
+        export(run, tmp_path / "d")
+    with pytest.raises(ExportError, match="Frame 8"):
+        export(run, tmp_path / "d", hold_pictures=(age - 10**6) / 1e9)
+    report = export(run, tmp_path / "d", hold_pictures=(age + 10**6) / 1e9)
+    assert report.transcoded == ("top, frames show pictures again, or leave some out",)
+    with av.open(str(next((tmp_path / "d" / "videos").rglob("*.mp4")))) as file:
+        shown = [float(frame.to_ndarray(format="rgb24")[30, 30, 1]) for frame in file.decode(video=0)]
+    assert np.abs(np.array(shown) - [5 * (6 if index in (7, 8) else index) for index in range(30)]).max() < 12
+    assert json.loads((tmp_path / "d" / "demorec" / "export.json").read_text())["hold_pictures"] > 0
+    first = replace(episode, frames=[replace(episode.frames[0], pictures={}), *episode.frames[1:]])
+    with pytest.raises(ExportError, match="none came before it: leave the camera"):
+        export(run_of(tmp_path / "first", first), tmp_path / "e", hold_pictures=9)
+
+
+def test_failures_stay_out_and_unknown_outcomes_do_not(tmp_path: Path) -> None:
+    outcomes = (True, False, None)
+    run = run_of(
+        tmp_path / "run",
+        *(complete(num_frames=5, episode_index=index, success=success) for index, success in enumerate(outcomes)),
+    )
+    report = export(run, tmp_path / "d")
+    assert (report.num_episodes, report.skipped_failures) == (2, 1)
+    table = pq.read_table(next((tmp_path / "d" / "demorec" / "episodes").rglob("*.parquet")))
+    assert table.column("success").to_pylist() == [True, None]
+    card = (tmp_path / "d" / "README.md").read_text()
+    assert "1 of 2 attempts" in card
+    assert "Of 1 episodes nobody said" in card
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"action": "ee"}, "exported as they came"),
+        ({"privileged": True}, "privileged is asked for"),
+        ({"depth": True}, "depth is asked for"),
+        ({"fps": 10}, "was collected at 30"),
+        ({"features": ("observation.forse",)}, "Unknown feature 'observation.forse'.*observation.force"),
+    ],
+)
+def test_options_that_a_collected_episode_cannot_serve(tmp_path: Path, options: dict[str, Any], words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        export(run_of(tmp_path / "run", complete(num_frames=5)), tmp_path / "d", **options)
+
+
+def test_episodes_of_other_kinds_do_not_mix(tmp_path: Path) -> None:
+    run = run_of(tmp_path / "run", complete(num_frames=5))
+    write_episode(tmp_path / "run" / "episodes" / "episode_000001.mcap", num_frames=5)
+    with pytest.raises(ExportError, match="kind of episode is simulated instead of collected"):
+        export(run, tmp_path / "d")
+
+
+def test_a_dataset_can_be_appended_to(tmp_path: Path) -> None:
+    export(run_of(tmp_path / "a", complete(num_frames=5)), tmp_path / "d")
+    report = export(run_of(tmp_path / "b", complete(num_frames=7, episode_index=3)), tmp_path / "d", append=True)
+    assert (report.num_episodes, report.num_frames) == (2, 12)
+
+
+def test_kept_h265_becomes_hevc(tmp_path: Path) -> None:
+    from typing import cast
+
+    from demorec.recording import CollectedWriter
+
+    context = cast(av.VideoCodecContext, av.CodecContext.create("libx265", "w"))
+    context.width, context.height, context.pix_fmt, context.time_base = 64, 48, "yuv420p", Fraction(1, 30)
+    context.options = {"tune": "zerolatency", "x265-params": "log-level=none:bframes=0:keyint=5"}
+    episode = make_collected(num_frames=12, cameras=(replace(TOP, kept="h265"),))
+    packets = []
+    for index in range(12):
+        frame = av.VideoFrame.from_ndarray(np.full((48, 64, 3), 9 * index, dtype=np.uint8), format="rgb24")
+        frame.pts = index
+        packets += [bytes(packet) for packet in context.encode(frame)]
+    packets += [bytes(packet) for packet in context.encode(None)]
+    (tmp_path / "run" / "episodes").mkdir(parents=True)
+    with CollectedWriter(tmp_path / "run" / "episodes" / "episode_000000.mcap", episode.info) as writer:
+        for frame_, packet in zip(episode.frames, packets, strict=True):
+            writer.picture("top", frame_.time_ns, packet)
+            writer.write(frame_)
+        writer.finish(episode.outcome)
+    report = export(tmp_path / "run", tmp_path / "d")
+    assert report.transcoded == ()
+    with av.open(str(next((tmp_path / "d" / "videos").rglob("*.mp4")))) as file:
+        assert file.streams.video[0].codec_context.name == "hevc"
+        shown = [int(picture.to_ndarray(format="rgb24").mean()) for picture in file.decode(video=0)]
+    assert np.abs(np.array(shown) - 9 * np.arange(12)).max() < 6
