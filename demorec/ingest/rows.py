@@ -88,7 +88,6 @@ class Timelines:
         self.lines: dict[Key, Timeline] = {
             key: _from_keyframe(stream, timeline(stream, mapping)) for key, stream in self.streams.items()
         }
-        self._by_topic = {stream.topic: self.lines[key] for key, stream in self.streams.items()}
 
     def rule(self, key: Key) -> tuple[Sampling, int]:
         """How a stream is sampled, and how old what it gives may be, nanoseconds."""
@@ -107,7 +106,7 @@ class Timelines:
     def rows(self, window: Window) -> EpisodeRows:
         """The rows of an episode; NoRowsError where a stream has nothing fit for them."""
         begin, end = self._extent(window)
-        times = self._times(begin, end)
+        times = self._times(begin, end, window)
         if len(times) < 2:
             raise NoRowsError(f"only {len(times)} rows have all streams")
         chosen = {key: self.chosen(key, times) for key in self.lines}
@@ -137,7 +136,7 @@ class Timelines:
             times_ns=times[:count],
             features={name: _first_rows(features[name], count) for name in self.mapping.features},
             cameras=cameras,
-            trimmed_ns=(begin - window.begin_ns, max(0, window.end_ns - end)),
+            trimmed_ns=(int(times[0]) - window.begin_ns, max(0, window.end_ns - end)),
         )
 
     def chosen(self, key: Key, times: Int) -> Chosen:
@@ -177,14 +176,22 @@ class Timelines:
             age = min(age, line.period_ns if sample == "latest" else line.period_ns // 2)
         return int(line.times_ns[last]) + (0 if sample == "linear" else age)
 
-    def _times(self, begin: int, end: int) -> Int:
-        topic = self.mapping.clock.rows
-        if topic == "grid":
-            return grid(begin, end, self.mapping.clock.fps)
-        if topic not in self._by_topic:
-            raise BagError(f"clock.rows is {topic!r}, of which the mapping takes no feature or camera")
-        times = self._by_topic[topic].times_ns
-        return times[(times >= begin) & (times <= end)]
+    def _times(self, begin: int, end: int, window: Window) -> Int:
+        clock = self.mapping.clock
+        if clock.rows == "grid":
+            return grid(begin, end, clock.fps)
+        key = next((key for key, stream in self.streams.items() if stream.topic == clock.rows), None)
+        if key is None:
+            raise BagError(f"clock.rows is {clock.rows!r}, of which the mapping takes no feature or camera")
+        line, heads = self.lines[key], self.streams[key].heads
+        inside = np.flatnonzero((line.times_ns >= begin) & (line.times_ns <= end))
+        if heads:
+            # Video that begins with a keyframe goes into a dataset as it is.
+            keyframes = [place for place in inside if heads[int(line.order[place])].is_keyframe]
+            limit = window.begin_ns + round(clock.max_trim_s * NS)
+            if keyframes and line.times_ns[keyframes[0]] <= limit:
+                inside = inside[inside >= keyframes[0]]
+        return line.times_ns[inside]
 
     def _label(self, key: Key) -> str:
         stream = self.streams[key]

@@ -8,12 +8,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import av
 import numpy as np
 import pytest
+from av.bitstream import BitStreamFilterContext
 from PIL import Image
 from rosbags.rosbag2 import StoragePlugin
 from support import bag_mappings, bags
 
+from demorec.cli import main
 from demorec.errors import ConfigError
 from demorec.ingest.channel import BagError
 from demorec.ingest.import_run import import_bags
@@ -269,3 +272,50 @@ def test_pictures_of_jpeg_are_what_the_camera_sent(tmp_path: Path) -> None:
         for shown, stamp in zip(recording.images("front"), stamps.tolist(), strict=True):
             expected = np.asarray(Image.open(io.BytesIO(bags.jpeg(bags.picture(stamp, 0)))))
             assert np.array_equal(shown, expected)
+
+
+@pytest.fixture(scope="module")
+def trossen_dataset(tmp_path_factory: pytest.TempPathFactory) -> tuple[bags.Notes, Path]:
+    """Messages with video, and the LeRobot dataset that was made of them."""
+    folder = tmp_path_factory.mktemp("dataset")
+    notes = bags.trossen(SECONDS)
+    bag = bags.write_trossen(bags.in_order(notes), folder / "bag.mcap")
+    text = bag_mappings.TROSSEN.replace("fps = 30", 'fps = 30\nrows = "/cameras/cam_high/image"')
+    import_bags([bag], bag_mappings.write_mapping(text, folder / "robot.toml"), folder / "run")
+    with pytest.raises(SystemExit) as ended:
+        main(["export", "lerobot", str(folder / "run"), "--out", str(folder / "dataset"), "--repo-id", "local/x"])
+    assert not ended.value.code
+    return notes, folder / "dataset"
+
+
+def test_a_lerobot_dataset_of_a_bag(trossen_dataset: tuple[bags.Notes, Path]) -> None:
+    """As LeRobot reads it: float32 as the bag has it, and the row's message found by the plainest search."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    notes, folder = trossen_dataset
+    dataset = LeRobotDataset("local/x", root=folder, video_backend="pyav")
+    pictures = bags.of_topic(notes, "/cameras/cam_high/image")
+    assert len(dataset) == len(pictures) - 10  # it begins with the second keyframe, before which the arms had begun
+    for row in range(len(dataset)):
+        time_ns = pictures[row + 10].header_ns
+        item = dataset[row]
+        for feature, arm in (("observation.state", "follower"), ("action", "leader")):
+            told = [note for note in bags.of_topic(notes, f"{arm}/joints/state") if note.header_ns <= time_ns]
+            assert item[feature].numpy().tobytes() == told[-1].body["positions"].tobytes()
+
+
+def test_kept_packets_are_in_the_dataset_byte_for_byte(trossen_dataset: tuple[bags.Notes, Path]) -> None:
+    notes, folder = trossen_dataset
+    (video,) = (folder / "videos/observation.images.high").rglob("*.mp4")
+    with av.open(str(video)) as container:
+        stream = container.streams.video[0]
+        to_annex_b = BitStreamFilterContext("h264_mp4toannexb", stream)
+        found = [bytes(out) for packet in container.demux(stream) for out in to_annex_b.filter(packet) if out.size]
+    given = [bytes(note.body["data"]) for note in bags.of_topic(notes, "/cameras/cam_high/image")][10:]
+    assert [_slices(packet) for packet in found] == [_slices(packet) for packet in given]
+
+
+def _slices(packet: bytes) -> list[bytes]:
+    """The coded pictures of an access unit, without parameter sets and the lengths of start codes."""
+    units = [unit.rstrip(b"\0") for unit in packet.split(b"\0\0\1")[1:]]
+    return [unit for unit in units if unit[0] & 31 in (1, 5)]
