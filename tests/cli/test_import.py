@@ -52,11 +52,11 @@ def test_a_suggested_mapping_works_as_it_is(name: str, tmp_path: Path, capsys: p
     told = capsys.readouterr()
     assert "Nothing odd was found." in told.out
     assert told.err == ""
-    (line,) = load_collected_run(tmp_path / "run").episodes
-    with CollectedRecording(tmp_path / "run" / line.file) as recording:
+    (episode,) = load_collected_run(tmp_path / "run").episodes
+    with CollectedRecording(tmp_path / "run" / episode.file) as recording:
         sizes = {feature.name: len(feature.names) for feature in recording.info.features}
         assert (sizes["observation.state"], sizes["action"], len(recording.info.cameras)) == FEATURES[name]
-        assert recording.num_frames == line.num_frames >= 30
+        assert recording.num_frames == episode.num_frames >= 30
 
 
 def test_a_doubtful_topic_is_commented_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
