@@ -17,7 +17,7 @@ from demorec.check.limits import limit_table
 from demorec.errors import DemorecError, MissingDependencyError, NotAllowedError, resource_error
 
 Level = Literal["pass", "warn", "fail", "skip"]
-Scope = Literal["recording", "run", "dataset"]
+Scope = Literal["recording", "collected", "run", "collected_run", "dataset"]
 Group = Literal["file", "time", "physics", "alignment", "calibration", "pictures", "outcome", "run", "dataset"]
 
 _BLOCKED = "it needs what is damaged"
@@ -64,7 +64,7 @@ class Check:
     Attributes:
         name: Its row in `demorec.tables.CHECKS`.
         group: What it is about.
-        scope: What it looks at: a recording, a run (its folder) or a dataset.
+        scope: What it looks at: a recording of a simulated or of a collected episode, a run (its folder) or a dataset.
         measures: What the value is, in words.
         unit: Of the value and the limits; "" for counts and ratios.
         warn, fail: The value passes up to `warn`, is a warning up to `fail`, and a failure above.

@@ -15,7 +15,7 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 from demorec.geometry import Pose
 from demorec.lerobot.layout import AUTOMATIC_FEATURES
 from demorec.recording import channels
-from demorec.recording.metadata import EPISODE, OUTCOME, RECOVERED, CameraStreams
+from demorec.recording.metadata import COLLECTED, EPISODE, OUTCOME, RECOVERED, CameraStreams
 from demorec.recording.streams import frame_streams
 from demorec.recording.transforms import FrameTree
 from demorec.runs.run_file import RunFile
@@ -91,6 +91,9 @@ def everything() -> Iterator[tuple[Kind, str]]:
     for name, kind in (("info", EpisodeInfo), ("cameras", CameraStreams), ("outcome", Outcome), ("run", RunFile)):
         for field in _leaves(kind, name):
             yield "field", field
+    yield "field", f"metadata {COLLECTED}"
+    for topic in ("/frames", "/{feature}"):
+        yield "topic", topic
     for column in columns():
         yield "column", column
 

@@ -9,11 +9,15 @@ from pathlib import Path
 from typing import Literal
 
 from demorec.check.base import Check, Group, Level, Result, Scope
+from demorec.check.collected import NOT_APPLICABLE, CollectedSubject
 from demorec.check.dataset import Dataset
 from demorec.check.episode import RecordedEpisode
 from demorec.check.run import CheckedRun
 from demorec.errors import check_option, resource_error
 from demorec.processes import SPAWN
+from demorec.recording import CollectedRecording
+from demorec.recording.opening import is_collected
+from demorec.runs.collected import is_collected_run
 from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings, find
 from demorec.runs.run_file import DATASET
 from demorec.scene.assets import allow_models
@@ -146,9 +150,14 @@ def check_subject(subject: Subject, options: CheckOptions) -> SubjectReport:
     """All checks of one recording, run or dataset."""
     allow_models(options.allowed)
     checks = options.checks(subject.kind)
-    if subject.kind == "recording":
+    if subject.kind == "recording" and is_collected(subject.path):
+        found = _collected(subject.path, options)
+    elif subject.kind == "recording":
         with RecordedEpisode(subject.path) as episode:
             found = _run(checks, episode, ("opens", "readable"), lambda: episode.columns)
+    elif subject.kind == "run" and is_collected_run(subject.path):
+        found = [check.run(subject.path) for check in options.checks("collected_run")]
+        found += [check.skipped(NOT_APPLICABLE) for check in checks]
     elif subject.kind == "run":
         found = _run(checks, CheckedRun(subject.path), (), None)
     else:
@@ -160,6 +169,15 @@ def check_subject(subject: Subject, options: CheckOptions) -> SubjectReport:
         results=tuple(replace(result, detail=_within(subject.path, result.detail)) for result in found),
         is_failed_attempt=subject.is_failed_attempt,
     )
+
+
+def _collected(path: Path, options: CheckOptions) -> list[Result]:
+    """The checks of collected episodes; those of simulated ones say that they are not applicable."""
+    checks = options.checks("collected")
+    with CollectedRecording(path) as recording:
+        subject = CollectedSubject(recording)
+        found = _run(checks, subject, ("collected_opens", "collected_readable"), lambda: subject.columns)
+    return found + [check.skipped(NOT_APPLICABLE) for check in options.checks("recording")]
 
 
 def _within(path: Path, detail: str) -> str:

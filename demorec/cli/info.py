@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 from tyro.conf import Positional
 
 from demorec.cli.output import say, say_json
+from demorec.cli.table import aligned, size_in_words
 from demorec.errors import ConfigError, ExportError, RecordingError, in_words, resource_error, without_path
 from demorec.lerobot.paths import INFO_PATH
 from demorec.runs.find import Found, expect
-from demorec.safety.text import display_width, printable
 from demorec.scene.features import IMAGE_PREFIX
 
 if TYPE_CHECKING:
@@ -68,8 +67,15 @@ def _describe(path: Path) -> tuple[dict[str, Any], list[str]]:
 
 def _recording(path: Path) -> tuple[dict[str, Any], list[str]]:
     from demorec.plain import to_plain
+    from demorec.recording.opening import is_collected
     from demorec.recording.summary import summarize
 
+    if is_collected(path):
+        from demorec.cli.info_collected import collected_lines
+        from demorec.recording.collected.summary import summarize_collected
+
+        collected = summarize_collected(path)
+        return {"kind": "collected recording", **to_plain(collected)}, collected_lines(collected)
     summary = summarize(path)
     return {"kind": "recording", **to_plain(summary)}, _recording_lines(summary)
 
@@ -78,7 +84,7 @@ def _recording_lines(summary: RecordingSummary) -> list[str]:
     attempt = f", attempt {summary.attempt}" if summary.attempt else ""
     rates = f"{summary.fps} Hz (physics {summary.physics_hz} Hz)"
     facts = [
-        ("recording", f"{summary.path} ({_size(summary.bytes)}, format {summary.format_version})"),
+        ("recording", f"{summary.path} ({size_in_words(summary.bytes)}, format {summary.format_version})"),
         ("instruction", summary.instruction),
         ("episode", f"{summary.task}, seed {summary.root_seed}, episode {summary.episode_index}{attempt}"),
         ("outcome", _outcome(summary)),
@@ -101,7 +107,7 @@ def _recording_lines(summary: RecordingSummary) -> list[str]:
     facts.append(("digest", summary.digest[:16]))
     facts.append(("made with", ", ".join(f"{name} {version}" for name, version in summary.versions.items())))
     streams = [(stream.topic, str(stream.messages), stream.type) for stream in summary.streams]
-    return [*_aligned(facts), "", *_aligned([("topic", "messages", "type"), *streams])]
+    return [*aligned(facts), "", *aligned([("topic", "messages", "type"), *streams])]
 
 
 def _outcome(summary: RecordingSummary) -> str:
@@ -115,8 +121,15 @@ def _outcome(summary: RecordingSummary) -> str:
 
 def _run(path: Path) -> tuple[dict[str, Any], list[str]]:
     from demorec.plain import to_plain
+    from demorec.runs.collected import is_collected_run, load_collected_run
     from demorec.runs.run_file import load_run_file
 
+    if is_collected_run(path):
+        from demorec.cli.info_collected import collected_run_lines
+
+        collected = load_collected_run(path)
+        plain = {"kind": "collected run", "path": str(path), "digest": collected.digest, **to_plain(collected)}
+        return plain, collected_run_lines(path, collected)
     run = load_run_file(path)
     plain = {
         "kind": "run",
@@ -143,7 +156,7 @@ def _run_lines(path: Path, run: RunFile) -> list[str]:
         ("task", f"{config.task} with {config.robot}, seed {config.seed}"),
         ("episodes", f"{len(run.successes)} of {run.num_episodes}, {len(run.failures)} failed attempts"),
         ("frames", f"{frames} ({frames / config.fps:.1f} s at {config.fps} Hz)"),
-        ("size", _size(sum(attempt.num_bytes for attempt in run.attempts))),
+        ("size", size_in_words(sum(attempt.num_bytes for attempt in run.attempts))),
         ("cameras", _run_cameras(config)),
         ("digest", run.digest),
     ]
@@ -158,12 +171,12 @@ def _run_lines(path: Path, run: RunFile) -> list[str]:
             str(attempt.attempt),
             "success" if attempt.success else f"{attempt.phase}: {attempt.reason}",
             str(attempt.num_frames),
-            _size(attempt.num_bytes),
+            size_in_words(attempt.num_bytes),
             attempt.file or "(no scene)",
         )
         for attempt in run.attempts
     ]
-    return [*_aligned(facts), "", *_aligned(rows)]
+    return [*aligned(facts), "", *aligned(rows)]
 
 
 def _dataset(path: Path) -> tuple[dict[str, Any], list[str]]:
@@ -178,7 +191,7 @@ def _dataset(path: Path) -> tuple[dict[str, Any], list[str]]:
             ("frames", f"{info['total_frames']} ({info['total_frames'] / info['fps']:.1f} s at {info['fps']} Hz)"),
             ("tasks", str(info["total_tasks"])),
             ("robot", str(info["robot_type"])),
-            ("size", _size(sum(part.stat().st_size for part in path.rglob("*") if part.is_file()))),
+            ("size", size_in_words(sum(part.stat().st_size for part in path.rglob("*") if part.is_file()))),
         ]
         more, problems = _dataset_content(path)
         facts += [*more, *(("problem", problem) for problem in problems[:_MOST_PROBLEMS])]
@@ -191,7 +204,7 @@ def _dataset(path: Path) -> tuple[dict[str, Any], list[str]]:
     except (OSError, ValueError, KeyError, TypeError, AttributeError, ArithmeticError) as error:
         raise RecordingError(f"The dataset's info.json is damaged ({in_words(error)}): {file}") from error
     plain = {"kind": "dataset", "path": str(path), "info": info, "problems": problems}
-    return plain, [*_aligned(facts), "", *_aligned(rows)]
+    return plain, [*aligned(facts), "", *aligned(rows)]
 
 
 def _dataset_content(path: Path) -> tuple[list[tuple[str, str]], list[str]]:
@@ -228,43 +241,29 @@ def _names(names: object) -> str:
 
 
 def _folder(found: Found) -> tuple[dict[str, Any], list[str]]:
-    from demorec.recording import Recording
+    from demorec.recording import open_recording
+    from demorec.scene.collected import CollectedInfo
 
     path, recordings = found.path, (*found.recordings, *found.failed)
     rows = [("file", "task", "seed", "episode", "outcome", "frames", "size")]
     items = []
     for file in recordings:
-        with Recording(file) as recording:
+        with open_recording(file) as recording:
             info, outcome = recording.info, recording.outcome
+            task, seed = ("(collected)", "") if isinstance(info, CollectedInfo) else (info.task, str(info.root_seed))
             success = None if outcome is None else outcome.success
-        items.append({"path": str(file), "task": info.task, "success": success, "frames": recording.num_frames})
-        word = {None: "recovered", True: "success", False: "failure"}[success]
+        items.append({"path": str(file), "task": task, "success": success, "frames": recording.num_frames})
+        word = {None: "unknown" if outcome is not None else "recovered", True: "success", False: "failure"}[success]
         rows.append(
             (
                 str(file.relative_to(path)),
-                info.task,
-                str(info.root_seed),
+                task,
+                seed,
                 str(info.episode_index),
                 word,
                 str(recording.num_frames),
-                _size(file.stat().st_size),
+                size_in_words(file.stat().st_size),
             )
         )
     plain = {"kind": "folder", "path": str(path), "recordings": items}
-    return plain, [f"{len(recordings)} recordings in {path}", "", *_aligned(rows)]
-
-
-def _aligned(rows: Iterable[Sequence[str]]) -> list[str]:
-    """Columns of equal width, two spaces between them, on a terminal that shows `printable` text."""
-    table = [[printable(cell) for cell in row] for row in rows]
-    widths = [max(map(display_width, column)) for column in zip(*table, strict=True)]
-    return [
-        "  ".join(cell + " " * (width - display_width(cell)) for cell, width in zip(row, widths, strict=True)).rstrip()
-        for row in table
-    ]
-
-
-def _size(num_bytes: int) -> str:
-    if num_bytes < 1_000_000:
-        return f"{num_bytes / 1000:.0f} kB"
-    return f"{num_bytes / 1e6:.1f} MB"
+    return plain, [f"{len(recordings)} recordings in {path}", "", *aligned(rows)]

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from demorec.cli.info import _aligned
 from demorec.cli.output import OutputError, say, tell
+from demorec.cli.table import aligned
 from demorec.safety.text import display_width, printable
 
 
@@ -74,6 +74,6 @@ def test_a_text_takes_the_columns_that_a_terminal_gives_it(text: str, width: int
 
 @given(st.lists(st.tuples(st.text(), st.text(min_size=1)), min_size=1))
 def test_columns_stand_below_each_other_whatever_is_in_them(cells: list[tuple[str, str]]) -> None:
-    rows = _aligned([("name", "|"), *((name, "|") for name, _ in cells)])
+    rows = aligned([("name", "|"), *((name, "|") for name, _ in cells)])
     assert len({display_width(row.rpartition("|")[0]) for row in rows}) == 1
     assert all(printable(row) == row for row in rows)

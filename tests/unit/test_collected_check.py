@@ -1,0 +1,198 @@
+"""What is wrong with a collected episode is named by the check meant for it; a good one passes them all."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.collected import TOP, Episode, make_collected, write_collected
+
+from demorec.check.report import CheckOptions, Subject, check_subject
+from demorec.cli import main
+from demorec.recording import recover
+from demorec.runs.collected import open_collected_run
+from demorec.scene.collected import CollectedFrame, Sample
+
+CAMERAS = (TOP, replace(TOP, name="side"))
+
+
+def steady(**changes: Any) -> Episode:
+    """An episode at its nominal rate, in which nothing is late or missing."""
+    episode = make_collected(cameras=CAMERAS, **changes)
+    frames, top, side = [], [], []
+    for index, frame in enumerate(episode.frames):
+        time_ns = 10**18 + index * 33_333_333
+        samples = {name: Sample(stamp_ns=time_ns, vector=one.vector) for name, one in frame.samples.items()}
+        frames.append(CollectedFrame(time_ns=time_ns, samples=samples, pictures={"top": index, "side": index}))
+        pixels = episode.pictures["top"][index][1]
+        top.append((time_ns, pixels))
+        side.append((time_ns, pixels[::-1].copy()))
+    return replace(
+        episode, frames=frames, pictures={"top": top, "side": side}, outcome=replace(episode.outcome, drops={})
+    )
+
+
+def shifted(frame: CollectedFrame, *, by: int) -> CollectedFrame:
+    samples = {name: replace(sample, stamp_ns=sample.stamp_ns + by) for name, sample in frame.samples.items()}
+    return replace(frame, time_ns=frame.time_ns + by, samples=samples)
+
+
+def moved(offset: Callable[[int], int]) -> Callable[[Episode], Episode]:
+    """Frames and their pictures later by so much."""
+
+    def change(episode: Episode) -> Episode:
+        pictures = {
+            name: [(stamp + offset(index), pixels) for index, (stamp, pixels) in enumerate(ones)]
+            for name, ones in episode.pictures.items()
+        }
+        frames = [shifted(frame, by=offset(index)) for index, frame in enumerate(episode.frames)]
+        return replace(episode, frames=frames, pictures=pictures)
+
+    return change
+
+
+def each(change: Callable[[int, CollectedFrame], CollectedFrame]) -> Callable[[Episode], Episode]:
+    return lambda episode: replace(episode, frames=[change(index, frame) for index, frame in enumerate(episode.frames)])
+
+
+def state(value: Callable[[int, Any], Any]) -> Callable[[Episode], Episode]:
+    def change(index: int, frame: CollectedFrame) -> CollectedFrame:
+        one = frame.samples["observation.state"]
+        vector = np.asarray(value(index, one.vector.copy()), dtype=np.float32)
+        return replace(frame, samples={**frame.samples, "observation.state": replace(one, vector=vector)})
+
+    return each(change)
+
+
+def older(name: str, by: int) -> Callable[[Episode], Episode]:
+    def change(index: int, frame: CollectedFrame) -> CollectedFrame:
+        one = frame.samples[name]
+        return replace(frame, samples={**frame.samples, name: replace(one, stamp_ns=one.stamp_ns - by)})
+
+    return each(change)
+
+
+FAULTS: dict[str, tuple[Callable[[Episode], Episode], str, str]] = {
+    "a gap": (moved(lambda i: 6 * 10**7 if i >= 20 else 0), "collected_gaps", "warn"),
+    "another rate": (moved(lambda i: i * 5_000_000), "collected_rate", "warn"),
+    "half the rate": (moved(lambda i: i * 40_000_000), "collected_rate", "fail"),
+    "a late sensor": (older("observation.force", 2 * 10**8), "collected_sample_age", "warn"),
+    "a clock offset": (older("action", 3 * 10**9), "collected_sample_age", "fail"),
+    "late pictures": (
+        lambda e: replace(e, pictures={**e.pictures, "top": [(s - 3 * 10**8, p) for s, p in e.pictures["top"]]}),
+        "collected_picture_age",
+        "warn",
+    ),
+    "a missing picture": (
+        each(lambda i, f: replace(f, pictures={"top": f.pictures["top"]}) if i == 9 else f),
+        "collected_missing_pictures",
+        "warn",
+    ),
+    "a joint beyond its limit": (
+        state(lambda i, v: [3.0, *v[1:]] if i == 7 else v),
+        "collected_joint_limits",
+        "fail",
+    ),
+    "a stuck sensor": (state(lambda i, v: [0.1, 0.2, 0.3]), "collected_stuck", "warn"),
+    "drops": (lambda e: replace(e, outcome=replace(e.outcome, drops={"frames": 3})), "collected_drops", "warn"),
+    "a covered camera": (
+        lambda e: replace(e, pictures={**e.pictures, "side": [(s, p * 0) for s, p in e.pictures["side"]]}),
+        "collected_pictures",
+        "fail",
+    ),
+    "one camera twice": (
+        lambda e: replace(e, pictures={**e.pictures, "side": e.pictures["top"]}),
+        "collected_distinct_cameras",
+        "fail",
+    ),
+}
+
+
+def levels(path: Path) -> dict[str, str]:
+    report = check_subject(Subject(path=path, kind="recording"), CheckOptions())
+    return {result.check: result.level for result in report.results}
+
+
+def test_a_good_episode_passes(tmp_path: Path) -> None:
+    found = levels(write_collected(tmp_path / "a.mcap", steady()))
+    assert {level for check, level in found.items() if check.startswith("collected_")} == {"pass"}
+    assert {level for check, level in found.items() if not check.startswith("collected_")} == {"skip"}
+    assert found["penetration"] == "skip"
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_is_named_by_its_check_alone(tmp_path: Path, fault: str) -> None:
+    change, check, level = FAULTS[fault]
+    found = levels(write_collected(tmp_path / "a.mcap", change(steady())))
+    assert {name: found for name, found in found.items() if found not in ("pass", "skip")} == {check: level}
+
+
+def test_a_damaged_file_is_a_failure(tmp_path: Path) -> None:
+    path = write_collected(tmp_path / "a.mcap", steady())
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 255
+    path.write_bytes(data)
+    assert "fail" in levels(path).values()
+
+
+def test_a_recovered_file_is_a_warning(tmp_path: Path) -> None:
+    data = write_collected(tmp_path / "a.mcap", steady(num_frames=100)).read_bytes()
+    (tmp_path / "b.mcap").write_bytes(data[: len(data) * 3 // 4])
+    recover(tmp_path / "b.mcap", tmp_path / "c.mcap")
+    found = levels(tmp_path / "c.mcap")
+    assert {name: level for name, level in found.items() if level not in ("pass", "skip")} == {
+        "collected_complete": "warn"
+    }
+
+
+def run(capsys: pytest.CaptureFixture[str], *args: object) -> tuple[int, str, str]:
+    with pytest.raises(SystemExit) as ended:
+        main([str(arg) for arg in args])
+    told = capsys.readouterr()
+    return int(ended.value.code or 0), told.out, told.err
+
+
+@pytest.fixture(scope="module")
+def collected_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    with open_collected_run(folder) as opened:
+        for index in range(2):
+            opened.add(write_collected(opened.path_of(index), steady(num_frames=20, episode_index=index)))
+    return folder
+
+
+def test_a_run_is_told_and_checked(collected_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, told, _ = run(capsys, "check", collected_run)
+    assert (code, "3 checked, 0 failed, 0 with warnings" in told) == (0, True)
+    code, told, _ = run(capsys, "info", collected_run)
+    assert (code, "2 (2 success)" in told, "stack the cups" in told) == (0, True, True)
+    code, told, _ = run(capsys, "info", collected_run / "episodes" / "episode_000001.mcap", "--json")
+    plain = json.loads(told)
+    assert (plain["kind"], plain["frames"], plain["robot"]) == ("collected recording", 20, "two_joints")
+    code, told, _ = run(capsys, "info", collected_run / "episodes")
+    assert (code, told.count("(collected)")) == (0, 2)
+
+
+def test_a_run_of_other_files_is_a_failure(collected_run: Path, tmp_path: Path) -> None:
+    (tmp_path / "episodes").mkdir()
+    (tmp_path / "run.json").write_bytes((collected_run / "run.json").read_bytes())
+    write_collected(tmp_path / "episodes" / "episode_000001.mcap", steady(num_frames=9, episode_index=1))
+    report = check_subject(Subject(path=tmp_path, kind="run"), CheckOptions())
+    told = next(result for result in report.results if result.check == "collected_run_files")
+    assert (told.level, told.value) == ("fail", 2)
+    assert "episode_000000.mcap is missing" in told.detail
+
+
+@pytest.mark.parametrize("command", ["replay", "render", "reproduce"])
+def test_what_needs_a_scene_says_so(collected_run: Path, command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    out = [] if command == "replay" else ["--out", collected_run.parent / "x"]
+    code, _, error = run(capsys, command, collected_run, *out)
+    assert code in (1, 2)
+    assert "collected from another robot or program" in error
+    assert len(error.strip().splitlines()) == 1
+    assert not (collected_run.parent / "x").exists()
