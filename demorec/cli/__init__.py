@@ -37,6 +37,7 @@ COMMANDS: Registry[type[Command]] = Registry(
     kind="command",
     rows={
         "generate": "demorec.cli.generate:Generate",
+        "import": "demorec.cli.import_bags:Import",
         "info": "demorec.cli.info:Info",
         "view": "demorec.cli.view:View",
         "export": "demorec.cli.export:Export",

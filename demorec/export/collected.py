@@ -46,8 +46,8 @@ def check_options(recording: CollectedRecording, options: CommonOptions) -> None
             f"action is {options.action!r}, but the actions of collected episodes are exported as they came: "
             f"{recording.path}"
         )
-    for name in ("privileged", "depth"):
-        if getattr(options, name):
+    for name in ("privileged", "depth", "language", "progress", "boxes"):  # the last three of LeRobot datasets alone
+        if getattr(options, name, None) not in (None, False):
             raise ConfigError(f"{name} is asked for, which collected episodes do not have: {recording.path}")
     if options.fps not in (None, info.fps):
         raise ConfigError(

@@ -93,12 +93,24 @@ def chunk_content(record: bytes | memoryview, limits: Limits, expected_size: int
         if zstandard.frame_content_size(stored) not in (size, -1):
             raise ValueError("a chunk of another size than its compressed data")
         content = zstandard.ZstdDecompressor().decompress(stored, max_output_size=size)
+    elif compression == b"lz4":  # not ours; the writers of other people's bags know it
+        content = _lz4_content(stored, size)
     elif compression == b"":
         content = bytes(stored)
     else:
-        raise ValueError(f"a chunk compressed with {compression!r}, expected zstd")
+        raise ValueError(f"a chunk compressed with {compression!r}, expected zstd or lz4")
     if len(content) != size or (stored_crc and zlib.crc32(content) != stored_crc):
         raise ValueError("a chunk fails its checksum")
+    return content
+
+
+def _lz4_content(stored: memoryview, size: int) -> bytes:
+    import lz4.frame
+
+    try:
+        content: bytes = lz4.frame.LZ4FrameDecompressor().decompress(stored, max_length=size)
+    except RuntimeError as error:  # all that lz4 raises
+        raise ValueError("a chunk that lz4 cannot unpack") from error
     return content
 
 

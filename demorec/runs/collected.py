@@ -22,6 +22,7 @@ from demorec.runs.run_file import (
     COLLECTED,
     DATASET,
     EPISODES,
+    IMPORT_NAME,
     MAX_RUN_FILE_BYTES,
     RUN_FORMAT,
     RUN_NAME,
@@ -135,14 +136,19 @@ class CollectedFolder:
         path: Of the folder.
         episodes: What is there, in order.
         recovered: Recordings that were made whole when it was opened.
+
+    Args:
+        path: Of the folder.
+        recovers: Whether what a crash left of an episode is made whole; an import makes it again.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, recovers: bool = True) -> None:
         self.path = path
         self.recovered: list[Path] = []
         self._session = CollectedSession(started=_now())
         known, is_damaged = self._known()
-        self._recover_parts()
+        if recovers:
+            self._recover_parts()
         self._sessions = known.sessions
         lines = {line.file: line for line in known.episodes}
         self.episodes = [self._line(file, lines) for file in self._recordings()]
@@ -236,8 +242,8 @@ class CollectedFolder:
 
 
 @contextmanager
-def open_collected_run(path: Path) -> Iterator[CollectedFolder]:
-    """Open, continue or begin a run, locked until the context ends.
+def open_collected_run(path: Path, *, recovers: bool = True) -> Iterator[CollectedFolder]:
+    """Open, continue or begin a run, locked until the context ends; arguments as of `CollectedFolder`.
 
     Raises:
         ConfigError: The folder is in use, holds another kind of run or somebody's files, or cannot be written to.
@@ -250,7 +256,7 @@ def open_collected_run(path: Path) -> Iterator[CollectedFolder]:
         _refuse_strangers(path)
     make_folder(path / EPISODES)
     with run_lock(path):
-        folder = CollectedFolder(path)
+        folder = CollectedFolder(path, recovers=recovers)
         folder.save()
         try:
             yield folder
@@ -266,7 +272,7 @@ def _refuse_strangers(path: Path) -> None:
     strangers = [
         entry.name
         for entry in sorted(path.iterdir())
-        if entry.name not in (EPISODES, DATASET, LOCK_NAME) and not entry.name.startswith(RUN_NAME)
+        if entry.name not in (EPISODES, DATASET, IMPORT_NAME, LOCK_NAME) and not entry.name.startswith(RUN_NAME)
     ]
     if strangers:
         raise ConfigError(f"The folder holds files that are of no run ({shown(strangers)}): choose another: {path}")

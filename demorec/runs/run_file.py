@@ -25,6 +25,8 @@ MAX_EPISODES = 10_000_000
 EPISODES, FAILED, UNFINISHED, DATASET = "episodes", "failed", "unfinished", "dataset"
 COLLECTED = "collected"
 """The "kind" that run.json has where the run's episodes were collected; see `demorec.runs.collected`."""
+IMPORT_NAME = "import.json"
+"""Beside run.json: what `demorec import` read, and what it found in it (`demorec.ingest.import_file`)."""
 STARTING = "starting"
 """What a worker does before its first frame, once: it compiles, or loads, and fills caches that later episodes find."""
 

@@ -26,6 +26,8 @@ HOMES = {
     "tyro": "demorec.cli",
     "tqdm": "demorec.cli",
     "h5py": "demorec.hdf5",
+    "rosbags": "demorec.ingest",
+    "ruamel": "demorec.ingest",
     "ray": "demorec.generate.on_ray",
 }
 """Heavy library -> the folder or module of demorec that alone imports it (CONTRIBUTING.md)."""

@@ -1,0 +1,221 @@
+"""The import of a bag against LeRobot's own writer on the same bag: CPU seconds a gigabyte, milliseconds a frame.
+
+    python benchmarks/import.py                              a small sample
+    python benchmarks/import.py --seconds 30 --rounds 5 --pictures h264 jpeg
+    python benchmarks/import.py --growth 1 2 4               peak memory for bags that many times as long
+
+The bag is written by `mcap` and `rosbags`: two joint topics at 200 Hz and two 640x480 cameras. Each round runs the
+candidates one after the other in processes of their own; loading libraries is not counted.
+LeRobot's writer is given frames that were decoded by the same reader as ours, aligned as ours.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import resource
+import shutil
+import statistics
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
+
+from support import bags
+
+CAMERAS = ("/front/image", "/side/image")
+WIDTH, HEIGHT, FPS = 640, 480, 30
+AXES = ("height", "width", "channels")
+MAPPING = """
+[robot]
+name = "benchmark"
+[task]
+text = "measure"
+[clock]
+fps = 30
+rows = "/front/image"
+[[features."observation.state"]]
+topic = "/follower/joint_states"
+field = "position"
+[[features.action]]
+topic = "/leader/joint_states"
+field = "position"
+[cameras.front]
+topic = "/front/image"
+[cameras.side]
+topic = "/side/image"
+"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cost:
+    """Of one candidate in one round: CPU seconds of all threads and children, peak memory in bytes."""
+
+    cpu: float
+    peak: int
+
+
+def scene(step: int, camera: int) -> NDArray[np.uint8]:
+    """A picture with texture and motion, which costs a coder what real ones do."""
+    generator = np.random.default_rng(camera)
+    coarse = generator.integers(0, 255, (HEIGHT // 16 + 4, WIDTH // 16 + 4, 3), np.uint8)
+    large = coarse.repeat(16, axis=0).repeat(16, axis=1)
+    shift = step % 48
+    return np.ascontiguousarray(large[shift // 2 : shift // 2 + HEIGHT, shift : shift + WIDTH])
+
+
+def make_bag(path: Path, seconds: float, pictures: str) -> Path:
+    """A bag with `pictures` (h264 or jpeg)."""
+    bags.WIDTH, bags.HEIGHT = WIDTH, HEIGHT
+    notes = bags.joints("/follower/joint_states", bags.SO101_JOINTS, bags.times(200, seconds, seed=1))
+    notes += bags.joints("/leader/joint_states", bags.SO101_JOINTS, bags.times(200, seconds, seed=2), shift=0.1)
+    for camera, topic in enumerate(CAMERAS):
+        moments = bags.times(FPS, seconds, seed=3, jitter=0.01)
+        loop = [scene(step, camera) for step in range(48)]
+        if pictures == "h264":
+            packets = bags.video([loop[step % 48] for step in range(len(moments))], gop=2)
+        else:
+            coded = [bags.jpeg(picture) for picture in loop]
+            packets = [coded[step % 48] for step in range(len(moments))]
+        notes += [
+            bags.Note(
+                topic=topic,
+                type="sensor_msgs/msg/CompressedImage",
+                log_ns=moment + 1_000_000,
+                header_ns=moment,
+                body={"format": pictures, "data": np.frombuffer(packet, np.uint8)},
+            )
+            for moment, packet in zip(moments, packets, strict=True)
+        ]
+    return bags.write_mcap(bags.in_order(notes), path)
+
+
+def ours(bag: Path, out: Path, mapping: Path, *, exports: bool) -> None:
+    """The bag to a run, and with `exports` on to a LeRobot dataset."""
+    from demorec.ingest.import_run import import_bags
+
+    import_bags([bag], mapping, out / "run")
+    if exports:
+        from demorec.lerobot import ExportOptions, export_lerobot
+
+        export_lerobot([out / "run"], out / "dataset", ExportOptions(verify=False))
+
+
+def lerobots(bag: Path, out: Path, mapping: Path) -> None:
+    """The same rows through LeRobotDataset.add_frame and save_episode, with its defaults."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    from demorec.ingest.bag import open_bag
+    from demorec.ingest.episodes import windows
+    from demorec.ingest.fields import picture_bytes
+    from demorec.ingest.mapping import read_mapping
+    from demorec.ingest.picture_messages import decode_picture, decode_video
+    from demorec.ingest.rows import Timelines
+    from demorec.ingest.streams import BagDecoder, read_streams
+
+    known = read_mapping(mapping)
+    opened = open_bag(bag)
+    streams = read_streams(opened, known)
+    lines = Timelines(streams, known)
+    rows = lines.rows(windows(opened, streams, list(lines.lines.values()), known)[0])
+    features: dict[str, object] = {
+        f"observation.images.{name}": {"dtype": "video", "shape": (HEIGHT, WIDTH, 3), "names": list(AXES)}
+        for name in rows.cameras
+    }
+    for name, feature in rows.features.items():
+        features[name] = {"dtype": "float32", "shape": (len(feature.names),), "names": list(feature.names)}
+    dataset = LeRobotDataset.create("local/x", fps=FPS, features=features, root=out / "dataset", use_videos=True)
+    decoder, kept = BagDecoder(), {name: list[NDArray[np.uint8]]() for name in rows.cameras}
+    packets: dict[str, list[bytes]] = {name: [] for name in rows.cameras}
+    topics = {camera.topic: name for name, camera in known.cameras.items()}
+    for message in opened.messages([], topics.keys()):
+        values, name = decoder.values(message), topics[message.channel.topic]
+        if values["format"] == "jpeg":
+            kept[name].append(decode_picture(values))
+        else:
+            packets[name].append(picture_bytes(values))
+    for name, coded in packets.items():
+        kept[name] += decode_video("h264", coded) if coded else []
+    for row in range(len(rows.times_ns)):
+        frame: dict[str, object] = {
+            f"observation.images.{name}": kept[name][int(camera.numbers[row])] for name, camera in rows.cameras.items()
+        }
+        frame |= {name: feature.values[row].astype(np.float32) for name, feature in rows.features.items()}
+        dataset.add_frame({**frame, "task": "measure"})
+    dataset.save_episode()
+    dataset.finalize()
+
+
+def _child(candidate: str, bag: Path, out: Path, mapping: Path, answer: multiprocessing.queues.Queue[Cost]) -> None:
+
+    import demorec.ingest.import_run
+    import demorec.lerobot  # noqa: F401
+
+    begin = _used()
+    if candidate == "lerobot":
+        lerobots(bag, out, mapping)
+    else:
+        ours(bag, out, mapping, exports=candidate == "import and export")
+    answer.put(Cost(cpu=_used() - begin, peak=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss << 10))
+
+
+def _used() -> float:
+    return sum(
+        usage.ru_utime + usage.ru_stime
+        for usage in (resource.getrusage(resource.RUSAGE_SELF), resource.getrusage(resource.RUSAGE_CHILDREN))
+    )
+
+
+def measure(candidate: str, bag: Path, folder: Path) -> Cost:
+    """One run of a candidate in a fresh process."""
+    out = folder / candidate.replace(" ", "_")
+    shutil.rmtree(out, ignore_errors=True)
+    out.mkdir()
+    mapping = folder / "robot.toml"
+    mapping.write_text(MAPPING)
+    context = multiprocessing.get_context("spawn")
+    answer: multiprocessing.queues.Queue[Cost] = context.Queue()
+    process = context.Process(target=_child, args=(candidate, bag, out, mapping, answer))
+    process.start()
+    cost = answer.get()
+    process.join()
+    shutil.rmtree(out, ignore_errors=True)
+    return cost
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seconds", type=float, default=4.0, help="of the bag")
+    parser.add_argument("--rounds", type=int, default=2)
+    parser.add_argument("--pictures", nargs="+", choices=("h264", "jpeg"), default=["h264", "jpeg"])
+    parser.add_argument("--growth", type=int, nargs="*", default=[], help="lengths for which peak memory is measured")
+    options = parser.parse_args()
+    candidates: tuple[str, ...] = ("import", "import and export", "lerobot")
+    with tempfile.TemporaryDirectory(prefix="demorec-import-") as name:
+        folder = Path(name)
+        for pictures in options.pictures:
+            bag = make_bag(folder / f"{pictures}.mcap", options.seconds, pictures)
+            frames, size = int(options.seconds * FPS), bag.stat().st_size
+            costs: dict[str, list[Cost]] = {candidate: [] for candidate in candidates}
+            for _ in range(options.rounds):
+                for candidate in candidates:
+                    costs[candidate].append(measure(candidate, bag, folder))
+            print(f"{pictures}, {size / 1e6:.1f} MB, {frames} frames, two cameras 640x480")
+            print(f"  {'':18} {'CPU ms/frame':>13} {'CPU s/GB':>9} {'against lerobot':>16}")
+            base = statistics.median(cost.cpu for cost in costs["lerobot"])
+            for candidate in candidates:
+                cpu = statistics.median(cost.cpu for cost in costs[candidate])
+                print(f"  {candidate:18} {1e3 * cpu / frames:13.3f} {cpu / size * 1e9:9.1f} {base / cpu:15.1f}x")
+        for factor in options.growth:
+            bag = make_bag(folder / "long.mcap", options.seconds * factor, options.pictures[0])
+            cost = measure("import", bag, folder)
+            print(f"growth {factor}: {bag.stat().st_size / 1e6:.0f} MB, peak {cost.peak / 1e6:.0f} MB")
+
+
+if __name__ == "__main__":
+    main()

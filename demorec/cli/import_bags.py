@@ -1,0 +1,69 @@
+"""`demorec import`: other robots' bags to a run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from demorec.cli.output import say, tell
+from demorec.config import VideoConfig
+from demorec.errors import ConfigError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Import:
+    """Make a run of another robot's bags: MCAP files, .db3 files and rosbag2 folders, without ROS.
+
+    A mapping (TOML) says which topics become which features; --suggest writes one from what is in a bag. Every row
+    holds messages that are in the bag and says how old they are; what is missing or too old is an error, or drops the
+    episode, as the mapping says. Coded pictures stay as they are. The same command again goes on.
+
+    Examples:
+      demorec import --suggest monday.mcap > robot.toml
+      demorec import monday.mcap tuesday/ --mapping robot.toml --out runs/robot
+    """
+
+    bags: Positional[tuple[Path, ...]]
+    """Bags; each is an episode, or several, as the mapping says."""
+    mapping: Path | None = None
+    """What of the bags becomes what; an import needs it."""
+    out: Path | None = None
+    """The run to make or to continue; an import needs it."""
+    suggest: bool = False
+    """Write a mapping for the first bag to standard output instead of importing."""
+    video: Annotated[VideoConfig, arg(name="")] = field(default_factory=VideoConfig)
+    """How pictures are coded that come as pixels."""
+
+    def run(self) -> int:
+        """Import, or suggest a mapping, and say what was found."""
+        if not self.bags:
+            raise ConfigError("No bag is given: name one, e.g. demorec import --suggest monday.mcap.")
+        if self.suggest:
+            from demorec.ingest.suggest import suggested_mapping
+
+            say(*suggested_mapping(self.bags[0]))
+            return 0
+        if self.mapping is None or self.out is None:
+            raise ConfigError(
+                f"An import needs --mapping and --out: demorec import --suggest {self.bags[0]} > robot.toml writes a "
+                "mapping."
+            )
+        from demorec.ingest.import_run import import_bags
+        from demorec.ingest.report import report_lines
+
+        self.video.validate()
+        result = import_bags(
+            self.bags, self.mapping, self.out, video=self.video, tell=lambda report: say(*report_lines(report), "")
+        )
+        if result.num_new < len(result.reports):
+            tell(f"{len(result.reports) - result.num_new} bags were imported before.")
+        episodes = [episode for report in result.reports for episode in report.episodes]
+        made = [episode for episode in episodes if episode.episode_index is not None]
+        dropped = f", {len(episodes) - len(made)} dropped" if len(made) < len(episodes) else ""
+        findings = sum(len(report.findings) for report in result.reports)
+        say(f"{len(made)} episodes, {sum(row.num_frames for row in made)} frames{dropped}: {self.out}")
+        say(f"{findings} findings in the bags, see above and demorec check." if findings else "Nothing odd was found.")
+        return 0

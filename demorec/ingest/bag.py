@@ -1,0 +1,191 @@
+"""Bags: MCAP and .db3 files, and the folders of rosbag2 with their metadata.yaml, compressed or not.
+
+What a bag is called by does not matter, what it begins with does. Reading goes from the front to the end, once for
+each call of `messages`, in the memory of a chunk.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import stat
+import tempfile
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path, PurePath
+from typing import Any
+
+import zstandard
+
+from demorec.errors import ConfigError, resource_error
+from demorec.ingest.channel import BagError, BagMessage
+from demorec.ingest.mcap_bag import read_mcap
+from demorec.ingest.sqlite_bag import SQLITE_MAGIC, read_sqlite
+from demorec.recording.limits import Limits
+from demorec.safety.files import MCAP_MAGIC, open_regular, read_text_limited
+
+METADATA = "metadata.yaml"
+_MAX_METADATA_BYTES = 4 << 20
+_ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+_COPY_BYTES = 1 << 20
+_MAX_MESSAGE_BYTES = 1 << 28
+_READERS = {MCAP_MAGIC: read_mcap, SQLITE_MAGIC: read_sqlite}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bag:
+    """A recording of somebody else's robot: a file, or a folder of rosbag2.
+
+    Attributes:
+        path: Of the file or folder.
+        files: That hold its messages, in order.
+        messages_are_compressed: Whether each message is compressed by itself (rosbag2's compression mode MESSAGE).
+    """
+
+    path: Path
+    files: tuple[Path, ...]
+    messages_are_compressed: bool = False
+
+    @property
+    def name(self) -> str:
+        """Of the file or folder, without what tells its format."""
+        return self.path.name.split(".")[0] if self.path.is_file() else self.path.name
+
+    @property
+    def num_bytes(self) -> int:
+        """Of its files."""
+        return sum(file.stat().st_size for file in self.files)
+
+    def sha256s(self) -> dict[str, str]:
+        """Name of each of its files -> SHA-256 of its bytes, hex digits."""
+        found = {}
+        for path in self.files:
+            sha = hashlib.sha256()
+            with open_regular(path) as file:
+                while block := file.read(_COPY_BYTES):
+                    sha.update(block)
+            found[path.name] = sha.hexdigest()
+        return found
+
+    def messages(self, problems: list[str], topics: Collection[str] | None = None) -> Iterator[BagMessage]:
+        """Its messages in the order in which they were written.
+
+        Args:
+            problems: Gets a reason for each file that cannot be read to its end, or each message that is left out.
+            topics: That are wanted; None: all.
+
+        Raises:
+            BagError: A file cannot be read at all.
+        """
+        for path in self.files:
+
+            def tell(reason: str, name: str = path.name) -> None:
+                problems.append(f"{name}: {reason}")
+
+            with _unpacked(path) as (plain, magic):
+                for message in _READERS[magic](plain, tell):
+                    if topics is None or message.channel.topic in topics:
+                        yield self._unpack(message, tell) if self.messages_are_compressed else message
+
+    def _unpack(self, message: BagMessage, tell: Any) -> BagMessage:
+        try:
+            data = zstandard.ZstdDecompressor().decompress(message.data, max_output_size=_MAX_MESSAGE_BYTES)
+        except zstandard.ZstdError as error:
+            tell(f"a message of {message.channel.topic} cannot be unpacked: {error}")
+            data = b""
+        return message._replace(data=data)
+
+
+def open_bag(path: Path) -> Bag:
+    """The bag at a path; nothing of its messages is read.
+
+    Raises:
+        ConfigError: There is none.
+        BagError: It is of no kind that is read.
+    """
+    try:
+        mode = path.stat().st_mode
+    except OSError as error:
+        raise resource_error(error, path) or ConfigError(
+            f"There is no bag that could be read ({error.strerror}): {path}"
+        ) from error
+    if stat.S_ISDIR(mode):
+        return _folder(path)
+    _kind_of(path)
+    return Bag(path=path, files=(path,))
+
+
+def _kind_of(path: Path) -> bytes:
+    """The first bytes that tell what a file is: those of MCAP, SQLite or zstd."""
+    try:
+        with open_regular(path) as file:
+            head = file.read(max(map(len, (*_READERS, _ZSTD_MAGIC))))
+    except OSError as error:
+        raise resource_error(error, path) or BagError(f"The bag cannot be read ({error.strerror}): {path}") from error
+    if not head:
+        raise BagError(f"The bag is empty: {path}")
+    for magic in (*_READERS, _ZSTD_MAGIC):
+        if head.startswith(magic):
+            return magic
+    if head.startswith(b"#ROSBAG"):
+        raise BagError(
+            f"This is a bag of ROS 1; rosbags-convert --src {path.name} --dst {path.stem} makes a rosbag2 folder of "
+            f"it, which is read: {path}"
+        )
+    raise BagError(f"This is no bag: MCAP files, .db3 files and rosbag2 folders are read: {path}")
+
+
+def _folder(path: Path) -> Bag:
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+
+    try:
+        text = read_text_limited(path / METADATA, _MAX_METADATA_BYTES)
+        information = YAML(typ="safe", pure=True).load(text)["rosbag2_bagfile_information"]
+        names = [PurePath(str(name)).name for name in information["relative_file_paths"]]
+        mode = str(information.get("compression_mode") or "").lower()
+        compression = str(information.get("compression_format") or "")
+    except FileNotFoundError:
+        raise BagError(f"The folder holds no {METADATA}, so it is no bag of rosbag2: {path}") from None
+    except (OSError, UnicodeDecodeError, YAMLError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise BagError(f"The bag's {METADATA} cannot be read: {path}") from error
+    if mode not in ("", "none") and compression != "zstd":
+        raise BagError(f"The bag is compressed with {compression[:40]!r}, only zstd is read: {path}")
+    if not names:
+        raise BagError(f"The bag's {METADATA} names no files: {path}")
+    files = tuple(path / name for name in names)
+    if missing := [file.name for file in files if not os.path.lexists(file)]:
+        raise BagError(f"The bag lacks its file {missing[0]}: {path}")
+    for file in files:
+        _kind_of(file)
+    return Bag(path=path, files=files, messages_are_compressed=mode == "message")
+
+
+@contextmanager
+def _unpacked(path: Path) -> Iterator[tuple[Path, bytes]]:
+    """A file and its kind; a compressed one is unpacked into a temporary file, within the limits of its size."""
+    magic = _kind_of(path)
+    if magic != _ZSTD_MAGIC:
+        yield path, magic
+        return
+    with tempfile.TemporaryDirectory(prefix="demorec-bag-") as folder:
+        plain = Path(folder) / path.stem
+        try:
+            _unpack_file(path, plain)
+            kind = _kind_of(plain)
+        except (zstandard.ZstdError, ValueError) as error:
+            raise BagError(f"The compressed bag cannot be unpacked ({error}): {path}") from error
+        if kind == _ZSTD_MAGIC:
+            raise BagError(f"The bag is compressed twice: {path}")
+        yield plain, kind
+
+
+def _unpack_file(path: Path, target: Path) -> None:
+    limits = Limits.of_file(path.stat().st_size)
+    written = 0
+    with open_regular(path) as source, target.open("wb") as file:
+        for block in zstandard.ZstdDecompressor().read_to_iter(source, write_size=_COPY_BYTES):
+            written += len(block)
+            limits.check_total(written)
+            file.write(block)

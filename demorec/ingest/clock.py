@@ -1,0 +1,174 @@
+"""One clock for streams that have each their own: which message, or which two, a row takes from each stream.
+
+Integer nanoseconds throughout. Nothing is made up where a stream has nothing: a row tells how old what it holds is,
+and what is older than the mapping allows is no row.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.ingest.mapping import BagMapping, Sampling
+from demorec.ingest.streams import NO_STAMP, Stream
+
+NS = 1_000_000_000
+MISSING = 2**62
+"""Age of what is not there."""
+MAX_ROWS = 10_000_000
+Int = NDArray[np.int64]
+Numbers = NDArray[np.floating[Any]]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Timeline:
+    """A stream's messages in the order of their times.
+
+    Attributes:
+        times_ns: (M,) int64, strictly increasing.
+        order: (M,) which of the stream's messages they are. Those of equal times are left out but the first, and so
+            are those whose header has no time where others have.
+        is_header: Whether times are those of the headers.
+        period_ns: The usual distance of two, 0 for fewer than two.
+        is_regular: Whether distances are alike; a stream that speaks only when something changes is not.
+    """
+
+    times_ns: Int
+    order: Int
+    is_header: bool
+    period_ns: int
+    is_regular: bool
+
+
+def timeline(stream: Stream, mapping: BagMapping) -> Timeline:
+    """The timeline of a stream, by header stamps if the mapping wants them and most messages have one."""
+    stamped = (stream.header_ns != NO_STAMP) & (stream.header_ns > 0)
+    is_header = mapping.clock.stamp == "header" and bool(len(stamped)) and bool(np.mean(stamped) > 0.5)
+    times = stream.header_ns if is_header else stream.log_ns
+    usable = np.flatnonzero(stamped) if is_header else np.arange(len(times))
+    order = usable[np.argsort(times[usable], kind="stable")]
+    ordered = times[order]
+    first = np.concatenate(([True], np.diff(ordered) > 0)) if len(ordered) else np.zeros(0, bool)
+    ordered, order = ordered[first], order[first]
+    period, is_regular = _period(ordered)
+    return Timeline(times_ns=ordered, order=order, is_header=is_header, period_ns=period, is_regular=is_regular)
+
+
+def _period(times: Int) -> tuple[int, bool]:
+    steps = np.diff(times)
+    if not len(steps):
+        return 0, False
+    period = int(np.median(steps))
+    # Most steps of a sensor are about a period, whatever is lost; those of commands on change are of any length.
+    near = (steps > 0.3 * period) & (steps < 1.7 * period)
+    return period, len(steps) >= 8 and bool(np.mean(near) > 0.6)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Chosen:
+    """What rows take from a stream.
+
+    Attributes:
+        index: (R,) the message in its timeline; of two, the earlier one; -1 for none.
+        fraction: (R,) how far the row is between that and the next one, 0 to 1; None unless they are mixed.
+        age_ns: (R,) row minus message, below 0 where the message is later; of two, the earlier one's.
+        reach_ns: (R,) how far off the message is; of two, the farther one. MISSING where there is none.
+    """
+
+    index: Int
+    fraction: NDArray[np.float64] | None
+    age_ns: Int
+    reach_ns: Int
+
+
+def choose(times_ns: Int, rows_ns: Int, sample: Sampling) -> Chosen:
+    """The messages for some rows.
+
+    Args:
+        times_ns: (M,) strictly increasing.
+        rows_ns: (R,) increasing.
+        sample: latest: the last message at or before the row; nearest: the earlier one of two that are as near;
+            linear: both neighbours, or one that is at the row.
+    """
+    count = len(times_ns)
+    if not count:
+        nothing = np.full(len(rows_ns), MISSING)
+        return Chosen(index=np.full(len(rows_ns), -1), fraction=None, age_ns=nothing, reach_ns=nothing)
+    before = np.searchsorted(times_ns, rows_ns, side="right") - 1
+    after = np.minimum(before + 1, count - 1)
+    since = np.where(before >= 0, rows_ns - times_ns[np.maximum(before, 0)], MISSING)
+    until = np.where(before + 1 < count, times_ns[after] - rows_ns, MISSING)
+    if sample == "latest":
+        return Chosen(index=before, fraction=None, age_ns=since, reach_ns=since)
+    if sample == "nearest":
+        later = until < since
+        age = np.where(later, -until, since)
+        return Chosen(index=np.where(later, after, before), fraction=None, age_ns=age, reach_ns=np.abs(age))
+    exact = since == 0
+    # A row outside of the stream has a neighbour on one side only, and no line to be on.
+    is_outside = ~exact & ((before < 0) | (before + 1 >= count))
+    reach = np.where(is_outside, MISSING, np.where(exact, 0, np.maximum(since, until)))
+    width = np.where(exact | is_outside, 1, times_ns[after] - times_ns[np.maximum(before, 0)])
+    fraction = np.where(exact, 0.0, np.clip(since / width, 0.0, 1.0))
+    return Chosen(index=before, fraction=fraction, age_ns=np.where(is_outside, MISSING, since), reach_ns=reach)
+
+
+def sampled(values: Numbers, chosen: Chosen, *, unit: str, quaternions: tuple[int, ...]) -> Numbers:
+    """(R, D) the numbers of some rows.
+
+    Args:
+        values: (M, D) in the order of the timeline.
+        chosen: For the rows; all of them have a message.
+        unit: Of the values: the line between two angles (rad, degree) is the short way round.
+        quaternions: First elements of x, y, z, w, which are mixed on the sphere.
+
+    Returns:
+        The very bits of a message where one is taken; where two are mixed, float64.
+    """
+    if chosen.fraction is None or not np.any(chosen.fraction):
+        return values[chosen.index]
+    first = values[chosen.index].astype(np.float64)
+    second = values[np.minimum(chosen.index + 1, len(values) - 1)].astype(np.float64)
+    fraction = chosen.fraction[:, np.newaxis]
+    step = second - first
+    turn = {"rad": 2 * np.pi, "degree": 360.0}.get(unit)
+    wraps = np.abs(step) > turn / 2 if turn else np.zeros(step.shape, bool)
+    if turn:
+        step = np.where(wraps, step - turn * np.round(step / turn), step)
+    mixed = first + fraction * step
+    if turn:
+        mixed = np.where(wraps, mixed - turn * np.round(mixed / turn), mixed)
+    for start in quaternions:
+        part = slice(start, start + 4)
+        mixed[:, part] = _slerp(first[:, part], second[:, part], chosen.fraction)
+    return np.where(fraction == 0.0, first, mixed)
+
+
+def _slerp(first: Numbers, second: Numbers, fraction: NDArray[np.float64]) -> Numbers:
+    """(R, 4) on the shorter great arc from `first` to `second`, of the length of their mean."""
+    lengths = [np.linalg.norm(part, axis=1, keepdims=True) for part in (first, second)]
+    a, b = first / np.maximum(lengths[0], 1e-300), second / np.maximum(lengths[1], 1e-300)
+    cosine = np.sum(a * b, axis=1, keepdims=True)
+    b = np.where(cosine < 0, -b, b)
+    angle = np.arccos(np.clip(np.abs(cosine), 0.0, 1.0))
+    t, sine = fraction[:, np.newaxis], np.sin(angle)
+    small = sine < 1e-6
+    safe = np.where(small, 1.0, sine)
+    weights = (
+        np.where(small, 1 - t, np.sin((1 - t) * angle) / safe),
+        np.where(small, t, np.sin(t * angle) / safe),
+    )
+    mixed = weights[0] * a + weights[1] * b
+    length = (1 - t) * lengths[0] + t * lengths[1]
+    return np.asarray(mixed / np.maximum(np.linalg.norm(mixed, axis=1, keepdims=True), 1e-300) * length)
+
+
+def grid(begin_ns: int, end_ns: int, fps: int) -> Int:
+    """Row times from `begin_ns` on, `fps` a second, none after `end_ns`; no rounding error adds up."""
+    count = max(0, (end_ns - begin_ns) * fps // NS + 1)
+    if count > MAX_ROWS:
+        raise ValueError(f"{count:,} rows, at most {MAX_ROWS:,} are made")
+    return begin_ns + np.arange(count, dtype=np.int64) * NS // fps

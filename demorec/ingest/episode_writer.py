@@ -1,0 +1,190 @@
+"""An episode on its way into its recording, while its bag is read a second time for the pictures.
+
+Pictures that are coded already stay as they are, byte for byte; pixels are coded once. A frame is written as soon as
+its pictures are, so that of a bag of any size only what is under way is in memory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, Self, cast
+
+import numpy as np
+
+from demorec.config import VideoConfig
+from demorec.ingest.channel import BagError
+from demorec.ingest.clock import Int, Timeline
+from demorec.ingest.fields import picture_bytes
+from demorec.ingest.picture_messages import KEPT_FORMATS, PictureHead, decode_picture
+from demorec.ingest.ros_types import Values
+from demorec.ingest.rows import CameraRows, EpisodeRows
+from demorec.ingest.streams import Stream
+from demorec.recording import CollectedWriter
+from demorec.scene.collected import CollectedFrame, CollectedInfo, CollectedOutcome, Sample
+
+Kept = Literal["", "h264", "h265", "av1", "jpeg"]
+_MAX_WAITING = 1 << 29
+"""Bytes of pictures that wait for earlier ones, which come later in the bag."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PicturePlan:
+    """The pictures that an episode takes of a camera.
+
+    Attributes:
+        topic: Of them.
+        head: Of the first.
+        kept: The codec whose packets stay as they are; "" for pixels, which are coded once.
+        numbers: (P,) which of the topic's messages are taken, in the order of their times.
+        stamps_ns: (P,) their times.
+        positions: (R,) which of the taken ones each row shows.
+    """
+
+    topic: str
+    head: PictureHead
+    kept: Kept
+    numbers: Int
+    stamps_ns: Int
+    positions: Int
+
+    @property
+    def told(self) -> str:
+        """What becomes of them, for people."""
+        shown = len(np.unique(self.positions))
+        what = f"{len(self.numbers)} pictures {self.head.width}x{self.head.height}, "
+        what += f"{self.kept} kept as it is" if self.kept else f"{_name_of(self.head)}, coded once"
+        repeated = len(self.positions) - shown
+        what += f", {repeated} rows show the picture of the row before" if repeated else ""
+        return what + (f", {len(self.numbers) - shown} shown by no row" if len(self.numbers) > shown else "")
+
+
+def _name_of(head: PictureHead) -> str:
+    return head.encoding if head.format == "raw" else head.format
+
+
+def picture_plan(rows: CameraRows, stream: Stream, line: Timeline) -> PicturePlan:
+    """Of a camera in an episode: of stills those that rows show, of video all from the keyframe before on."""
+    place = np.searchsorted(line.times_ns, _times_of(stream, line, rows))
+    head = stream.heads[int(line.order[place[0]])]
+    taken = np.unique(place)
+    if head.format in KEPT_FORMATS and head.format != "jpeg":
+        first = int(taken[0])
+        while not stream.heads[int(line.order[first])].is_keyframe:
+            first -= 1
+        head = stream.heads[int(line.order[first])]
+        taken = np.arange(first, int(taken[-1]) + 1)
+    return PicturePlan(
+        topic=stream.topic,
+        head=head,
+        kept=cast(Kept, head.format) if head.format in KEPT_FORMATS else "",
+        numbers=stream.numbers[line.order[taken]],
+        stamps_ns=line.times_ns[taken],
+        positions=np.searchsorted(taken, place),
+    )
+
+
+def _times_of(stream: Stream, line: Timeline, rows: CameraRows) -> Int:
+    return np.asarray((stream.header_ns if line.is_header else stream.log_ns)[rows.index])
+
+
+@dataclass(kw_only=True, eq=False)
+class _Waiting:
+    plan: PicturePlan
+    places: dict[int, int]
+    num_written: int = 0
+    pictures: dict[int, tuple[bytes | Any, int]] = field(default_factory=dict)
+    num_bytes: int = 0
+
+
+class EpisodeWriter:
+    """Writes one episode; a context manager, which leaves nothing behind unless `finish` was called.
+
+    Args:
+        path: Of the recording.
+        info: What is known of the episode.
+        rows: Its rows.
+        plans: Camera -> its pictures.
+        video: How pixels are coded.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        info: CollectedInfo,
+        rows: EpisodeRows,
+        plans: Mapping[str, PicturePlan],
+        *,
+        video: VideoConfig,
+    ) -> None:
+        self._rows = rows
+        self._waiting = {
+            name: _Waiting(plan=plan, places={int(number): k for k, number in enumerate(plan.numbers)})
+            for name, plan in plans.items()
+        }
+        self._next_row = 0
+        self._writer = CollectedWriter(path, info, video=video)
+        self._is_finished = False
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if not self._is_finished:
+            self._writer.discard()
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether nothing more is needed of the bag."""
+        return all(waiting.num_written == len(waiting.plan.numbers) for waiting in self._waiting.values())
+
+    def add(self, topic: str, number: int, values: Values) -> None:
+        """Take a message of a camera's topic, if the episode wants it.
+
+        Raises:
+            FieldError: Its picture cannot be decoded.
+            RecordingError: It cannot be written.
+        """
+        for name, waiting in self._waiting.items():
+            if waiting.plan.topic == topic and number in waiting.places:
+                self._take(name, waiting, waiting.places[number], values)
+        self._write_rows()
+
+    def _take(self, name: str, waiting: _Waiting, place: int, values: Values) -> None:
+        data: Any = picture_bytes(values) if waiting.plan.kept else decode_picture(values)
+        size = len(data) if isinstance(data, bytes) else data.nbytes
+        waiting.pictures[place] = (data, size)
+        waiting.num_bytes += size
+        while waiting.num_written in waiting.pictures:
+            picture, size = waiting.pictures.pop(waiting.num_written)
+            waiting.num_bytes -= size
+            self._writer.picture(name, int(waiting.plan.stamps_ns[waiting.num_written]), picture)
+            waiting.num_written += 1
+        if waiting.num_bytes > _MAX_WAITING:
+            raise BagError(
+                f"The pictures of {waiting.plan.topic} are too far out of order to be read in bounded memory."
+            )
+
+    def _write_rows(self) -> None:
+        while self._next_row < len(self._rows.times_ns) and all(
+            int(waiting.plan.positions[self._next_row]) < waiting.num_written for waiting in self._waiting.values()
+        ):
+            row = self._next_row
+            time_ns = int(self._rows.times_ns[row])
+            samples = {
+                name: Sample(stamp_ns=time_ns - int(feature.ages_ns[row]), vector=feature.values[row])
+                for name, feature in self._rows.features.items()
+            }
+            pictures = {name: int(waiting.plan.positions[row]) for name, waiting in self._waiting.items()}
+            self._writer.write(CollectedFrame(time_ns=time_ns, samples=samples, pictures=pictures))
+            self._next_row += 1
+
+    def finish(self, *, success: bool | None) -> None:
+        """Write what is left and give the recording its name; BagError when pictures have not come."""
+        self._write_rows()
+        if self._next_row < len(self._rows.times_ns):
+            missing = [w.plan.topic for w in self._waiting.values() if w.num_written < len(w.plan.numbers)]
+            raise BagError(f"The bag has changed while it was read: pictures of {missing[0]} are missing.")
+        self._writer.finish(CollectedOutcome(success=success, num_frames=self._next_row))
+        self._is_finished = True

@@ -1,0 +1,106 @@
+"""Where the episodes of a bag begin and end, what they are called and how they ended."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+import numpy as np
+
+from demorec.ingest.bag import Bag
+from demorec.ingest.channel import BagError
+from demorec.ingest.clock import NS, Timeline
+from demorec.ingest.mapping import BagMapping
+from demorec.ingest.streams import BagStreams, Text
+
+_NUMBER = re.compile(r"([_\-. ]*\d+)+$")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Window:
+    """Where an episode is in its bag.
+
+    Attributes:
+        begin_ns, end_ns: Its first and last moment, by the mapping's clock.
+        success: How it ended; None where the bag does not say.
+    """
+
+    begin_ns: int
+    end_ns: int
+    success: bool | None = None
+
+
+def windows(bag: Bag, streams: BagStreams, timelines: list[Timeline], mapping: BagMapping) -> list[Window]:
+    """The episodes of a bag, in order; BagError when there are none."""
+    begin = min(int(line.times_ns[0]) for line in timelines if len(line.times_ns))
+    end = max(int(line.times_ns[-1]) for line in timelines if len(line.times_ns))
+    episodes = mapping.episodes
+    if episodes.cut == "file":
+        return [Window(begin_ns=begin, end_ns=end)]
+    if episodes.cut == "times":
+        found = [
+            Window(begin_ns=begin + round(first * NS), end_ns=begin + round(last * NS))
+            for first, last in episodes.times_s
+        ]
+        if outside := [window for window in found if window.begin_ns >= end]:
+            raise BagError(
+                f"An episode begins {(outside[0].begin_ns - begin) / NS:g} s after the first message, the bag has only "
+                f"{(end - begin) / NS:.1f} s: {bag.path}"
+            )
+        return found
+    if episodes.cut == "gap":
+        return _between_gaps(timelines, episodes.gap_s)
+    found = _between_markers(streams.texts[episodes.topic], mapping)
+    if not found:
+        raise BagError(
+            f"No marker of {episodes.topic} says {episodes.start!r} and then {episodes.stop!r}, so there is no "
+            f"episode: {bag.path}"
+        )
+    return found
+
+
+def _between_gaps(timelines: list[Timeline], gap_s: float) -> list[Window]:
+    times = np.unique(np.concatenate([line.times_ns for line in timelines]))
+    breaks = np.flatnonzero(np.diff(times) > gap_s * NS)
+    begins = np.concatenate(([0], breaks + 1))
+    ends = np.concatenate((breaks, [len(times) - 1]))
+    return [Window(begin_ns=int(times[a]), end_ns=int(times[b])) for a, b in zip(begins, ends, strict=True)]
+
+
+def _between_markers(markers: list[Text], mapping: BagMapping) -> list[Window]:
+    words = mapping.episodes
+    found: list[Window] = []
+    begin: int | None = None
+    for marker in sorted(markers, key=lambda marker: marker.time_ns):
+        if marker.value is True or marker.value == words.start:
+            begin = marker.time_ns
+        elif begin is not None and (
+            marker.value is False or marker.value in (words.stop, words.success, words.failure)
+        ):
+            success = {words.success: True, words.failure: False}.get(marker.value) if marker.value else None
+            found.append(Window(begin_ns=begin, end_ns=marker.time_ns, success=success))
+            begin = None
+        elif begin is None and found and marker.value in (words.success, words.failure):
+            # The verdict may come after the end.
+            last = found[-1]
+            found[-1] = Window(begin_ns=last.begin_ns, end_ns=last.end_ns, success=marker.value == words.success)
+    return found
+
+
+def task_text(bag: Bag, streams: BagStreams, window: Window, mapping: BagMapping) -> str:
+    """What the robot was asked to do in an episode; BagError where the bag does not say."""
+    task = mapping.task
+    if task.text:
+        return task.text.strip()
+    if task.file_name:
+        text = _NUMBER.sub("", bag.name).replace("_", " ").replace("-", " ").strip()
+        if not text:
+            raise BagError(f"The bag's name says no task, which the mapping takes from it: {bag.path}")
+        return text
+    told = [text for text in streams.texts[task.topic] if text.time_ns <= window.end_ns]
+    if not told:
+        raise BagError(f"No text of {task.topic} is before the episode's end, so its task is unknown: {bag.path}")
+    value = max(told, key=lambda text: text.time_ns).value
+    if not isinstance(value, str) or not value.strip():
+        raise BagError(f"The task of {task.topic} is no text: {bag.path}")
+    return value.strip()

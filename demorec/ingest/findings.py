@@ -1,0 +1,319 @@
+"""What is odd in a bag's streams, found from times, numbers and picture heads alone, with names for each kind.
+
+The limits are such that sensors with ordinary jitter and latency, and robots that stand still for a while, give none.
+Nothing is repaired: a finding tells what the rows hold.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.ingest.clock import NS, Int, Timeline
+from demorec.ingest.mapping import ACTION, STATE, BagMapping
+from demorec.ingest.streams import NO_STAMP, BagStreams, Stream
+
+_JITTER = 0.25
+"""Of a period: what nine of ten steps of a sensor stay within."""
+_GAP = 5.0
+"""Periods without a message that are told as a gap; shorter ones are lost messages."""
+_SKEW_S = 0.1
+"""Between the times of headers and of recording: a camera's exposure and transport take less."""
+_STEP_S = 0.05
+"""By which a clock must jump, or drift in a bag, to be told."""
+_STILL_S = 0.5
+"""For which a sensor with noise never gives the same number."""
+_FROZEN = 5
+"""Pictures in a row with the same bytes: no camera without noise."""
+_SPIKE = 25.0
+"""Times the usual step of an element."""
+_FULL_TURNS = 4 * np.pi
+"""Beyond which no joint angle is in rad."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """Something odd.
+
+    Attributes:
+        kind: What, in one word of a fixed list.
+        stream: Which ("observation.state", "camera front"), "" for the bag as a whole.
+        text: What was found, with figures.
+    """
+
+    kind: str
+    stream: str
+    text: str
+
+
+def stream_findings(stream: Stream, line: Timeline, *, is_camera: bool) -> Iterator[Finding]:
+    """What is odd in one stream by itself."""
+    found = [*_message_findings(stream), *_time_findings(stream, line), *_clock_findings(stream)]
+    found += _picture_findings(stream, line) if is_camera else _value_findings(stream, line)
+    for kind, text in found:
+        yield Finding(kind=kind, stream=stream.label, text=f"{stream.topic}: {text}")
+
+
+def _message_findings(stream: Stream) -> Iterator[tuple[str, str]]:
+    if stream.num_malformed:
+        yield "malformed", f"{stream.num_malformed} messages cannot be used, the first since {stream.first_problem}"
+    unstamped = int(np.sum((stream.header_ns == 0) | ((stream.header_ns < 0) & (stream.header_ns != NO_STAMP))))
+    if unstamped:
+        yield "unstamped", f"{unstamped} of {len(stream)} headers have no time"
+    if len(stream.frame_ids) > 1:
+        yield "frame_id", f"its messages name several coordinate frames ({', '.join(stream.frame_ids[:4])})"
+
+
+def _time_findings(stream: Stream, line: Timeline) -> Iterator[tuple[str, str]]:
+    late = int(np.sum(np.diff(stream.log_ns) < 0))
+    times = stream.header_ns if line.is_header else stream.log_ns
+    known = times[(times != NO_STAMP) & (times > 0)]
+    backwards = int(np.sum(np.diff(known) < 0))
+    if late or backwards:
+        yield "order", f"{max(late, backwards)} messages come before earlier ones"
+    repeated = len(known) - len(np.unique(known))
+    if repeated:
+        same = int(np.sum((np.diff(known) == 0) & (np.diff(stream.checksums.astype(np.int64)[-len(known) :]) == 0)))
+        yield "duplicates", f"{repeated} messages have the time of another one, {same} of them the same bytes as well"
+    if not line.is_regular:
+        return
+    steps = np.diff(line.times_ns)
+    gaps = np.flatnonzero(steps > _GAP * line.period_ns)
+    lost = np.round(steps / line.period_ns).astype(np.int64) - 1
+    small = np.flatnonzero((lost > 0) & (steps <= _GAP * line.period_ns) & (steps > 1.6 * line.period_ns))
+    if len(gaps):
+        longest = int(steps[gaps].max())
+        begin = (line.times_ns[gaps[0]] - line.times_ns[0]) / NS
+        yield "gap", f"{len(gaps)} gaps, the first at {begin:.2f} s, the longest of {longest / NS:.3f} s"
+    if len(small):
+        yield "drops", f"{int(lost[small].sum())} of {len(line.times_ns) + int(lost[small].sum())} messages are lost"
+    regular = steps[steps <= 1.6 * line.period_ns]
+    off = np.percentile(np.abs(regular - line.period_ns), 90) if len(regular) else 0.0
+    if off > _JITTER * line.period_ns:
+        yield "jitter", f"its steps of {line.period_ns / 1e6:.1f} ms are off by {off / 1e6:.1f} ms (one of ten by more)"
+
+
+def _clock_findings(stream: Stream) -> Iterator[tuple[str, str]]:
+    """Of the difference between the times of recording and of headers."""
+    stamped = (stream.header_ns != NO_STAMP) & (stream.header_ns > 0)
+    skew = (stream.log_ns - stream.header_ns)[stamped]
+    if len(skew) < 8:
+        return
+    median = float(np.median(skew)) / NS
+    if abs(median) > _SKEW_S:
+        yield "clock_offset", f"its headers are {median:+.3f} s behind the times of recording"
+    width = max(3, min(20, len(skew) // 4))
+    smooth = np.array([np.median(part) for part in np.array_split(skew, max(2, len(skew) // width))]) / NS
+    largest = int(np.argmax(np.abs(np.diff(smooth))))
+    step = float(np.diff(smooth)[largest])
+    rest = np.delete(np.diff(smooth), largest)
+    total = float(smooth[-1] - smooth[0])
+    if abs(step) > _STEP_S and abs(step) > 5 * (np.abs(rest).max(initial=0.0) + 1e-4):
+        yield "clock_jump", f"its clock jumps by {-step:+.3f} s"
+    elif abs(total) > _STEP_S and abs(total) > 0.7 * np.abs(np.diff(smooth)).sum():
+        yield "clock_drift", f"its clock drifts by {-total:+.3f} s in the bag"
+
+
+def _value_findings(stream: Stream, line: Timeline) -> Iterator[tuple[str, str]]:
+    if stream.values is None or stream.layout is None or len(line.order) < 2:
+        return
+    values, names = stream.values[line.order].astype(np.float64), stream.layout.names
+    bad = ~np.isfinite(values)
+    if bad.any():
+        column = int(np.argwhere(bad)[0][1])
+        kind = "nan" if np.isnan(values[bad]).any() else "infinite"
+        yield kind, f"{int(bad.any(axis=1).sum())} messages hold no finite number, the first in {names[column]!r}"
+        values = np.where(bad, 0.0, values)
+    for start in stream.layout.quaternions:
+        off = float(np.abs(np.linalg.norm(values[:, start : start + 4], axis=1) - 1).max())
+        if off > 1e-3:
+            yield "quaternion", f"the length of a quaternion is off by {off:.3g}"
+    if len(names) > 1 and not np.any(values):
+        yield "zeros", "all numbers are 0"
+        return
+    yield from _still_findings(values, names, line)
+    steps = np.abs(np.diff(values, axis=0))
+    for column, name in enumerate(names):
+        usual = float(np.percentile(steps[:, column], 90))
+        largest = int(steps[:, column].argmax())
+        if usual > 0 and steps[largest, column] > _SPIKE * usual:
+            at = (line.times_ns[largest + 1] - line.times_ns[0]) / NS
+            yield "jump", f"{name!r} jumps by {steps[largest, column]:.3g} at {at:.2f} s, usual are {usual:.2g}"
+            break
+
+
+def _still_findings(values: NDArray[np.float64], names: tuple[str, ...], line: Timeline) -> Iterator[tuple[str, str]]:
+    """Elements with noise that suddenly have none."""
+    stuck = []
+    for column, name in enumerate(names):
+        begin, end = _longest_run(values[:, column])
+        seconds = (line.times_ns[end] - line.times_ns[begin]) / NS
+        others = np.concatenate((values[:begin, column], values[end + 1 :, column]))
+        if seconds < _STILL_S or end - begin < 10 or len(others) < 10:
+            continue
+        if np.mean(np.diff(others) != 0) > 0.8:
+            stuck.append((name, seconds, (line.times_ns[begin] - line.times_ns[0]) / NS))
+    if stuck:
+        name, seconds, at = stuck[0]
+        more = f" and {len(stuck) - 1} more elements" if len(stuck) > 1 else ""
+        yield "stuck", f"{name!r}{more} gives the very same number for {seconds:.2f} s from {at:.2f} s on"
+
+
+def _longest_run(numbers: NDArray[Any]) -> tuple[int, int]:
+    """First and last index of the longest run of equal numbers."""
+    edges = np.concatenate(([0], np.flatnonzero(np.diff(numbers) != 0) + 1, [len(numbers)]))
+    longest = int(np.argmax(np.diff(edges)))
+    return int(edges[longest]), int(edges[longest + 1]) - 1
+
+
+def _picture_findings(stream: Stream, line: Timeline) -> Iterator[tuple[str, str]]:
+    formats = {(head.format, head.encoding) for head in stream.heads}
+    if len(formats) > 1:
+        told = ", ".join(sorted(f"{name} {encoding}".strip() for name, encoding in formats))
+        yield "format", f"its pictures are of several kinds ({told})"
+    sizes = {(head.width, head.height) for head in stream.heads if head.width}
+    if len(sizes) > 1:
+        yield "size", f"its pictures change their size ({', '.join(f'{w}x{h}' for w, h in sorted(sizes))})"
+    sums = stream.picture_sums[line.order]
+    begin, end = _longest_run(sums.astype(np.int64))
+    if end - begin + 1 >= _FROZEN:
+        at = (line.times_ns[begin] - line.times_ns[0]) / NS
+        yield "frozen", f"{end - begin + 1} pictures from {at:.2f} s on have the very same bytes"
+    if stream.heads and stream.heads[0].format in ("h264", "h265", "av1") and not stream.heads[0].is_keyframe:
+        first = next((k for k, head in enumerate(stream.heads) if head.is_keyframe), len(stream.heads))
+        yield "keyframe", f"its first {first} pictures cannot be decoded, since no keyframe is before them"
+
+
+def bag_findings(
+    streams: BagStreams, lines: dict[str, tuple[Stream, Timeline]], mapping: BagMapping
+) -> Iterator[Finding]:
+    """What is odd between streams; `lines` has every stream by its label and topic."""
+    for problem in streams.problems:
+        yield Finding(kind="cut_off", stream="", text=problem)
+    yield from _extent_findings(list(lines.values()))
+    yield from _offset_findings(list(lines.values()))
+    yield from _camera_findings(streams)
+    yield from _rate_findings(streams, lines, mapping)
+    yield from _unit_findings(streams, mapping)
+    yield from _action_findings(streams, mapping)
+
+
+def _extent_findings(lines: list[tuple[Stream, Timeline]]) -> Iterator[Finding]:
+    regular = [(stream, line) for stream, line in lines if line.is_regular]
+    if len(regular) < 2:
+        return
+    begin = float(np.median([line.times_ns[0] for _, line in regular]))
+    end = float(np.median([line.times_ns[-1] for _, line in regular]))
+    for stream, line in regular:
+        late, early = (line.times_ns[0] - begin) / NS, (end - line.times_ns[-1]) / NS
+        if late > _STILL_S:
+            yield Finding(kind="late_start", stream=stream.label, text=f"{stream.topic}: begins {late:.2f} s late")
+        if early > _STILL_S:
+            yield Finding(kind="early_end", stream=stream.label, text=f"{stream.topic}: ends {early:.2f} s early")
+
+
+def _offset_findings(lines: list[tuple[Stream, Timeline]]) -> Iterator[Finding]:
+    """Streams whose headers are on another clock than those of most."""
+    skews = {}
+    for stream, _ in lines:
+        stamped = (stream.header_ns != NO_STAMP) & (stream.header_ns > 0)
+        if stamped.any():
+            skews[stream.label] = float(np.median((stream.log_ns - stream.header_ns)[stamped])) / NS
+    if len(skews) < 2:
+        return
+    usual = float(np.median(list(skews.values())))
+    for label, skew in skews.items():
+        if abs(skew - usual) > _SKEW_S:
+            text = f"its clock is off by {usual - skew:+.3f} s against that of the other streams"
+            yield Finding(kind="clock_offset", stream=label, text=text)
+
+
+def _camera_findings(streams: BagStreams) -> Iterator[Finding]:
+    """Cameras whose messages are those of another one, by coordinate frame or picture."""
+    for name, stream in streams.cameras.items():
+        info = streams.infos.get(name)
+        frame = str((info or {}).get("header", {}).get("frame_id", "")) if info else ""
+        if frame and stream.frame_ids and stream.frame_ids[0] and frame != stream.frame_ids[0]:
+            text = f"{stream.topic}: its pictures are of {stream.frame_ids[0]!r}, its calibration is of {frame!r}"
+            yield Finding(kind="swapped", stream=stream.label, text=text)
+        elif other := _claimed_by(name, streams):
+            text = f"{stream.topic}: its coordinate frame {stream.frame_ids[0]!r} is named like the topic of {other}"
+            yield Finding(kind="swapped", stream=stream.label, text=text)
+    for (name, stream), (other_name, other_stream) in pairwise(sorted(streams.cameras.items())):
+        shared = min(len(stream), len(other_stream))
+        if shared >= _FROZEN and np.mean(np.isin(stream.picture_sums, other_stream.picture_sums)) > 0.9:
+            text = f"{stream.topic} and {other_stream.topic} show the same pictures"
+            yield Finding(kind="same_pictures", stream=f"camera {name}, camera {other_name}", text=text)
+
+
+def _claimed_by(name: str, streams: BagStreams) -> str:
+    """The camera to whose topic a camera's coordinate frame belongs by its words, where it is not its own."""
+
+    def words(text: str) -> set[str]:
+        return {word for word in text.lower().replace("/", " ").replace("_", " ").split() if word not in _COMMON}
+
+    stream = streams.cameras[name]
+    frame = words(stream.frame_ids[0]) if stream.frame_ids else set()
+    own = words(stream.topic)
+    for other, other_stream in streams.cameras.items():
+        theirs = words(other_stream.topic)
+        if other != name and frame & (theirs - own) and not frame & (own - theirs):
+            return f"camera {other}"
+    return ""
+
+
+_COMMON = {"camera", "cam", "color", "image", "raw", "rect", "compressed", "optical", "frame", "link", "rgb", "depth"}
+
+
+def _rate_findings(
+    streams: BagStreams, lines: dict[str, tuple[Stream, Timeline]], mapping: BagMapping
+) -> Iterator[Finding]:
+    period = NS / mapping.clock.fps
+    for stream, line in lines.values():
+        if line.is_regular and line.period_ns > 1.15 * period:
+            text = f"{stream.topic}: comes {NS / line.period_ns:.1f} times a second, rows {mapping.clock.fps} times"
+            yield Finding(kind="slow", stream=stream.label, text=text)
+    if mapping.clock.rows != "grid":
+        for stream, line in lines.values():
+            if stream.topic == mapping.clock.rows and abs(line.period_ns - period) > 0.05 * period:
+                text = f"rows follow {stream.topic} at {NS / line.period_ns:.1f} a second, fps says {mapping.clock.fps}"
+                yield Finding(kind="fps", stream=stream.label, text=text)
+                break
+
+
+def _unit_findings(streams: BagStreams, mapping: BagMapping) -> Iterator[Finding]:
+    for (name, index), stream in streams.sources.items():
+        source = mapping.features[name][index]
+        if stream.values is None or source.next or (source.to or source.unit) != "rad":
+            continue
+        largest = float(np.nanmax(np.abs(stream.values), initial=0.0))
+        if largest > _FULL_TURNS:
+            text = f"{stream.topic}: angles reach {largest:.4g}, which is hardly rad"
+            yield Finding(kind="unit", stream=stream.label, text=text)
+
+
+def _action_findings(streams: BagStreams, mapping: BagMapping) -> Iterator[Finding]:
+    """State and action that do not speak of the same thing."""
+    if any(source.next for source in mapping.features[ACTION]):
+        return
+    state, action = streams.sources[STATE, 0], streams.sources[ACTION, 0]
+    if state.values is None or action.values is None or state.layout is None or action.layout is None:
+        return
+    shared = [(state.layout.names.index(name), column) for column, name in enumerate(action.layout.names)
+              if name in state.layout.names]  # fmt: skip
+    moving = [pair for pair in shared if _spread(action.values[:, pair[1]]) > 0.05]
+    dead = [pair for pair in moving if _spread(state.values[:, pair[0]]) == 0.0]
+    if dead:
+        name = state.layout.names[dead[0][0]]
+        text = f"{state.topic}: {name!r} never changes while the action of the same name does"
+        yield Finding(kind="stuck", stream=state.label, text=text)
+
+
+def _spread(numbers: NDArray[Any]) -> float:
+    finite: Int = numbers[np.isfinite(numbers)]
+    return float(np.ptp(finite)) if len(finite) else 0.0

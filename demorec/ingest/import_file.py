@@ -1,0 +1,70 @@
+"""import.json: what a run was imported from, by which mapping, and what was found; the reports, kept for `check`."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from demorec.errors import ConfigError, in_words, resource_error
+from demorec.ingest.channel import BagError
+from demorec.ingest.mapping import BagMapping
+from demorec.ingest.report import BagReport
+from demorec.plain import from_json, to_json
+from demorec.runs.run_file import IMPORT_NAME
+from demorec.safety.files import read_text_limited
+
+FORMAT = 1
+_MAX_BYTES = 256 << 20
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportFile:
+    """The content of import.json.
+
+    Attributes:
+        format: Of this file.
+        mapping: Of all bags.
+        mapping_digest: Of it.
+        bags: What was read, in order; those that are not whole yet are missing.
+    """
+
+    format: int = FORMAT
+    mapping: BagMapping
+    mapping_digest: str
+    bags: tuple[BagReport, ...] = ()
+
+
+def load_import_file(folder: Path) -> ImportFile | None:
+    """That of a run; None when there is none, BagError when it cannot be read."""
+    path = folder / IMPORT_NAME
+    try:
+        found = from_json(read_text_limited(path, _MAX_BYTES), ImportFile)
+        if found.format != FORMAT:
+            raise ConfigError(f"import.json has format {found.format}, this demorec knows up to {FORMAT}: {path}")
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except OSError as error:
+        raise resource_error(error, path) or BagError(
+            f"import.json cannot be read ({error.strerror}): {path}"
+        ) from error
+    except ValueError as error:
+        raise BagError(f"import.json is damaged ({in_words(error)}): {path}") from error
+    return found
+
+
+def save_import_file(content: ImportFile, folder: Path) -> None:
+    """Replace import.json in one step; BagError when it cannot be written."""
+    path = folder / IMPORT_NAME
+    part = folder / f"{IMPORT_NAME}.part"
+    try:
+        part.unlink(missing_ok=True)
+        with part.open("x") as file:
+            file.write(to_json(content, indent=2) + "\n")
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(path)
+    except OSError as error:
+        raise resource_error(error, path) or BagError(
+            f"import.json cannot be written ({error.strerror}): {path}"
+        ) from error

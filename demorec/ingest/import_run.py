@@ -1,0 +1,265 @@
+"""Bags become a run: every bag is read, judged as a whole, and only then written, episode by episode.
+
+The same command again goes on: bags that import.json knows are not read, episodes that are there are not written.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from demorec.config import VideoConfig
+from demorec.errors import ConfigError
+from demorec.ingest.bag import Bag, open_bag
+from demorec.ingest.channel import BagError
+from demorec.ingest.clock import NS
+from demorec.ingest.description import describe, origin_of, urdf_text
+from demorec.ingest.episode_writer import EpisodeWriter, PicturePlan, picture_plan
+from demorec.ingest.episodes import Window, task_text, windows
+from demorec.ingest.fields import FieldError
+from demorec.ingest.import_file import ImportFile, load_import_file, save_import_file
+from demorec.ingest.mapping import BagMapping, read_mapping
+from demorec.ingest.report import BagReport, EpisodeReport, all_findings, stream_reports
+from demorec.ingest.rows import EpisodeRows, NoRowsError, Timelines
+from demorec.ingest.streams import BagDecoder, BagStreams, read_streams
+from demorec.recording import CollectedRecording
+from demorec.runs.collected import CollectedFolder, differences, open_collected_run
+from demorec.scene.collected import CollectedInfo
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportResult:
+    """What an import made.
+
+    Attributes:
+        reports: Of every bag, in the order in which they were given.
+        num_new: Bags that were read now; the others were there.
+    """
+
+    reports: tuple[BagReport, ...]
+    num_new: int
+
+
+def import_bags(
+    paths: Sequence[Path],
+    mapping_path: Path,
+    out: Path,
+    *,
+    video: VideoConfig | None = None,
+    tell: Callable[[BagReport], None] = lambda report: None,
+) -> ImportResult:
+    """Import bags into a run, by a mapping.
+
+    Args:
+        paths: Of bags: each is an episode, or several as the mapping says.
+        mapping_path: Of the mapping.
+        out: The run's folder; one that the same mapping began is continued.
+        video: How pictures are coded that come as pixels.
+        tell: Called with the report of each bag that was read now.
+
+    Raises:
+        ConfigError: The mapping is impossible, or the folder holds something else.
+        BagError: A bag cannot be read, does not fit the mapping, or would give an episode with something missing.
+        RecordingError: The disk is full or gone.
+    """
+    mapping = read_mapping(mapping_path)
+    urdf = urdf_text(mapping, mapping_path)
+    bags = [open_bag(path) for path in paths]
+    known = load_import_file(out) or ImportFile(mapping=mapping, mapping_digest=mapping.digest)
+    if known.mapping_digest != mapping.digest:
+        raise ConfigError(f"The run was imported by another mapping: choose another --out: {out}")
+    hashes = [tuple(bag.sha256s().items()) for bag in bags]
+    reports = {report.files: report for report in known.bags}
+    new = {files: bag for files, bag in zip(hashes, bags, strict=True) if files not in reports}
+    if new:
+        with open_collected_run(out, recovers=False) as folder:
+            for files, bag in new.items():
+                first = sum(episode.episode_index is not None for row in known.bags for episode in row.episodes)
+                report = _Import(bag, dict(files), mapping, urdf, folder, video or VideoConfig()).run(first)
+                known = replace(known, bags=(*known.bags, report))
+                save_import_file(known, out)
+                reports[files] = report
+                tell(report)
+    return ImportResult(reports=tuple(reports[files] for files in dict.fromkeys(hashes)), num_new=len(new))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Episode:
+    """An episode that shall be written."""
+
+    info: CollectedInfo
+    rows: EpisodeRows
+    plans: dict[str, PicturePlan]
+    path: Path
+
+
+class _Import:
+    """The import of one bag."""
+
+    def __init__(
+        self,
+        bag: Bag,
+        files: dict[str, str],
+        mapping: BagMapping,
+        urdf: str,
+        folder: CollectedFolder,
+        video: VideoConfig,
+    ) -> None:
+        self._bag, self._files, self._mapping = bag, files, mapping
+        self._urdf, self._folder, self._video = urdf, folder, video
+
+    def run(self, first_index: int) -> BagReport:
+        """Read, judge and write it."""
+        streams = read_streams(self._bag, self._mapping)
+        lines = Timelines(streams, self._mapping)
+        found = windows(
+            self._bag, streams, [line for line in lines.lines.values() if len(line.times_ns)], self._mapping
+        )
+        findings = all_findings(streams, lines, self._mapping)
+        begin = min(window.begin_ns for window in found)
+        episodes: list[_Episode] = []
+        reports: list[EpisodeReport] = []
+        for window in found:
+            try:
+                rows = lines.rows(window)
+            except NoRowsError as error:
+                if self._mapping.clock.when_old == "error":
+                    kinds = sorted({finding.kind for finding in findings})
+                    told = f" (the bag's report: {', '.join(kinds)})" if kinds else ""
+                    raise BagError(f"The bag gives no whole episode: {error}{told}: {self._bag.path}") from error
+                reports.append(_dropped(window, begin, str(error)))
+                continue
+            episode = self._episode(streams, lines, rows, first_index + len(episodes))
+            episodes.append(episode)
+            reports.append(_made(episode, begin))
+        self._check_alike(episodes)
+        self._write([episode for episode in episodes if not _is_there(episode)])
+        return BagReport(
+            name=self._bag.path.name,
+            files=tuple(self._files.items()),
+            num_bytes=self._bag.num_bytes,
+            streams=tuple(stream_reports(lines, [episode.rows for episode in episodes])),
+            findings=findings,
+            episodes=tuple(reports),
+        )
+
+    def _episode(self, streams: BagStreams, lines: Timelines, rows: EpisodeRows, index: int) -> _Episode:
+        plans = {
+            name: picture_plan(camera, lines.streams[name], lines.lines[name]) for name, camera in rows.cameras.items()
+        }
+        info = describe(
+            bag=self._bag,
+            lines=lines,
+            streams=streams,
+            rows=rows,
+            plans=plans,
+            urdf=self._urdf,
+            episode_index=index,
+            instruction=task_text(self._bag, streams, rows.window, self._mapping),
+            origin=origin_of(self._files, self._mapping),
+        )
+        return _Episode(info=info, rows=rows, plans=plans, path=self._folder.path_of(index))
+
+    def _check_alike(self, episodes: Sequence[_Episode]) -> None:
+        """ConfigError unless the episodes are of the kind that the run holds, and of one kind."""
+        for episode in episodes[:1]:
+            self._folder.check_fits(episode.info)
+        for episode in episodes[1:]:
+            if different := differences(episodes[0].info, episode.info):
+                raise ConfigError(f"The bag's episodes differ ({'; '.join(different)}): {self._bag.path}")
+
+    def _write(self, episodes: list[_Episode]) -> None:
+        """Read the bag's pictures once more, and write each episode while they pass."""
+        waiting = sorted(episodes, key=lambda episode: int(episode.rows.times_ns[0]))
+        for episode in (episode for episode in waiting if not episode.plans):
+            with self._writer(episode) as writer:
+                self._finish(episode, writer)
+        waiting = [episode for episode in waiting if episode.plans]
+        if not waiting:
+            return
+        with ExitStack() as stack:
+            under_way: list[tuple[_Episode, EpisodeWriter]] = []
+            for topic, number, values in self._pictures(waiting):
+                for episode in [episode for episode in waiting if _wants(episode, topic, number)]:
+                    under_way.append((episode, stack.enter_context(self._writer(episode))))
+                    waiting.remove(episode)
+                for pair in list(under_way):
+                    episode, writer = pair
+                    try:
+                        writer.add(topic, number, values)
+                    except FieldError as error:
+                        raise self._unusable(topic, error) from error
+                    if writer.is_complete:
+                        self._finish(episode, writer)
+                        under_way.remove(pair)
+            for episode, writer in under_way:
+                self._finish(episode, writer)
+
+    def _finish(self, episode: _Episode, writer: EpisodeWriter) -> None:
+        writer.finish(success=episode.rows.window.success)
+        self._folder.add(episode.path)
+
+    def _writer(self, episode: _Episode) -> EpisodeWriter:
+        return EpisodeWriter(episode.path, episode.info, episode.rows, episode.plans, video=self._video)
+
+    def _pictures(self, episodes: Sequence[_Episode]) -> Iterator[tuple[str, int, dict[str, object]]]:
+        """(topic, number, values) of the pictures that any episode takes."""
+        wanted: dict[str, set[int]] = {}
+        for episode in episodes:
+            for plan in episode.plans.values():
+                wanted.setdefault(plan.topic, set()).update(plan.numbers.tolist())
+        decoder, counts = BagDecoder(), dict.fromkeys(wanted, 0)
+        for message in self._bag.messages([], wanted.keys()):
+            topic = message.channel.topic
+            number, counts[topic] = counts[topic], counts[topic] + 1
+            if number in wanted[topic]:
+                try:
+                    values = decoder.values(message)
+                except ValueError as error:
+                    raise self._unusable(topic, error) from error
+                yield topic, number, values
+
+    def _unusable(self, topic: str, error: ValueError) -> BagError:
+        return BagError(f"A picture of {topic} cannot be used, since {error}: {self._bag.path}")
+
+
+def _wants(episode: _Episode, topic: str, number: int) -> bool:
+    return any(plan.topic == topic and number in plan.numbers for plan in episode.plans.values())
+
+
+def _is_there(episode: _Episode) -> bool:
+    """Whether an earlier start of the same import has written an episode; ConfigError for another recording."""
+    if not episode.path.exists():
+        return False
+    with CollectedRecording(episode.path) as recording:
+        if recording.info == episode.info and recording.outcome is not None:
+            return True
+    raise ConfigError(f"Another recording is there already: choose another --out: {episode.path}")
+
+
+def _made(episode: _Episode, begin_ns: int) -> EpisodeReport:
+    rows = episode.rows
+    return EpisodeReport(
+        episode_index=episode.info.episode_index,
+        begin_s=(int(rows.times_ns[0]) - begin_ns) / NS,
+        end_s=(int(rows.times_ns[-1]) - begin_ns) / NS,
+        num_frames=len(rows.times_ns),
+        success=rows.window.success,
+        trimmed_s=(rows.trimmed_ns[0] / NS, rows.trimmed_ns[1] / NS),
+        pictures={name: plan.told for name, plan in episode.plans.items()},
+    )
+
+
+def _dropped(window: Window, begin_ns: int, reason: str) -> EpisodeReport:
+    return EpisodeReport(
+        episode_index=None,
+        begin_s=(window.begin_ns - begin_ns) / NS,
+        end_s=(window.end_ns - begin_ns) / NS,
+        num_frames=0,
+        success=window.success,
+        trimmed_s=(0.0, 0.0),
+        pictures={},
+        reason=reason,
+    )

@@ -1,0 +1,152 @@
+"""Messages that hold a picture, as ROS and Foxglove define them: what is in them, without decoding it."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterable, Iterator
+from typing import NamedTuple, cast
+
+import av
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from demorec.config import MAX_PIXELS
+from demorec.errors import in_words
+from demorec.ingest.fields import FieldError, picture_bytes
+from demorec.ingest.raw_pictures import RAW_ENCODINGS, check_raw, raw_picture
+from demorec.ingest.ros_types import Values
+from demorec.recording.video import is_keyframe
+
+VIDEO_FORMATS = ("h264", "h265", "av1")
+KEPT_FORMATS = ("jpeg", *VIDEO_FORMATS)
+"""What stays as it is, byte for byte."""
+_JPEG, _PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
+_DECODERS = {"h264": "h264", "h265": "hevc", "av1": "libdav1d"}
+_PARAMETER_BYTES = 48
+_ALIASES = {"hevc": "h265", "avc": "h264", "jpg": "jpeg"}
+
+
+class PictureHead(NamedTuple):
+    """What is known of a picture before it is decoded.
+
+    Attributes:
+        format: raw, jpeg, png or a codec of `VIDEO_FORMATS`.
+        encoding: Of raw pixels: "rgb8", "bayer_rggb8", "16UC1"; else "".
+        width, height: Pixels; 0 in video between keyframes.
+        is_keyframe: Whether it can be decoded without those before it: in video a keyframe with its parameter sets.
+    """
+
+    format: str
+    encoding: str
+    width: int
+    height: int
+    is_keyframe: bool
+
+
+def picture_head(values: Values) -> PictureHead:
+    """Of a message; FieldError when it holds no picture, a damaged one, or one in a format that is not read."""
+    if "data" not in values:
+        raise FieldError("it holds no picture")
+    if "encoding" in values and "width" in values and "height" in values:
+        head = _checked(PictureHead("raw", str(values["encoding"]), int(values["width"]), int(values["height"]), True))
+        check_raw(values)
+        return head
+    if "format" not in values:
+        raise FieldError("it holds no picture")
+    data = picture_bytes(values)
+    name = str(values["format"]).lower()
+    if "compresseddepth" in name:
+        raise FieldError("it holds depth, which an episode has no place for")
+    if data.startswith((_JPEG, _PNG)):
+        return _checked(_file_head("jpeg" if data.startswith(_JPEG) else "png", data))
+    codec = _ALIASES.get(name, name)
+    if codec not in VIDEO_FORMATS:
+        raise FieldError(f"its format {name[:40]!r} is not read; jpeg, png, {', '.join(VIDEO_FORMATS)} are")
+    if not _starts_by_itself(codec, data):
+        return PictureHead(codec, "", 0, 0, False)
+    return _checked(PictureHead(codec, "", *_video_size(codec, data), True))
+
+
+def _checked(head: PictureHead) -> PictureHead:
+    if head.width < 1 or head.height < 1 or head.width * head.height > MAX_PIXELS:
+        raise FieldError(f"its picture has {head.width}x{head.height} pixels, at most {MAX_PIXELS} are read")
+    if head.format == "raw" and head.encoding not in RAW_ENCODINGS:
+        raise FieldError(f"its encoding {head.encoding[:40]!r} is not read; {', '.join(RAW_ENCODINGS)} are")
+    return head
+
+
+def _file_head(kind: str, data: bytes) -> PictureHead:
+    try:
+        with Image.open(io.BytesIO(data), formats=(kind.upper(),)) as image:
+            width, height = image.size
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise FieldError(f"its picture is damaged ({in_words(error)})") from error
+    end = b"\xff\xd9" if kind == "jpeg" else b"IEND\xaeB`\x82"
+    if end not in data[-64:]:  # some cameras pad their pictures
+        raise FieldError("its picture is cut off")
+    return PictureHead(kind, "", width, height, True)
+
+
+def decode_picture(values: Values) -> NDArray[np.uint8]:
+    """(H, W, 3) RGB of a picture that is no video; FieldError when it cannot be decoded."""
+    if "encoding" in values:
+        return raw_picture(values)
+    try:
+        with Image.open(io.BytesIO(picture_bytes(values)), formats=("JPEG", "PNG")) as image:
+            if image.mode not in ("RGB", "RGBA", "L", "P", "1"):
+                raise FieldError(f"its pixels are {image.mode!r}, which is no colour of 8 bits")
+            return np.asarray(image.convert("RGB"))
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise FieldError(f"its picture cannot be decoded ({in_words(error)})") from error
+
+
+def _starts_by_itself(codec: str, data: bytes) -> bool:
+    if codec == "av1":
+        return is_keyframe(codec, data)
+    kinds = list(_nal_types(codec, data))
+    if codec == "h264":  # ITU-T H.264, table 7-1
+        return 5 in kinds and 7 in kinds
+    return 33 in kinds and any(16 <= kind <= 23 for kind in kinds)  # ITU-T H.265, table 7-1
+
+
+def _nal_types(codec: str, data: bytes) -> Iterator[int]:
+    """Those of an access unit up to its first slice."""
+    position = data.find(b"\x00\x00\x01")
+    while 0 <= position < len(data) - 3:
+        head = data[position + 3]
+        kind = head & 31 if codec == "h264" else (head >> 1) & 63
+        yield kind
+        if kind in (1, 5) if codec == "h264" else kind < 32:
+            return
+        position = data.find(b"\x00\x00\x01", position + 3)
+
+
+_sizes: dict[tuple[str, bytes], tuple[int, int]] = {}
+"""(codec, beginning of a keyframe) -> its size. The parameter sets are there, which say it in bits."""
+
+
+def _video_size(codec: str, data: bytes) -> tuple[int, int]:
+    key = (codec, data[:_PARAMETER_BYTES])
+    size = _sizes.get(key)
+    if size is None:
+        (picture,) = decode_video(codec, [data])
+        if len(_sizes) > 1000:
+            _sizes.clear()
+        size = _sizes[key] = (picture.shape[1], picture.shape[0])
+    return size
+
+
+def decode_video(codec: str, packets: Iterable[bytes]) -> Iterator[NDArray[np.uint8]]:
+    """The pictures of packets, from a keyframe on; FieldError when they cannot be decoded."""
+    try:
+        context = cast(av.VideoCodecContext, av.CodecContext.create(_DECODERS[codec], "r"))
+        context.thread_count = 1
+        context.options = {"max_pixels": str(MAX_PIXELS)}
+        for data in packets:
+            for frame in context.decode(av.Packet(data)):
+                yield cast(NDArray[np.uint8], frame.to_ndarray(format="rgb24"))
+        for frame in context.decode(None):
+            yield cast(NDArray[np.uint8], frame.to_ndarray(format="rgb24"))
+    except (av.FFmpegError, ValueError) as error:
+        raise FieldError(f"its {codec} video cannot be decoded") from error

@@ -1,0 +1,205 @@
+"""What an import says about a bag: a line for each stream, what is odd, which episodes came of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from demorec.ingest.clock import NS, Timeline
+from demorec.ingest.findings import Finding, bag_findings, stream_findings
+from demorec.ingest.mapping import BagMapping
+from demorec.ingest.rows import EpisodeRows, Timelines
+from demorec.ingest.streams import NO_STAMP, BagStreams, Stream
+
+
+@dataclass(frozen=True, kw_only=True)
+class StreamReport:
+    """A stream of a bag in figures.
+
+    Attributes:
+        label, topic, type: Which it is.
+        clock: Whether its times are those of headers or of recording.
+        count: Messages.
+        rate_hz: Of its usual distance; 0 for fewer than two messages.
+        is_regular: Whether it comes at that rate, or whenever something happens.
+        skew_ms: Time of recording minus that of the header, median; None without headers.
+        skew_range_ms: Largest minus smallest of these, without the outer hundredth.
+        jitter_ms: By how much its steps differ from the usual one, standard deviation of those without losses.
+        longest_ms: Longest step.
+        lost: Messages that are missing by the rate.
+        duplicates: Messages of the time of another one.
+        malformed: Messages that could not be used.
+        max_age_ms: The oldest that any row holds.
+    """
+
+    label: str
+    topic: str
+    type: str
+    clock: str
+    count: int
+    rate_hz: float
+    is_regular: bool
+    skew_ms: float | None
+    skew_range_ms: float | None
+    jitter_ms: float
+    longest_ms: float
+    lost: int
+    duplicates: int
+    malformed: int
+    max_age_ms: float | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodeReport:
+    """An episode of a bag.
+
+    Attributes:
+        episode_index: In the run; None when it was dropped.
+        begin_s, end_s: In the bag, from its first message on.
+        num_frames: Rows.
+        success: None where the bag does not say.
+        trimmed_s: What of its window no row covers, at the beginning and the end.
+        pictures: Camera -> what became of its pictures, in words.
+        reason: Why it was dropped; "" for others.
+    """
+
+    episode_index: int | None
+    begin_s: float
+    end_s: float
+    num_frames: int
+    success: bool | None
+    trimmed_s: tuple[float, float]
+    pictures: dict[str, str]
+    reason: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BagReport:
+    """All that is said about a bag.
+
+    Attributes:
+        name: Of the file or folder, without its place.
+        files: Name and SHA-256 of each of its files.
+        num_bytes: Of them.
+        streams, findings, episodes: As described there.
+    """
+
+    name: str
+    files: tuple[tuple[str, str], ...]
+    num_bytes: int
+    streams: tuple[StreamReport, ...]
+    findings: tuple[Finding, ...]
+    episodes: tuple[EpisodeReport, ...]
+
+
+def stream_reports(lines: Timelines, episodes: Sequence[EpisodeRows]) -> Iterator[StreamReport]:
+    """A line for each stream."""
+    for key, stream in lines.streams.items():
+        line = lines.lines[key]
+        steps = np.diff(line.times_ns)
+        ages = [lines.chosen(key, rows.times_ns).reach_ns.max() for rows in episodes]
+        usual = steps[(steps > 0.4 * line.period_ns) & (steps < 1.6 * line.period_ns)]
+        skew, spread = _skew(stream)
+        lost = int((np.round(steps / line.period_ns) - 1).clip(min=0).sum()) if line.is_regular else 0
+        yield StreamReport(
+            label=stream.label,
+            topic=stream.topic,
+            type=stream.type,
+            clock="header" if line.is_header else "log",
+            count=len(stream),
+            rate_hz=NS / line.period_ns if line.period_ns else 0.0,
+            is_regular=line.is_regular,
+            skew_ms=skew,
+            skew_range_ms=spread,
+            jitter_ms=float(np.std(usual)) / 1e6 if len(usual) else 0.0,
+            longest_ms=float(steps.max()) / 1e6 if len(steps) else 0.0,
+            lost=lost,
+            duplicates=_duplicates(stream, line),
+            malformed=stream.num_malformed,
+            max_age_ms=float(max(ages)) / 1e6 if ages else None,
+        )
+
+
+def _skew(stream: Stream) -> tuple[float | None, float | None]:
+    stamped = (stream.header_ns != NO_STAMP) & (stream.header_ns > 0)
+    if not stamped.any():
+        return None, None
+    skew = (stream.log_ns - stream.header_ns)[stamped]
+    low, high = np.percentile(skew, [1, 99])
+    return float(np.median(skew)) / 1e6, float(high - low) / 1e6
+
+
+def _duplicates(stream: Stream, line: Timeline) -> int:
+    times = stream.header_ns if line.is_header else stream.log_ns
+    known = times[(times != NO_STAMP) & (times > 0)]
+    return len(known) - len(np.unique(known))
+
+
+def all_findings(streams: BagStreams, lines: Timelines, mapping: BagMapping) -> tuple[Finding, ...]:
+    """What is odd in a bag, each thing once."""
+    by_label = {f"{key}": (stream, lines.lines[key]) for key, stream in lines.streams.items()}
+    found = [
+        finding
+        for key, stream in lines.streams.items()
+        for finding in stream_findings(stream, lines.lines[key], is_camera=isinstance(key, str))
+    ]
+    found += bag_findings(streams, by_label, mapping)
+    once: dict[tuple[str, str], Finding] = {}
+    for finding in found:
+        once.setdefault((finding.kind, finding.text.partition(":")[0] if finding.stream else finding.text), finding)
+    return tuple(once.values())
+
+
+_HEAD = ("stream", "topic", "messages", "rate Hz", "clock", "skew ms", "jitter ms", "longest ms", "lost", "age ms")
+
+
+def report_lines(report: BagReport) -> list[str]:
+    """The report as text: a table of the streams, the findings, the episodes."""
+    rows = [_HEAD, *(_row(stream) for stream in report.streams)]
+    widths = [max(len(row[column]) for row in rows) for column in range(len(_HEAD))]
+    lines = [f"{report.name} ({report.num_bytes / 1e6:,.1f} MB)"]
+    for row in rows:
+        cells = [
+            cell.ljust(width) if column in (0, 1, 4) else cell.rjust(width)
+            for column, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ]
+        lines.append("  " + "  ".join(cells).rstrip())
+    for finding in report.findings:
+        place = f"{finding.stream}: " if finding.stream else ""
+        lines.append(f"  {finding.kind}: {place}{finding.text}")
+    for episode in report.episodes:
+        lines += _episode_lines(episode)
+    return lines
+
+
+def _row(stream: StreamReport) -> tuple[str, ...]:
+    def number(value: float | None) -> str:
+        return "-" if value is None else f"{value:.1f}"
+
+    skew = "-" if stream.skew_ms is None else f"{stream.skew_ms:.1f}"
+    rate = f"{stream.rate_hz:.1f}" if stream.is_regular else "on change"
+    return (
+        stream.label,
+        stream.topic,
+        str(stream.count),
+        rate,
+        stream.clock,
+        skew,
+        number(stream.jitter_ms) if stream.is_regular else "-",
+        number(stream.longest_ms),
+        str(stream.lost),
+        number(stream.max_age_ms),
+    )
+
+
+def _episode_lines(episode: EpisodeReport) -> Iterator[str]:
+    place = f"{episode.begin_s:.2f} to {episode.end_s:.2f} s"
+    if episode.episode_index is None:
+        yield f"  no episode from {place}: {episode.reason}"
+        return
+    verdict = {True: ", success", False: ", failure", None: ""}[episode.success]
+    yield f"  episode {episode.episode_index}: {place}, {episode.num_frames} frames{verdict}"
+    for camera, told in episode.pictures.items():
+        yield f"    camera {camera}: {told}"

@@ -1,0 +1,278 @@
+"""The rows of an episode: what each takes from every stream, how old that is, and why there can be no episode."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.ingest.channel import BagError
+from demorec.ingest.clock import MISSING, NS, Chosen, Int, Timeline, choose, grid, sampled, timeline
+from demorec.ingest.episodes import Window
+from demorec.ingest.mapping import BagMapping, CameraSource, Sampling, Source
+from demorec.ingest.streams import BagStreams, Stream
+
+Key = tuple[str, int] | str
+"""A stream: (feature, number of its source), or the name of a camera."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FeatureRows:
+    """A feature of an episode.
+
+    Attributes:
+        values: (R, D), float32 where all its sources are, otherwise float64.
+        names: (D,) of the elements.
+        units: (D,) of the elements, "" where the mapping does not say.
+        ages_ns: (R,) of the oldest of its sources, signed as in `Chosen`.
+    """
+
+    values: NDArray[np.floating[Any]]
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    ages_ns: Int
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CameraRows:
+    """A camera of an episode.
+
+    Attributes:
+        numbers: (R,) which message of its topic each row shows, from 0.
+        index: (R,) which message of its stream that is.
+        ages_ns: (R,) as in `Chosen`.
+    """
+
+    numbers: Int
+    index: Int
+    ages_ns: Int
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class EpisodeRows:
+    """An episode before its pictures are read.
+
+    Attributes:
+        window: Where it is in the bag.
+        times_ns: (R,) of the rows, by the mapping's clock.
+        features: Name -> feature.
+        cameras: Name -> camera.
+        trimmed_ns: How much of the window's beginning and end no row covers.
+    """
+
+    window: Window
+    times_ns: Int
+    features: Mapping[str, FeatureRows]
+    cameras: Mapping[str, CameraRows]
+    trimmed_ns: tuple[int, int]
+
+
+class NoRowsError(BagError):
+    """An episode would hold what is missing or too old; `str` says what."""
+
+
+class Timelines:
+    """All streams of a bag on the mapping's clock.
+
+    Attributes:
+        lines: Stream -> timeline.
+    """
+
+    def __init__(self, streams: BagStreams, mapping: BagMapping) -> None:
+        self.mapping = mapping
+        pairs: tuple[tuple[Key, Stream], ...] = (*streams.sources.items(), *streams.cameras.items())
+        self.streams = dict(pairs)
+        self.lines: dict[Key, Timeline] = {
+            key: _from_keyframe(stream, timeline(stream, mapping)) for key, stream in self.streams.items()
+        }
+
+    def rule(self, key: Key) -> tuple[Sampling, int]:
+        """How a stream is sampled, and how old what it gives may be, nanoseconds."""
+        clock = self.mapping.clock
+        owner: Source | CameraSource
+        sample: Sampling
+        if isinstance(key, str):
+            owner = self.mapping.cameras[key]
+            sample = owner.sample or ("latest" if clock.sample == "linear" else clock.sample)  # pictures are not mixed
+        else:
+            owner = self.mapping.features[key[0]][key[1]]
+            sample = owner.sample or clock.sample
+        age = clock.max_age_s if owner.max_age_s is None else owner.max_age_s
+        return sample, MISSING - 1 if age >= 1e9 else round(age * NS)
+
+    def rows(self, window: Window) -> EpisodeRows:
+        """The rows of an episode; NoRowsError where a stream has nothing fit for them."""
+        begin, end = self._extent(window)
+        times = self._times(begin, end, window)
+        if len(times) < 2:
+            raise NoRowsError(f"only {len(times)} rows have all streams")
+        chosen = {key: self.chosen(key, times) for key in self.lines}
+        problems = [text for key, rows in chosen.items() if (text := self._too_old(key, rows, times))]
+        if problems := problems or [text for key, rows in chosen.items() if (text := self._unfit(key, rows, times))]:
+            raise NoRowsError("; ".join(problems))
+        features = {
+            name: self._feature(name, sources, chosen)
+            for name, sources in self.mapping.features.items()
+            if not any(source.next for source in sources)
+        }
+        count = len(times)
+        for name, sources in self.mapping.features.items():
+            if any(source.next for source in sources):
+                features[name] = _next_of(features[sources[0].next], times)
+                count = len(times) - 1
+        cameras = {
+            name: CameraRows(
+                numbers=self.streams[name].numbers[self.lines[name].order[chosen[name].index]][:count],
+                index=self.lines[name].order[chosen[name].index][:count],
+                ages_ns=chosen[name].age_ns[:count],
+            )
+            for name in self.mapping.cameras
+        }
+        return EpisodeRows(
+            window=window,
+            times_ns=times[:count],
+            features={name: _first_rows(features[name], count) for name in self.mapping.features},
+            cameras=cameras,
+            trimmed_ns=(int(times[0]) - window.begin_ns, max(0, window.end_ns - end)),
+        )
+
+    def chosen(self, key: Key, times: Int) -> Chosen:
+        """What rows of these times take from a stream."""
+        return choose(self.lines[key].times_ns, times, self.rule(key)[0])
+
+    def _extent(self, window: Window) -> tuple[int, int]:
+        """From where on and until when all streams have something, within a window."""
+        clock = self.mapping.clock
+        begins = {key: self._first(key, line, window) for key, line in self.lines.items()}
+        ends = {key: self._last(key, line, window) for key, line in self.lines.items()}
+        late, early = max(begins, key=lambda key: begins[key]), min(ends, key=lambda key: ends[key])
+        last = max(int(line.times_ns[-1]) for line in self.lines.values())
+        begin, end = begins[late], min(window.end_ns, ends[early], last)
+        limit = round(clock.max_trim_s * NS)
+        problems = []
+        if begin - window.begin_ns > limit:
+            problems.append(f"{self._label(late)} begins {(begin - window.begin_ns) / NS:.2f} s late")
+        if window.end_ns - end > limit:
+            problems.append(f"{self._label(early)} ends {(window.end_ns - end) / NS:.2f} s early")
+        if problems:
+            raise NoRowsError(f"{' and '.join(problems)}, allowed are {clock.max_trim_s:g} s")
+        return begin, end
+
+    def _first(self, key: Key, line: Timeline, window: Window) -> int:
+        """From when on a stream has something in a window: at once if what came before is still fit to be used."""
+        before = int(np.searchsorted(line.times_ns, window.begin_ns, side="right")) - 1
+        if before >= 0 and window.begin_ns - int(line.times_ns[before]) <= self.rule(key)[1]:
+            return window.begin_ns
+        return int(line.times_ns[min(before + 1, len(line.times_ns) - 1)])
+
+    def _last(self, key: Key, line: Timeline, window: Window) -> int:
+        """Until when it has: what its last message says holds until the next would have come."""
+        sample, age = self.rule(key)
+        last = max(0, int(np.searchsorted(line.times_ns, window.end_ns, side="right")) - 1)
+        if sample != "linear" and line.is_regular:
+            age = min(age, line.period_ns if sample == "latest" else line.period_ns // 2)
+        return int(line.times_ns[last]) + (0 if sample == "linear" else age)
+
+    def _times(self, begin: int, end: int, window: Window) -> Int:
+        clock = self.mapping.clock
+        if clock.rows == "grid":
+            return grid(begin, end, clock.fps)
+        key = next((key for key, stream in self.streams.items() if stream.topic == clock.rows), None)
+        if key is None:
+            raise BagError(f"clock.rows is {clock.rows!r}, of which the mapping takes no feature or camera")
+        line, heads = self.lines[key], self.streams[key].heads
+        inside = np.flatnonzero((line.times_ns >= begin) & (line.times_ns <= end))
+        if heads:
+            # Video that begins with a keyframe goes into a dataset as it is.
+            keyframes = [place for place in inside if heads[int(line.order[place])].is_keyframe]
+            limit = window.begin_ns + round(clock.max_trim_s * NS)
+            if keyframes and line.times_ns[keyframes[0]] <= limit:
+                inside = inside[inside >= keyframes[0]]
+        return line.times_ns[inside]
+
+    def _label(self, key: Key) -> str:
+        stream = self.streams[key]
+        return f"{stream.label} ({stream.topic})"
+
+    def _too_old(self, key: Key, chosen: Chosen, times: Int) -> str:
+        limit = self.rule(key)[1]
+        ages = chosen.reach_ns
+        bad = np.flatnonzero((ages > limit) | (chosen.index < 0))
+        if not len(bad):
+            return ""
+        worst = int(ages[bad].max())
+        first = (times[bad[0]] - times[0]) / NS
+        what = "has nothing" if worst >= MISSING else f"is up to {worst / NS:.3f} s away"
+        return (
+            f"{self._label(key)} {what} at {len(bad)} of {len(times)} rows, from {first:.2f} s on, allowed are "
+            f"{limit / NS:g} s"
+        )
+
+    def _unfit(self, key: Key, chosen: Chosen, times: Int) -> str:
+        """Why what the rows take cannot be recorded; "" when it can."""
+        stream, line = self.streams[key], self.lines[key]
+        if stream.values is not None:
+            used = stream.values[line.order[chosen.index]]
+            if chosen.fraction is not None:
+                after = np.minimum(chosen.index + 1, len(line.order) - 1)
+                used = np.where(chosen.fraction[:, np.newaxis] > 0, used + stream.values[line.order[after]], used)
+            bad = np.flatnonzero(~np.isfinite(used).all(axis=1))
+            if len(bad):
+                at = (times[bad[0]] - times[0]) / NS
+                return f"{self._label(key)} holds no finite number at {len(bad)} rows, from {at:.2f} s on"
+            return ""
+        first, last = int(chosen.index.min()), int(chosen.index.max())
+        heads = [stream.heads[index] for index in line.order[first : last + 1]]
+        sizes = sorted({(head.width, head.height) for head in heads if head.width})
+        formats = sorted({head.format for head in heads})
+        if len(sizes) > 1:
+            return f"{self._label(key)} changes its size ({', '.join(f'{w}x{h}' for w, h in sizes)})"
+        return f"{self._label(key)} has pictures of several kinds ({', '.join(formats)})" if len(formats) > 1 else ""
+
+    def _feature(self, name: str, sources: tuple[Source, ...], chosen: Mapping[Key, Chosen]) -> FeatureRows:
+        parts, ages = [], []
+        names: list[str] = []
+        units: list[str] = []
+        for index, source in enumerate(sources):
+            key = (name, index)
+            stream, line, rows = self.streams[key], self.lines[key], chosen[key]
+            assert stream.values is not None
+            assert stream.layout is not None
+            unit = source.to or source.unit
+            parts.append(sampled(stream.values[line.order], rows, unit=unit, quaternions=stream.layout.quaternions))
+            names += stream.layout.names
+            units += [unit] * len(stream.layout.names)
+            ages.append(rows.age_ns)
+        return FeatureRows(
+            values=np.concatenate(parts, axis=1),
+            names=tuple(names),
+            units=tuple(units),
+            ages_ns=np.max(np.stack(ages), axis=0),
+        )
+
+
+def _from_keyframe(stream: Stream, line: Timeline) -> Timeline:
+    """Of video only what can be decoded: from the first keyframe on."""
+    if not stream.heads:
+        return line
+    first = next((k for k, index in enumerate(line.order) if stream.heads[index].is_keyframe), len(line.order))
+    return replace(line, times_ns=line.times_ns[first:], order=line.order[first:]) if first else line
+
+
+def _first_rows(feature: FeatureRows, count: int) -> FeatureRows:
+    return FeatureRows(
+        values=feature.values[:count], names=feature.names, units=feature.units, ages_ns=feature.ages_ns[:count]
+    )
+
+
+def _next_of(feature: FeatureRows, times: Int) -> FeatureRows:
+    """What a feature is one row later; its age is told from the row that has it, and so is below 0."""
+    return FeatureRows(
+        values=feature.values[1:],
+        names=feature.names,
+        units=feature.units,
+        ages_ns=feature.ages_ns[1:] - np.diff(times),
+    )

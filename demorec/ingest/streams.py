@@ -1,0 +1,356 @@
+"""A bag's streams: when each message of the mapping's topics was, and the numbers of those that hold any.
+
+Numbers stay in memory, some hundred bytes a message; of pictures only what is needed to choose among them does. They
+are read from the bag once more when their rows are written.
+"""
+
+from __future__ import annotations
+
+import zlib
+from array import array
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.ingest.bag import Bag
+from demorec.ingest.channel import BagChannel, BagError, BagMessage
+from demorec.ingest.decoding import Decoder, UnknownEncodingError, decoder_of
+from demorec.ingest.fields import (
+    OtherPublisherError,
+    SourceLayout,
+    SourceReader,
+    converted,
+    follow,
+    frame_id_of,
+    layout_of,
+    parse_path,
+    picture_bytes,
+    stamp_of,
+)
+from demorec.ingest.mapping import BagMapping, CameraSource, Source
+from demorec.ingest.picture_messages import PictureHead, picture_head
+from demorec.ingest.ros_types import Values
+from demorec.registry import nearest_match
+
+NO_STAMP = -(2**63)
+_MAX_TEXT = 10_000
+_MAX_URDF = 4 << 20
+
+
+@dataclass(kw_only=True, eq=False)
+class Stream:
+    """The messages of one source or camera, in the order in which the bag has them.
+
+    Attributes:
+        label: Which it is: "observation.state" or "camera front".
+        topic, type: Of its messages.
+        log_ns: (N,) int64, when each was recorded.
+        header_ns: (N,) int64, the time in each header, or NO_STAMP.
+        numbers: (N,) int64, which of the topic's messages it is, from 0.
+        values: (N, D) in the unit of the feature; None for cameras.
+        layout: Of the values; None for cameras.
+        heads: (N,) what is known of each picture; empty for others.
+        checksums: (N,) CRC-32 of each message's bytes.
+        picture_sums: (N,) CRC-32 of each picture's bytes; empty for others.
+        frame_ids: Coordinate frames that messages name, in the order of their first occurrence.
+        num_malformed: Messages that cannot be read or lack something.
+        first_problem: What is wrong with the first of them.
+    """
+
+    label: str
+    topic: str
+    type: str
+    log_ns: NDArray[np.int64]
+    header_ns: NDArray[np.int64]
+    numbers: NDArray[np.int64]
+    values: NDArray[np.floating[Any]] | None
+    layout: SourceLayout | None
+    heads: Sequence[PictureHead]
+    checksums: NDArray[np.uint32]
+    picture_sums: NDArray[np.uint32]
+    frame_ids: tuple[str, ...]
+    num_malformed: int
+    first_problem: str
+
+    def __len__(self) -> int:
+        return len(self.log_ns)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Text:
+    """A text of a topic (task, marker, robot description).
+
+    Attributes:
+        time_ns: Of its message, as the mapping's clock takes it.
+        log_ns: When it was recorded.
+        value: The text, number or boolean.
+    """
+
+    time_ns: int
+    log_ns: int
+    value: Any
+
+
+@dataclass(kw_only=True, eq=False)
+class BagStreams:
+    """All that a mapping takes from a bag.
+
+    Attributes:
+        sources: (feature, number of the source) -> its stream.
+        cameras: Name of a camera -> its stream.
+        infos: Name of a camera -> its first calibration message.
+        texts: Topic -> its texts.
+        problems: Why parts of the bag could not be read.
+        first_ns, last_ns: When the first and last message of the bag was recorded.
+    """
+
+    sources: dict[tuple[str, int], Stream]
+    cameras: dict[str, Stream]
+    infos: dict[str, Values]
+    texts: dict[str, list[Text]]
+    problems: list[str]
+    first_ns: int
+    last_ns: int
+
+
+@dataclass(kw_only=True, eq=False)
+class _Growing:
+    """A stream while it is read."""
+
+    label: str
+    topic: str
+    source: Source | None = None
+    camera: CameraSource | None = None
+    type: str = ""
+    layout: SourceLayout | None = None
+    reader: SourceReader | None = None
+    log_ns: array[int] = field(default_factory=lambda: array("q"))
+    header_ns: array[int] = field(default_factory=lambda: array("q"))
+    numbers: array[int] = field(default_factory=lambda: array("q"))
+    checksums: array[int] = field(default_factory=lambda: array("I"))
+    picture_sums: array[int] = field(default_factory=lambda: array("I"))
+    vectors: list[NDArray[np.floating[Any]]] = field(default_factory=list)
+    blocks: list[NDArray[np.floating[Any]]] = field(default_factory=list)
+    heads: list[PictureHead] = field(default_factory=list)
+    frame_ids: dict[str, None] = field(default_factory=dict)
+    num_malformed: int = 0
+    first_problem: str = ""
+    first_refusal: str = ""
+
+    def add(self, number: int, message: BagMessage, values: Values, checksum: int) -> None:
+        """Take one message."""
+        self.type = self.type or message.channel.type
+        try:
+            if self.source is not None:
+                if self.reader is None:
+                    self.layout = layout_of(self.source, values)
+                    self.reader = SourceReader(self.source, self.layout)
+                self.vectors.append(self.reader.read(values))
+                if len(self.vectors) >= 4096:
+                    self._pack()
+            else:
+                self.heads.append(picture_head(values))
+                self.picture_sums.append(zlib.crc32(picture_bytes(values)))
+        except OtherPublisherError as error:
+            self.first_refusal = self.first_refusal or str(error)
+            return
+        except ValueError as error:
+            self.malformed(str(error))
+            return
+        stamp = stamp_of(values)
+        self.log_ns.append(message.log_ns)
+        self.header_ns.append(NO_STAMP if stamp is None else stamp)
+        self.numbers.append(number)
+        self.checksums.append(checksum)
+        if len(self.frame_ids) < 16:
+            self.frame_ids.setdefault(frame_id_of(values))
+
+    def malformed(self, problem: str) -> None:
+        """Count a message that cannot be used."""
+        self.num_malformed += 1
+        self.first_problem = self.first_problem or problem
+
+    def _pack(self) -> None:
+        if self.vectors:
+            self.blocks.append(np.stack(self.vectors))
+            self.vectors.clear()
+
+    def finished(self) -> Stream:
+        """The stream as it is now."""
+        self._pack()
+        values = None
+        if self.source is not None and self.blocks:
+            values = converted(self.source, np.concatenate(self.blocks))
+        return Stream(
+            label=self.label,
+            topic=self.topic,
+            type=self.type,
+            log_ns=np.frombuffer(self.log_ns, np.int64) if self.log_ns else np.empty(0, np.int64),
+            header_ns=np.frombuffer(self.header_ns, np.int64) if self.header_ns else np.empty(0, np.int64),
+            numbers=np.frombuffer(self.numbers, np.int64) if self.numbers else np.empty(0, np.int64),
+            values=values,
+            layout=self.layout,
+            heads=self.heads,
+            checksums=np.array(self.checksums, dtype=np.uint32),
+            picture_sums=np.array(self.picture_sums, dtype=np.uint32),
+            frame_ids=tuple(self.frame_ids),
+            num_malformed=self.num_malformed,
+            first_problem=self.first_problem,
+        )
+
+
+class BagDecoder:
+    """Decoders of a bag's channels, made when they are first needed."""
+
+    def __init__(self) -> None:
+        self._decoders: dict[BagChannel, Decoder] = {}
+
+    def values(self, message: BagMessage) -> Values:
+        """Of a message.
+
+        Raises:
+            UnknownEncodingError: Its channel cannot be read at all.
+            ValueError: The message does not fit its type.
+        """
+        decoder = self._decoders.get(message.channel)
+        if decoder is None:
+            decoder = self._decoders[message.channel] = decoder_of(message.channel)
+        return decoder(message.data)
+
+
+def read_streams(bag: Bag, mapping: BagMapping) -> BagStreams:
+    """Read a bag from its front to its end.
+
+    Raises:
+        BagError: The mapping does not fit the bag; one message tells all problems.
+    """
+    reading = _Reading(mapping)
+    problems: list[str] = []
+    for message in bag.messages(problems):
+        reading.add(message)
+    reading.check(bag)
+    return reading.finished(problems)
+
+
+class _Reading:
+    def __init__(self, mapping: BagMapping) -> None:
+        self._mapping = mapping
+        self._decoder = BagDecoder()
+        self._sources = {
+            (name, index): _Growing(label=name, topic=source.topic, source=source)
+            for name, sources in mapping.features.items()
+            for index, source in enumerate(sources)
+            if source.topic
+        }
+        self._cameras = {
+            name: _Growing(label=f"camera {name}", topic=camera.topic, camera=camera)
+            for name, camera in mapping.cameras.items()
+        }
+        self._streams: dict[str, list[_Growing]] = {}
+        for stream in (*self._sources.values(), *self._cameras.values()):
+            self._streams.setdefault(stream.topic, []).append(stream)
+        self._fields = {mapping.task.topic: mapping.task.field, mapping.robot.urdf_topic: "data"}
+        if mapping.episodes.cut == "marker":
+            self._fields[mapping.episodes.topic] = mapping.episodes.field
+        self._fields.pop("", None)
+        self._texts: dict[str, list[Text]] = {topic: [] for topic in self._fields}
+        self._infos: dict[str, Values] = {}
+        self._info_topics = {camera.info_topic: name for name, camera in mapping.cameras.items() if camera.info_topic}
+        self._wanted = mapping.topics
+        self._counts: dict[str, int] = {}
+        self._types: dict[str, set[str]] = {}
+        self._refused: dict[str, str] = {}
+        self._first_ns, self._last_ns = 2**63 - 1, 0
+
+    def add(self, message: BagMessage) -> None:
+        """Take a message."""
+        topic = message.channel.topic
+        number = self._counts.get(topic, 0)
+        self._counts[topic] = number + 1
+        self._first_ns, self._last_ns = min(self._first_ns, message.log_ns), max(self._last_ns, message.log_ns)
+        if number == 0 or message.channel.type not in self._types[topic]:
+            self._types.setdefault(topic, set()).add(message.channel.type)
+        if topic not in self._wanted or topic in self._refused:
+            return
+        streams = self._streams.get(topic, ())
+        try:
+            values = self._decoder.values(message)
+        except UnknownEncodingError as error:
+            self._refused[topic] = str(error)
+            return
+        except (ValueError, RecursionError, OverflowError, TypeError) as error:
+            for stream in streams:
+                stream.malformed(str(error))
+            return
+        checksum = zlib.crc32(message.data)
+        for stream in streams:
+            stream.add(number, message, values, checksum)
+        if topic in self._texts:
+            self._add_text(topic, message, values)
+        if topic in self._info_topics:
+            self._infos.setdefault(self._info_topics[topic], values)
+
+    def _add_text(self, topic: str, message: BagMessage, values: Values) -> None:
+        try:
+            value = follow(values, parse_path(self._fields[topic]))
+        except ValueError as error:
+            self._refused[topic] = str(error)
+            return
+        limit = _MAX_URDF if topic == self._mapping.robot.urdf_topic else _MAX_TEXT
+        if isinstance(value, str) and len(value) > limit:
+            self._refused[topic] = f"a text has {len(value):,} characters, at most {limit:,} are read"
+            return
+        stamp = stamp_of(values) if self._mapping.clock.stamp == "header" else None
+        self._texts[topic].append(
+            Text(time_ns=message.log_ns if stamp is None else stamp, log_ns=message.log_ns, value=value)
+        )
+
+    def check(self, bag: Bag) -> None:
+        """Raise BagError for all that the mapping names and the bag lacks."""
+        problems = []
+        if not self._counts:
+            raise BagError(f"The bag holds no messages: {bag.path}")
+        for topic in sorted(self._wanted):
+            if topic not in self._counts:
+                problems.append(f"there is no message of {topic!r}.{nearest_match(topic, self._counts)}".rstrip("."))
+            elif topic in self._refused:
+                problems.append(f"{topic} cannot be read, since {self._refused[topic]}")
+            elif len(self._types[topic]) > 1:
+                problems.append(f"{topic} has messages of several types ({', '.join(sorted(self._types[topic]))})")
+        for stream in (*self._sources.values(), *self._cameras.values()):
+            if stream.topic in self._counts and stream.topic not in self._refused and not stream.log_ns:
+                reason = stream.first_problem or stream.first_refusal
+                problems.append(f"{stream.label} cannot be taken from {stream.topic} ({stream.type}): {reason}")
+        problems += self._double_names()
+        if problems:
+            raise BagError(f"The mapping does not fit the bag: {'; '.join(problems)}: {bag.path}")
+
+    def _double_names(self) -> list[str]:
+        problems = []
+        for feature in self._mapping.features:
+            seen: dict[str, str] = {}
+            for (name, _), stream in self._sources.items():
+                for label in stream.layout.names if name == feature and stream.layout else ():
+                    if label in seen:
+                        problems.append(
+                            f"{feature} gets {label!r} from {seen[label]} and from {stream.topic}: leave one out, or "
+                            "tell them apart by prefix or names"
+                        )
+                        break
+                    seen[label] = stream.topic
+        return problems
+
+    def finished(self, problems: list[str]) -> BagStreams:
+        """All that was read."""
+        return BagStreams(
+            sources={key: stream.finished() for key, stream in self._sources.items()},
+            cameras={name: stream.finished() for name, stream in self._cameras.items()},
+            infos=self._infos,
+            texts=self._texts,
+            problems=problems,
+            first_ns=self._first_ns,
+            last_ns=self._last_ns,
+        )

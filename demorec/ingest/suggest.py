@@ -1,0 +1,318 @@
+"""A mapping from what is in a bag: the likely choices made, the doubtful ones commented out, everything listed.
+
+The words that people give their topics are what there is to go by: a follower, a puppet and a measured state are what
+the robot does, a leader, a master and a command what it shall do. A topic that says neither is not guessed at.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from demorec.ingest.bag import Bag, open_bag
+from demorec.ingest.channel import BagError, BagMessage
+from demorec.ingest.clock import NS
+from demorec.ingest.decoding import UnknownEncodingError
+from demorec.ingest.fields import FieldError, OtherPublisherError, SourceLayout, follow, layout_of, stamp_of
+from demorec.ingest.mapping import Source
+from demorec.ingest.picture_messages import VIDEO_FORMATS, PictureHead, picture_head
+from demorec.ingest.ros_types import Values
+from demorec.ingest.streams import BagDecoder
+
+_KEPT = 64
+"""Messages of a topic that are looked into."""
+_SHOWN = 4
+_LONGEST = 40
+_ACTION = re.compile(r"leader|master|gello|command|cmd|target|desired|goal|teleop|/action")
+_STATE = re.compile(r"follower|puppet|measured|joint_states?$|joints/state$|robot_state")
+_TASK = re.compile(r"task|instruction|prompt")
+_POSE_TYPES = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/PoseStamped", "foxglove.PoseInFrame")
+_VECTOR_FIELDS = ("position", "positions", "joints.position", "points[0].positions", "data")
+_STOP_WORDS = {"camera", "cam", "color", "image", "raw", "rect", "compressed", "rgb", "cameras", "images", "video"}
+_CAMERA_WORD = re.compile(r"[^a-z0-9]+")
+
+
+@dataclass(kw_only=True, eq=False)
+class _Topic:
+    """What a topic has shown.
+
+    Attributes:
+        type: Of its messages.
+        count: Of them.
+        first_ns, last_ns: When they were recorded.
+        values: Of the first ones.
+        has_stamp: Whether these have headers with a time.
+        problem: Why none can be read; "".
+    """
+
+    type: str
+    count: int = 0
+    first_ns: int = 0
+    last_ns: int = 0
+    values: list[Values] = field(default_factory=list)
+    has_stamp: bool = True
+    problem: str = ""
+
+    @property
+    def rate_hz(self) -> float:
+        """Of its messages, on average."""
+        seconds = (self.last_ns - self.first_ns) / NS
+        return (self.count - 1) / seconds if self.count > 1 and seconds > 0 else 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Vector:
+    """A topic that could be part of a feature."""
+
+    topic: str
+    field: str
+    layout: SourceLayout
+    has_names: bool
+    role: str
+    rate_hz: float
+
+
+def suggested_mapping(path: Path) -> list[str]:
+    """The lines of a mapping for a bag, with what is in it as comments.
+
+    Raises:
+        ConfigError: There is no bag.
+        BagError: It cannot be read, or holds no messages.
+    """
+    bag = open_bag(path)
+    problems: list[str] = []
+    topics = _topics(bag, problems)
+    if not topics:
+        raise BagError(f"The bag holds no messages: {path}")
+    cameras = dict(_cameras(topics))
+    vectors = [vector for name, topic in sorted(topics.items()) for vector in _vectors(name, topic)]
+    lines = [f"# A mapping for {path.name}, suggested from what is in it; docs/import.md explains every key.", "#"]
+    lines += [f"# {problem}" for problem in problems[:5]]
+    lines += list(_listed(topics))
+    lines += ["", "[robot]", f"name = {_quoted(_robot_name(bag))}", *_robot_model(topics)]
+    lines += ["", "[task]", *_task(topics, bag)]
+    lines += ["", "[clock]", *_clock(topics, cameras, vectors)]
+    lines += list(_features(vectors))
+    lines += list(_poses(topics))
+    for camera, topic in cameras.items():
+        lines += ["", f"[cameras.{camera}]", f"topic = {_quoted(topic)}", *_info_topic(topic, topics)]
+    return lines
+
+
+def _topics(bag: Bag, problems: list[str]) -> dict[str, _Topic]:
+    topics: dict[str, _Topic] = {}
+    decoder = BagDecoder()
+    for message in bag.messages(problems):
+        topic = topics.setdefault(message.channel.topic, _Topic(type=message.channel.type, first_ns=message.log_ns))
+        topic.count += 1
+        topic.first_ns, topic.last_ns = min(topic.first_ns, message.log_ns), max(topic.last_ns, message.log_ns)
+        if len(topic.values) < _KEPT and not topic.problem:
+            _look_into(topic, message, decoder)
+    return topics
+
+
+def _look_into(topic: _Topic, message: BagMessage, decoder: BagDecoder) -> None:
+    try:
+        values = decoder.values(message)
+    except UnknownEncodingError as error:
+        topic.problem = str(error)
+        return
+    except (ValueError, RecursionError, OverflowError, TypeError):
+        return
+    topic.has_stamp = topic.has_stamp and bool(stamp_of(values))
+    if len(topic.values) < 2 or not _is_picture(values):
+        topic.values.append(values)
+
+
+def _is_picture(values: Values) -> bool:
+    return _head(values) is not None
+
+
+def _head(values: Values) -> PictureHead | None:
+    try:
+        return picture_head(values)
+    except FieldError:
+        return None
+
+
+def _listed(topics: Mapping[str, _Topic]) -> Iterator[str]:
+    """Every topic with its type, rate, count and first values."""
+    yield "# What is in it:"
+    for name, topic in sorted(topics.items()):
+        rate = f"{topic.rate_hz:.1f} Hz, " if topic.rate_hz else ""
+        stamp = "" if topic.has_stamp else ", no times in its headers"
+        yield f"#   {name}  {topic.type}, {rate}{topic.count} messages{stamp}"
+        told = topic.problem or (_told(topic.values[0]) if topic.values else "none of its messages can be read")
+        yield f"#     {told}"
+
+
+def _told(values: Values) -> str:
+    parts = []
+    for key, value in values.items():
+        if key in ("header", "ts", "timestamp", "stamp"):
+            continue
+        parts.append(f"{key}: {_short(value)}")
+    return "; ".join(parts)[:160] or "no fields"
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, np.ndarray):
+        more = ", ..." if value.size > _SHOWN else ""
+        return f"[{', '.join(f'{number:.4g}' for number in value[:_SHOWN].tolist())}{more}]"
+    if isinstance(value, bytes):
+        return f"{len(value)} bytes"
+    if isinstance(value, list):
+        return f"[{', '.join(_short(item) for item in value[:_SHOWN])}{', ...' if len(value) > _SHOWN else ''}]"
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{key}: {_short(item)}" for key, item in list(value.items())[:_SHOWN]) + "}"
+    return (
+        json.dumps(value[:40]) if isinstance(value, str) else f"{value:.6g}" if isinstance(value, float) else str(value)
+    )
+
+
+def _vectors(name: str, topic: _Topic) -> Iterator[_Vector]:
+    """The joint positions, or other numbers, that a topic holds."""
+    if not topic.values or any(_is_picture(values) for values in topic.values[:1]):
+        return
+    for path in _VECTOR_FIELDS:
+        try:
+            layout = layout_of(Source(topic=name, field=path), topic.values[0])
+            found = follow(topic.values[0], layout.steps)
+        except (FieldError, OtherPublisherError):
+            continue
+        if not isinstance(found, np.ndarray) or not len(found) or (path == "data" and not topic.rate_hz):
+            continue
+        lower = name.lower()
+        role = "action" if _ACTION.search(lower) else "state" if _STATE.search(lower) else ""
+        yield _Vector(
+            topic=name,
+            field=path,
+            layout=layout,
+            has_names=layout.names_steps is not None,
+            role=role,
+            rate_hz=topic.rate_hz,
+        )
+        return
+
+
+def _cameras(topics: Mapping[str, _Topic]) -> Iterator[tuple[str, str]]:
+    """(name, topic) of each camera: of several topics of the same one, the coded one."""
+    heads = {name: _head(topic.values[0]) for name, topic in topics.items() if topic.values}
+    pictures = [name for name, head in heads.items() if head is not None]
+    taken: set[str] = set()
+    for name in sorted(pictures):
+        if any(other != name and other.startswith(f"{name}/") for other in pictures):
+            continue  # image_raw beside image_raw/compressed: the same pictures
+        words = [word for word in _CAMERA_WORD.split(name.lower()) if word and word not in _STOP_WORDS]
+        camera = "_".join(dict.fromkeys(words[-2:])) or "camera"
+        camera = camera if camera[0].isalpha() else f"camera_{camera}"
+        while camera in taken:
+            camera += "_2"
+        taken.add(camera)
+        yield camera, name
+
+
+def _info_topic(topic: str, topics: Mapping[str, _Topic]) -> list[str]:
+    base = topic.removesuffix("/compressed").rpartition("/")[0]
+    name = f"{base}/camera_info"
+    return [f"info_topic = {_quoted(name)}"] if name in topics else []
+
+
+def _robot_name(bag: Bag) -> str:
+    return re.sub(r"[^A-Za-z0-9_]+", "_", bag.name).strip("_") or "robot"
+
+
+def _robot_model(topics: Mapping[str, _Topic]) -> list[str]:
+    found = next((name for name in sorted(topics) if name.endswith("robot_description")), "")
+    return [f"urdf_topic = {_quoted(found)}"] if found else ['# urdf = "robot.urdf"']
+
+
+def _task(topics: Mapping[str, _Topic], bag: Bag) -> list[str]:
+    told = [name for name, topic in sorted(topics.items()) if _TASK.search(name.lower()) and _is_text(topic)]
+    if told:
+        return [f"topic = {_quoted(told[0])}"]
+    return [f"text = {_quoted(bag.name.replace('_', ' '))}  # what the robot was asked to do", "# file_name = true"]
+
+
+def _is_text(topic: _Topic) -> bool:
+    return any(isinstance(values.get("data"), str) for values in topic.values)
+
+
+def _clock(topics: Mapping[str, _Topic], cameras: Mapping[str, str], vectors: Sequence[_Vector]) -> list[str]:
+    rates = {name: topics[topic].rate_hz for name, topic in cameras.items() if topics[topic].rate_hz}
+    rate = min(rates.values(), default=min([30.0, *(vector.rate_hz for vector in vectors if vector.rate_hz)]))
+    lines = [f"fps = {max(1, round(rate))}"]
+    slowest = min(rates, key=lambda name: rates[name], default="")
+    if slowest:
+        head = _head(topics[cameras[slowest]].values[0])
+        chosen = f"rows = {_quoted(cameras[slowest])}  # a row for each of its pictures"
+        lines.append(chosen if head is not None and head.format in VIDEO_FORMATS else f"# {chosen}")
+    mapped = [*cameras.values(), *(vector.topic for vector in vectors if vector.role)]
+    if any(not topics[name].has_stamp for name in mapped):
+        lines.append('stamp = "log"  # not all headers have a time')
+    return [*lines, 'when_old = "error"  # or "drop_episode"']
+
+
+def _features(vectors: Sequence[_Vector]) -> Iterator[str]:
+    states = [vector for vector in vectors if vector.role == "state"]
+    actions = [vector for vector in vectors if vector.role == "action"]
+    others = [vector for vector in vectors if not vector.role]
+    if not states and len(others) == 1:
+        states, others = others, []
+    for name, chosen in (("observation.state", states), ("action", actions)):
+        double = _doubles(chosen)
+        for vector in chosen:
+            yield from _source(name, vector, prefix=_prefix(vector, chosen) if double else "")
+        if not chosen and name == "observation.state":
+            yield from ("", "# No topic says that it is the robot's state: take one of those above.")
+        elif not chosen:
+            yield from (
+                "",
+                "# No topic says that it is a command, so the next state is the action.",
+                "[[features.action]]",
+            )
+            yield 'next = "observation.state"'
+    for vector in others:
+        for line in _source("observation.extra", vector, prefix=""):
+            yield f"# {line}" if line else ""
+
+
+def _doubles(chosen: Sequence[_Vector]) -> bool:
+    names = [name for vector in chosen for name in vector.layout.names]
+    return len(set(names)) < len(names)
+
+
+def _prefix(vector: _Vector, chosen: Sequence[_Vector]) -> str:
+    """The words of a topic that the others of the same feature do not have."""
+    words = [word for word in re.split(r"[^A-Za-z0-9]+", vector.topic) if word]
+    shared = set.intersection(*(set(re.split(r"[^A-Za-z0-9]+", other.topic)) for other in chosen))
+    return "_".join(word for word in words if word not in shared) + "_"
+
+
+def _source(feature: str, vector: _Vector, *, prefix: str) -> Iterator[str]:
+    key = feature if "." not in feature else f'"{feature}"'
+    yield from ("", f"[[features.{key}]]", f"topic = {_quoted(vector.topic)}", f"field = {_quoted(vector.field)}")
+    if vector.has_names:
+        yield f"joints = [{', '.join(_quoted(name) for name in vector.layout.names)}]"
+    if prefix:
+        yield f"prefix = {_quoted(prefix)}"
+
+
+def _poses(topics: Mapping[str, _Topic]) -> Iterator[str]:
+    found = [name for name, topic in sorted(topics.items()) if topic.type in _POSE_TYPES and topic.values]
+    is_sure = len(found) == 1 and topics[found[0]].rate_hz > 0
+    for name in found:
+        mark = "" if is_sure else "# "
+        yield from ("", f'{mark}[[features."observation.ee_pose"]]', f"{mark}topic = {_quoted(name)}")
+        yield f'{mark}field = "pose"'
+
+
+def _quoted(text: str) -> str:
+    """A TOML string."""
+    return json.dumps(text, ensure_ascii=False)

@@ -1,0 +1,232 @@
+"""`demorec import` as a user meets it: what it says, what it suggests, and how it refuses bad input."""
+
+from __future__ import annotations
+
+import errno
+import os
+import tomllib
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from rosbags.rosbag2 import StoragePlugin
+from support import bag_mappings, bags
+
+from demorec.cli import main
+from demorec.recording import CollectedRecording
+from demorec.runs.collected import load_collected_run
+
+
+def _run(*words: str | Path) -> int:
+    with pytest.raises(SystemExit) as ended:
+        main([str(word) for word in words])
+    return int(ended.value.code or 0)
+
+
+BAGS: dict[str, tuple[Callable[[float], bags.Notes], Callable[[bags.Notes, Path], Path]]] = {
+    "franka": (bags.franka, lambda notes, path: bags.write_rosbag2(notes, path / "franka")),
+    "so101": (
+        bags.so101,
+        lambda notes, path: bags.write_rosbag2(notes, path / "so101", storage=StoragePlugin.SQLITE3),
+    ),
+    "agilex": (bags.agilex, lambda notes, path: bags.write_mcap(notes, path / "agilex.mcap", is_ros1=True)),
+    "trossen": (bags.trossen, lambda notes, path: bags.write_trossen(notes, path / "trossen.mcap")),
+}
+FEATURES = {"franka": (9, 7, 2), "so101": (6, 6, 2), "agilex": (14, 14, 3), "trossen": (7, 7, 2)}
+"""Elements of the state and of the action, and cameras."""
+
+
+@pytest.mark.parametrize("name", sorted(BAGS))
+def test_a_suggested_mapping_works_as_it_is(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    make, write = BAGS[name]
+    notes = bags.in_order(make(1.2))
+    bag = write(notes, tmp_path)
+    assert _run("import", "--suggest", bag) == 0
+    text = capsys.readouterr().out
+    for topic in {note.topic for note in notes}:
+        (line,) = [line for line in text.splitlines() if line.startswith(f"#   {topic}  ")]
+        assert f"{sum(note.topic == topic for note in notes)} messages" in line
+    mapping = bag_mappings.write_mapping(text, tmp_path / "robot.toml")
+    assert _run("import", bag, "--mapping", mapping, "--out", tmp_path / "run") == 0
+    told = capsys.readouterr()
+    assert "Nothing odd was found." in told.out
+    assert told.err == ""
+    (episode,) = load_collected_run(tmp_path / "run").episodes
+    with CollectedRecording(tmp_path / "run" / episode.file) as recording:
+        sizes = {feature.name: len(feature.names) for feature in recording.info.features}
+        assert (sizes["observation.state"], sizes["action"], len(recording.info.cameras)) == FEATURES[name]
+        assert recording.num_frames == episode.num_frames >= 30
+
+
+def test_a_doubtful_topic_is_commented_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    notes = bags.so101(0.5)
+    moments = bags.times(50, 0.5)
+    notes += [
+        bags.Note(
+            topic="/odd/numbers", type="std_msgs/msg/Float64MultiArray", log_ns=moment, header_ns=0,
+            body={"data": bags.motion(moment, 3)},
+        )
+        for moment in moments
+    ]  # fmt: skip
+    assert _run("import", "--suggest", bags.write_mcap(bags.in_order(notes), tmp_path / "bag.mcap")) == 0
+    text = capsys.readouterr().out
+    assert '# topic = "/odd/numbers"' in text
+    assert "observation.extra" not in tomllib.loads(text)["features"]
+
+
+def test_foreign_names_do_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    evil = '/x\x1b[2J"\n[robot]\nname = "y"\u202e'
+    notes = [replace(note, topic=note.topic.replace("/leader", evil)) for note in bags.so101(0.5)]
+    assert _run("import", "--suggest", bags.write_mcap(bags.in_order(notes), tmp_path / "bag.mcap")) == 0
+    text = capsys.readouterr().out
+    assert all(line.isprintable() for line in text.splitlines())
+    assert tomllib.loads(text)["robot"]["name"] == "bag"
+    assert any(
+        source["topic"].startswith(evil)
+        for rows in tomllib.loads(text)["features"].values()
+        for source in rows
+        if "topic" in source
+    )
+
+
+BAD: dict[str, tuple[int, str]] = {
+    "no bag": (2, "No bag is given"),
+    "no mapping": (2, "An import needs --mapping and --out"),
+    "a bag that is not there": (2, "There is no bag that could be read"),
+    "a mapping that is not there": (2, "The mapping cannot be read"),
+    "no toml": (2, "The mapping is no valid TOML"),
+    "unknown key": (2, "Did you mean 'fps'?"),
+    "unknown topic": (1, "Did you mean '/leader/joint_states'?"),
+    "no message of a topic": (1, "there is no message of '/leader/joint_states'"),
+    "unknown encoding": (1, "the encoding 'cbor' is not read"),
+    "two types on a topic": (1, "has messages of several types"),
+    "a text file": (1, "This is no bag"),
+    "an empty file": (1, "The bag is empty"),
+    "somebody's folder": (2, "choose another"),
+    "a URDF that is not there": (2, "The URDF cannot be read"),
+    "a folder without metadata": (1, "holds no metadata.yaml"),
+    "codec": (2, "gop"),
+}
+
+
+@pytest.mark.parametrize("name", sorted(BAD))
+def test_bad_input_is_refused_in_one_sentence(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, told = BAD[name]
+    notes = bags.in_order(bags.so101(0.4))
+    text, run = bag_mappings.SO101, tmp_path / "run"
+    if name == "no message of a topic":
+        notes = [note for note in notes if note.topic != "/leader/joint_states"]
+    if name == "two types on a topic":
+        notes.append(
+            bags.Note(topic="/leader/joint_states", type="std_msgs/msg/String", log_ns=notes[-1].log_ns, header_ns=0)
+        )
+    bag = (
+        bags.write_mcap(notes, tmp_path / "bag.mcap") if name != "two types on a topic" else _two_types(notes, tmp_path)
+    )
+    match name:
+        case "unknown key":
+            text = text.replace("fps =", "fsp =")
+        case "unknown topic":
+            text = text.replace("/leader/joint_states", "/leader/joint_state")
+        case "no toml":
+            text = "["
+        case "a text file":
+            bag.write_text("hello")
+        case "an empty file":
+            bag.write_bytes(b"")
+        case "a URDF that is not there":
+            text = text.replace('name = "so101"', 'name = "so101"\nurdf = "none.urdf"')
+        case "somebody's folder":
+            run.mkdir()
+            (run / "thesis.tex").write_text("years")
+        case "a bag that is not there":
+            bag = tmp_path / "none.mcap"
+        case "a folder without metadata":
+            bag = tmp_path / "folder"
+            bag.mkdir()
+        case "unknown encoding":
+            bag = _with_encoding(tmp_path, "cbor")
+    mapping = bag_mappings.write_mapping(text, tmp_path / "robot.toml")
+    if name == "a mapping that is not there":
+        mapping = tmp_path / "none.toml"
+    words: list[str | Path] = [bag, "--mapping", mapping, "--out", run]
+    words = {"no bag": words[1:], "no mapping": words[:1], "codec": [*words, "--gop", "0"]}.get(name, words)
+    before = sorted(path for path in tmp_path.rglob("*"))
+    assert _run("import", *words) == code
+    out, err = capsys.readouterr()
+    assert told in err
+    assert err.startswith("demorec import: ")
+    assert err.count("\n") == 1
+    assert out == ""
+    left = [path for path in tmp_path.rglob("*") if path not in before and path.is_file() and path.name != ".lock"]
+    assert left == []
+
+
+def _with_encoding(tmp_path: Path, encoding: str) -> Path:
+    from mcap.writer import Writer
+
+    path = tmp_path / "odd.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        for topic in ("/follower/joint_states", "/leader/joint_states", "/follower/cam_front/image_raw/compressed",
+                      "/static_camera/cam_side/image_raw/compressed"):  # fmt: skip
+            writer.add_message(writer.register_channel(topic, encoding, 0), 1, b"x", 1)
+        writer.finish()
+    return path
+
+
+def _two_types(notes: bags.Notes, tmp_path: Path) -> Path:
+    """A bag with two channels of the same topic, which `mcap` writes as two of its own."""
+    one = [note for note in notes if note.type != "std_msgs/msg/String"]
+    other = [note for note in notes if note.type == "std_msgs/msg/String"]
+    folder = tmp_path / "bag"
+    bags.write_rosbag2(one, folder)
+    bags.write_mcap([replace(note, body={"data": "x"}) for note in other], folder / "second.mcap")
+    text = (folder / "metadata.yaml").read_text()
+    (folder / "metadata.yaml").write_text(text.replace("  - bag.mcap\n", "  - bag.mcap\n  - second.mcap\n", 1))
+    assert "second.mcap" in (folder / "metadata.yaml").read_text()
+    return folder
+
+
+def test_a_full_disk_leaves_nothing_half_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = bags.write_mcap(bags.in_order(bags.so101(0.5)), tmp_path / "bag.mcap")
+    mapping = bag_mappings.write_mapping(bag_mappings.SO101, tmp_path / "robot.toml")
+
+    def full(descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fsync", full)
+        assert _run("import", bag, "--mapping", mapping, "--out", tmp_path / "run") == 1
+    err = capsys.readouterr().err
+    assert "No space left on device" in err
+    assert err.count("\n") == 1
+    assert not list((tmp_path / "run/episodes").glob("*.mcap"))
+    assert _run("import", bag, "--mapping", mapping, "--out", tmp_path / "run") == 0
+    assert len(list((tmp_path / "run/episodes").glob("*.mcap"))) == 1
+
+
+def test_interrupting_leaves_nothing_half_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from demorec.ingest.episode_writer import EpisodeWriter
+
+    bag = bags.write_mcap(bags.in_order(bags.so101(0.5)), tmp_path / "bag.mcap")
+    mapping = bag_mappings.write_mapping(bag_mappings.SO101, tmp_path / "robot.toml")
+    add, calls = EpisodeWriter.add, iter(range(100))
+
+    def interrupted(self: EpisodeWriter, topic: str, number: int, values: dict[str, object]) -> None:
+        if next(calls) == 9:
+            raise KeyboardInterrupt
+        add(self, topic, number, values)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(EpisodeWriter, "add", interrupted)
+        assert _run("import", bag, "--mapping", mapping, "--out", tmp_path / "run") == 130
+    assert "interrupted" in capsys.readouterr().err
+    assert not list((tmp_path / "run/episodes").iterdir())
+    assert _run("import", bag, "--mapping", mapping, "--out", tmp_path / "run") == 0

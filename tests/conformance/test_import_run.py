@@ -1,0 +1,321 @@
+"""Bags of four robots become runs: every number, age and packet of the recordings is that of the bag."""
+
+from __future__ import annotations
+
+import io
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from av.bitstream import BitStreamFilterContext
+from PIL import Image
+from rosbags.rosbag2 import StoragePlugin
+from support import bag_mappings, bags
+
+from demorec.cli import main
+from demorec.errors import ConfigError
+from demorec.ingest.channel import BagError
+from demorec.ingest.import_run import import_bags
+from demorec.recording import CollectedRecording
+
+SECONDS = 1.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class Layout:
+    """A robot's bag, its mapping, and which topic each camera is."""
+
+    make: Callable[[float], bags.Notes]
+    write: Callable[[bags.Notes, Path], Path]
+    mapping: str
+    cameras: dict[str, str]
+
+
+LAYOUTS = {
+    "franka": Layout(
+        make=bags.franka,
+        write=lambda notes, path: bags.write_rosbag2(notes, path / "bag"),
+        mapping=bag_mappings.FRANKA,
+        cameras={"wrist": "/camera/wrist_camera/color/image_raw", "scene": "/camera/scene_camera/color/image_raw"},
+    ),
+    "so101": Layout(
+        make=bags.so101,
+        write=lambda notes, path: bags.write_rosbag2(notes, path / "bag", storage=StoragePlugin.SQLITE3),
+        mapping=bag_mappings.SO101,
+        cameras={
+            "front": "/follower/cam_front/image_raw/compressed",
+            "side": "/static_camera/cam_side/image_raw/compressed",
+        },
+    ),
+    "agilex": Layout(
+        make=bags.agilex,
+        write=lambda notes, path: bags.write_mcap(notes, path / "bag.mcap", is_ros1=True),
+        mapping=bag_mappings.AGILEX,
+        cameras={name: f"/camera_{name[0]}/color/image_raw" for name in ("front", "left", "right")},
+    ),
+    "trossen": Layout(
+        make=bags.trossen,
+        write=lambda notes, path: bags.write_trossen(notes, path / "bag.mcap"),
+        mapping=bag_mappings.TROSSEN,
+        cameras={"high": "/cameras/cam_high/image", "wrist": "/cameras/cam_wrist/image"},
+    ),
+}
+
+
+@pytest.fixture(scope="module", params=sorted(LAYOUTS))
+def imported(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Layout, bags.Notes, Path]:
+    """A layout, its messages and the run that was made of them."""
+    layout = LAYOUTS[request.param]
+    folder = tmp_path_factory.mktemp(request.param)
+    notes = layout.make(SECONDS)
+    bag = layout.write(bags.in_order(notes), folder)
+    mapping = bag_mappings.write_mapping(layout.mapping, folder / "robot.toml")
+    (report,) = import_bags([bag], mapping, folder / "run").reports
+    assert not report.findings
+    return layout, notes, folder / "run"
+
+
+def _open(run: Path, index: int = 0) -> CollectedRecording:
+    return CollectedRecording(run / "episodes" / f"episode_{index:06d}.mcap")
+
+
+def test_numbers_and_ages(imported: tuple[Layout, bags.Notes, Path]) -> None:
+    _, notes, run = imported
+    with _open(run) as recording:
+        columns, info = recording.columns(), recording.info
+        for feature in info.features:
+            (topic,) = {part.split()[0] for part in feature.source.split("; ")} if ";" not in feature.source else ("",)
+            if not topic:
+                continue
+            of_topic = bags.of_topic(notes, topic)
+            for row, time_ns in enumerate(columns.time_ns.tolist()):
+                expected = max(
+                    (note for note in of_topic if note.header_ns <= time_ns), key=lambda note: note.header_ns
+                )
+                assert columns.stamps[feature.name][row] == expected.header_ns
+                if "position" in expected.body or "positions" in expected.body:
+                    numbers = expected.body["position" if "position" in expected.body else "positions"]
+                    assert columns.features[feature.name][row].tobytes() == numbers[: len(feature.names)].tobytes()
+
+
+def test_pictures(imported: tuple[Layout, bags.Notes, Path]) -> None:
+    layout, notes, run = imported
+    with _open(run) as recording:
+        columns = recording.columns()
+        for camera, topic in layout.cameras.items():
+            of_topic = bags.of_topic(notes, topic)
+            packets = list(recording.packets(camera))
+            stamps = columns.picture_stamps[camera]
+            by_stamp = {note.header_ns: note for note in of_topic}
+            for row, time_ns in enumerate(columns.time_ns.tolist()):
+                expected = max(
+                    (note for note in of_topic if note.header_ns <= time_ns), key=lambda note: note.header_ns
+                )
+                assert stamps[columns.pictures[camera][row]] == expected.header_ns
+            kept = next(row for row in recording.info.cameras if row.name == camera).kept
+            for packet, stamp in zip(packets, stamps.tolist(), strict=True):
+                if kept:
+                    assert packet.data == bytes(by_stamp[stamp].body["data"])
+            if not kept:
+                pictures = list(recording.images(camera))
+                assert len(pictures) == len(stamps)
+                for shown, stamp in zip(pictures, stamps.tolist(), strict=True):
+                    given = by_stamp[stamp].body["data"].astype(float)
+                    assert np.abs(shown.astype(float) - given).mean() < 12
+
+
+def test_the_same_command_again_changes_nothing(imported: tuple[Layout, bags.Notes, Path]) -> None:
+    _, _, run = imported
+    before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+    bag = next(path for path in run.parent.iterdir() if path.name.startswith("bag"))
+    assert import_bags([bag], run.parent / "robot.toml", run).num_new == 0
+    assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
+
+
+def _so101(tmp_path: Path, notes: bags.Notes, name: str = "bag") -> Path:
+    return bags.write_mcap(bags.in_order(notes), tmp_path / f"{name}.mcap")
+
+
+def _mapping(tmp_path: Path, *changes: tuple[str, str]) -> Path:
+    text = bag_mappings.SO101
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    return bag_mappings.write_mapping(text, tmp_path / "robot.toml")
+
+
+def test_bags_that_are_added_later(tmp_path: Path) -> None:
+    first, second = _so101(tmp_path, bags.so101(1.0), "a"), _so101(tmp_path, bags.so101(1.2), "b")
+    mapping, run = _mapping(tmp_path), tmp_path / "run"
+    import_bags([first], mapping, run)
+    alone = (run / "episodes/episode_000000.mcap").read_bytes()
+    assert import_bags([first, second], mapping, run).num_new == 1
+    assert (run / "episodes/episode_000000.mcap").read_bytes() == alone
+    with _open(run, 1) as recording:
+        assert recording.info.episode_index == 1
+        assert [file.name for file in recording.info.origin.files] == ["b.mcap"]
+    at_once = tmp_path / "at_once"
+    import_bags([first, second], mapping, at_once)
+    for index in range(2):
+        name = f"episodes/episode_{index:06d}.mcap"
+        assert (run / name).read_bytes() == (at_once / name).read_bytes()
+
+
+def test_an_import_that_was_killed_goes_on(tmp_path: Path) -> None:
+    """Between two episodes of a bag, and within one."""
+    bag = _so101(tmp_path, bags.so101(2.0))
+    cut = '[episodes]\ncut = "times"\ntimes_s = [[0.1, 0.8], [1.0, 1.7]]\n'
+    mapping, run = _mapping(tmp_path, ("[cameras.front]", cut + "[cameras.front]")), tmp_path / "run"
+    import_bags([bag], mapping, run)
+    whole = {path.name: path.read_bytes() for path in run.glob("episodes/*")}
+    assert len(whole) == 2
+    (run / "import.json").unlink()
+    second = run / "episodes/episode_000001.mcap"
+    second.with_name(f"{second.name}.part").write_bytes(second.read_bytes()[:5000])
+    second.unlink()
+    assert import_bags([bag], mapping, run).num_new == 1
+    assert {path.name: path.read_bytes() for path in run.glob("episodes/*")} == whole
+
+
+def test_another_mapping_is_refused(tmp_path: Path) -> None:
+    bag, run = _so101(tmp_path, bags.so101(1.0)), tmp_path / "run"
+    import_bags([bag], _mapping(tmp_path), run)
+    with pytest.raises(ConfigError, match="imported by another mapping"):
+        import_bags([bag], _mapping(tmp_path, ("fps = 30", "fps = 15")), run)
+
+
+def test_an_episode_that_lacks_something_is_dropped_where_the_mapping_says_so(tmp_path: Path) -> None:
+    notes = bags.changed(bags.so101(2.0), "/leader/joint_states", lambda k, note: None if 60 <= k < 80 else note)
+    cut = '[episodes]\ncut = "times"\ntimes_s = [[0.1, 0.8], [1.0, 1.9]]\n'
+    mapping = _mapping(
+        tmp_path, ("[cameras.front]", cut + "[cameras.front]"), ("fps = 30", 'fps = 30\nwhen_old = "drop_episode"')
+    )
+    (report,) = import_bags([_so101(tmp_path, notes)], mapping, tmp_path / "run").reports
+    assert [episode.episode_index for episode in report.episodes] == [0, None]
+    assert "action (/leader/joint_states) is up to" in report.episodes[1].reason
+    assert len(list((tmp_path / "run/episodes").iterdir())) == 1
+
+
+@pytest.mark.parametrize("encoding", ["bgr8", "mono8", "bgra8", "bayer_rggb8"])
+def test_raw_pictures_of_other_encodings(encoding: str, tmp_path: Path) -> None:
+    from demorec.ingest.raw_pictures import raw_picture
+
+    image = bags.picture(bags.EPOCH_NS, 1)
+    smooth = np.broadcast_to(np.linspace(0, 255, bags.WIDTH).astype(np.uint8)[:, None], (bags.HEIGHT, bags.WIDTH, 3))
+    given = {
+        "bgr8": image[:, :, ::-1],
+        "bgra8": np.dstack((image[:, :, ::-1], image[:, :, 0])),
+        "mono8": image[:, :, 0],
+        "bayer_rggb8": smooth[:, :, 0],
+    }[encoding]
+    expected = {"mono8": np.repeat(image[:, :, :1], 3, axis=2), "bayer_rggb8": smooth}.get(encoding, image)
+    padded = np.pad(np.ascontiguousarray(given).reshape(bags.HEIGHT, -1), ((0, 0), (0, 5)))
+    values = {
+        "encoding": encoding,
+        "width": bags.WIDTH,
+        "height": bags.HEIGHT,
+        "step": padded.shape[1],
+        "data": padded.reshape(-1),
+    }
+    assert np.abs(raw_picture(values).astype(int) - expected).max() <= (5 if "bayer" in encoding else 0)
+
+
+def test_h265_and_av1_stay_as_they_are(tmp_path: Path) -> None:
+    from demorec.ingest.picture_messages import picture_head
+
+    for codec, name in (("libx265", "h265"), ("libsvtav1", "av1")):
+        packets = bags.video([bags.picture(bags.EPOCH_NS + k * 33_000_000, 0) for k in range(12)], gop=5, codec=codec)
+        heads = [picture_head({"data": packet, "format": name, "frame_id": ""}) for packet in packets]
+        assert [head.is_keyframe for head in heads] == [k % 5 == 0 for k in range(12)]
+        assert {(head.width, head.height) for head in heads if head.is_keyframe} == {(bags.WIDTH, bags.HEIGHT)}
+
+
+def test_nothing_is_left_where_a_picture_cannot_be_decoded(tmp_path: Path) -> None:
+    buffer = io.BytesIO()
+    Image.fromarray(np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)).save(buffer, format="PNG")
+    good, bad = bytearray(buffer.getvalue()), bytearray(buffer.getvalue())
+    bad[200:220] = bytes(20)
+    notes = bags.changed(
+        bags.so101(1.0),
+        "/follower/cam_front/image_raw/compressed",
+        lambda k, note: bags.with_body(note, data=np.frombuffer(bad if k == 12 else good, np.uint8)),
+    )
+    with pytest.raises(BagError, match="cannot be decoded") as caught:
+        import_bags([_so101(tmp_path, notes)], _mapping(tmp_path), tmp_path / "run")
+    assert str(caught.value).endswith(f": {tmp_path / 'bag.mcap'}")
+    assert not list((tmp_path / "run/episodes").iterdir())
+
+
+def test_a_run_whose_recording_was_exchanged_is_refused(tmp_path: Path) -> None:
+    bag, run = _so101(tmp_path, bags.so101(1.0)), tmp_path / "run"
+    other = _so101(tmp_path, bags.so101(1.3), "other")
+    mapping = _mapping(tmp_path)
+    import_bags([bag], mapping, run)
+    import_bags([other], mapping, tmp_path / "other_run")
+    (run / "import.json").unlink()
+    shutil.copy(tmp_path / "other_run/episodes/episode_000000.mcap", run / "episodes/episode_000000.mcap")
+    with pytest.raises(ConfigError, match="Another recording is there"):
+        import_bags([bag], mapping, run)
+
+
+def test_pictures_of_jpeg_are_what_the_camera_sent(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    import_bags([_so101(tmp_path, bags.so101(1.0))], _mapping(tmp_path), run)
+    with _open(run) as recording:
+        stamps = recording.columns().picture_stamps["front"]
+        for shown, stamp in zip(recording.images("front"), stamps.tolist(), strict=True):
+            expected = np.asarray(Image.open(io.BytesIO(bags.jpeg(bags.picture(stamp, 0)))))
+            assert np.array_equal(shown, expected)
+
+
+@pytest.fixture(scope="module")
+def trossen_dataset(tmp_path_factory: pytest.TempPathFactory) -> tuple[bags.Notes, Path]:
+    """Messages with video, and the LeRobot dataset that was made of them."""
+    folder = tmp_path_factory.mktemp("dataset")
+    notes = bags.trossen(SECONDS)
+    bag = bags.write_trossen(bags.in_order(notes), folder / "bag.mcap")
+    text = bag_mappings.TROSSEN.replace("fps = 30", 'fps = 30\nrows = "/cameras/cam_high/image"')
+    import_bags([bag], bag_mappings.write_mapping(text, folder / "robot.toml"), folder / "run")
+    with pytest.raises(SystemExit) as ended:
+        main(["export", "lerobot", str(folder / "run"), "--out", str(folder / "dataset"), "--repo-id", "local/x"])
+    assert not ended.value.code
+    return notes, folder / "dataset"
+
+
+def test_a_lerobot_dataset_of_a_bag(trossen_dataset: tuple[bags.Notes, Path]) -> None:
+    """As LeRobot reads it: float32 as the bag has it, and the row's message found by the plainest search."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    notes, folder = trossen_dataset
+    dataset = LeRobotDataset("local/x", root=folder, video_backend="pyav")
+    pictures = bags.of_topic(notes, "/cameras/cam_high/image")
+    assert len(dataset) == len(pictures) - 10  # it begins with the second keyframe, before which the arms had begun
+    for row in range(len(dataset)):
+        time_ns = pictures[row + 10].header_ns
+        item = dataset[row]
+        for feature, arm in (("observation.state", "follower"), ("action", "leader")):
+            told = [note for note in bags.of_topic(notes, f"{arm}/joints/state") if note.header_ns <= time_ns]
+            assert item[feature].numpy().tobytes() == told[-1].body["positions"].tobytes()
+
+
+def test_kept_packets_are_in_the_dataset_byte_for_byte(trossen_dataset: tuple[bags.Notes, Path]) -> None:
+    notes, folder = trossen_dataset
+    (video,) = (folder / "videos/observation.images.high").rglob("*.mp4")
+    with av.open(str(video)) as container:
+        stream = container.streams.video[0]
+        to_annex_b = BitStreamFilterContext("h264_mp4toannexb", stream)
+        found = [bytes(out) for packet in container.demux(stream) for out in to_annex_b.filter(packet) if out.size]
+    given = [bytes(note.body["data"]) for note in bags.of_topic(notes, "/cameras/cam_high/image")][10:]
+    assert [_slices(packet) for packet in found] == [_slices(packet) for packet in given]
+
+
+def _slices(packet: bytes) -> list[bytes]:
+    """The coded pictures of an access unit, without parameter sets and the lengths of start codes."""
+    units = [unit.rstrip(b"\0") for unit in packet.split(b"\0\0\1")[1:]]
+    return [unit for unit in units if unit[0] & 31 in (1, 5)]

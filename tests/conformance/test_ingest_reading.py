@@ -1,0 +1,204 @@
+"""Bags of foreign writers are read message for message, number for number, in every form that they have."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.writer import IndexType
+from mcap.writer import Writer as McapWriter
+from rosbags.rosbag2 import CompressionMode, StoragePlugin
+from support import bags
+
+from demorec.ingest.bag import Bag, open_bag
+from demorec.ingest.channel import BagChannel, BagError
+from demorec.ingest.decoding import UnknownEncodingError, decoder_of
+from demorec.ingest.fields import stamp_of
+from demorec.ingest.streams import BagDecoder
+
+
+def _read(bag: Bag) -> tuple[list[tuple[str, int, dict[str, Any]]], list[str]]:
+    """(topic, log time, values) of all messages, and the problems."""
+    decoder, problems = BagDecoder(), list[str]()
+    found = [(m.channel.topic, m.log_ns, decoder.values(m)) for m in bag.messages(problems)]
+    return found, problems
+
+
+def _assert_same(notes: bags.Notes, found: list[tuple[str, int, dict[str, Any]]]) -> None:
+    assert [(note.topic, note.log_ns) for note in notes] == [row[:2] for row in found]
+    for note, (_, _, values) in zip(notes, found, strict=True):
+        assert stamp_of(values) == note.header_ns
+        for key, item in note.body.items():
+            if isinstance(item, np.ndarray):
+                assert values[key].tobytes() == item.tobytes()
+            else:
+                assert values[key] == item, (note.topic, key)
+
+
+@pytest.fixture(scope="module")
+def notes() -> bags.Notes:
+    return bags.in_order(bags.so101(1.0))
+
+
+@pytest.mark.parametrize("storage", [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
+@pytest.mark.parametrize("compression", [None, CompressionMode.FILE, CompressionMode.MESSAGE])
+def test_rosbag2_folders(
+    notes: bags.Notes, storage: StoragePlugin, compression: CompressionMode | None, tmp_path: Path
+) -> None:
+    bag = open_bag(bags.write_rosbag2(notes, tmp_path / "bag", storage=storage, compression=compression))
+    found, problems = _read(bag)
+    assert not problems
+    _assert_same(notes, found)
+
+
+def test_mcap_with_chunks_compressed_by_the_storage(notes: bags.Notes, tmp_path: Path) -> None:
+    path = bags.write_rosbag2(notes, tmp_path / "bag", compression=CompressionMode.STORAGE)
+    _assert_same(notes, _read(open_bag(path))[0])
+
+
+@pytest.mark.parametrize("is_ros1", [False, True])
+@pytest.mark.parametrize("compression", ["", "zstd", "lz4"])
+@pytest.mark.parametrize("is_bare", [False, True])
+def test_mcap_files(notes: bags.Notes, is_ros1: bool, compression: str, is_bare: bool, tmp_path: Path) -> None:
+    bare: dict[str, Any] = {
+        "index_types": IndexType.NONE, "use_statistics": False, "use_summary_offsets": False, "repeat_channels": False,
+        "repeat_schemas": False, "use_chunking": False,
+    }  # fmt: skip
+    path = bags.write_mcap(
+        notes, tmp_path / "bag.mcap", is_ros1=is_ros1, compression=compression, **(bare if is_bare else {})
+    )
+    found, problems = _read(open_bag(path))
+    assert not problems
+    _assert_same(notes, found)
+
+
+def test_poses_and_calibrations(tmp_path: Path) -> None:
+    notes = bags.in_order(bags.franka(0.3))
+    _assert_same(notes, _read(open_bag(bags.write_rosbag2(notes, tmp_path / "bag")))[0])
+
+
+def test_protobuf(tmp_path: Path) -> None:
+    notes = bags.in_order(bags.trossen(1.0))
+    found, problems = _read(open_bag(bags.write_trossen(notes, tmp_path / "bag.mcap")))
+    assert not problems
+    _assert_same(notes, found)
+
+
+def test_protobuf_of_another_writer(tmp_path: Path) -> None:
+    from google.protobuf.timestamp_pb2 import Timestamp
+    from mcap_protobuf.writer import Writer as ProtobufWriter
+
+    with (tmp_path / "bag.mcap").open("wb") as file, ProtobufWriter(file) as writer:
+        writer.write_message("/when", Timestamp(seconds=12, nanos=34), log_time=5)
+    (row,), problems = _read(open_bag(tmp_path / "bag.mcap"))
+    assert row == ("/when", 5, {"seconds": 12, "nanos": 34})
+    assert not problems
+
+
+def test_json(tmp_path: Path) -> None:
+    with (tmp_path / "bag.mcap").open("wb") as file:
+        writer = McapWriter(file)
+        writer.start()
+        schema = writer.register_schema("state", "jsonschema", b"{}")
+        channel = writer.register_channel("/state", "json", schema)
+        body = {"timestamp": {"sec": 3, "nsec": 4}, "q": [0.1, 2], "name": ["a", "b"]}
+        writer.add_message(channel, 7, json.dumps(body).encode(), 7)
+        writer.finish()
+    ((_, _, values),), problems = _read(open_bag(tmp_path / "bag.mcap"))
+    assert stamp_of(values) == 3_000_000_004
+    assert values["q"].tolist() == [0.1, 2.0]
+    assert values["name"] == ["a", "b"]
+    assert not problems
+
+
+@pytest.mark.parametrize("part", [0.05, 0.3, 0.7, 0.98])
+@pytest.mark.parametrize("use_chunking", [True, False])
+def test_a_bag_that_is_cut_off_is_read_up_to_there(
+    notes: bags.Notes, part: float, use_chunking: bool, tmp_path: Path
+) -> None:
+    path = bags.write_mcap(notes, tmp_path / "bag.mcap", use_chunking=use_chunking, chunk_size=20_000)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(len(whole) * part)])
+    found, problems = _read(open_bag(path))
+    assert len(problems) == (0 if len(found) == len(notes) else 1)
+    _assert_same(notes[: len(found)], found)
+    assert len(found) >= len(notes) * (part - 0.3)
+
+
+def test_a_damaged_chunk_is_told(notes: bags.Notes, tmp_path: Path) -> None:
+    path = bags.write_mcap(notes, tmp_path / "bag.mcap", chunk_size=20_000)
+    data = bytearray(path.read_bytes())
+    middle = len(data) // 3
+    data[middle : middle + 8] = bytes(8)
+    assert bytes(data) != path.read_bytes()
+    path.write_bytes(data)
+    found, problems = _read(open_bag(path))
+    assert len(problems) == 1
+    assert 0 < len(found) < len(notes)
+
+
+@pytest.mark.parametrize("content", [b"", b"hello", b"#ROSBAG V2.0\n", b"\x89MCAP0\r\n"[:5]])
+def test_no_bag(content: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "bag.mcap"
+    path.write_bytes(content)
+    with pytest.raises(BagError, match=r"bag\.mcap$") as caught:
+        open_bag(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_no_folder_of_rosbag2(tmp_path: Path) -> None:
+    with pytest.raises(BagError, match=r"metadata\.yaml"):
+        open_bag(tmp_path)
+    (tmp_path / "metadata.yaml").write_text("a: [")
+    with pytest.raises(BagError, match="cannot be read"):
+        open_bag(tmp_path)
+    (tmp_path / "metadata.yaml").write_text("rosbag2_bagfile_information: {relative_file_paths: [x.mcap]}")
+    with pytest.raises(BagError, match=r"lacks its file x\.mcap"):
+        open_bag(tmp_path)
+
+
+HOSTILE = {
+    "itself": b"Loop again\n" + b"=" * 80 + b"\nMSG: a/Loop\nLoop again\n",
+    "unknown": b"b/Missing x\n",
+    "no text": b"\xff\xfe",
+    "code": b"float64 x = __import__('os').system('touch /tmp/ran')\n'''\n",
+}
+
+
+@pytest.mark.parametrize("name", sorted(HOSTILE))
+def test_definitions_are_data(name: str) -> None:
+    channel = BagChannel(topic="/x", type="a/msg/Top", encoding="cdr", schema_encoding="ros2msg", schema=HOSTILE[name])
+    with pytest.raises(UnknownEncodingError):
+        decoder_of(channel)
+    assert not Path("/tmp/ran").exists()
+
+
+def test_no_message_fills_the_memory() -> None:
+    schema = b"float64[] values\nstring[] names\nb/E[] items\n" + b"=" * 80 + b"\nMSG: b/E\n"
+    decode = decoder_of(
+        BagChannel(topic="/x", type="a/msg/Top", encoding="cdr", schema_encoding="ros2msg", schema=schema)
+    )
+    many = (2**32 - 1).to_bytes(4, "little")
+    for data in (many, bytes(4) + many, bytes(8) + many, b""):
+        with pytest.raises(ValueError, match="end"):
+            decode(b"\x00\x01\x00\x00" + data)
+
+
+def test_mutated_messages_are_refused_or_read(notes: bags.Notes, tmp_path: Path) -> None:
+    bag = open_bag(bags.write_mcap(notes, tmp_path / "bag.mcap"))
+    decoder, outcomes = BagDecoder(), Counter[str]()
+    generator = np.random.default_rng(0)
+    for message in bag.messages([]):
+        data = bytearray(message.data)
+        for place in generator.integers(0, min(len(data), 80), 3):
+            data[place] = int(generator.integers(256))
+        try:
+            decoder.values(message._replace(data=bytes(data)))
+            outcomes["read"] += 1
+        except ValueError:
+            outcomes["refused"] += 1
+    assert min(outcomes["read"], outcomes["refused"]) > 10

@@ -1,0 +1,72 @@
+"""Each fault of a bag is named by the report of its import; bags without a fault give no finding."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from support import bag_mappings, bags
+from support.bag_faults import FAULTS, hurt
+
+from demorec.ingest.bag import open_bag
+from demorec.ingest.channel import BagError
+from demorec.ingest.import_run import import_bags
+from demorec.ingest.mapping import read_mapping
+from demorec.ingest.report import all_findings
+from demorec.ingest.rows import Timelines
+from demorec.ingest.streams import read_streams
+
+MAPPING = bag_mappings.SO101.replace('field = "position"', 'field = "position"\nunit = "rad"', 1)
+
+
+@pytest.fixture(scope="module")
+def notes() -> bags.Notes:
+    return bags.so101(2.0)
+
+
+def _findings(bag: Path, tmp_path: Path) -> set[str]:
+    mapping = read_mapping(bag_mappings.write_mapping(MAPPING, tmp_path / "robot.toml"))
+    streams = read_streams(open_bag(bag), mapping)
+    return {finding.kind for finding in all_findings(streams, Timelines(streams, mapping), mapping)}
+
+
+def test_there_are_enough() -> None:
+    assert len(FAULTS) >= 25
+
+
+@pytest.mark.parametrize("name", sorted(FAULTS))
+def test_a_fault_is_named(name: str, notes: bags.Notes, tmp_path: Path) -> None:
+    hurt_notes = hurt(notes, name)
+    bag = bags.write_mcap(hurt_notes, tmp_path / "bag.mcap")
+    assert bag.read_bytes() != bags.write_mcap(bags.in_order(notes), tmp_path / "whole.mcap").read_bytes()
+    assert FAULTS[name].kind in _findings(bag, tmp_path)
+    run = tmp_path / "run"
+    if FAULTS[name].is_refused:
+        with pytest.raises(BagError) as caught:
+            import_bags([bag], tmp_path / "robot.toml", run)
+        assert "\n" not in str(caught.value)
+        assert str(caught.value).endswith(f": {bag}")
+        assert not list(run.glob("episodes/*"))
+    else:
+        (report,) = import_bags([bag], tmp_path / "robot.toml", run).reports
+        assert FAULTS[name].kind in {finding.kind for finding in report.findings}
+        assert len(list(run.glob("episodes/*.mcap"))) == 1
+
+
+def test_a_bag_that_is_cut_off_is_named(notes: bags.Notes, tmp_path: Path) -> None:
+    bag = bags.write_mcap(bags.in_order(notes), tmp_path / "bag.mcap", chunk_size=20_000)
+    data = bag.read_bytes()
+    bag.write_bytes(data[: len(data) * 3 // 4])
+    assert "cut_off" in _findings(bag, tmp_path)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_clean_bag_gives_no_finding(seed: int, tmp_path: Path) -> None:
+    """Ordinary jitter, latency, a robot that rests, and a gripper's commands on change are no faults."""
+    seconds = 2.0 + 0.3 * seed
+    notes = bags.so101(seconds)
+    resting = bags.changed(
+        notes, "/leader/joint_states", lambda k, note: bags.with_body(note, position=note.body["position"].round(1))
+    )
+    bag = bags.write_mcap(bags.in_order(resting if seed % 2 else notes), tmp_path / "bag.mcap")
+    assert _findings(bag, tmp_path) == set()

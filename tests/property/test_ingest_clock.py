@@ -1,0 +1,85 @@
+"""Which message a row takes, against the plainest way to find it."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation, Slerp
+
+from demorec.ingest.clock import MISSING, NS, Chosen, choose, grid, sampled
+
+TIMES = st.lists(st.integers(0, 10**6), min_size=1, max_size=30, unique=True).map(sorted)
+ROWS = st.lists(st.integers(-10, 10**6 + 10), min_size=1, max_size=30, unique=True).map(sorted)
+
+
+def _chosen(index: NDArray[np.int64], fraction: NDArray[np.float64]) -> Chosen:
+    return Chosen(index=index, fraction=fraction, age_ns=np.zeros_like(index), reach_ns=np.zeros_like(index))
+
+
+@given(TIMES, ROWS)
+def test_latest(times: list[int], rows: list[int]) -> None:
+    chosen = choose(np.array(times), np.array(rows), "latest")
+    for row, index, age in zip(rows, chosen.index, chosen.age_ns, strict=True):
+        before = [time for time in times if time <= row]
+        if not before:
+            assert (index, age) == (-1, MISSING)
+        else:
+            assert (times[index], age) == (before[-1], row - before[-1])
+
+
+@given(TIMES, ROWS)
+def test_nearest(times: list[int], rows: list[int]) -> None:
+    chosen = choose(np.array(times), np.array(rows), "nearest")
+    for row, index, age in zip(rows, chosen.index, chosen.age_ns, strict=True):
+        best = min(times, key=lambda time: (abs(time - row), time))
+        assert (times[index], age) == (best, row - best)
+
+
+@given(TIMES, ROWS)
+def test_linear(times: list[int], rows: list[int]) -> None:
+    values = np.array([[3.0 * time + 1.0] for time in times])
+    chosen = choose(np.array(times), np.array(rows), "linear")
+    inside = np.array([times[0] <= row <= times[-1] for row in rows])
+    assert np.array_equal(chosen.reach_ns == MISSING, ~inside)
+    assert chosen.fraction is not None
+    part = _chosen(chosen.index[inside], chosen.fraction[inside])
+    mixed = sampled(values, part, unit="", quaternions=())
+    assert np.allclose(mixed[:, 0], [3.0 * row + 1.0 for row, ok in zip(rows, inside, strict=True) if ok], atol=1e-6)
+    widest = max(np.diff(times), default=0)
+    assert np.all(chosen.reach_ns[inside] <= widest)
+    assert np.all(np.diff(np.array(rows)[inside] - chosen.age_ns[inside]) >= 0)
+
+
+@given(st.floats(-3.0, 3.0), st.floats(-3.0, 3.0), st.floats(0.0, 1.0))
+def test_angles_go_the_short_way_round(first: float, turn: float, fraction: float) -> None:
+    wrapped = (first + turn + np.pi) % (2 * np.pi) - np.pi
+    chosen = _chosen(np.array([0]), np.array([fraction]))
+    (mixed,) = sampled(np.array([[first], [wrapped]]), chosen, unit="rad", quaternions=())[0]
+    assert abs((mixed - (first + fraction * turn) + np.pi) % (2 * np.pi) - np.pi) < 1e-9
+
+
+@given(st.integers(0, 2**31), st.floats(0.0, 1.0))
+def test_quaternions_against_scipy(seed: int, fraction: float) -> None:
+    pair = Rotation.random(2, random_state=seed)
+    chosen = _chosen(np.array([0]), np.array([fraction]))
+    values = pair.as_quat()
+    values[1] *= -1 if seed % 2 else 1  # the same rotation
+    mixed = sampled(values, chosen, unit="", quaternions=(0,))[0]
+    expected = Slerp([0, 1], pair)([fraction])
+    assert (Rotation.from_quat(mixed).inv() * expected[0]).magnitude() < 1e-6
+
+
+def test_one_message_is_taken_to_the_bit() -> None:
+    values = np.array([[0.1], [np.pi]], dtype=np.float32)
+    chosen = choose(np.array([0, 10]), np.array([10]), "linear")
+    assert sampled(values, chosen, unit="rad", quaternions=()).tobytes() == values[1:].tobytes()
+
+
+@given(st.integers(1, 1000), st.integers(0, 20 * NS))
+def test_grid_never_drifts(fps: int, length: int) -> None:
+    rows = grid(5, 5 + length, fps)
+    assert rows[0] == 5
+    assert rows[-1] <= 5 + length < rows[-1] + NS // fps + 1
+    assert np.all(np.abs((rows - 5) - np.arange(len(rows)) * (NS / fps)) <= 1)

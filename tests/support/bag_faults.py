@@ -1,0 +1,200 @@
+"""Faults that recorders, networks, drivers and people put into bags, each as a change of a layout's messages."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from support.bags import NS, Note, Notes, changed, in_order, jpeg, with_body
+
+STATE, ACTION = "/follower/joint_states", "/leader/joint_states"
+FRONT, SIDE = "/follower/cam_front/image_raw/compressed", "/static_camera/cam_side/image_raw/compressed"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fault:
+    """One of them.
+
+    Attributes:
+        kind: The finding that must name it.
+        hurt: Makes it, of messages in the order of recording.
+        is_refused: Whether no episode may come of it.
+    """
+
+    kind: str
+    hurt: Callable[[Notes], Notes]
+    is_refused: bool = False
+
+
+def _each(topic: str, change: Callable[[int, Note], Note | None]) -> Callable[[Notes], Notes]:
+    return lambda notes: changed(notes, topic, change)
+
+
+def _later(note: Note, seconds: float) -> Note:
+    return replace(note, header_ns=note.header_ns + round(seconds * NS))
+
+
+def _position(note: Note, change: Callable[[NDArray[np.float64]], None]) -> Note:
+    position = note.body["position"].copy()
+    change(position)
+    return with_body(note, position=position)
+
+
+def _set(index: int, value: float) -> Callable[[NDArray[np.float64]], None]:
+    def change(position: NDArray[np.float64]) -> None:
+        position[index] = value
+
+    return change
+
+
+def _held(topic: str, first: int, last: int, columns: slice) -> Callable[[Notes], Notes]:
+    """An encoder that gives the same number again and again."""
+
+    def hurt(notes: Notes) -> Notes:
+        (kept,) = [note.body["position"] for k, note in enumerate(n for n in notes if n.topic == topic) if k == first]
+
+        def change(number: int, note: Note) -> Note:
+            def hold(position: NDArray[np.float64]) -> None:
+                position[columns] = kept[columns]
+
+            return _position(note, hold) if first <= number < last else note
+
+        return changed(notes, topic, change)
+
+    return hurt
+
+
+def _swapped_times(notes: Notes) -> Notes:
+    """Ten pairs of neighbours in the wrong order."""
+    mine = [k for k, note in enumerate(notes) if note.topic == STATE][10:30]
+    result = list(notes)
+    for a, b in zip(mine[::2], mine[1::2], strict=True):
+        result[a], result[b] = notes[b], notes[a]
+    return result
+
+
+def _repeated(notes: Notes) -> Notes:
+    return [
+        copy
+        for k, note in enumerate(notes)
+        for copy in ([note, note] if note.topic == STATE and k % 3 == 0 else [note])
+    ]
+
+
+def _jittered(notes: Notes) -> Notes:
+    generator = np.random.default_rng(5)
+    return changed(notes, STATE, lambda k, note: _later(note, float(generator.uniform(-0.009, 0.009))))
+
+
+def _swapped_cameras(notes: Notes) -> Notes:
+    other = {FRONT: SIDE, SIDE: FRONT}
+    return [replace(note, topic=other.get(note.topic, note.topic)) for note in notes]
+
+
+def _same_pictures(notes: Notes) -> Notes:
+    fronts = [note for note in notes if note.topic == FRONT]
+    return changed(notes, SIDE, lambda k, note: with_body(note, data=fronts[min(k, len(fronts) - 1)].body["data"]))
+
+
+def _frozen(notes: Notes) -> Notes:
+    data = [note.body["data"] for note in notes if note.topic == FRONT][20]
+    return changed(notes, FRONT, lambda k, note: with_body(note, data=data) if 20 <= k < 35 else note)
+
+
+def _resized(number: int, note: Note) -> Note:
+    if number < 40:
+        return note
+    return with_body(note, data=np.frombuffer(jpeg(np.zeros((24, 32, 3), np.uint8)), np.uint8))
+
+
+def _cut_picture(number: int, note: Note) -> Note:
+    return with_body(note, data=note.body["data"][:300]) if number % 20 == 7 else note
+
+
+def _garbage(number: int, note: Note) -> Note:
+    return replace(note, data=b"\x00\x01\x00\x00abc") if number in (20, 21) else note
+
+
+def _short(number: int, note: Note) -> Note:
+    return with_body(note, name=note.body["name"][:-1], position=note.body["position"][:-1]) if number == 33 else note
+
+
+FAULTS: dict[str, Fault] = {
+    "a clock half a second behind": Fault(kind="clock_offset", hurt=_each(STATE, lambda k, n: _later(n, -0.5))),
+    "a camera stamped in the future": Fault(kind="clock_offset", hurt=_each(SIDE, lambda k, n: _later(n, 0.15))),
+    "a clock of another epoch": Fault(
+        kind="clock_offset", hurt=_each(ACTION, lambda k, n: _later(n, -1e6)), is_refused=True
+    ),
+    "a clock that jumps ahead": Fault(
+        kind="clock_jump", hurt=_each(STATE, lambda k, n: _later(n, 0.4) if k > 60 else n), is_refused=True
+    ),
+    "a clock that jumps back": Fault(
+        kind="clock_jump", hurt=_each(SIDE, lambda k, n: _later(n, -0.15) if k > 30 else n)
+    ),
+    "a clock that drifts": Fault(kind="clock_drift", hurt=_each(STATE, lambda k, n: _later(n, 0.0008 * k))),
+    "headers without time": Fault(kind="unstamped", hurt=_each(STATE, lambda k, n: replace(n, header_ns=0))),
+    "some headers without time": Fault(
+        kind="unstamped", hurt=_each(STATE, lambda k, n: replace(n, header_ns=0) if k % 10 == 3 else n)
+    ),
+    "single messages lost": Fault(kind="drops", hurt=_each(STATE, lambda k, n: None if k % 10 == 5 else n)),
+    "pictures lost": Fault(kind="drops", hurt=_each(FRONT, lambda k, n: None if k in (20, 21, 40) else n)),
+    "a pause within the allowed age": Fault(kind="gap", hurt=_each(ACTION, lambda k, n: None if 40 <= k < 47 else n)),
+    "a long pause": Fault(kind="gap", hurt=_each(FRONT, lambda k, n: None if 20 <= k < 35 else n), is_refused=True),
+    "jitter": Fault(kind="jitter", hurt=_jittered),
+    "a stream that begins late": Fault(kind="late_start", hurt=_each(SIDE, lambda k, n: n if k > 20 else None)),
+    "a stream that ends early": Fault(kind="early_end", hurt=_each(ACTION, lambda k, n: n if k < 65 else None)),
+    "duplicated messages": Fault(kind="duplicates", hurt=_repeated),
+    "messages in the wrong order": Fault(kind="order", hurt=_swapped_times),
+    "a number that is none": Fault(
+        kind="nan",
+        hurt=_each(STATE, lambda k, n: _position(n, _set(2, np.nan)) if 30 <= k < 40 else n),
+        is_refused=True,
+    ),
+    "an infinite number": Fault(
+        kind="infinite",
+        hurt=_each(ACTION, lambda k, n: _position(n, _set(0, np.inf)) if 30 <= k < 40 else n),
+        is_refused=True,
+    ),
+    "an encoder that is stuck": Fault(kind="stuck", hurt=_held(STATE, 40, 90, slice(1, 2))),
+    "an arm that is stuck": Fault(kind="stuck", hurt=_held(STATE, 20, 60, slice(0, 6))),
+    "a joint that never moves though it shall": Fault(
+        kind="stuck", hurt=_each(STATE, lambda k, n: _position(n, _set(3, 0.25)))
+    ),
+    "only zeros": Fault(kind="zeros", hurt=_each(STATE, lambda k, n: with_body(n, position=np.zeros(6)))),
+    "a spike": Fault(kind="jump", hurt=_each(STATE, lambda k, n: _position(n, _set(4, 3.0)) if k == 50 else n)),
+    "degrees called rad": Fault(
+        kind="unit", hurt=_each(STATE, lambda k, n: with_body(n, position=np.degrees(n.body["position"])))
+    ),
+    "messages that cannot be decoded": Fault(kind="malformed", hurt=_each(STATE, _garbage)),
+    "a message that lacks a joint": Fault(kind="malformed", hurt=_each(STATE, _short)),
+    "pictures cut off": Fault(kind="malformed", hurt=_each(FRONT, _cut_picture)),
+    "swapped cameras": Fault(kind="swapped", hurt=_swapped_cameras),
+    "one camera twice": Fault(kind="same_pictures", hurt=_same_pictures),
+    "a frozen camera": Fault(kind="frozen", hurt=_frozen),
+    "a camera that changes its size": Fault(kind="size", hurt=_each(FRONT, _resized), is_refused=True),
+    "a camera of half the rate": Fault(kind="slow", hurt=_each(SIDE, lambda k, n: n if k % 2 else None)),
+    "frames of another camera in between": Fault(
+        kind="frame_id", hurt=_each(FRONT, lambda k, n: replace(n, frame_id="cam_side") if k == 30 else n)
+    ),
+    "another kind of picture": Fault(
+        kind="format",
+        hurt=_each(FRONT, lambda k, n: with_body(n, format="png", data=_png()) if k == 30 else n),
+        is_refused=True,
+    ),
+}
+
+
+def _png() -> NDArray[np.uint8]:
+    buffer = io.BytesIO()
+    Image.fromarray(np.zeros((48, 64, 3), np.uint8)).save(buffer, format="PNG")
+    return np.frombuffer(buffer.getvalue(), np.uint8)
+
+
+def hurt(notes: Notes, name: str) -> Notes:
+    """The messages with a fault, in the order of recording."""
+    return FAULTS[name].hurt(in_order(notes))

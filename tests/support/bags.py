@@ -1,0 +1,449 @@
+"""Bags as real recorders write them, written by libraries that are not ours: `rosbags`, `mcap`, `foxglove`.
+
+A layout makes plain messages first, so that a test can hurt them before they are written, and knows what is in the bag
+without reading it. Topics, types, joint names and rates are those of:
+
+- franka: franka_ros2's broadcasters and GELLO's leader arm at up to 1 kHz, realsense2_camera, rosbag2 with MCAP;
+- so101: so101_ros2's follower and leader, usb_cam's JPEG pictures, rosbag2 with SQLite;
+- agilex: Cobot Magic's two master and two puppet arms and three cameras, ROS 1 messages in MCAP;
+- trossen: Trossen SDK's protobuf joint states and Foxglove's CompressedVideo in MCAP.
+"""
+
+from __future__ import annotations
+
+import functools
+import io
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
+from numpy.typing import NDArray
+from PIL import Image
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+NS = 1_000_000_000
+EPOCH_NS = 1_760_000_000 * NS
+WIDTH, HEIGHT = 64, 48
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Note:
+    """A message before it is written.
+
+    Attributes:
+        topic, type: Of it.
+        log_ns: When it is recorded.
+        header_ns: In its header.
+        body: Fields of it; the header is made when it is written.
+        frame_id: In its header.
+        data: In place of a body: the message's bytes.
+    """
+
+    topic: str
+    type: str
+    log_ns: int
+    header_ns: int
+    body: dict[str, Any] = field(default_factory=dict)
+    frame_id: str = ""
+    data: bytes | None = None
+
+
+Notes = list[Note]
+
+
+def times(rate: float, seconds: float, *, phase: float = 0.0, jitter: float = 0.03, seed: int = 0) -> list[int]:
+    """Times of a sensor, nanoseconds: `rate` a second, each off by a part `jitter` of the period at most."""
+    generator = np.random.default_rng(seed)
+    period = 1.0 / rate
+    count = int((seconds - phase) * rate)
+    off = generator.uniform(-jitter, jitter, count) * period
+    return [EPOCH_NS + round((phase + k * period + off[k] + 0.01) * NS) for k in range(count)]
+
+
+def motion(time_ns: int, count: int, *, shift: float = 0.0) -> NDArray[np.float64]:
+    """(count,) joint positions, rad: smooth, and with the noise of an encoder."""
+    t = (time_ns - EPOCH_NS) / NS
+    noise = np.random.default_rng(time_ns % 2**32).normal(0, 1e-5, count)
+    return np.asarray(0.5 * np.sin(2 * np.pi * 0.4 * t + np.arange(count) * 0.7 + shift) + noise)
+
+
+def picture(time_ns: int, camera: int) -> NDArray[np.uint8]:
+    """(HEIGHT, WIDTH, 3): of another colour for each camera, with a bar that moves."""
+    image = np.full((HEIGHT, WIDTH, 3), (40 + 60 * camera, 200 - 50 * camera, 90), np.uint8)
+    x = int((time_ns - EPOCH_NS) / NS * 25) % (WIDTH - 8)
+    image[8:40, x : x + 8] = 250
+    image[0, 0] = [(time_ns // 1000) % 251, camera, 7]
+    return image
+
+
+def jpeg(image: NDArray[np.uint8]) -> bytes:
+    """Of a picture."""
+    buffer = io.BytesIO()
+    Image.fromarray(image).save(buffer, format="JPEG", quality=90)
+    return buffer.getvalue()
+
+
+def joints(
+    topic: str, names: Sequence[str], moments: Sequence[int], *, shift: float = 0.0, latency: int = 500_000
+) -> Notes:
+    """Messages of sensor_msgs/JointState."""
+    return [
+        Note(
+            topic=topic,
+            type="sensor_msgs/msg/JointState",
+            log_ns=moment + latency,
+            header_ns=moment,
+            body={"name": list(names), "position": motion(moment, len(names), shift=shift)},
+        )
+        for moment in moments
+    ]
+
+
+def raw_pictures(topic: str, moments: Sequence[int], camera: int, frame_id: str) -> Notes:
+    """Messages of sensor_msgs/Image, rgb8."""
+    return [
+        Note(
+            topic=topic,
+            type="sensor_msgs/msg/Image",
+            log_ns=moment + 20_000_000,
+            header_ns=moment,
+            body={"encoding": "rgb8", "width": WIDTH, "height": HEIGHT, "data": picture(moment, camera)},
+            frame_id=frame_id,
+        )
+        for moment in moments
+    ]
+
+
+def jpeg_pictures(topic: str, moments: Sequence[int], camera: int, frame_id: str) -> Notes:
+    """Messages of sensor_msgs/CompressedImage, JPEG."""
+    return [
+        Note(
+            topic=topic,
+            type="sensor_msgs/msg/CompressedImage",
+            log_ns=moment + 15_000_000,
+            header_ns=moment,
+            body={"format": "jpeg", "data": np.frombuffer(jpeg(picture(moment, camera)), np.uint8)},
+            frame_id=frame_id,
+        )
+        for moment in moments
+    ]
+
+
+FRANKA_JOINTS = tuple(f"fr3_joint{k}" for k in range(1, 8))
+FRANKA_FINGERS = ("fr3_finger_joint1", "fr3_finger_joint2")
+SO101_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
+AGILEX_JOINTS = tuple(f"joint{k}" for k in range(7))
+
+
+def franka(seconds: float = 2.0) -> Notes:
+    """A Franka arm with GELLO and two RealSense cameras."""
+    color = "/camera/{}/color/image_raw"
+    notes = joints("/joint_states", (*FRANKA_JOINTS, *FRANKA_FINGERS), times(1000, seconds, seed=1), latency=200_000)
+    notes += joints("/gello/joint_states", FRANKA_JOINTS, times(100, seconds, seed=2), shift=0.1)
+    notes += [
+        Note(
+            topic="/franka_robot_state_broadcaster/current_pose",
+            type="geometry_msgs/msg/PoseStamped",
+            log_ns=moment + 200_000,
+            header_ns=moment,
+            body={"pose": _pose(moment)},
+            frame_id="fr3_link0",
+        )
+        for moment in times(200, seconds, seed=3)
+    ]
+    for camera, name in enumerate(("wrist_camera", "scene_camera")):
+        moments = times(30, seconds, seed=4 + camera)
+        notes += raw_pictures(color.format(name), moments, camera, f"{name}_color_optical_frame")
+        notes += [
+            Note(
+                topic=f"/camera/{name}/color/camera_info",
+                type="sensor_msgs/msg/CameraInfo",
+                log_ns=moment + 20_000_000,
+                header_ns=moment,
+                body={"k": np.array([60.0, 0, 32, 0, 60.0, 24, 0, 0, 1])},
+                frame_id=f"{name}_color_optical_frame",
+            )
+            for moment in moments
+        ]
+    return notes
+
+
+def _pose(moment: int) -> dict[str, Any]:
+    angle = 0.3 * np.sin((moment - EPOCH_NS) / NS)
+    position = motion(moment, 3)
+    return {
+        "position": dict(zip("xyz", position.tolist(), strict=True)),
+        "orientation": {"x": 0.0, "y": 0.0, "z": float(np.sin(angle / 2)), "w": float(np.cos(angle / 2))},
+    }
+
+
+def so101(seconds: float = 2.0) -> Notes:
+    """An SO-101 leader and follower with two USB cameras."""
+    notes = joints("/follower/joint_states", SO101_JOINTS, times(50, seconds, seed=1))
+    notes += joints("/leader/joint_states", SO101_JOINTS, times(50, seconds, phase=0.004, seed=2), shift=0.1)
+    for camera, (topic, frame) in enumerate(
+        (
+            ("/follower/cam_front/image_raw/compressed", "cam_front"),
+            ("/static_camera/cam_side/image_raw/compressed", "cam_side"),
+        )
+    ):
+        notes += jpeg_pictures(topic, times(30, seconds, seed=3 + camera), camera, frame)
+    return notes
+
+
+def agilex(seconds: float = 2.0) -> Notes:
+    """Two master and two puppet arms of 7 joints each, and three cameras."""
+    notes: Notes = []
+    for number, side in enumerate(("left", "right")):
+        notes += joints(f"/puppet/joint_{side}", AGILEX_JOINTS, times(200, seconds, seed=1 + number), shift=number)
+        notes += joints(
+            f"/master/joint_{side}", AGILEX_JOINTS, times(200, seconds, seed=3 + number), shift=number + 0.1
+        )
+    for camera, letter in enumerate("flr"):
+        topic = f"/camera_{letter}/color/image_raw"
+        notes += raw_pictures(
+            topic, times(30, seconds, seed=5 + camera), camera, f"camera_{letter}_color_optical_frame"
+        )
+    return notes
+
+
+def trossen(seconds: float = 2.0, *, gop: int = 10) -> Notes:
+    """Trossen's arms and cameras, the pictures coded as H.264."""
+    notes: Notes = []
+    for number, arm in enumerate(("leader", "follower")):
+        for moment in times(200, seconds, seed=1 + number):
+            positions = motion(moment, 7, shift=0.1 * number).astype(np.float32)
+            notes.append(
+                Note(
+                    topic=f"{arm}/joints/state",
+                    type="trossen_sdk.msg.JointState",
+                    log_ns=moment,
+                    header_ns=moment,
+                    body={"positions": positions},
+                )
+            )
+    for camera, name in enumerate(("cam_high", "cam_wrist")):
+        moments = times(30, seconds, seed=3 + camera)
+        packets = video([picture(moment, camera) for moment in moments], gop=gop)
+        notes += [
+            Note(
+                topic=f"/cameras/{name}/image",
+                type="foxglove.CompressedVideo",
+                log_ns=moment,
+                header_ns=moment,
+                body={"format": "h264", "data": packet},
+                frame_id=name,
+            )
+            for moment, packet in zip(moments, packets, strict=True)
+        ]
+    return notes
+
+
+def video(pictures: Sequence[NDArray[np.uint8]], *, gop: int, codec: str = "libx264") -> list[bytes]:
+    """One packet a picture, parameter sets before each keyframe."""
+    context = av.CodecContext.create(codec, "w")
+    assert isinstance(context, av.VideoCodecContext)
+    context.width, context.height, context.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+    context.framerate, context.time_base = Fraction(30), Fraction(1, 30)
+    context.gop_size = gop
+    context.options = {"bf": "0", "tune": "zerolatency"}
+    if codec == "libx265":
+        context.options = {"tune": "zerolatency", "x265-params": "bframes=0:repeat-headers=1:log-level=none"}
+    packets = []
+    for image in pictures:
+        packets += context.encode(av.VideoFrame.from_ndarray(image, format="rgb24"))
+    packets += context.encode(None)
+    return [bytes(packet) for packet in packets]
+
+
+@functools.cache
+def _store(*, is_ros1: bool = False) -> Any:
+    return get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
+
+
+def ros_message(note: Note, *, is_ros1: bool = False) -> Any:
+    """A message of `rosbags`."""
+    store = _store(is_ros1=is_ros1)
+    return _filled(store, note.type, note.body | {"header": note}, is_ros1)
+
+
+def _filled(store: Any, name: str, body: dict[str, Any], is_ros1: bool) -> Any:
+    from rosbags.interfaces import Nodetype
+
+    values = {}
+    for key, (kind, rest) in store.fielddefs[name][1]:
+        given = body.get(key)
+        if kind == Nodetype.NAME:
+            if isinstance(given, Note):
+                sec, nanosec = divmod(given.header_ns, NS)
+                stamp = store.types["builtin_interfaces/msg/Time"](sec=sec, nanosec=nanosec)
+                extra = {"seq": 0} if is_ros1 else {}
+                values[key] = store.types[rest](stamp=stamp, frame_id=given.frame_id, **extra)
+            elif rest == "builtin_interfaces/msg/Time":
+                values[key] = store.types[rest](sec=0, nanosec=0)
+            else:
+                values[key] = _filled(store, rest, given or {}, is_ros1)
+        elif kind == Nodetype.BASE:
+            values[key] = given if given is not None else "" if rest[0] == "string" else 0
+        elif given is not None and rest[0][0] == Nodetype.BASE and rest[0][1][0] != "string":
+            values[key] = np.asarray(given).reshape(-1)
+        elif rest[0][1][0] == "string":
+            values[key] = given or []
+        else:
+            length = rest[1] if kind == Nodetype.ARRAY else 0
+            values[key] = np.zeros(length, rest[0][1][0]) if rest[0][0] == Nodetype.BASE else given or []
+    return store.types[name](**values)
+
+
+def write_rosbag2(
+    notes: Notes,
+    path: Path,
+    *,
+    storage: StoragePlugin = StoragePlugin.MCAP,
+    compression: CompressionMode | None = None,
+) -> Path:
+    """A folder of rosbag2, by `rosbags`."""
+    writer = Writer(path, version=9, storage_plugin=storage)
+    if compression is not None:
+        writer.set_compression(compression, CompressionFormat.ZSTD)
+    store = _store()
+    with writer:
+        connections: dict[str, Any] = {}
+        for note in notes:
+            if note.topic not in connections:
+                connections[note.topic] = writer.add_connection(note.topic, note.type, typestore=store)
+            data = note.data
+            if data is None:
+                data = store.serialize_cdr(ros_message(note), note.type)
+            writer.write(connections[note.topic], note.log_ns, data)
+    return path
+
+
+def write_mcap(
+    notes: Notes,
+    path: Path,
+    *,
+    is_ros1: bool = False,
+    compression: str = "zstd",
+    use_chunking: bool = True,
+    **options: Any,
+) -> Path:
+    """An MCAP file of ROS messages, by `mcap`; ROS 1 ones are serialised by `rosbags`."""
+    from mcap.writer import CompressionType
+    from mcap.writer import Writer as McapWriter
+
+    store = _store(is_ros1=is_ros1)
+    with path.open("wb") as file:
+        kinds = {"": CompressionType.NONE, "zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4}
+        writer = McapWriter(file, compression=kinds[compression], use_chunking=use_chunking, **options)
+        writer.start(profile="ros1" if is_ros1 else "ros2")
+        channels: dict[str, int] = {}
+        for note in notes:
+            if note.topic not in channels:
+                text, _ = store.generate_msgdef(note.type, ros_version=1 if is_ros1 else 2)
+                schema = writer.register_schema(
+                    note.type.replace("/msg/", "/") if is_ros1 else note.type,
+                    "ros1msg" if is_ros1 else "ros2msg",
+                    text.encode(),
+                )
+                channels[note.topic] = writer.register_channel(note.topic, "ros1" if is_ros1 else "cdr", schema)
+            data = note.data
+            if data is None:
+                serialise: Callable[..., memoryview] = store.serialize_ros1 if is_ros1 else store.serialize_cdr
+                data = bytes(serialise(ros_message(note, is_ros1=is_ros1), note.type))
+            writer.add_message(channels[note.topic], note.log_ns, data, note.log_ns)
+        writer.finish()
+    return path
+
+
+@functools.cache
+def _trossen_type() -> tuple[Any, bytes]:
+    """The class and the definition of Trossen's joint states."""
+    stamp = descriptor_pb2.FileDescriptorProto.FromString(timestamp_pb2.DESCRIPTOR.serialized_pb)
+    times_file = descriptor_pb2.FileDescriptorProto(
+        name="Timestamp.proto", package="trossen_sdk", syntax="proto3", dependency=[stamp.name]
+    )
+    holder = times_file.message_type.add(name="Timestamp")
+    for number, name in enumerate(("monotonic", "realtime"), 1):
+        holder.field.add(name=name, number=number, type=11, label=1, type_name=".google.protobuf.Timestamp")
+    main = descriptor_pb2.FileDescriptorProto(
+        name="JointState.proto", package="trossen_sdk.msg", syntax="proto3", dependency=[times_file.name]
+    )
+    state = main.message_type.add(name="JointState")
+    state.field.add(name="ts", number=1, type=11, label=1, type_name=".trossen_sdk.Timestamp")
+    state.field.add(name="seq", number=2, type=4, label=1)
+    for number, name in enumerate(("positions", "velocities", "efforts"), 3):
+        state.field.add(name=name, number=number, type=2, label=3)
+    files = descriptor_pb2.FileDescriptorSet(file=[stamp, times_file, main])
+    pool = descriptor_pool.DescriptorPool()
+    for file in files.file:
+        pool.Add(file)
+    kind = message_factory.GetMessageClass(pool.FindMessageTypeByName("trossen_sdk.msg.JointState"))
+    return kind, files.SerializeToString()
+
+
+def write_trossen(notes: Notes, path: Path) -> Path:
+    """An MCAP file of protobuf messages, by `foxglove`."""
+    import foxglove
+    from foxglove.channels import CompressedVideoChannel
+    from foxglove.mcap import MCAPCompression, MCAPWriteOptions
+    from foxglove.messages import CompressedVideo, Timestamp
+
+    context = foxglove.Context()
+    kind, definition = _trossen_type()
+    options = MCAPWriteOptions(compression=MCAPCompression.Lz4, profile="trossen")
+    with foxglove.open_mcap(path, context=context, writer_options=options):
+        channels: dict[str, Any] = {}
+        for note in notes:
+            seconds, nanos = divmod(note.header_ns, NS)
+            if note.type == "foxglove.CompressedVideo":
+                channel = channels.get(note.topic) or CompressedVideoChannel(note.topic, context=context)
+                channels[note.topic] = channel
+                stamp = Timestamp(seconds, nanos)
+                channel.log(CompressedVideo(timestamp=stamp, frame_id=note.frame_id, **note.body), log_time=note.log_ns)
+                continue
+            if note.topic not in channels:
+                schema = foxglove.Schema(name=note.type, encoding="protobuf", data=definition)
+                channels[note.topic] = foxglove.Channel(
+                    note.topic, schema=schema, message_encoding="protobuf", context=context
+                )
+            message = kind(positions=note.body["positions"].tolist())
+            message.ts.realtime.seconds, message.ts.realtime.nanos = seconds, nanos
+            channels[note.topic].log(note.data or message.SerializeToString(), log_time=note.log_ns)
+    return path
+
+
+def in_order(notes: Notes) -> Notes:
+    """As a recorder gets them: by the time of recording."""
+    return sorted(notes, key=lambda note: note.log_ns)
+
+
+def of_topic(notes: Notes, topic: str) -> Notes:
+    """Those of a topic, in the order of their headers."""
+    return sorted((note for note in notes if note.topic == topic), key=lambda note: note.header_ns)
+
+
+def changed(notes: Notes, topic: str, change: Callable[[int, Note], Note | None]) -> Notes:
+    """The same with a topic's messages changed, or left out, by their number."""
+    result: Notes = []
+    number = 0
+    for note in notes:
+        if note.topic != topic:
+            result.append(note)
+            continue
+        other = change(number, note)
+        number += 1
+        if other is not None:
+            result.append(other)
+    return result
+
+
+def with_body(note: Note, **fields: Any) -> Note:
+    """The same with other fields."""
+    return replace(note, body=note.body | fields)

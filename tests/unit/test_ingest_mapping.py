@@ -1,0 +1,128 @@
+"""Mappings: what they may say, and how all that is wrong with one is told at once."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support import bag_mappings, bags
+
+from demorec.errors import ConfigError
+from demorec.ingest.bag import open_bag
+from demorec.ingest.channel import BagError
+from demorec.ingest.fields import FieldError, SourceReader, converted, follow, layout_of, parse_path
+from demorec.ingest.mapping import Source, read_mapping
+from demorec.ingest.streams import read_streams
+
+WRONG = [
+    ('fps = 30', 'fpss = 30', r"unknown key 'fpss' in clock. Did you mean 'fps'\?"),
+    ('[robot]', '[robott]', r"unknown key 'robott'. Did you mean 'robot'\?"),
+    ('field = "position"', 'feild = "position"', r"unknown key 'feild' in features.observation.state"),
+    ('fps = 30', 'fps = "x"', r"'x' is no whole number"),
+    ('fps = 30', 'fps = 0', r"clock.fps is 0, allowed are 1 to 1000"),
+    ('fps = 30', 'fps = 30\nmax_age_s = 0', r"clock.max_age_s is 0, it must be above 0"),
+    ('text = "stack the cups"', '', r"\[task\] needs one of text, topic and file_name"),
+    ('[features.action]', '[features.act]', r"there is no feature 'action'"),
+    ('[cameras.front]', '[cameras."a b"]', r"a camera cannot be called 'a b'"),
+    ('topic = "/leader/joint_states"', 'next = "observation.stat"', r"Did you mean 'observation.state'\?"),
+    ('topic = "/leader/joint_states"', 'next = "observation.state"\ntopic = "/x"', r"either a topic or next"),
+    ('field = "position"\n[cam', 'field = "position"\nunit = "rad"\nto = "m"\n[cam', r"cannot turn rad into m"),
+    ('field = "position"\n[cam', 'field = "position"\nunit = "percent"\nto = "rad"\n[cam', r"needs limits"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("old", "new", "told"), WRONG)
+def test_a_wrong_mapping_is_refused(old: str, new: str, told: str, tmp_path: Path) -> None:
+    assert old in bag_mappings.SO101
+    path = bag_mappings.write_mapping(bag_mappings.SO101.replace(old, new), tmp_path / "robot.toml")
+    with pytest.raises(ConfigError, match=told) as caught:
+        read_mapping(path)
+    assert str(caught.value).endswith(f": {path}")
+    assert "\n" not in str(caught.value)
+
+
+def test_all_that_is_wrong_is_told_at_once(tmp_path: Path) -> None:
+    text = bag_mappings.SO101.replace("fps = 30", "fps = 0").replace("[cameras.front]", '[cameras."a b"]')
+    with pytest.raises(ConfigError, match=r"clock\.fps is 0.*|a camera cannot.*") as caught:
+        read_mapping(bag_mappings.write_mapping(text, tmp_path / "robot.toml"))
+    assert "clock.fps" in str(caught.value)
+    assert "a camera" in str(caught.value)
+
+
+MISFITS = [
+    ("/follower/joint_states", "/folower/joint_states", r"no message of '/folower/joint_states'. Did you mean '/foll"),
+    ('field = "position"', 'field = "postion"', r"no field 'postion'. Did you mean 'position'\?"),
+    ('field = "position"', 'field = "header.frame_id"', r"holds no numbers"),
+    ('field = "position"', 'field = "position"\njoints = ["shoulder_pam"]', r"Did you mean 'shoulder_pan'\?"),
+    ('field = "position"', 'field = "position"\nelements = [9]', r"no element 9 among the 6"),
+    ('field = "position"', 'field = "position"\nnames = ["a"]', r"names has 1 names for the 6 elements"),
+    ("/follower/cam_front/image_raw/compressed", "/follower/joint_states", r"camera front .* it holds no picture"),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "told"), MISFITS)
+def test_a_mapping_that_does_not_fit_its_bag_is_refused(old: str, new: str, told: str, tmp_path: Path) -> None:
+    bag = open_bag(bags.write_mcap(bags.in_order(bags.so101(0.3)), tmp_path / "bag.mcap"))
+    text = bag_mappings.SO101.replace(old, new, 1)
+    assert text != bag_mappings.SO101
+    mapping = read_mapping(bag_mappings.write_mapping(text, tmp_path / "robot.toml"))
+    with pytest.raises(BagError, match=told) as caught:
+        read_streams(bag, mapping)
+    assert "\n" not in str(caught.value)
+
+
+def test_two_topics_for_the_same_elements_are_refused(tmp_path: Path) -> None:
+    bag = open_bag(bags.write_mcap(bags.in_order(bags.agilex(0.3)), tmp_path / "bag.mcap"))
+    text = bag_mappings.AGILEX.replace('prefix = "right_"', 'prefix = "left_"')
+    mapping = read_mapping(bag_mappings.write_mapping(text, tmp_path / "robot.toml"))
+    with pytest.raises(BagError, match=r"gets 'left_joint0' from /puppet/joint_left and from /puppet/joint_right"):
+        read_streams(bag, mapping)
+
+
+def test_paths_of_fields() -> None:
+    values = {
+        "transforms": [
+            {"child_frame_id": "base", "transform": {"translation": {"x": 1.0}}},
+            {"child_frame_id": "hand", "transform": {"translation": {"x": 2.0}}},
+        ],
+        "points": [{"positions": np.array([3.0, 4.0])}],
+    }
+    assert follow(values, parse_path("transforms[child_frame_id=hand].transform.translation.x")) == 2.0
+    assert follow(values, parse_path("points[0].positions")).tolist() == [3.0, 4.0]
+    assert follow(values, parse_path("transforms.transform.translation.x")).tolist() == [1.0, 2.0]
+    with pytest.raises(FieldError, match="no element 1"):
+        follow(values, parse_path("points[1].positions"))
+    with pytest.raises(FieldError, match="no path"):
+        parse_path("a[")
+
+
+def test_joints_are_found_by_name_in_whatever_order() -> None:
+    source = Source(topic="/j", field="position", joints=("b", "a"))
+    first = {"name": ["a", "b", "c"], "position": np.array([1.0, 2.0, 3.0])}
+    reader = SourceReader(source, layout_of(source, first))
+    assert reader.read(first).tolist() == [2.0, 1.0]
+    assert reader.read({"name": ["c", "b", "a"], "position": np.array([1.0, 2.0, 3.0])}).tolist() == [2.0, 3.0]
+    with pytest.raises(FieldError, match="'a' is missing"):
+        reader.read({"name": ["b"], "position": np.array([1.0])})
+    with pytest.raises(FieldError, match="1 values have 2 names"):
+        reader.read({"name": ["a", "b"], "position": np.array([1.0])})
+
+
+@pytest.mark.parametrize(
+    ("unit", "to", "given", "expected"),
+    [
+        ("degree", "rad", [180.0, -90.0], [np.pi, -np.pi / 2]),
+        ("rad", "degree", [np.pi, 0.0], [180.0, 0.0]),
+        ("percent", "rad", [-100.0, 50.0], [-1.0, 1.5]),
+        ("mm", "m", [5.0, 0.0], [0.005, 0.0]),
+    ],
+)
+def test_units(unit: str, to: str, given: list[float], expected: list[float]) -> None:
+    source = Source(topic="/j", field="x", unit=unit, to=to, limits=((-1.0, 1.0), (-3.0, 3.0)))  # type: ignore[arg-type]
+    assert np.allclose(converted(source, np.array([given])), expected)
+
+
+def test_without_a_conversion_no_bit_changes() -> None:
+    values = np.array([[0.1, np.nan]], dtype=np.float32)
+    assert converted(Source(topic="/j", field="x", unit="rad"), values) is values
