@@ -151,17 +151,18 @@ def strays(seen: Cells, drawn: Cells) -> Array:
     """(T,) share of the cells whose value lies outside those of the drawn cell and its eight neighbours.
 
     For depth and labels, which are coded without loss: edges may lie elsewhere by a cell, nothing else may differ.
+    Cells at the picture's border, some of whose neighbours are not in it, are left out.
     """
     drawn = drawn[: len(seen)]
-    padded = np.pad(drawn, ((0, 0), (1, 1), (1, 1), (0, 0)), mode="edge")
-    height, width = drawn.shape[1:3]
-    around = [padded[:, i : i + height, j : j + width] for i in range(3) for j in range(3)]
+    height, width = (max(size - 2, 0) for size in drawn.shape[1:3])
+    around = [drawn[:, i : i + height, j : j + width] for i in range(3) for j in range(3)]
     low, high = around[0].copy(), around[0].copy()
     for cells in around[1:]:
         np.minimum(low, cells, out=low)
         np.maximum(high, cells, out=high)
-    off = np.maximum(low - seen, seen - high).max(axis=3) > _STRAY
-    return np.asarray(off.mean(axis=(1, 2)), dtype=np.float64)
+    inner = seen[:, 1 : 1 + height, 1 : 1 + width]
+    off = np.maximum(low - inner, inner - high).max(axis=3) > _STRAY
+    return np.asarray(off.sum(axis=(1, 2)) / max(height * width, 1), dtype=np.float64)
 
 
 def _rms(cells: Cells) -> Array:

@@ -24,6 +24,9 @@ from demorec.scene.urdf import parse_xml
 MIN_LOAD = 3.0
 """N m: joints that bear less, root mean square, say nothing about efforts."""
 MIN_FRAMES = 20
+MAX_ACCELERATION = 5.0
+"""m/s^2: in frames in which a link is faster than that, its own rotational inertia, which is left out here, counts, and
+differences between frames say little: exploration noise shakes the arm."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -45,6 +48,7 @@ class _Dynamics:
     def __init__(self, episode: RecordedEpisode) -> None:
         self.episode = episode
         self._positions = dict(zip(episode.info.robot.joint_names, episode.columns.joint_position.T, strict=True))
+        self._is_calm = np.ones(episode.num_frames, dtype=np.bool_)
         self.loads = [*self._link_loads(), *self._carried_loads()]
 
     def frames_of(self, link: str) -> Array:
@@ -62,6 +66,7 @@ class _Dynamics:
             point = pose[:, :3, :3] @ (scale * centre) + pose[:, :3, 3]
             acceleration = np.zeros_like(point)
             acceleration[1:-1] = (point[2:] - 2 * point[1:-1] + point[:-2]) * episode.info.fps**2
+            self._is_calm &= np.linalg.norm(acceleration, axis=1) < MAX_ACCELERATION
             joints = frozenset(joint.name for joint in episode.urdf.path_to(name))
             found.append(_Load(point=point, force=mass * (acceleration - gravity), joints=joints))
         return found
@@ -84,12 +89,12 @@ class _Dynamics:
 
     @cached_property
     def is_free(self) -> NDArray[np.bool_]:
-        """(T,) frames in which the hand touches nothing but what it carries."""
+        """(T,) frames in which the hand touches nothing but what it carries, and no link is accelerated fast."""
         c = self.episode.columns
         carries = np.zeros(c.num_frames, dtype=bool)
         for poses in c.object_poses.values():
             carries |= self._carries(poses[:, :3])
-        free = (c.contact_force == 0) | carries
+        free = ((c.contact_force == 0) | carries) & self._is_calm
         free[:1] = free[-1:] = False
         return np.asarray(free, dtype=np.bool_)
 
@@ -171,7 +176,9 @@ def _dynamics(episode: RecordedEpisode) -> _Dynamics | NotMeasured:
     except (SceneError, KeyError) as error:
         return NotMeasured(why=f"the robot's masses are not to be had here: {error}")
     num_free = int(dynamics.is_free.sum())
-    return dynamics if num_free >= MIN_FRAMES else NotMeasured(why=f"the hand is free in {num_free} frames")
+    if num_free < MIN_FRAMES:
+        return NotMeasured(why=f"the hand is free and the arm calm in {num_free} frames")
+    return dynamics
 
 
 @check(

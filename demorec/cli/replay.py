@@ -143,10 +143,9 @@ def demonstrations(
         versions = demonstration.info.versions
         lines = [f"{line} since this was recorded" for line in changed_sources(versions, options.allowed)]
         lines += version_differences({name: versions[name] for name in versions if name in here}, here)
-        for line in lines:
-            if line not in noted:
-                tell(f"Note: {line}.")
-            noted.add(line)
+        if new := [line for line in lines if line not in noted]:
+            tell(f"Note: {'; '.join(new)}.")
+        noted.update(new)
         yield demonstration
 
 

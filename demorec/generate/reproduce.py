@@ -96,8 +96,9 @@ def reproduce(
         raise ConfigError(f"The copy needs a place of its own, but {overlap}: choose another --out: {options.out}")
     original.config.check_names(allowed)
     here = deciding_versions(original.config)
-    for line in dict.fromkeys(line for there in original.versions for line in version_differences(there, here)):
-        progress.says(f"Note: {line}.")
+    different = dict.fromkeys(line for there in original.versions for line in version_differences(there, here))
+    if different:
+        progress.says(f"Note: {'; '.join(different)}.")
     result = generate(original.config, replace(options, num_episodes=original.num_episodes), progress=progress)
     if result.interrupted:
         return result

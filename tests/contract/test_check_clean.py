@@ -35,6 +35,12 @@ def test_every_robot_and_variation(robot: str, variation: str, tmp_path: Path) -
     assert [r for r in report.results if r.level in ("warn", "fail")] == []
 
 
+def test_an_arm_that_noise_shakes(tmp_path: Path) -> None:
+    """At 60 frames a second: differences between frames say little about forces then."""
+    path = simulate(tmp_path / "e.mcap", task="pick_from_clutter", robot="iiwa", fps=60, seed=2026, episode_index=3)
+    assert [r for r in checked(path).results if r.level in ("warn", "fail")] == []
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "config",
