@@ -15,7 +15,7 @@ from demorec.playback.style import FRUSTUM, segment_colors
 from demorec.playback.times import indexes
 from demorec.scene.scene import Camera
 
-_CODECS = {"h264": rr.VideoCodec.H264, "av1": rr.VideoCodec.AV1}
+_CODECS = {"h264": rr.VideoCodec.H264, "h265": rr.VideoCodec.H265, "av1": rr.VideoCodec.AV1}
 _PICTURES_AT_ONCE = 64
 _FRUSTUM_METRES = {"world": 0.22}
 _FRUSTUM_ON_ROBOT = 0.04
@@ -26,7 +26,7 @@ def log_cameras(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpis
     for camera in episode.info.scene.cameras:
         _log_pinhole(recording, paths, episode, camera)
         if camera.name in episode.videos:
-            _send_video(recording, paths.camera(camera.name), episode, episode.videos[camera.name])
+            send_video(recording, paths.camera(camera.name), episode.time_ns, episode.videos[camera.name])
         if camera.name in episode.depth:
             _send_depth(recording, paths.depth(camera.name), episode, episode.depth[camera.name])
         if camera.name in episode.segmentation:
@@ -58,7 +58,8 @@ def _log_pinhole(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpi
         recording.send_columns(entity, indexes(episode.time_ns, episode.time_ns), columns)
 
 
-def _send_video(recording: rr.RecordingStream, entity: str, episode: PlayedEpisode, video: Video) -> None:
+def send_video(recording: rr.RecordingStream, entity: str, frame_times: NDArray[np.int64], video: Video) -> None:
+    """Coded pictures as they are, each at its time."""
     if video.codec in _CODECS:
         recording.log(entity, rr.VideoStream(codec=_CODECS[video.codec]), static=True)
     for batch in video.batches():
@@ -66,7 +67,7 @@ def _send_video(recording: rr.RecordingStream, entity: str, episode: PlayedEpiso
             columns = rr.VideoStream.columns(sample=batch.samples, is_keyframe=batch.is_keyframe)
         else:
             columns = rr.EncodedImage.columns(blob=batch.samples, media_type=["image/jpeg"] * len(batch.samples))
-        recording.send_columns(entity, indexes(batch.time_ns, episode.time_ns), columns)
+        recording.send_columns(entity, indexes(batch.time_ns, frame_times), columns)
 
 
 def _send_depth(

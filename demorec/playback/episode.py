@@ -41,7 +41,7 @@ class Video:
     """Coded pictures of a camera.
 
     Attributes:
-        codec: "h264", "av1" or "jpeg".
+        codec: "h264", "h265", "av1" or "jpeg".
         batches: Reads them anew, some hundred pictures at a time.
     """
 

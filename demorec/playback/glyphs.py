@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 
+from demorec.playback.collected import PlayedCollected
 from demorec.playback.episode import PlayedEpisode
 from demorec.playback.sources import PlaybackSource
 from demorec.scene.episode import Outcome
@@ -55,14 +56,17 @@ class DrawableText:
         """The same episode, with drawable text wherever a layout shows text."""
 
         @contextmanager
-        def opened() -> Iterator[PlayedEpisode]:
+        def opened() -> Iterator[PlayedEpisode | PlayedCollected]:
             with source.open() as episode:
                 yield self.episode(episode)
 
         return PlaybackSource(name=source.name, open=opened)
 
-    def episode(self, episode: PlayedEpisode) -> PlayedEpisode:
+    def episode(self, episode: PlayedEpisode | PlayedCollected) -> PlayedEpisode | PlayedCollected:
         """The same with drawable text."""
+        if isinstance(episode, PlayedCollected):
+            told = replace(episode.info, instruction=self.sentence(episode.info.instruction))
+            return replace(episode, name=self.sentence(episode.name), group=self.sentence(episode.group), info=told)
         info = episode.info
         bodies = {self.name(body.name): body.name for body in info.scene.bodies}
         return replace(

@@ -8,6 +8,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from demorec.geometry import Array
+from demorec.playback.collected import PlayedCollected, collected_layout
 from demorec.playback.compare import DIFFERENCES, comparison_paths
 from demorec.playback.episode import PlayedEpisode
 from demorec.playback.paths import Paths
@@ -18,8 +19,10 @@ _FLOOR = 3.0
 """Bodies wider than this (metres) are the floor, which would only hide the grid."""
 
 
-def episode_layout(episode: PlayedEpisode, *, is_alone: bool = False) -> rrb.Blueprint:
+def episode_layout(episode: PlayedEpisode | PlayedCollected, *, is_alone: bool = False) -> rrb.Blueprint:
     """The layout of one episode, or of all that have its streams; one that is alone needs no list of episodes."""
+    if isinstance(episode, PlayedCollected):
+        return collected_layout(episode, is_alone=is_alone)
     paths = Paths()
     return _blueprint(
         episode,

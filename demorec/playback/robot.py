@@ -8,9 +8,10 @@ from collections.abc import Mapping
 
 import numpy as np
 import rerun as rr
+from numpy.typing import NDArray
 
 from demorec.errors import DemorecError, as_reason
-from demorec.geometry import Array, quat_multiply
+from demorec.geometry import Array, Pose, quat_multiply
 from demorec.playback.episode import PlayedEpisode
 from demorec.playback.meshes import SurfaceMesh, urdf_meshes
 from demorec.playback.paths import Paths
@@ -33,16 +34,31 @@ def log_robot(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisod
     """
     placement = episode.info.scene.robot
     urdf, meshes = robot_model(episode.info.robot.urdf, placement.scale, episode.robot_description)
+    positions = dict(zip(episode.info.robot.joint_names, episode.joint_position.T, strict=True))
+    base = placement.world_from_base
+    log_model(recording, paths, urdf, meshes, positions, base=base, time_ns=episode.time_ns, tint=tint)
+
+
+def log_model(
+    recording: rr.RecordingStream,
+    paths: Paths,
+    urdf: Urdf,
+    meshes: Mapping[str, SurfaceMesh],
+    positions: Mapping[str, Array],
+    *,
+    base: Pose,
+    time_ns: NDArray[np.int64],
+    tint: Rgba | None = None,
+) -> None:
+    """The same of a model whose joints have known positions (T,) at `time_ns` (T,); the others stay at 0."""
     entities = {urdf.root: f"{paths.robot}/{urdf.root}"}
     waiting = list(urdf.joints)
     while waiting:
         for joint in [joint for joint in waiting if joint.parent in entities]:
             entities[joint.child] = f"{entities[joint.parent]}/{joint.child}"
             waiting.remove(joint)
-    base = placement.world_from_base
     _log_pose(recording, entities[urdf.root], base.position, base.quat_xyzw)
-    positions = dict(zip(episode.info.robot.joint_names, episode.joint_position.T, strict=True))
-    times = indexes(episode.time_ns, episode.time_ns)
+    times = indexes(time_ns, time_ns)
     for joint in urdf.joints:
         entity = entities[joint.child]
         if joint.kind == "fixed" or joint.name not in positions:

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import rerun as rr
 
-from demorec.errors import RecordingError
+from demorec.errors import ConfigError, RecordingError
+from demorec.playback.collected import PlayedCollected
 from demorec.playback.compare import log_comparison, new_comparison
 from demorec.playback.layout import comparison_layout, episode_layout
 from demorec.playback.scene import log_episode, new_recording
@@ -56,6 +57,11 @@ def save_comparison(a: PlaybackSource, b: PlaybackSource, target: Path) -> None:
         DemorecError: As `save`; ConfigError when they cannot be compared.
     """
     with _partial(target) as part, a.open() as first, b.open() as second:
+        if isinstance(first, PlayedCollected) or isinstance(second, PlayedCollected):
+            raise ConfigError(
+                "Collected episodes cannot be laid over each other: nobody knows that their robots stand alike. View "
+                "them without --compare."
+            )
         recording = new_comparison(first, second)
         with _saving(recording, part, comparison_layout(first, second)):
             log_comparison(recording, first, second)

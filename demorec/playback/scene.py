@@ -8,6 +8,12 @@ import rerun as rr
 
 from demorec.playback.bodies import log_bodies
 from demorec.playback.cameras import log_cameras
+from demorec.playback.collected import (
+    PlayedCollected,
+    collected_application,
+    log_collected,
+    new_collected_recording,
+)
 from demorec.playback.episode import PlayedEpisode
 from demorec.playback.motion import log_curves, log_ee_path, log_events, log_phases
 from demorec.playback.paths import Paths
@@ -17,13 +23,21 @@ from demorec.scene.scene import Rgba
 
 
 def log_episode(
-    recording: rr.RecordingStream, episode: PlayedEpisode, *, root: str = "", label: str = "", tint: Rgba | None = None
+    recording: rr.RecordingStream,
+    episode: PlayedEpisode | PlayedCollected,
+    *,
+    root: str = "",
+    label: str = "",
+    tint: Rgba | None = None,
 ) -> None:
     """Send all of an episode below `root`; `label` goes before the names of its curves, `tint` colours its robot.
 
     Raises:
         DemorecError: The source is damaged, or a model is neither installed nor recorded.
     """
+    if isinstance(episode, PlayedCollected):
+        log_collected(recording, episode)
+        return
     paths = Paths(root)
     recording.log(paths.world, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     log_robot(recording, paths, episode, tint)
@@ -36,16 +50,20 @@ def log_episode(
     recording.log(paths.summary, rr.TextDocument(summary(episode), media_type="text/markdown"), static=True)
 
 
-def new_recording(episode: PlayedEpisode) -> rr.RecordingStream:
+def new_recording(episode: PlayedEpisode | PlayedCollected) -> rr.RecordingStream:
     """An empty Rerun recording with the episode's name and properties."""
+    if isinstance(episode, PlayedCollected):
+        return new_collected_recording(episode)
     recording = rr.RecordingStream(application_id(episode), recording_id=f"{episode.name}-{episode.identity}")
     recording.send_recording_name(entry(episode))
     recording.send_property("episode", rr.AnyValues(**properties(episode)))
     return recording
 
 
-def application_id(episode: PlayedEpisode) -> str:
+def application_id(episode: PlayedEpisode | PlayedCollected) -> str:
     """The group in the viewer's list: episodes of one group, task and set of cameras share a layout."""
+    if isinstance(episode, PlayedCollected):
+        return collected_application(episode)
     cameras = "-".join(camera.name for camera in episode.info.scene.cameras)
     words = (episode.group, episode.info.task, cameras)
     return "-".join(re.sub(r"[^A-Za-z0-9_]+", "-", word).strip("-") for word in words if word)

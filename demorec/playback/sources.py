@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 from demorec.errors import ConfigError, OptionError
+from demorec.playback.collected import PlayedCollected, open_collected
 from demorec.playback.episode import PlayedEpisode
 from demorec.playback.from_dataset import dataset_episodes, open_dataset_episode
 from demorec.playback.from_recording import open_recording
+from demorec.recording.opening import is_collected
 from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings
 
 
@@ -25,7 +27,7 @@ class PlaybackSource:
     """
 
     name: str
-    open: Callable[[], AbstractContextManager[PlayedEpisode]]
+    open: Callable[[], AbstractContextManager[PlayedEpisode | PlayedCollected]]
 
 
 def find_episodes(paths: Sequence[Path], *, include_failures: bool = False) -> list[PlaybackSource]:
@@ -55,7 +57,13 @@ def _sources(path: Path, include_failures: bool) -> list[PlaybackSource]:
 
 
 def _recording(path: Path) -> PlaybackSource:
-    return PlaybackSource(name=str(path), open=partial(open_recording, path, group=_group(path)))
+    return PlaybackSource(name=str(path), open=partial(_open, path, group=_group(path)))
+
+
+@contextmanager
+def _open(path: Path, *, group: str) -> Iterator[PlayedEpisode | PlayedCollected]:
+    with (open_collected if is_collected(path) else open_recording)(path, group=group) as episode:
+        yield episode
 
 
 def _group(path: Path) -> str:

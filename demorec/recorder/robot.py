@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from demorec.errors import ConfigError, in_words
+from demorec.errors import ConfigError, SceneError, in_words
+from demorec.recording.description import robot_description, self_contained
 from demorec.safety.files import read_text_limited
-from demorec.scene.assets import asset_path
 from demorec.scene.robot import RobotSpec
 from demorec.scene.urdf import MAX_BYTES, Urdf, parse_xml
 
@@ -21,7 +21,8 @@ class RobotFacts:
 
     Attributes:
         name: Of it.
-        urdf: Its description as text, "" when unknown.
+        urdf: Its description as text, "" when unknown; that of a file with every mesh replaced by boxes and cylinders,
+            so that it can be drawn without any other file.
         joints: Names in the order in which vectors have them, where that is known.
         known_joints: Names of all joints that move.
     """
@@ -40,7 +41,7 @@ def robot_facts(robot: RobotLike) -> RobotFacts:
     """
     if isinstance(robot, RobotSpec):
         joints = robot.joint_names
-        urdf = asset_path(robot.urdf).read_text()
+        urdf = robot_description(robot.urdf, 1.0)
         return RobotFacts(name=robot.name, urdf=urdf, joints=joints, known_joints=frozenset(joints))
     if isinstance(robot, Path) or (isinstance(robot, str) and robot.endswith(".urdf")):
         path = Path(robot)
@@ -65,7 +66,9 @@ def _described(text: str, path: Path | None) -> RobotFacts:
     try:
         urdf = Urdf.parse(text)
         name = parse_xml(text).get("name") or "robot"
-    except ValueError as error:
+        if path is not None:
+            text = self_contained(text, path.parent)
+    except (ValueError, SceneError) as error:
         raise ConfigError(f"The robot's URDF cannot be used ({in_words(error)}){where}") from error
     moving = tuple(joint.name for joint in urdf.joints if joint.kind != "fixed")
     return RobotFacts(name=name, urdf=text, joints=moving, known_joints=frozenset(moving))

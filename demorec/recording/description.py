@@ -17,7 +17,7 @@ from demorec.recording.shapes import Primitive, fit_primitives
 from demorec.scene.assets import asset_path, mesh_path
 from demorec.scene.obj import read_obj
 from demorec.scene.scene import Body, Rgba
-from demorec.scene.urdf import quat_from_rpy
+from demorec.scene.urdf import parse_xml, quat_from_rpy
 from demorec.scene.urdf_shapes import UrdfShape, read_links
 
 _WHITE: Rgba = (1.0, 1.0, 1.0, 1.0)
@@ -31,15 +31,24 @@ def robot_description(urdf: str, scale: float) -> str:
         SceneError: The URDF or one of its meshes cannot be read.
     """
     path = asset_path(urdf)
-    text = path.read_text()
-    source = ET.fromstring(text)
+    return self_contained(path.read_text(), path.parent, scale=scale)
+
+
+def self_contained(text: str, folder: Path, *, scale: float = 1.0) -> str:
+    """A URDF that needs no other file, as `robot_description`, of the text of one whose meshes lie below `folder`.
+
+    Raises:
+        SceneError: One of its meshes cannot be read.
+        ValueError: The text is no URDF.
+    """
+    source = parse_xml(text)
     robot = ET.Element("robot", name=source.get("name", "robot"))
     for link in read_links(text, scale=scale):
         target = ET.SubElement(robot, "link", name=link.name)
         # Collision shapes are simpler to begin with; their pose may differ from the picture's.
         shapes = link.collisions if len(link.collisions) == len(link.visuals) else link.visuals
         for visual, shape in zip(link.visuals, shapes, strict=True):
-            for primitive in _primitives(shape, path.parent):
+            for primitive in _primitives(shape, folder):
                 _add_visual(target, primitive, shape.link_from_shape, visual.rgba or _WHITE)
     for joint in source.findall("joint"):
         robot.append(_joint(joint, scale))

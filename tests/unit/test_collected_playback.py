@@ -1,0 +1,64 @@
+"""Collected episodes in Rerun: every feature as a plot, every camera, the robot where its URDF is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.collected import TOP, WRIST, make_collected, write_collected
+
+from demorec.errors import ConfigError
+from demorec.playback.collected import PlayedCollected
+from demorec.playback.save import save, save_comparison
+from demorec.playback.sources import find_episodes
+
+
+def opened(path: Path) -> PlayedCollected:
+    with find_episodes([path])[0].open() as episode:
+        assert isinstance(episode, PlayedCollected)
+        return episode
+
+
+def test_an_episode_is_shown_from_its_first_frame_on(tmp_path: Path) -> None:
+    given = make_collected()
+    path = write_collected(tmp_path / "a.mcap", given)
+    with find_episodes([path])[0].open() as episode:
+        assert isinstance(episode, PlayedCollected)
+        times = [frame.time_ns - given.frames[0].time_ns for frame in given.frames]
+        assert episode.time_ns.tolist() == times
+        assert set(episode.curves) == {"observation.state", "action", "observation.force"}
+        assert set(episode.joint_position) == {"shoulder", "elbow"}
+        expected = [float(frame.samples["observation.state"].vector[1]) for frame in given.frames]
+        assert episode.joint_position["elbow"].tolist() == expected
+        shown = np.concatenate([batch.time_ns for batch in episode.videos["wrist"].batches()]).tolist()
+        assert shown == times[1::2]  # each with the first frame that holds it
+
+
+@pytest.mark.parametrize("cameras", [(), (TOP, WRIST)])
+@pytest.mark.parametrize("urdf", [True, False])
+def test_it_can_be_saved_with_whatever_is_known(tmp_path: Path, cameras: tuple[object, ...], urdf: bool) -> None:
+    given = make_collected(num_frames=5)
+    if not cameras:
+        given = make_collected(num_frames=5, cameras=())
+    if not urdf:
+        given = replace(given, info=replace(given.info, urdf=""))
+    path = write_collected(tmp_path / "a.mcap", given)
+    save(find_episodes([path])[0], tmp_path / "a.rrd")
+    assert (tmp_path / "a.rrd").read_bytes().startswith(b"RR")
+
+
+def test_meshes_that_are_not_here_leave_the_rest_visible(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    given = make_collected(num_frames=5)
+    mesh = given.info.urdf.replace('<box size="0.1 0.1 0.1"/>', '<mesh filename="package://arm/base.stl"/>')
+    path = write_collected(tmp_path / "a.mcap", replace(given, info=replace(given.info, urdf=mesh)))
+    save(find_episodes([path])[0], tmp_path / "a.rrd")
+    assert "The robot is not drawn" in caplog.text
+
+
+def test_two_of_them_are_not_laid_over_each_other(tmp_path: Path) -> None:
+    path = write_collected(tmp_path / "a.mcap", make_collected(num_frames=5))
+    (source,) = find_episodes([path])
+    with pytest.raises(ConfigError, match="without --compare"):
+        save_comparison(source, source, tmp_path / "a.rrd")
