@@ -20,7 +20,7 @@ from demorec.recording import channels
 from demorec.recording.metadata import COLLECTED, EPISODE, OUTCOME, RECOVERED, CameraStreams
 from demorec.recording.streams import frame_streams
 from demorec.recording.transforms import FrameTree
-from demorec.runs.run_file import RunFile
+from demorec.runs.run_file import IMPORT_NAME, RunFile
 from demorec.scene import features
 from demorec.scene.episode import EpisodeInfo, Outcome
 from demorec.scene.scene import Body, Camera, RobotPlacement, Scene, Shape
@@ -95,6 +95,7 @@ def everything() -> Iterator[tuple[Kind, str]]:
         for field in _leaves(kind, name):
             yield "field", field
     yield "field", f"metadata {COLLECTED}"
+    yield "field", IMPORT_NAME
     for topic in ("/frames", "/{feature}"):
         yield "topic", topic
     for column in columns():

@@ -59,7 +59,7 @@ class Import:
             self.bags, self.mapping, self.out, video=self.video, tell=lambda report: say(*report_lines(report), "")
         )
         if result.num_new < len(result.reports):
-            tell(f"{len(result.reports) - result.num_new} bags were imported before.")
+            tell(f"{len(result.reports) - result.num_new} of {len(result.reports)} bags had been imported before.")
         episodes = [episode for report in result.reports for episode in report.episodes]
         made = [episode for episode in episodes if episode.episode_index is not None]
         dropped = f", {len(episodes) - len(made)} dropped" if len(made) < len(episodes) else ""

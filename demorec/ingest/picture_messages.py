@@ -23,7 +23,8 @@ KEPT_FORMATS = ("jpeg", *VIDEO_FORMATS)
 """What stays as it is, byte for byte."""
 _JPEG, _PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
 _DECODERS = {"h264": "h264", "h265": "hevc", "av1": "libdav1d"}
-_PARAMETER_BYTES = 48
+_SEQUENCE_BYTES = 24
+"""Of an AV1 keyframe, within which its sequence header ends."""
 _ALIASES = {"hevc": "h265", "avc": "h264", "jpg": "jpeg"}
 
 
@@ -104,30 +105,31 @@ def decode_picture(values: Values) -> NDArray[np.uint8]:
 def _starts_by_itself(codec: str, data: bytes) -> bool:
     if codec == "av1":
         return is_keyframe(codec, data)
-    kinds = list(_nal_types(codec, data))
+    kinds = [kind for kind, _ in _nal_units(codec, data)]
     if codec == "h264":  # ITU-T H.264, table 7-1
         return 5 in kinds and 7 in kinds
     return 33 in kinds and any(16 <= kind <= 23 for kind in kinds)  # ITU-T H.265, table 7-1
 
 
-def _nal_types(codec: str, data: bytes) -> Iterator[int]:
-    """Those of an access unit up to its first slice."""
+def _nal_units(codec: str, data: bytes) -> Iterator[tuple[int, int]]:
+    """Type and place of those of an access unit, up to its first slice."""
     position = data.find(b"\x00\x00\x01")
     while 0 <= position < len(data) - 3:
         head = data[position + 3]
         kind = head & 31 if codec == "h264" else (head >> 1) & 63
-        yield kind
+        yield kind, position
         if kind in (1, 5) if codec == "h264" else kind < 32:
             return
         position = data.find(b"\x00\x00\x01", position + 3)
 
 
 _sizes: dict[tuple[str, bytes], tuple[int, int]] = {}
-"""(codec, beginning of a keyframe) -> its size. The parameter sets are there, which say it in bits."""
+"""(codec, what is in front of a keyframe's picture) -> its size: the parameter sets say it, in bits."""
 
 
 def _video_size(codec: str, data: bytes) -> tuple[int, int]:
-    key = (codec, data[:_PARAMETER_BYTES])
+    end = _SEQUENCE_BYTES if codec == "av1" else [place for _, place in _nal_units(codec, data)][-1]
+    key = (codec, data[:end])
     size = _sizes.get(key)
     if size is None:
         (picture,) = decode_video(codec, [data])

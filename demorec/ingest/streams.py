@@ -325,6 +325,9 @@ class _Reading:
                 reason = stream.first_problem or stream.first_refusal
                 problems.append(f"{stream.label} cannot be taken from {stream.topic} ({stream.type}): {reason}")
         problems += self._double_names()
+        for camera in self._cameras.values():
+            if camera.heads and not any(head.is_keyframe for head in camera.heads):
+                problems.append(f"{camera.topic} has no keyframe with its parameter sets, so it cannot be decoded")
         if problems:
             raise BagError(f"The mapping does not fit the bag: {'; '.join(problems)}: {bag.path}")
 

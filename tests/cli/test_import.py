@@ -40,7 +40,7 @@ FEATURES = {"franka": (9, 7, 2), "so101": (6, 6, 2), "agilex": (14, 14, 3), "tro
 @pytest.mark.parametrize("name", sorted(BAGS))
 def test_a_suggested_mapping_works_as_it_is(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     make, write = BAGS[name]
-    notes = bags.in_order(make(1.2))
+    notes = bags.in_order(make(1.6))
     bag = write(notes, tmp_path)
     assert _run("import", "--suggest", bag) == 0
     text = capsys.readouterr().out

@@ -319,3 +319,27 @@ def _slices(packet: bytes) -> list[bytes]:
     """The coded pictures of an access unit, without parameter sets and the lengths of start codes."""
     units = [unit.rstrip(b"\0") for unit in packet.split(b"\0\0\1")[1:]]
     return [unit for unit in units if unit[0] & 31 in (1, 5)]
+
+
+def _video(tmp_path: Path, *, gop: int, first: int) -> tuple[Path, Path]:
+    """A bag with a video whose first packets are missing, and its mapping."""
+    notes = bags.trossen(1.5, gop=gop)
+    notes = bags.changed(notes, "/cameras/cam_high/image", lambda k, note: note if k >= first else None)
+    bag = bags.write_trossen(bags.in_order(notes), tmp_path / "bag.mcap")
+    return bag, bag_mappings.write_mapping(bag_mappings.TROSSEN, tmp_path / "robot.toml")
+
+
+def test_a_video_that_begins_between_keyframes(tmp_path: Path) -> None:
+    bag, mapping = _video(tmp_path, gop=10, first=3)
+    (report,) = import_bags([bag], mapping, tmp_path / "run").reports
+    (finding,) = [finding for finding in report.findings if finding.kind == "keyframe"]
+    assert "first 7 pictures" in finding.text
+    with _open(tmp_path / "run") as recording:
+        assert next(iter(recording.packets("high"))).is_keyframe
+        assert len(list(recording.images("high"))) == len(recording.columns().picture_stamps["high"])
+
+
+def test_a_video_without_keyframes_is_refused(tmp_path: Path) -> None:
+    bag, mapping = _video(tmp_path, gop=1000, first=1)
+    with pytest.raises(BagError, match="/cameras/cam_high/image has no keyframe"):
+        import_bags([bag], mapping, tmp_path / "run")

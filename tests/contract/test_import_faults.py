@@ -15,6 +15,7 @@ from demorec.ingest.mapping import read_mapping
 from demorec.ingest.report import all_findings
 from demorec.ingest.rows import Timelines
 from demorec.ingest.streams import read_streams
+from demorec.tables import CHECKS
 
 MAPPING = bag_mappings.SO101.replace('field = "position"', 'field = "position"\nunit = "rad"', 1)
 
@@ -70,3 +71,36 @@ def test_a_clean_bag_gives_no_finding(seed: int, tmp_path: Path) -> None:
     )
     bag = bags.write_mcap(bags.in_order(resting if seed % 2 else notes), tmp_path / "bag.mcap")
     assert _findings(bag, tmp_path) == set()
+
+
+CHECK_OF = {"drops": "import_times", "stuck": "import_numbers", "frozen": "import_pictures"}
+
+
+@pytest.mark.parametrize("kind", [*CHECK_OF, "nothing"])
+def test_check_reads_the_report(kind: str, notes: bags.Notes, tmp_path: Path) -> None:
+    """The bag itself is gone by then."""
+    name = next((name for name in sorted(FAULTS) if FAULTS[name].kind == kind), "")
+    bag = bags.write_mcap(hurt(notes, name) if name else bags.in_order(notes), tmp_path / "bag.mcap")
+    mapping = bag_mappings.write_mapping(MAPPING, tmp_path / "robot.toml")
+    import_bags([bag], mapping, tmp_path / "run")
+    bag.unlink()
+    found = {check: CHECKS.load(check).run(tmp_path / "run") for check in CHECKS.names() if check.startswith("import_")}
+    assert len(found) == 4
+    for check, result in found.items():
+        assert result.level == ("warn" if CHECK_OF.get(kind) == check else "pass"), check
+        assert (kind in result.detail) == (CHECK_OF.get(kind) == check)
+
+
+def test_a_run_that_was_not_imported_has_no_report(tmp_path: Path) -> None:
+    assert CHECKS.load("import_times").run(tmp_path).level == "skip"
+
+
+def test_dropped_episodes_are_told(notes: bags.Notes, tmp_path: Path) -> None:
+    bag = bags.write_mcap(hurt(notes, "a long pause"), tmp_path / "bag.mcap")
+    cut = '[episodes]\ncut = "times"\ntimes_s = [[0.1, 0.6], [0.6, 1.3]]\n'
+    text = MAPPING.replace("fps = 30", 'fps = 30\nwhen_old = "drop_episode"')
+    text = text.replace("[cameras.front]", cut + "[cameras.front]")
+    import_bags([bag], bag_mappings.write_mapping(text, tmp_path / "robot.toml"), tmp_path / "run")
+    result = CHECKS.load("import_dropped").run(tmp_path / "run")
+    assert (result.level, result.value) == ("warn", 1)
+    assert "camera front" in result.detail

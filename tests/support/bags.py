@@ -252,7 +252,7 @@ def video(pictures: Sequence[NDArray[np.uint8]], *, gop: int, codec: str = "libx
     context.width, context.height, context.pix_fmt = WIDTH, HEIGHT, "yuv420p"
     context.framerate, context.time_base = Fraction(30), Fraction(1, 30)
     context.gop_size = gop
-    context.options = {"bf": "0", "tune": "zerolatency"}
+    context.options = {"bf": "0", "tune": "zerolatency", "sc_threshold": "0"}  # no keyframes but those of the GOP
     if codec == "libx265":
         context.options = {"tune": "zerolatency", "x265-params": "bframes=0:repeat-headers=1:log-level=none"}
     packets = []

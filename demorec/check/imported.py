@@ -1,0 +1,99 @@
+"""What the import of a run found in its bags: the report that `demorec import` keeps in import.json, judged again.
+
+The bags themselves need not be there any more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from demorec.check.base import Found, Measurement, check
+
+if TYPE_CHECKING:
+    from demorec.ingest.report import BagReport
+
+_TIMES = frozenset(
+    ("clock_offset", "clock_jump", "clock_drift", "unstamped", "drops", "gap", "slow", "fps", "jitter", "order")
+) | {"duplicates", "late_start", "early_end", "cut_off"}
+_PICTURES = frozenset(("frozen", "same_pictures", "swapped", "size", "format", "keyframe", "frame_id"))
+_MOST_TOLD = 5
+
+
+@check(
+    scope="collected_run",
+    group="time",
+    measures="findings about times in the bags that were imported: clocks, losses, gaps, jitter, order",
+    warn=0,
+    fail=float("inf"),
+    reads=("import.json",),
+)
+def import_times(folder: Path) -> Found:
+    """The streams of the bags were whole, in order and on one clock."""
+    return _found(folder, lambda kind: kind in _TIMES)
+
+
+@check(
+    scope="collected_run",
+    group="pictures",
+    measures="findings about cameras in the bags that were imported: frozen, swapped, of several sizes",
+    warn=0,
+    fail=float("inf"),
+    reads=("import.json",),
+)
+def import_pictures(folder: Path) -> Found:
+    """Each camera showed its own pictures, of one size and kind."""
+    return _found(folder, lambda kind: kind in _PICTURES)
+
+
+@check(
+    scope="collected_run",
+    group="physics",
+    measures="findings about numbers in the bags that were imported: NaN, stuck sensors, spikes, units",
+    warn=0,
+    fail=float("inf"),
+    reads=("import.json",),
+)
+def import_numbers(folder: Path) -> Found:
+    """The numbers of the bags were such as robots have."""
+    return _found(folder, lambda kind: kind not in _TIMES | _PICTURES)
+
+
+@check(
+    scope="collected_run",
+    group="run",
+    measures="episodes that an import dropped, since something was missing or too old",
+    warn=0,
+    fail=float("inf"),
+    reads=("import.json",),
+)
+def import_dropped(folder: Path) -> Found:
+    """Every episode that the bags hold is in the run."""
+    bags = _bags(folder)
+    if bags is None:
+        return None
+    dropped = [row for bag in bags for row in bag.episodes if row.episode_index is None]
+    return Measurement(value=len(dropped), detail="; ".join(row.reason for row in dropped[:_MOST_TOLD]))
+
+
+def _bags(folder: Path) -> tuple[BagReport, ...] | None:
+    from demorec.ingest.import_file import load_import_file
+
+    found = load_import_file(folder)
+    return None if found is None else found.bags
+
+
+def _found(folder: Path, is_mine: Callable[[str], bool]) -> Found:
+    bags = _bags(folder)
+    if bags is None:
+        return None
+    told = list(_told(bags, is_mine))
+    return Measurement(value=len(told), detail="; ".join(told[:_MOST_TOLD]))
+
+
+def _told(bags: tuple[BagReport, ...], is_mine: Callable[[str], bool]) -> Iterator[str]:
+    for bag in bags:
+        for finding in bag.findings:
+            if is_mine(finding.kind):
+                yield f"{bag.name}: {finding.kind}, {finding.stream}: {finding.text}".replace(", : ", ": ")
