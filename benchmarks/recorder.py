@@ -97,7 +97,7 @@ def main() -> None:
     parser.add_argument("--hz", type=int, default=100)
     parser.add_argument("--cameras", type=int, default=3)
     parser.add_argument("--codec", choices=("h264", "av1", "jpeg"), default="h264")
-    parser.add_argument("--preset", default="")
+    parser.add_argument("--preset", default="ultrafast")
     parser.add_argument("--gop", type=int, default=2)
     parser.add_argument("--victim", type=Path, help=argparse.SUPPRESS)
     args = parser.parse_args()
