@@ -88,7 +88,8 @@ def lost_seconds(folder: Path, args: argparse.Namespace) -> float:
     with Recorder(folder, robot="any", fps=args.hz, task="measure") as recorder:
         (kept,) = recorder.recovered
     with CollectedRecording(kept) as recording:
-        return (last - float(recording.columns().features["observation.state"][-1, 0])) / args.hz
+        there = float(recording.columns().features["observation.state"][-1, 0])
+    return (last - there) / float(args.hz)
 
 
 def main() -> None:
