@@ -88,7 +88,8 @@ def lost_seconds(folder: Path, args: argparse.Namespace) -> float:
     with Recorder(folder, robot="any", fps=args.hz, task="measure") as recorder:
         (kept,) = recorder.recovered
     with CollectedRecording(kept) as recording:
-        return (last - float(recording.columns().features["observation.state"][-1, 0])) / args.hz
+        there = float(recording.columns().features["observation.state"][-1, 0])
+    return (last - there) / float(args.hz)
 
 
 def main() -> None:
@@ -97,7 +98,7 @@ def main() -> None:
     parser.add_argument("--hz", type=int, default=100)
     parser.add_argument("--cameras", type=int, default=3)
     parser.add_argument("--codec", choices=("h264", "av1", "jpeg"), default="h264")
-    parser.add_argument("--preset", default="")
+    parser.add_argument("--preset", default="ultrafast")
     parser.add_argument("--gop", type=int, default=2)
     parser.add_argument("--victim", type=Path, help=argparse.SUPPRESS)
     args = parser.parse_args()

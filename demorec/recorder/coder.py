@@ -1,7 +1,8 @@
-"""The thread that codes pictures and writes frames, so that the program that gives them need not wait.
+"""The threads that code pictures and write frames, so that the program that gives them need not wait.
 
-Libraries that code pictures and write files release Python's lock, so a thread is enough, and nothing has to be carried
-to another process. What waits is bounded: a queue that grew without end would hide that the machine cannot keep up.
+Libraries that code pictures and write files release Python's lock, so threads are enough, one a camera beside the one
+that writes, and nothing has to be carried to another process. What waits is bounded: a queue that grew without end
+would hide that the machine cannot keep up.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from queue import Empty, Full, Queue
 from typing import Literal
@@ -23,8 +25,10 @@ from demorec.scene.collected import CollectedCamera, CollectedFrame, CollectedOu
 
 WhenFull = Literal["error", "drop", "wait"]
 
-_FLUSH_SECONDS = 0.5
-"""After which what has come is written: with the time that it takes, a crash loses less than a second."""
+_FLUSH_SECONDS = 0.25
+_WAITING_SECONDS = 0.5
+"""What has come is written after the first, and of the second at most waits to be coded: so a crash loses less than a
+second, with the time that writing takes."""
 _WAIT_SECONDS = 0.001
 _MAX_WAITING_BYTES = 256 << 20
 _MIN_WAITING_FRAMES = 8
@@ -83,7 +87,7 @@ class Coder:
         writer: Of the episode; used by the thread alone until `end` returns.
         buffers: Where pictures are given back to.
         cameras: Of the episode; they decide how many frames may wait.
-        fps: Frames a second, nominal: as many may wait as come in a second, if memory allows.
+        fps: Frames a second, nominal: as many may wait as come in half a second, if memory allows.
         waits: Whether `put` waits for room.
 
     Attributes:
@@ -103,10 +107,12 @@ class Coder:
         self._writer, self._buffers, self._waits = writer, buffers, waits
         self.error: BaseException | None = None
         frame_bytes = sum(3 * camera.width * camera.height for camera in cameras)
-        self.capacity = max(_MIN_WAITING_FRAMES, min(fps, _MAX_WAITING_BYTES // max(frame_bytes, 1)))
+        most = _MAX_WAITING_BYTES // max(frame_bytes, 1)
+        self.capacity = max(_MIN_WAITING_FRAMES, min(round(_WAITING_SECONDS * fps), most))
         self._queue: Queue[WaitingFrame | None] = Queue(self.capacity)
         self._last: dict[str, int] = {}
         self._flushed_at = time.monotonic()
+        self._pool = ThreadPoolExecutor(max(len(cameras), 1), thread_name_prefix="demorec-camera")
         self._thread = threading.Thread(target=self._run, name="demorec-coder", daemon=True)
         self._thread.start()
 
@@ -137,6 +143,7 @@ class Coder:
             except Full:
                 continue
         self._thread.join()
+        self._pool.shutdown()
 
     def finish(self, outcome: CollectedOutcome) -> WriteStats:
         """Complete the recording, after `end`."""
@@ -172,9 +179,10 @@ class Coder:
         self._flushed_at = time.monotonic()
 
     def _write(self, frame: WaitingFrame) -> None:
-        for camera, (stamp_ns, pixels) in frame.pictures.items():
-            if pixels is not None:
-                self._last[camera] = self._writer.picture(camera, stamp_ns, pixels)
-                self._buffers.give_back(pixels)
+        new = [(camera, stamp, pixels) for camera, (stamp, pixels) in frame.pictures.items() if pixels is not None]
+        numbers = list(self._pool.map(lambda picture: self._writer.picture(*picture), new))
+        for (camera, _, pixels), number in zip(new, numbers, strict=True):
+            self._last[camera] = number
+            self._buffers.give_back(pixels)
         held = {camera: self._last[camera] for camera in frame.pictures}
         self._writer.write(CollectedFrame(time_ns=frame.time_ns, samples=frame.samples, pictures=held))

@@ -173,8 +173,8 @@ class RecordedEpisode:
                 self.drops[FRAMES] = self.drops.get(FRAMES, 0) + 1
                 return False
             raise RecordingError(
-                f"The coder cannot keep up, {self._coder.capacity} frames wait for it: give a quicker preset "
-                '(video=VideoConfig(preset="ultrafast")), smaller or fewer pictures, or when_full="drop" or "wait".'
+                f"The coder cannot keep up, {self._coder.capacity} frames wait for it: give quicker coding "
+                '(video=VideoConfig(codec="jpeg")), smaller or fewer pictures, or when_full="drop" or "wait".'
             )
         for camera, (stamp_ns, _) in new.items():
             self._check.note_picture(camera, stamp_ns)

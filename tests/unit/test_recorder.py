@@ -270,11 +270,11 @@ def held_up(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
 def test_frames_that_the_coder_cannot_take_are_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     go_on = held_up(monkeypatch)
     with recorder(tmp_path / "run", when_full="error") as run, run.episode() as episode:
-        with pytest.raises(RecordingError, match="cannot keep up, 30 frames wait for it: give a quicker"):  # noqa: PT012
+        with pytest.raises(RecordingError, match="cannot keep up, 15 frames wait for it: give quicker coding"):  # noqa: PT012
             for _ in range(40):
                 episode.write([0.0])
         go_on.set()
-    assert 30 <= load_collected_run(tmp_path / "run").episodes[0].num_frames <= 31
+    assert 15 <= load_collected_run(tmp_path / "run").episodes[0].num_frames <= 16
 
 
 def test_frames_that_the_coder_cannot_take_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
