@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from support.check import simulate_run
-from support.export import export, make_run
+from support.export import export, files_of, make_run
 from support.language import NOUNS, language_of, meant, phrases
 
 from demorec.errors import ConfigError, ExportError
@@ -305,3 +305,14 @@ def test_playback_has_the_words_and_the_boxes(dataset: Path, tmp_path: Path) -> 
     assert pages[-1].endswith("on the green target.")
     told = json.loads((dataset / "demorec" / "boxes" / f"{PREFIX}front.json").read_text())
     assert counts == [sum(item["image_id"] == frame for item in told["annotations"]) for frame in range(len(frames))]
+
+
+def test_a_dataset_with_everything_is_replaced_whole(run: Path, dataset: Path, tmp_path: Path) -> None:
+    out = tmp_path / "d"
+    export(run, out, language=(), boxes=True, progress=True)
+    assert not list(out.rglob("*.images"))
+    export(run, out, overwrite=True)
+    names = set(files_of(out))
+    assert not any(name.startswith(("sarm_progress", "demorec/boxes", "meta/temporal")) for name in names)
+    export(run, out, language=(), boxes=True, overwrite=True)
+    assert files_of(out) == files_of(dataset)
