@@ -7,6 +7,7 @@ is visible: occluded parts are not in them.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,6 @@ from demorec.geometry import Array, Pose
 from demorec.recording import Recording
 from demorec.scene.scene import Camera
 
-_BODY_MASK = (1 << 24) - 1
 MIN_PIXELS = 10
 """Pixels below which a thing is too hidden, or too far, to be spoken of."""
 
@@ -26,15 +26,31 @@ class Seen:
 
     Attributes:
         name: Of the body.
-        mask: (H, W) which pixels show it.
-        num_pixels: How many do.
-        box: (x_min, y_min, x_max, y_max), the outermost pixels that show it, both included.
+        pixels: (N,) numbers of the pixels that show it, counted column by column from the upper left, in order.
+        height: Of the picture, px.
     """
 
     name: str
-    mask: NDArray[np.bool_]
-    num_pixels: int
-    box: tuple[int, int, int, int]
+    pixels: NDArray[np.intp]
+    height: int
+
+    @property
+    def num_pixels(self) -> int:
+        """How many pixels show it."""
+        return len(self.pixels)
+
+    @cached_property
+    def box(self) -> tuple[int, int, int, int]:
+        """(x_min, y_min, x_max, y_max), the outermost pixels that show it, both included."""
+        rows = self.pixels % self.height
+        x_min, x_max = int(self.pixels[0]) // self.height, int(self.pixels[-1]) // self.height
+        return x_min, int(rows.min()), x_max, int(rows.max())
+
+    def is_at(self, x: int, y: int) -> bool:
+        """Whether a pixel shows it."""
+        number = x * self.height + y
+        place = int(np.searchsorted(self.pixels, number))
+        return place < len(self.pixels) and int(self.pixels[place]) == number
 
 
 def spoken_bodies(recording: Recording) -> tuple[str, ...]:
@@ -49,15 +65,13 @@ def seen_things(labels: NDArray[np.int32], values: dict[str, int]) -> dict[str, 
         labels: (H, W) segmentation as in `CameraImages`.
         values: Name of a body -> its number in the segmentation.
     """
-    bodies = np.where(labels >= 0, labels & _BODY_MASK, -1)
-    found = {}
-    for name, value in values.items():
-        mask = bodies == value
-        rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-        if len(rows):
-            box = (int(columns[0]), int(rows[0]), int(columns[-1]), int(rows[-1]))
-            found[name] = Seen(name=name, mask=mask, num_pixels=int(mask.sum()), box=box)
-    return found
+    # Bodies that are spoken of have no links, so that their numbers are the labels themselves.
+    by_column = labels.T.ravel()
+    known = {value: name for name, value in values.items()}
+    pixels = np.flatnonzero(np.isin(by_column, list(known)))
+    shown = by_column[pixels]
+    found = {known[value]: pixels[shown == value] for value in np.unique(shown).tolist()}
+    return {name: Seen(name=name, pixels=found[name], height=len(labels)) for name in values if name in found}
 
 
 def body_values(recording: Recording) -> dict[str, int]:

@@ -72,17 +72,24 @@ def seen_objects(
                 box=(x_min, y_min, x_max - x_min + 1, y_max - y_min + 1),
                 area=seen.num_pixels,
                 visible_fraction=None if whole is None else round(min(1.0, seen.num_pixels / max(whole, 1e-9)), 4),
-                counts=run_lengths(seen.mask),
+                counts=run_lengths(seen.pixels, labels.size),
             )
 
 
-def run_lengths(mask: NDArray[np.bool_]) -> tuple[int, ...]:
-    """Run lengths of a mask (H, W) column by column, beginning with those that are not set."""
-    flat = mask.ravel(order="F")
-    changes = np.flatnonzero(np.diff(flat)) + 1
-    bounds = np.concatenate([[0], changes, [flat.size]])
-    lengths = np.diff(bounds).tolist()
-    return tuple([0, *lengths] if flat[0] else lengths)
+def run_lengths(pixels: NDArray[np.intp], size: int) -> tuple[int, ...]:
+    """Lengths of the runs of pixels that are not among the given ones, that are, that are not, and so on.
+
+    Args:
+        pixels: (N,) numbers in order.
+        size: How many pixels there are.
+    """
+    if not len(pixels):
+        return (size,)
+    gaps = np.flatnonzero(np.diff(pixels) > 1)
+    starts = np.concatenate([pixels[:1], pixels[gaps + 1]])
+    ends = np.concatenate([pixels[gaps], pixels[-1:]]) + 1
+    lengths = np.diff(np.stack([starts, ends], axis=1).ravel(), prepend=0).tolist()
+    return tuple([*lengths, size - int(ends[-1])] if ends[-1] < size else lengths)
 
 
 def outline_area(camera: Camera, world_from_camera: Array, shape: Shape, world_from_body: Array) -> float | None:

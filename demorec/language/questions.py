@@ -156,7 +156,7 @@ def _keypoint(view: _View, turn: int) -> tuple[str, dict[str, Any]] | None:
     names = []
     for name in view.clear:
         pixel = pixel_of(view.camera, view.middle(name))
-        if pixel is not None and view.seen[name].mask[pixel[1], pixel[0]]:
+        if pixel is not None and view.seen[name].is_at(*pixel):
             names.append((name, pixel))
     if not names:
         return None

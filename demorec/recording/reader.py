@@ -200,10 +200,10 @@ class RecordingReader(EpisodeFile):
         if not self.has_segmentation(camera):
             raise RecordingError(f"The recording has no segmentation pictures of the camera {camera!r}: {self.path}")
         topic, size = channels.camera_topic(camera, "segmentation"), self._size(camera)
-        for frame, (_, data) in enumerate(self._pictures(topic, messages.read_compressed_image)):
+        for frame, (_, data) in enumerate(self._pictures(topic, lambda data: data)):
             if frame in frames:
                 with damage_as_recording_error(self.path):
-                    labels = decode_labels(data, size)
+                    labels = decode_labels(messages.read_compressed_image(data), size)
                 yield frame, labels
 
     def _size(self, camera: str) -> tuple[int, int]:

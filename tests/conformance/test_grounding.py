@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from support.check import simulate_run
-from support.export import export, make_run
+from support.export import export, files_of, make_run
 from support.language import NOUNS, language_of, meant, phrases
 
 from demorec.errors import ConfigError, ExportError
@@ -257,12 +257,11 @@ def test_outlines_of_what_faces_the_camera(shape: Shape) -> None:
 
 def test_run_lengths_go_column_by_column() -> None:
     mask = np.array([[1, 0, 0], [1, 1, 0]], dtype=np.bool_)
-    assert run_lengths(mask) == (0, 2, 1, 1, 2)
-    assert np.array_equal(decoded(coco_string(run_lengths(mask)), (2, 3)), mask)
+    assert run_lengths(np.flatnonzero(mask.T), mask.size) == (0, 2, 1, 1, 2)
     rng = np.random.default_rng(0)
     for share in (0.0, 0.001, 0.5, 1.0):
         mask = rng.random((70, 90)) < share
-        assert np.array_equal(decoded(coco_string(run_lengths(mask)), (70, 90)), mask)
+        assert np.array_equal(decoded(coco_string(run_lengths(np.flatnonzero(mask.T), mask.size)), (70, 90)), mask)
 
 
 def test_without_segmentation_there_are_traces_and_no_questions(tmp_path: Path) -> None:
@@ -306,3 +305,14 @@ def test_playback_has_the_words_and_the_boxes(dataset: Path, tmp_path: Path) -> 
     assert pages[-1].endswith("on the green target.")
     told = json.loads((dataset / "demorec" / "boxes" / f"{PREFIX}front.json").read_text())
     assert counts == [sum(item["image_id"] == frame for item in told["annotations"]) for frame in range(len(frames))]
+
+
+def test_a_dataset_with_everything_is_replaced_whole(run: Path, dataset: Path, tmp_path: Path) -> None:
+    out = tmp_path / "d"
+    export(run, out, language=(), boxes=True, progress=True)
+    assert not list(out.rglob("*.images"))
+    export(run, out, overwrite=True)
+    names = set(files_of(out))
+    assert not any(name.startswith(("sarm_progress", "demorec/boxes", "meta/temporal")) for name in names)
+    export(run, out, language=(), boxes=True, overwrite=True)
+    assert files_of(out) == files_of(dataset)
