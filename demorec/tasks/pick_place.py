@@ -14,6 +14,7 @@ from demorec.sim.world import World
 from demorec.tasks.base import Task
 from demorec.tasks.checks import gripper_open_check, placement_checks
 from demorec.tasks.furniture import cube, mark, robot_at_origin, table_and_floor
+from demorec.tasks.recovery import finish
 from demorec.tasks.sampling import WORKSPACE, Sampler, wording
 from demorec.tasks.script import Step
 from demorec.tasks.skills import Expert
@@ -73,6 +74,10 @@ class PickPlace(Task):
         """One pick-and-place."""
         for goal in expert.world.scene.goals:
             yield from expert.pick_and_place(goal)
+
+    def resume(self, expert: Expert) -> Iterator[Step]:
+        """On from where the cube is."""
+        yield from finish(expert, expert.world.scene.goals)
 
     def evaluate(self, world: World) -> tuple[SuccessCheck, ...]:
         """The cube lies on the mark and the hand has let go."""
