@@ -10,7 +10,18 @@ from typing import Literal, get_args
 
 import numpy as np
 
-Purpose = Literal["scene", "expert", "noise", "looks", "perception", "cameras", "physics", "sampling", "behaviour"]
+Purpose = Literal[
+    "scene",
+    "expert",
+    "noise",
+    "looks",
+    "perception",
+    "cameras",
+    "physics",
+    "sampling",
+    "behaviour",
+    "takeover",
+]
 """What a stream is used for. Append only: the position in this list is part of every recorded seed."""
 
 PURPOSES: tuple[Purpose, ...] = get_args(Purpose)

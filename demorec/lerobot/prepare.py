@@ -4,7 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from demorec.export.columns import DONE, REWARD, SUCCESS, check_feature_names, feature_columns, frame_stride
+from demorec.export.columns import (
+    DONE,
+    INTERVENTION,
+    REWARD,
+    SUCCESS,
+    check_feature_names,
+    feature_columns,
+    frame_stride,
+)
 from demorec.lerobot.depth import depth_info, depth_video
 from demorec.lerobot.layout import AUTOMATIC_FEATURES, Feature
 from demorec.lerobot.options import ExportOptions
@@ -52,6 +60,8 @@ def dataset_features(recording: Recording, options: ExportOptions) -> dict[str, 
             features[IMAGE_PREFIX + camera + DEPTH_SUFFIX] = _camera_feature((height, width, 1), described)
     names = action_names(info.robot, options.action)
     features[ACTION] = Feature(dtype="float32", shape=(len(names),), names=names)
+    if options.intervention:
+        features[INTERVENTION] = Feature(dtype="bool", shape=(1,))
     return _chosen({**features, **_SCALARS, **AUTOMATIC_FEATURES}, options)
 
 

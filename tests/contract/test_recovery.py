@@ -9,7 +9,7 @@ import pytest
 from support.sim import episode
 from support.tasks import tasks_with_long_ones_slow
 
-from demorec.geometry import Pose, quat_multiply
+from demorec.geometry import Array, Pose, quat_multiply
 from demorec.loop import Episode, ScriptAgent, Session, make_world
 from demorec.sim.world import World
 from demorec.tasks.grasping import hand_down, raised
@@ -77,7 +77,8 @@ def carry_tilted(world: World, expert: Expert) -> Iterator[Step]:
 
 def wave(world: World, expert: Expert) -> Iterator[Step]:
     """The arm flails: a random walk of all joints, which is not at rest when the expert takes over."""
-    random, velocity = np.random.default_rng(4), np.zeros(7)
+    random = np.random.default_rng(4)
+    velocity: Array = np.zeros(7)
     for _ in range(45):
         velocity = 0.9 * velocity + random.normal(0.0, 0.012, 7)
         expert.joint_target = np.clip(expert.joint_target + velocity, expert.arm.lower, expert.arm.upper)
