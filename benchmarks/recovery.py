@@ -17,7 +17,7 @@ import numpy as np
 
 from demorec.config import EpisodePlan, GenerateConfig
 from demorec.evaluate.statistics import Rate
-from demorec.geometry import Pose
+from demorec.geometry import Array, Pose
 from demorec.loop import Episode, ScriptAgent, Session, make_world, prepare
 from demorec.scene.episode import Action
 from demorec.sim.world import World
@@ -42,7 +42,8 @@ def bring_about(kind: str, world: World, episode: Episode, random: np.random.Gen
 
 
 def flail(world: World, random: np.random.Generator) -> None:
-    arm, target, velocity = world.arm.kinematics, world.arm.target.copy(), np.zeros(len(world.arm.target))
+    arm, target = world.arm.kinematics, world.arm.target.copy()
+    velocity: Array = np.zeros(len(target))
     opening = world.arm.gripper_target
     for step in range(int(random.integers(10, 60))):
         if step % 15 == 0:
