@@ -28,7 +28,7 @@ from demorec.loop.actions import ActionDecoder, action_bounds, check_action_kind
 from demorec.render import Renderer
 from demorec.render.painter import Painter
 from demorec.scene import features
-from demorec.scene.episode import CameraImages, EpisodeInfo, Frame, Observation, SuccessCheck
+from demorec.scene.episode import POLICY_PHASE, CameraImages, EpisodeInfo, Frame, Observation, SuccessCheck
 from demorec.scene.features import ActionKind, ObservationRows
 from demorec.scene.scene import Scene
 from demorec.scene.variation import Preset
@@ -39,9 +39,6 @@ SUCCESS_FRAMES = 5
 """For how many frames in a row every check of the task must hold."""
 SECONDS_PER_GOAL = 15.0
 """Time limit for each object to be moved, about twice what the expert takes."""
-
-POLICY_PHASE = "policy"
-"""Phase of every frame: whoever acts from outside tells none."""
 
 PROBED_SCENES = 16
 """How many scenes are looked at to tell whether the number of objects varies."""
@@ -201,6 +198,11 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         return self._situation
 
     @property
+    def max_episode_steps(self) -> int:
+        """The time limit, frames."""
+        return self._max_episode_steps
+
+    @property
     def task(self) -> str:
         """Name of the task."""
         return self.config.task
@@ -258,8 +260,14 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         if values.shape != self.action_space.shape or not np.isfinite(values).all():
             raise ValueError(f"An action has shape {self.action_space.shape} and finite values, found {values!r}.")
         command = self._decoder.command(values)
-        frame = self._session.frame(Decision(action=command, command=command, phase=POLICY_PHASE))
-        self._session.step(command)
+        return self.act(Decision(action=command, command=command, phase=POLICY_PHASE))
+
+    def act(self, decision: Decision) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        """One control step as `step` makes it, decided by somebody else than a policy; its command is sent as it is."""
+        if self._session is None:
+            raise RuntimeError("the environment has no episode yet: call reset first")
+        frame = self._session.frame(decision)
+        self._session.step(frame.command)
         self._situation = self._look(self._session, frame)
         success = self._situation.is_success
         truncated = not success and self._session.frame_index >= self._max_episode_steps

@@ -11,7 +11,17 @@ from typing import Literal, get_args
 import numpy as np
 
 Purpose = Literal[
-    "scene", "expert", "noise", "looks", "perception", "cameras", "physics", "sampling", "behaviour", "language"
+    "scene",
+    "expert",
+    "noise",
+    "looks",
+    "perception",
+    "cameras",
+    "physics",
+    "sampling",
+    "behaviour",
+    "language",
+    "takeover",
 ]
 """What a stream is used for. Append only: the position in this list is part of every recorded seed."""
 

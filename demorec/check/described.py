@@ -12,6 +12,7 @@ from demorec.check.base import Found, Measurement, NotMeasured, check
 from demorec.check.episode import RecordedEpisode
 from demorec.errors import ConfigError
 from demorec.plain import digest
+from demorec.scene.episode import POLICY_PHASE
 from demorec.scene.scene import Scene
 from demorec.tables import ROBOTS, camera_name, load_robot
 
@@ -139,6 +140,8 @@ def noise_as_said(episode: RecordedEpisode) -> Found:
     c, behaviour = episode.columns, episode.info.behaviour
     if "action_noise" not in behaviour:
         return NotMeasured(why="the behaviour names no exploration noise")
+    if POLICY_PHASE in c.phase:
+        return NotMeasured(why="a policy acted, on whom no noise is put")
     noise = c.command_joint_target - c.action_joint_target
     sigma = behaviour["action_noise"]
     loud = np.abs(noise).max(axis=1, initial=0.0)

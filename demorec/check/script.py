@@ -14,6 +14,7 @@ import numpy as np
 
 from demorec.check.base import Found, Measurement, NotMeasured, check
 from demorec.check.episode import RecordedEpisode
+from demorec.scene.episode import POLICY_PHASE
 from demorec.tables import TASKS
 
 OPEN_PHASES = {"approach", "descend", "release", "retreat", "verify", "recover", "open", "above_cube"}
@@ -63,6 +64,8 @@ def _is_scripted(episode: RecordedEpisode) -> NotMeasured | None:
     """None where the phases are those of demorec's own skills."""
     if episode.info.task not in TASKS.rows:
         return NotMeasured(why=f"phases of the task {episode.info.task!r} may mean anything")
+    if POLICY_PHASE in episode.columns.phase:
+        return NotMeasured(why="a policy acted, for whom there is no script")
     if not any(episode.columns.phase):
         return NotMeasured(why="the episode has no phases: no script made it")
     return None

@@ -47,6 +47,7 @@ COMMANDS: Registry[type[Command]] = Registry(
         "render": "demorec.cli.render:Render",
         "train": "demorec.cli.train:Train",
         "evaluate": "demorec.cli.evaluate:Evaluate",
+        "correct": "demorec.cli.correct:Correct",
         "reproduce": "demorec.cli.reproduce:Reproduce",
         "recover": "demorec.cli.recover:Recover",
         "list": "demorec.cli.list_rows:ListRows",

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
-from demorec.cli.allow import Allow, allowed_modules
 from demorec.cli.output import say, say_json
-from demorec.cli.progress import ProgressBar
-from demorec.config import GenerateConfig, VideoConfig
-from demorec.errors import ConfigError, check_option
+from demorec.cli.rollout_flags import RolloutFlags, Split
+from demorec.errors import ConfigError
 
 if TYPE_CHECKING:
     from demorec.evaluate.rollouts import Evaluation
@@ -18,7 +16,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Evaluate:
+class Evaluate(RolloutFlags):
     """Run a policy that LeRobot saved over held-out scenes: success rate, where it fails, every rollout recorded.
 
     Success is the task's own strict conditions, held for five frames. The same command again goes on where it
@@ -32,42 +30,8 @@ class Evaluate:
       demorec view evaluations/clean/failed            (watch the failures)
     """
 
-    policy: Path | None = None
-    """Output folder of lerobot-train, or a pretrained_model folder."""
-    task: str = "pick_place"
-    """A name of `demorec list tasks`, or my_package.my_module:MyTask."""
-    robot: str = "panda"
-    """A name of `demorec list robots`, or my_package.my_module:MY_ARM."""
-    cameras: tuple[str, ...] = ()
-    """Those of your own that the policy sees, as my_package.my_module:MY_CAMERA; it names the others itself."""
-    num_episodes: int = 50
-    """How many scenes."""
-    split: Literal["all", "train", "eval"] = "eval"
+    split: Split = "eval"
     """eval: scenes and seeds that --split train leaves out; all or train: as generate-dataset makes them."""
-    seed: int = 0
-    """Root of the scenes; with another split than eval take another one than the dataset's."""
-    out: Path | None = None
-    """Folder of the results (auto: evaluations/TASK)."""
-    action: str | None = None
-    """joint, joint_increment, ee or ee_delta (auto: as in the dataset that the policy was trained on)."""
-    action_steps: int | None = None
-    """Actions that are executed before the policy looks again (auto: as trained)."""
-    episode_length: int | None = None
-    """Time limit in frames (auto: 15 s for each object to be moved)."""
-    fps: int = 30
-    """Frames per second, those of the dataset."""
-    variation: Literal["none", "mild", "full"] = "mild"
-    """How much the scenes differ, as of generate-dataset."""
-    renderer: str | None = None
-    """For a policy that looks at pictures (auto: that of generate-dataset)."""
-    video: VideoConfig = field(default_factory=VideoConfig)
-    """Coding of the recorded pictures."""
-    workers: int | None = None
-    """Processes (auto: one for each core)."""
-    allow: Allow = ()
-    """A module or package of your own that may be imported for the cameras and steps that the policy names."""
-    overwrite: bool = False
-    """Delete the evaluation that the output folder holds, and begin anew."""
     compare: tuple[Path, Path] | None = None
     """Compare two finished evaluations instead: FOLDER FOLDER."""
     json: bool = False
@@ -79,55 +43,13 @@ class Evaluate:
             return self._compare(*self.compare)
         if self.policy is None:
             raise ConfigError("Nothing to evaluate: give --policy FOLDER, or --compare FOLDER FOLDER.")
-        check_option("num_episodes", self.num_episodes, 1, 1_000_000)
-        if self.workers is not None:
-            check_option("workers", self.workers, 1, 1024)
-        from demorec.evaluate.rollouts import evaluate, settings_for
-        from demorec.generate.options import available_cores
-        from demorec.loop.actions import check_action_kind
-
-        settings = settings_for(
-            self.policy,
-            self._config(),
-            action=None if self.action is None else check_action_kind(self.action),
-            action_steps=self.action_steps,
-            episode_length=self.episode_length,
-            allowed=allowed_modules(self.allow),
-        )
         out = self.out or Path("evaluations") / self.task.rpartition(":")[2]
-        with ProgressBar("evaluating", total=self.num_episodes, unit="rollout") as bar:
-
-            def progress(evaluation: Evaluation) -> None:
-                bar.note(str(evaluation.rate))
-                bar.set(len(evaluation.rollouts))
-
-            evaluation = evaluate(
-                settings,
-                out,
-                num_episodes=self.num_episodes,
-                workers=self.workers or available_cores(),
-                overwrite=self.overwrite,
-                progress=progress,
-            )
+        evaluation = self.carry_out(self.policy, out, title="evaluating")
         if self.json:
             say_json(_plain(evaluation))
         else:
             say(*_told(evaluation, out))
         return 0
-
-    def _config(self) -> GenerateConfig:
-        plain: dict[str, Any] = {} if self.renderer is None else {"renderer": self.renderer}
-        return GenerateConfig(
-            task=self.task,
-            robot=self.robot,
-            split=self.split,
-            seed=self.seed,
-            fps=self.fps,
-            cameras=self.cameras,
-            variation=self.variation,
-            video=self.video,
-            **plain,
-        )
 
     def _compare(self, first: Path, second: Path) -> int:
         from demorec.evaluate.rollouts import load_evaluation

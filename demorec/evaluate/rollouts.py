@@ -21,6 +21,8 @@ from typing import Any
 
 from demorec.config import EpisodePlan, GenerateConfig, deciding_versions
 from demorec.errors import ConfigError, DemorecError, in_words
+from demorec.evaluate.correction import Correction, Watch, correcting_behaviour
+from demorec.evaluate.moments import TakeOver
 from demorec.evaluate.policy import Policy, check_steps, find_checkpoint, policy_summary, trained_action
 from demorec.evaluate.progress import EvaluationObserver, factors_of
 from demorec.evaluate.statistics import Rate
@@ -36,7 +38,7 @@ from demorec.runs.find import EVALUATION_NAME
 from demorec.runs.run_file import EPISODES, FAILED, Attempt
 from demorec.safety.own_versions import version_differences
 from demorec.safety.replacing import Kind, check_replaceable, json_object, replaced_parts, settle_parts
-from demorec.scene.episode import Outcome
+from demorec.scene.episode import Frame, Outcome
 from demorec.scene.features import ENVIRONMENT_STATE, IMAGE_PREFIX, ActionKind
 from demorec.tables import camera_name
 
@@ -56,6 +58,7 @@ class Settings:
         action_steps: Actions executed before it looks again; None: as trained.
         privileged: Whether it sees observation.environment_state.
         episode_length: Time limit; None: the environment's.
+        takeover: When the expert takes over from the policy; None: never, as an evaluation of the policy wants it.
     """
 
     policy: str
@@ -66,6 +69,7 @@ class Settings:
     action_steps: int | None = None
     privileged: bool = False
     episode_length: int | None = None
+    takeover: TakeOver | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -206,24 +210,42 @@ def make_rollout(plan: EpisodePlan, folder: Path) -> Attempt:
     observation, _ = env.reset(seed=plan.episode_index)
     policy.reset(plan.episode_index)
     info = replace(env.info, origin=f"rollout of {settings.policy_type} {settings.policy_digest}")
+    watch = None
+    if settings.takeover is not None:
+        behaviour = {**info.behaviour, **correcting_behaviour(env.episode).as_mapping()}
+        info = replace(info, origin=info.origin.replace("rollout", "correction", 1), behaviour=behaviour)
+        watch = Watch(settings.takeover, env.episode, max_frames=env.max_episode_steps)
     progress = EvaluationObserver(info.scene)
     name = f"episode_{plan.episode_index:06d}.mcap"
     path = folder / name
     with EpisodeWriter(path, info, video=plan.config.video, overwrite=True) as recording:
         terminated = truncated = False
-        while not (terminated or truncated):
+        correction: Correction | None = None
+        while not terminated and (watch is not None or not truncated):
+            why = "" if watch is None else watch.reason(env.situation)
+            if why:
+                correction = Correction(env=env, reason=why)
+                break
             observation, _, terminated, truncated, _ = env.step(policy.act(observation, info.instruction))
-            assert env.situation.last_frame is not None  # since it is no situation after a reset
-            recording.write(env.situation.last_frame)
+            recording.write(_last_frame(env))
             progress.watch(env.world)
+        for decision in () if correction is None else correction.decisions():
+            _, _, terminated, _, _ = env.act(decision)
+            recording.write(_last_frame(env))
+            progress.watch(env.world)
+            if terminated:
+                break
         after = env.situation
         phase, reason = ("", "") if terminated else progress.failure(after)
+        if correction is not None and not terminated and correction.gave_up[1]:
+            phase, reason = correction.gave_up
         outcome = Outcome(
             success=terminated,
             checks=after.checks,
             failure_phase=phase,
             failure_reason=reason,
             num_frames=after.frame_index,
+            num_retries=0 if correction is None else correction.num_retries,
             final_state_digest=env.world.state_digest(),
         )
         stats = recording.finish(outcome)
@@ -242,6 +264,12 @@ def make_rollout(plan: EpisodePlan, folder: Path) -> Attempt:
         phase=phase,
         reason=reason,
     )
+
+
+def _last_frame(env: DemorecEnv) -> Frame:
+    frame = env.situation.last_frame
+    assert frame is not None  # since it is no situation after a reset
+    return frame
 
 
 class _Stage:

@@ -12,10 +12,12 @@ from demorec.errors import ConfigError, ExportError
 from demorec.export.options import CommonOptions
 from demorec.recording import Recording
 from demorec.registry import nearest_match
-from demorec.scene.episode import EpisodeColumns
+from demorec.scene.episode import POLICY_PHASE, EpisodeColumns
 from demorec.scene.features import ACTION, ENVIRONMENT_STATE, ObservationRows, action_vectors, observation_vectors
 
 REWARD, DONE, SUCCESS = "next.reward", "next.done", "next.success"
+INTERVENTION = "intervention"
+"""As LeRobot's DAgger calls it: whether the expert acts in an episode that a policy began."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -25,7 +27,7 @@ class FeatureColumns:
     Attributes:
         recorded: All of its numbers, every frame.
         rows: (T,) which of these frames the dataset has.
-        features: Feature -> (T, D) float32; (T,) float32 for REWARD, (T,) bool for DONE and SUCCESS.
+        features: Feature -> (T, D) float32; (T,) float32 for REWARD, (T,) bool for DONE, SUCCESS and INTERVENTION.
     """
 
     recorded: EpisodeColumns
@@ -95,4 +97,6 @@ def feature_columns(recording: Recording, options: CommonOptions) -> FeatureColu
     features[REWARD] = (is_last & success).astype(np.float32)
     features[DONE] = is_last
     features[SUCCESS] = is_last & success
+    by_policy = np.array([phase == POLICY_PHASE for phase in columns.phase])
+    features[INTERVENTION] = by_policy.any() & ~by_policy[rows]
     return FeatureColumns(recorded=columns, rows=rows, features=features)

@@ -60,6 +60,7 @@ _MEANING = {
     "next.reward": "1 at the last frame of a success, else 0",
     "next.done": "true at the last frame",
     "next.success": "true at the last frame of a success",
+    "intervention": "true where the expert acts in an episode that a policy began; its other frames are the policy's",
     "timestamp": "seconds since the episode's start",
 }
 _ACTION_MEANING: Mapping[ActionKind, str] = {

@@ -31,6 +31,8 @@ class ExportOptions(CommonOptions):
     """Add the episodes to the dataset that is there already."""
     allow_duplicates: bool = False
     """With --append: add episodes whose content the dataset has already a second time, instead of refusing them."""
+    intervention: bool = False
+    """Add the column intervention of LeRobot's DAgger: true where the expert acts in an episode that a policy began."""
     verify: bool = True
     """Open the finished dataset with LeRobot, where that is installed, and compare samples with the recordings."""
     workers: int = 0

@@ -9,6 +9,7 @@ from typing import Any
 from demorec.errors import ExportError
 from demorec.export.columns import (
     DONE,
+    INTERVENTION,
     REWARD,
     SUCCESS,
     FeatureColumns,
@@ -83,6 +84,8 @@ def dataset_features(recording: AnyRecording, options: ExportOptions) -> dict[st
             features[IMAGE_PREFIX + camera + DEPTH_SUFFIX] = _camera_feature((height, width, 1), described)
     names = action_names(info.robot, options.action)
     features[ACTION] = Feature(dtype="float32", shape=(len(names),), names=names)
+    if options.intervention:
+        features[INTERVENTION] = Feature(dtype="bool", shape=(1,))
     told = {} if options.language is None else dict.fromkeys(COLUMNS, _LANGUAGE)
     return {**_chosen({**features, **_SCALARS, **AUTOMATIC_FEATURES}, options), **told}
 

@@ -19,6 +19,9 @@ from demorec.geometry import Array, Pose
 from demorec.scene.robot import RobotSpec
 from demorec.scene.scene import Scene
 
+POLICY_PHASE = "policy"
+"""Phase of the frames in which a policy acts, or somebody else who tells no phase; all others are the expert's."""
+
 FORMAT_VERSION = 2
 """Of the recordings. A reader knows every version up to this one; `recordings/sample/` holds a file of each."""
 

@@ -13,6 +13,7 @@ from demorec.scene.episode import SuccessCheck
 from demorec.scene.robot import RobotSpec
 from demorec.scene.scene import Scene
 from demorec.sim.world import World
+from demorec.tasks.recovery import begin_again, is_served
 from demorec.tasks.sampling import Sampler
 from demorec.tasks.script import Step
 from demorec.tasks.skills import Expert
@@ -43,6 +44,17 @@ class Task(ABC):
     @abstractmethod
     def script(self, expert: Expert) -> Iterator[Step]:
         """Do it, one control step at a time: the world has advanced when the generator resumes."""
+
+    def resume(self, expert: Expert) -> Iterator[Step]:
+        """Do what is left of it from whatever state the world is in; `expert` is made for that state.
+
+        This one lets go of everything and follows the script from its beginning, unless the scene's goals are served
+        already. Tasks whose goals are the whole aim go on where they are (`demorec.tasks.recovery.finish`).
+        """
+        yield from begin_again(expert)
+        goals = expert.world.scene.goals
+        if not goals or not all(is_served(expert.world, goal) for goal in goals):
+            yield from self.script(expert)
 
     @abstractmethod
     def evaluate(self, world: World) -> tuple[SuccessCheck, ...]:

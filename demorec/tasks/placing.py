@@ -13,6 +13,7 @@ from demorec.scene.scene import Body, Goal, Rgba, Shape
 from demorec.sim.world import World
 from demorec.tasks.base import Task
 from demorec.tasks.furniture import COLORS, cube
+from demorec.tasks.recovery import finish, put_back
 from demorec.tasks.sampling import Sampler
 from demorec.tasks.script import Step
 from demorec.tasks.skills import Expert
@@ -35,6 +36,16 @@ class PlacingTask(Task):
         """One pick-and-place per goal."""
         for goal in expert.world.scene.goals:
             yield from expert.pick_and_place(goal)
+
+    def resume(self, expert: Expert) -> Iterator[Step]:
+        """What is left of the goals, then bystanders that were moved back to where they lay."""
+        world = expert.world
+        yield from finish(expert, world.scene.goals)
+        moved = [
+            put_back(world, check.name.partition(":")[2]) for check in undisturbed_checks(world) if not check.passed
+        ]
+        if moved:
+            yield from finish(expert, (*moved, *world.scene.goals))
 
     def evaluate(self, world: World) -> tuple[SuccessCheck, ...]:
         """Goals, bystanders, gripper."""

@@ -129,6 +129,26 @@ def test_evaluate_records_every_rollout_and_goes_on(trained: Path, capsys: pytes
     assert "0/3 = 0.0 %" in capsys.readouterr().out
 
 
+def test_correct_finishes_what_a_policy_has_begun(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["correct", "--policy", str(trained / "train"), "--episode-length", "9", "--workers", "1", "--seed", "3"]
+    for count in ("1", "2"):  # the second time it goes on
+        with pytest.raises(SystemExit) as exit_info:
+            main([*words, "--num-episodes", count, "--out", str(trained / "corrections")])
+        assert exit_info.value.code == 0
+    told = capsys.readouterr().out
+    assert "taken over       2  the policy has had its time" in told
+    assert "success       2/2 = 100.0 %" in told
+    for path in sorted((trained / "corrections" / "episodes").iterdir()):
+        with Recording(path) as recording:
+            phases = recording.columns().phase
+        assert set(phases[:9]) == {"policy"}
+        assert "policy" not in phases[9:]
+    with pytest.raises(SystemExit) as exit_info:
+        main([*words, "--num-episodes", "2", "--stuck-seconds", "1", "--out", str(trained / "corrections")])
+    assert exit_info.value.code == 2
+    assert "takeover stuck_seconds is 2.0 there and 1.0 here" in capsys.readouterr().err
+
+
 def test_another_evaluation_in_the_folder_is_refused(trained: Path) -> None:
     settings = settings_for(trained / "train", GenerateConfig(split="eval", cameras=()), episode_length=4)
     evaluate(settings, trained / "c", num_episodes=1, workers=1)

@@ -1,0 +1,187 @@
+"""Going on from whatever state somebody else has left: the expert takes over from a policy or a person, and finishes.
+
+A script begins at rest, hand open and high, objects where the layout put them. Nothing of that need hold here: the arm
+may be moving, tilted or low, the gripper closed beside an object or around one, objects pushed away or put down at a
+wrong place. So the arm is stopped and brought to where a script can begin, and every goal that is not served is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from demorec.geometry import wrap_angle
+from demorec.scene.motion import PEAK_VELOCITY, quintic, slowdown
+from demorec.scene.scene import Goal
+from demorec.sim.world import World
+from demorec.tasks.checks import placement_checks, resting_half_height
+from demorec.tasks.grasping import hand_down, hand_yaw, symmetric_yaws
+from demorec.tasks.script import Step
+from demorec.tasks.skills import Expert, GaveUp
+
+TAKE_OVER = "take_over"
+"""Phase in which the arm is stopped and brought to where a script can begin."""
+_STOP_SECONDS, _STOPPED = 0.3, 0.05
+"""The arm is held for so long, or until no joint is faster (rad/s)."""
+_CLEARANCE = 0.03
+"""Metres of air between the finger tips and everything that lies about, above which the hand moves where it wants."""
+_HEIGHTS = (0.16, 0.12, 0.08, _CLEARANCE)
+"""Metres above everything to which the hand rises; the first that it reaches."""
+_HOME_SPEED = 0.8
+"""Peak speed, rad/s, of the joints on their way home."""
+_ROUNDS = 2
+"""How often all goals are gone through: serving one may spoil another."""
+
+
+def finish(expert: Expert, goals: Sequence[Goal]) -> Iterator[Step]:
+    """Serve every goal, in order, from any state of the world; none is touched that is served already.
+
+    Args:
+        expert: Made for the world as it is now; its behaviour should not miss on purpose.
+        goals: What shall be where in the end.
+
+    Raises:
+        GaveUp: Something is out of reach, or several tries were not enough.
+    """
+    held = _held(expert)
+    yield from _stop(expert, holding=bool(held))
+    if held and expert.holds(held):
+        yield from _place_held(expert, held, goals)
+    yield from _stand_clear(expert)
+    for _ in range(_ROUNDS):
+        for goal in goals:
+            if not is_served(expert.world, goal):
+                yield from _serve(expert, goal)
+        if all(is_served(expert.world, goal) for goal in goals):
+            return
+    unserved = next(goal for goal in goals if not is_served(expert.world, goal))
+    raise GaveUp(expert.phase, f"unserved_{unserved.object}")
+
+
+def begin_again(expert: Expert) -> Iterator[Step]:
+    """Stop, let go of whatever is held, and bring the hand to where a script can begin."""
+    yield from _stop(expert, holding=False)
+    yield from _stand_clear(expert)
+
+
+def _stand_clear(expert: Expert) -> Iterator[Step]:
+    if not _is_clear(expert):
+        yield from _rise(expert)
+
+
+def _serve(expert: Expert, goal: Goal) -> Iterator[Step]:
+    """Pick and place; once more from home where the arm stands so that no straight line leads on."""
+    try:
+        yield from expert.pick_and_place(goal)
+    except GaveUp as error:
+        if error.reason != "unreachable":
+            raise
+        expert.phase = TAKE_OVER
+        yield from _rise(expert)
+        yield from _go_home(expert)
+        yield from expert.pick_and_place(goal)
+
+
+def is_served(world: World, goal: Goal) -> bool:
+    """Whether an object lies at its goal, at rest and let go."""
+    return all(check.passed for check in placement_checks(world, goal))
+
+
+def put_back(world: World, name: str) -> Goal:
+    """The goal that an object lies where it lay at the start."""
+    body = world.body(name)
+    return Goal(object=name, onto="", onto_from_goal=body.world_from_body, yaw_symmetry=body.yaw_symmetry)
+
+
+def _held(expert: Expert) -> str:
+    """Which object the fingers hold; "" for none."""
+    return next((body.name for body in expert.world.scene.movable if expert.holds(body.name)), "")
+
+
+def _stop(expert: Expert, *, holding: bool) -> Iterator[Step]:
+    """Hold the arm where it is until it stands still, with the hand closed around what it holds."""
+    world = expert.world
+    expert.phase = TAKE_OVER
+    if holding:
+        expert.gripper_target = 0.0
+    number = len(expert.joint_target)
+    expert.joint_target = world.arm.arm_position()
+    for _ in range(max(1, round(_STOP_SECONDS * world.fps))):
+        yield expert.step()
+        _, velocity, _ = world.arm.joint_states()
+        if float(np.abs(velocity[:number]).max()) < _STOPPED:
+            return
+
+
+def _place_held(expert: Expert, name: str, goals: Sequence[Goal]) -> Iterator[Step]:
+    """Bring what is held to its goal where its turn has come, else back to where it lay; let go where neither goes."""
+    goal = put_back(expert.world, name)
+    for wanted in goals:
+        if wanted.object == name:
+            goal = wanted
+            break
+        if not is_served(expert.world, wanted):
+            break
+    try:
+        yield from expert.place(goal)
+    except GaveUp:
+        expert.phase = TAKE_OVER
+
+
+def _is_clear(expert: Expert) -> bool:
+    """Whether the hand is open and so high that it may go anywhere."""
+    is_open = expert.world.arm.gripper_width() > expert.open_width - 0.01
+    return is_open and expert.tcp().position[2] >= _lowest_clear(expert)
+
+
+def _lowest_clear(expert: Expert) -> float:
+    """Height of the TCP, metres, at which the finger tips pass over everything that can be moved and every goal."""
+    world = expert.world
+    tops = [world.pose(body.name).position[2] + _half_height(world, body.name) for body in world.scene.bodies]
+    return max(tops, default=0.0) + world.robot.gripper.finger_depth + _CLEARANCE
+
+
+def _half_height(world: World, name: str) -> float:
+    return resting_half_height(world.body(name), world.pose(name))
+
+
+def _rise(expert: Expert) -> Iterator[Step]:
+    """Open the hand and rise, straightened, above everything; where no such line can be followed, go home."""
+    world = expert.world
+    yield from expert.set_gripper(
+        expert.open_width, max_seconds=0.5, done=lambda: world.arm.gripper_width() > expert.open_width - 0.002
+    )
+    here = expert.tcp()
+    yaws = sorted(symmetric_yaws(hand_yaw(here), 8), key=lambda yaw: abs(wrap_angle(yaw - hand_yaw(here))))
+    lowest = _lowest_clear(expert) - _CLEARANCE
+    for height in _HEIGHTS:
+        for yaw in yaws[:3]:
+            above = hand_down((*here.position[:2].tolist(), max(lowest + height, here.position[2])), yaw)
+            if not expert.reaches(above):
+                continue
+            try:
+                yield from expert.move(above, speed=0.3)
+            except GaveUp:
+                continue
+            return
+    yield from _go_home(expert)
+
+
+def _go_home(expert: Expert) -> Iterator[Step]:
+    """Joint by joint to the home configuration."""
+    start, home = expert.joint_target, np.array(expert.world.robot.home_q)
+    dt = 1.0 / expert.world.fps
+    seconds = PEAK_VELOCITY * max(float(np.abs(home - start).max()) / _HOME_SPEED, 0.2)
+    path = start
+    for _ in range(5):
+        steps = max(1, math.ceil(seconds / dt))
+        path = start + quintic(np.arange(1, steps + 1) / steps)[:, np.newaxis] * (home - start)
+        factor = slowdown(path, start=start, limits=expert.limits, dt=dt)
+        if factor <= 1.0:
+            break
+        seconds *= 1.02 * factor
+    for joint_target in path:
+        expert.joint_target = joint_target
+        yield expert.step()

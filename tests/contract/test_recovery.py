@@ -1,0 +1,144 @@
+"""The expert takes over from any state: what a policy or a person has begun, spoilt or nearly finished."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+from support.sim import episode
+from support.tasks import tasks_with_long_ones_slow
+
+from demorec.geometry import Array, Pose, quat_multiply
+from demorec.loop import Episode, ScriptAgent, Session, make_world
+from demorec.sim.world import World
+from demorec.tasks.grasping import hand_down, raised
+from demorec.tasks.recovery import TAKE_OVER, is_served
+from demorec.tasks.script import Behaviour, Step
+from demorec.tasks.skills import Expert
+
+Spoil = Callable[[World, Expert], Iterator[Step]]
+
+
+def apply(world: World, steps: Iterator[Step]) -> list[Step]:
+    """Send the commands of a script; all of its steps."""
+    done = []
+    for step in steps:
+        world.apply(step.action)
+        done.append(step)
+    return done
+
+
+def begin(world: World, prepared: Episode, until: str = "", frames: int = 10_000) -> None:
+    """Run the script until a phase, or for so many frames."""
+    session = Session.of_episode(world, prepared)
+    for frame in session.run(ScriptAgent(prepared)):
+        if frame.phase == until or frame.frame_index == frames:
+            return
+
+
+def taken_over(world: World, prepared: Episode) -> list[Step]:
+    """What the expert does from here on; the joints never jump."""
+    before = world.arm.target.copy()
+    steps = apply(world, prepared.task.resume(Expert(world, Behaviour(action_noise=0.0))))
+    targets = np.array([before, *(step.action.joint_target for step in steps)])
+    speeds = np.abs(np.diff(targets, axis=0)) * world.fps
+    assert (speeds <= np.array(world.robot.velocity_limit)).all()
+    return steps
+
+
+def failed_conditions(world: World, prepared: Episode) -> list[str]:
+    return [check.name for check in prepared.task.evaluate(world) if not check.passed]
+
+
+def close_beside(world: World, expert: Expert) -> Iterator[Step]:
+    """The closed hand stands low beside the cube, where opening alone would push it."""
+    pose = world.pose(world.scene.goals[0].object)
+    beside = hand_down(pose.position + np.array([0.0, 0.075, 0.0]), 0.3)
+    yield from expert.move(raised(beside, 0.1), speed=0.5)
+    yield from expert.set_gripper(0.0, max_seconds=0.8, done=lambda: False)
+    yield from expert.move(beside, speed=0.3)
+
+
+def push_away(world: World, expert: Expert) -> Iterator[Step]:
+    """The closed hand pushes the cube over the table, out of the place where it was seen."""
+    yield from close_beside(world, expert)
+    yield from expert.move(raised(expert.tcp_target() @ Pose(position=np.array([0.02, 0.1, 0.0])), 0.0), speed=0.2)
+
+
+def carry_tilted(world: World, expert: Expert) -> Iterator[Step]:
+    """The cube is in the hand, which tilts by 25 degrees on the way."""
+    yield from expert.pick(world.scene.goals[0].object)
+    tilt = np.array([np.sin(0.22), 0.0, 0.0, np.cos(0.22)])
+    here = expert.tcp_target()
+    tilted = Pose(position=here.position, quat_xyzw=quat_multiply(tilt, here.quat_xyzw))
+    yield from expert.move(tilted, speed=0.3)
+
+
+def wave(world: World, expert: Expert) -> Iterator[Step]:
+    """The arm flails: a random walk of all joints, which is not at rest when the expert takes over."""
+    random = np.random.default_rng(4)
+    velocity: Array = np.zeros(7)
+    for _ in range(45):
+        velocity = 0.9 * velocity + random.normal(0.0, 0.012, 7)
+        expert.joint_target = np.clip(expert.joint_target + velocity, expert.arm.lower, expert.arm.upper)
+        expert.gripper_target = 0.0
+        yield expert.step()
+
+
+@pytest.mark.parametrize("spoil", [close_beside, push_away, carry_tilted, wave], ids=lambda spoil: spoil.__name__)
+def test_the_expert_finishes_from_any_state(spoil: Spoil) -> None:
+    prepared = episode(2, variation="none")
+    with make_world(prepared.info) as world:
+        begin(world, prepared, frames=0)
+        goal = world.scene.goals[0]
+        start = world.pose(goal.object).position
+        apply(world, spoil(world, Expert(world)))
+        moved = float(np.abs(world.pose(goal.object).position - start).max())
+        assert (moved > 0.03) == (spoil in (push_away, carry_tilted)), "it is not the state that the test is about"
+        steps = taken_over(world, prepared)
+        assert steps[0].phase == TAKE_OVER
+        assert failed_conditions(world, prepared) == []
+        phases = {step.phase for step in steps}
+        assert ("approach" in phases) == (spoil is not carry_tilted), "what is held is not let go first"
+
+
+def test_what_is_served_is_left_alone() -> None:
+    prepared = episode(0, variation="none")
+    with make_world(prepared.info) as world:
+        begin(world, prepared)
+        goal = world.scene.goals[0]
+        assert is_served(world, goal)
+        before = world.pose(goal.object).vector()
+        steps = taken_over(world, prepared)
+        assert {step.phase for step in steps} == {TAKE_OVER}
+        np.testing.assert_allclose(world.pose(goal.object).vector(), before, atol=1e-4)
+
+
+def test_a_bystander_in_the_hand_is_put_back() -> None:
+    """Carried off by mistake: it goes back to where it lay, and then the goal is served."""
+    prepared = episode(0, task="pick_from_clutter", variation="none")
+    with make_world(prepared.info) as world:
+        begin(world, prepared, frames=0)
+        wanted = {goal.object for goal in world.scene.goals}
+        name = next(body.name for body in world.scene.movable if body.name not in wanted)
+        start = world.pose(name).position
+        expert = Expert(world)
+        apply(world, expert.pick(name))
+        assert expert.holds(name)
+        taken_over(world, prepared)
+        assert failed_conditions(world, prepared) == []
+        assert np.hypot(*(world.pose(name).position - start)[:2]) < 0.02
+
+
+@pytest.mark.slow  # every task is simulated twice; pick_place above is quick
+@pytest.mark.parametrize("share", [0.25, 0.5, 0.75])
+@pytest.mark.parametrize("task", tasks_with_long_ones_slow())
+def test_every_task_goes_on_from_the_middle_of_its_script(task: str, share: float) -> None:
+    prepared = episode(1, task=task, variation="mild")
+    with make_world(prepared.info) as world:
+        session = Session.of_episode(world, prepared)
+        length = sum(1 for _ in session.run(ScriptAgent(prepared)))
+        begin(world, prepared, frames=round(share * length))
+        taken_over(world, prepared)
+        assert failed_conditions(world, prepared) == []
