@@ -12,6 +12,7 @@ from demorec.errors import ConfigError, DemorecError, resource_error
 from demorec.generate.contents import is_dataset_of_run
 from demorec.lerobot import ExportOptions, ExportReport, dataset_digest, export_lerobot
 from demorec.lerobot.inspect import check_tables
+from demorec.lerobot.kind import DATASET as DATASET_KIND
 from demorec.runs.lock import run_lock
 from demorec.runs.run_file import (
     DATASET,
@@ -23,6 +24,7 @@ from demorec.runs.run_file import (
     save_run_file,
     sync_folder,
 )
+from demorec.safety.replacing import obstacle
 
 
 def export_run(
@@ -35,8 +37,8 @@ def export_run(
     """Export the successful episodes of a run to its dataset/, unless that is there already.
 
     Episodes beyond what was asked for last are left out. A dataset that this run made from other content is replaced;
-    one that it did not make is left alone. One that it made but that is damaged, or was changed since, is moved to
-    unfinished/, and made again.
+    one that it did not make is left alone. One that it made but that is damaged, was changed since, or has
+    something in it that is no part of a dataset, is moved to unfinished/, and made again.
 
     Args:
         folder: Of the run.
@@ -68,6 +70,9 @@ def export_run(
                 says(f"{DATASET}/ is not as the run made it (damaged, or changed since); it was moved to {aside}.")
             elif (present.run_digest, present.repo_id) == (run.digest, repo_id) and present.dataset_digest:
                 return present, None
+            elif reason := obstacle(target, DATASET_KIND):
+                aside = _set_aside(target, folder)
+                says(f"{DATASET}/ was moved to {aside} and is made again, since {reason}.")
         elif present is not None and present.dataset_digest:
             says(f"{DATASET}/ is no longer there; it is made again.")
         record = ExportRecord(run_digest=run.digest, repo_id=repo_id)

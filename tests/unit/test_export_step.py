@@ -96,6 +96,22 @@ def test_after_a_kill_in_the_export_only_the_runs_own_dataset_is_replaced(run: P
     assert (run / "unfinished" / "dataset").exists() == (not is_ours)
 
 
+@pytest.mark.parametrize("foreign", ["mine.txt", "data/notes.csv", ".git/HEAD"])
+def test_a_dataset_with_files_of_somebody_is_set_aside_when_the_run_has_changed(run: Path, foreign: str) -> None:
+    note = run / "dataset" / foreign
+    note.parent.mkdir(exist_ok=True)
+    note.write_text("years of work")
+    before = files_of(run / "dataset")
+    assert export_run(run, repo_id="me/cubes")[1] is None  # as long as there is nothing to do it stays
+    assert files_of(run / "dataset") == before
+    said: list[str] = []
+    assert export_run(run, repo_id="me/other", says=said.append)[1] is not None
+    (line,) = said
+    assert line.startswith("dataset/ was moved to unfinished/dataset and is made again, since it ")
+    assert files_of(run / "unfinished" / "dataset") == before
+    assert not (run / "dataset" / foreign).exists()
+
+
 def test_a_link_to_nothing_is_told(run: Path) -> None:
     shutil.rmtree(run / "dataset")
     (run / "dataset").symlink_to(run / "nowhere")
