@@ -37,7 +37,7 @@ from demorec.recording import EpisodeWriter
 from demorec.runs.find import EVALUATION_NAME
 from demorec.runs.run_file import EPISODES, FAILED, Attempt
 from demorec.safety.own_versions import version_differences
-from demorec.safety.replacing import Kind, check_replaceable, json_object, replaced_parts, settle_parts
+from demorec.safety.replacing import Kind, check_replaceable, json_object, obstacle, replaced_parts, settle_parts
 from demorec.scene.episode import Frame, Outcome
 from demorec.scene.features import ENVIRONMENT_STATE, IMAGE_PREFIX, ActionKind
 from demorec.tables import camera_name
@@ -324,9 +324,8 @@ def _begin_or_continue(settings: Settings, out: Path) -> Evaluation:
             *(version_differences(evaluation.versions, versions) if evaluation.versions else ()),
         ]
         if lines:
-            raise ConfigError(
-                f"Another evaluation is in this folder ({'; '.join(lines)}): choose another --out or --overwrite: {out}"
-            )
+            advice = "choose another --out" + ("" if obstacle(out, EVALUATION) else " or --overwrite")
+            raise ConfigError(f"Another evaluation is in this folder ({'; '.join(lines)}): {advice}: {out}")
         kept = [r for r in evaluation.rollouts if (out / r.file).is_file()]
         evaluation = _with(replace(evaluation, settings=settings), kept)
     for place in (EPISODES, FAILED):

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from demorec.generate.survey import recordings_of
 from demorec.lerobot.kind import DATASET, is_dataset_file
+from demorec.lerobot.paths import CARD_PATH
 from demorec.lerobot.sidecar import CONFIGS_PATH
 from demorec.runs.run_file import DATASET as DATASET_FOLDER
 from demorec.runs.run_file import EPISODES, FAILED, RUN_NAME, UNFINISHED
@@ -19,29 +20,26 @@ PARTS = (RUN_NAME, EPISODES, FAILED, UNFINISHED, DATASET_FOLDER)
 
 _NAME = r"episode_\d{6,}(\.attempt_\d+)?\.mcap"
 _RECORDING = re.compile(_NAME)
-_UNFINISHED = re.compile(
-    rf"[^/]+-\d+-\d+/{_NAME}\.part"  # of a worker: host, process, number
-    rf"|{_NAME}(\.\d+)?"  # set aside, since it was damaged or of another run
-    r"|error_episode_\d+\.txt"
+_PART = re.compile(rf"[^/]+-\d+-\d+/{_NAME}\.part")  # of a worker: host, process, number
+_RECORDING_ASIDE = re.compile(rf"{_NAME}(\.\d+)?")  # since it was damaged or of another run
+_REPORT = re.compile(r"error_episode_\d+\.txt")
+_CARD = re.compile(rf"{CARD_PATH}(\.\d+)?")  # edited by somebody, so that --overwrite does not delete it
+_LEFT = (
+    (_RECORDING_ASIDE, "recording", " not of this run, or damaged"),
+    (_PART, "unfinished recording", " (demorec recover reads what is whole)"),
+    (_REPORT, "error report", ""),
+    (_CARD, "edited dataset card", ""),
 )
 _SET_ASIDE_DATASET = re.compile(rf"({DATASET_FOLDER}(?:\.\d+)?)/(.*)")
 
 
 def set_aside(folder: Path) -> list[str]:
-    """What lies in a run's unfinished/, in words: how many of each kind."""
+    """What a run has left or moved to its unfinished/, in words: how many of each kind; not what somebody put there."""
     names = list(files_below(folder / UNFINISHED))
     datasets = {match[1] for name in names if (match := _SET_ASIDE_DATASET.fullmatch(name))}
     others = [name for name in names if not _SET_ASIDE_DATASET.fullmatch(name)]
-    cut = sum(name.endswith(".part") for name in others)
-    whole = sum(name.startswith("episode_") for name in others)
-    reports = sum(name.startswith("error_") for name in others)
-    counted = (
-        (len(datasets), "dataset", " that the run did not leave like this"),
-        (whole, "recording", " not of this run, or damaged"),
-        (cut, "unfinished recording", " (demorec recover reads what is whole)"),
-        (reports, "error report", ""),
-        (len(others) - cut - whole - reports, "other file", ""),
-    )
+    counted = [(len(datasets), "dataset", " that the run did not leave like this")]
+    counted += [(sum(bool(kind.fullmatch(name)) for name in others), noun, more) for kind, noun, more in _LEFT]
     return [f"{count} {noun}{'' if count == 1 else 's'}{more}" for count, noun, more in counted if count]
 
 
@@ -100,7 +98,9 @@ def _strangers(folder: Path) -> list[str]:
 
 def _is_unfinished(name: str) -> bool:
     dataset = _SET_ASIDE_DATASET.fullmatch(name)
-    return is_dataset_file(dataset[2]) if dataset else _UNFINISHED.fullmatch(name) is not None
+    if dataset:
+        return is_dataset_file(dataset[2])
+    return any(pattern.fullmatch(name) for pattern in (_PART, _RECORDING_ASIDE, _REPORT))
 
 
 RUN = Kind(name="a run of generate-dataset", is_folder=True, recognises=_recognises, strangers=_strangers)

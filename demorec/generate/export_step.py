@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -11,7 +12,10 @@ from pathlib import Path
 from demorec.errors import ConfigError, DemorecError, resource_error
 from demorec.generate.contents import is_dataset_of_run
 from demorec.lerobot import ExportOptions, ExportReport, dataset_digest, export_lerobot
+from demorec.lerobot.card import has_own_card
 from demorec.lerobot.inspect import check_tables
+from demorec.lerobot.kind import DATASET as DATASET_KIND
+from demorec.lerobot.paths import CARD_PATH
 from demorec.runs.lock import run_lock
 from demorec.runs.run_file import (
     DATASET,
@@ -23,6 +27,7 @@ from demorec.runs.run_file import (
     save_run_file,
     sync_folder,
 )
+from demorec.safety.replacing import obstacle
 
 
 def export_run(
@@ -35,8 +40,8 @@ def export_run(
     """Export the successful episodes of a run to its dataset/, unless that is there already.
 
     Episodes beyond what was asked for last are left out. A dataset that this run made from other content is replaced;
-    one that it did not make is left alone. One that it made but that is damaged, or was changed since, is moved to
-    unfinished/, and made again.
+    one that it did not make is left alone. One that it made but that is damaged, was changed since, or has
+    something in it that is no part of a dataset, is moved to unfinished/, and made again. So is a card that was edited.
 
     Args:
         folder: Of the run.
@@ -64,10 +69,11 @@ def export_run(
                         f"A dataset that this run did not make is in the way: move it elsewhere: {target}"
                     )
             elif not _is_as_made(target, present, run):
-                aside = _set_aside(target, folder)
+                aside = _move_aside(target, folder)
                 says(f"{DATASET}/ is not as the run made it (damaged, or changed since); it was moved to {aside}.")
             elif (present.run_digest, present.repo_id) == (run.digest, repo_id) and present.dataset_digest:
                 return present, None
+            _keep_what_is_not_ours(target, folder, says)
         elif present is not None and present.dataset_digest:
             says(f"{DATASET}/ is no longer there; it is made again.")
         record = ExportRecord(run_digest=run.digest, repo_id=repo_id)
@@ -99,9 +105,19 @@ def _is_as_made(dataset: Path, record: ExportRecord, run: RunFile) -> bool:
         return False
 
 
-def _set_aside(dataset: Path, folder: Path) -> str:
-    aside = free_name(folder / UNFINISHED / DATASET)
+def _keep_what_is_not_ours(dataset: Path, folder: Path, says: Callable[[str], None]) -> None:
+    """Move to unfinished/ what would be lost with a dataset of the run's that is about to be replaced."""
+    if reason := obstacle(dataset, DATASET_KIND):
+        aside = _move_aside(dataset, folder)
+        says(f"{DATASET}/ was moved to {aside} and is made again, since {reason}.")
+    elif has_own_card(dataset):
+        aside = _move_aside(dataset / CARD_PATH, folder)
+        says(f"{DATASET}/{CARD_PATH} is not as the run wrote it; it was moved to {aside}, and a new one is made.")
+
+
+def _move_aside(path: Path, folder: Path) -> str:
+    aside = free_name(folder / UNFINISHED / path.name)
     aside.parent.mkdir(exist_ok=True)
-    dataset.rename(aside)
+    shutil.move(path, aside)  # a dataset/ that is a link may lead to another disk
     sync_folder(folder)
     return aside.relative_to(folder).as_posix()

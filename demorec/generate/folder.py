@@ -39,10 +39,33 @@ from demorec.safety.replacing import (
     check_replaceable,
     files_below,
     has_unsettled_parts,
+    obstacle,
     replaced_parts,
     settle_parts,
     shown,
 )
+
+
+class AnotherRunError(ConfigError):
+    """The folder holds another run than the one that is asked for.
+
+    Args:
+        differences: Between the two, in words.
+        advice: What to do.
+        path: Of the folder.
+    """
+
+    def __init__(self, differences: str, advice: str, path: Path) -> None:
+        super().__init__(differences, advice, path)
+
+    def __str__(self) -> str:
+        differences, advice, path = self.args
+        return f"The output folder holds another run ({differences}): {advice}: {path}"
+
+    def advising(self, advice: str) -> AnotherRunError:
+        """The same with other advice, for a command with other options."""
+        differences, _, path = self.args
+        return AnotherRunError(differences, advice, path)
 
 
 class RunFolder:
@@ -232,7 +255,7 @@ def _known_run(path: Path, asked: RunFile, *, inspect: Inspector) -> tuple[RunFi
     Only reads. A run without any episode claims nothing: the one that is asked for takes its place.
 
     Raises:
-        ConfigError: The folder holds another run.
+        AnotherRunError: The folder holds another run.
     """
     run, damage = asked, ""
     try:
@@ -248,10 +271,10 @@ def _known_run(path: Path, asked: RunFile, *, inspect: Inspector) -> tuple[RunFi
     if different and not recordings and not any(line.file for line in run.known):
         return asked, damage
     if different:
-        raise ConfigError(
-            f"The output folder holds another run ({'; '.join(different)}): choose another --out, ask for the same, or "
-            f"give --overwrite to delete it: {path}"
-        )
+        advice = "choose another --out or ask for the same"
+        if not obstacle(path, RUN):
+            advice = "choose another --out, ask for the same, or give --overwrite to delete it"
+        raise AnotherRunError("; ".join(different), advice, path)
     return run, damage
 
 

@@ -15,6 +15,7 @@ from typing import Any
 from demorec.config import GenerateConfig, deciding_versions, parse_config
 from demorec.errors import ConfigError, DemorecError, RecordingError, in_words, resource_error
 from demorec.generate.contents import is_dataset_of_run
+from demorec.generate.folder import AnotherRunError
 from demorec.generate.observer import RunObserver, RunResult
 from demorec.generate.options import RunOptions
 from demorec.generate.run import generate
@@ -99,7 +100,10 @@ def reproduce(
     different = dict.fromkeys(line for there in original.versions for line in version_differences(there, here))
     if different:
         progress.says(f"Note: {'; '.join(different)}.")
-    result = generate(original.config, replace(options, num_episodes=original.num_episodes), progress=progress)
+    try:
+        result = generate(original.config, replace(options, num_episodes=original.num_episodes), progress=progress)
+    except AnotherRunError as error:
+        raise error.advising("choose another --out") from error
     if result.interrupted:
         return result
     if original.export is None:

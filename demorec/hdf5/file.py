@@ -2,15 +2,36 @@
 
 from __future__ import annotations
 
+import errno
 import io
+import json
+import re
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
 import h5py
 
+from demorec.errors import in_words
 from demorec.safety.files import HDF5_MAGIC, open_regular
 from demorec.safety.replacing import Kind
+
+ENV_ARGUMENTS = frozenset({"robot", "fps", "physics_hz", "cameras", "action", "privileged"})
+"""What `env_args` says of an environment of ours, by which our files are known."""
+_OBSERVATIONS = r"robot0_(joint_pos|joint_vel|gripper_qpos|gripper_qvel|eef_pos|eef_quat)|object|[^/]+_(image|depth)"
+_PARTS = re.compile(
+    r"data|mask|mask/(train|valid)|data/demo_\d+(/(actions|states|rewards|dones|obs))?"
+    rf"|data/demo_\d+/obs/({_OBSERVATIONS})"
+)
+_ATTRIBUTES = (
+    (re.compile("data"), frozenset({"env_args", "total", "task", "fps"})),
+    (
+        re.compile(r"data/demo_\d+"),
+        frozenset({"num_samples", "instruction", "episode_index", "attempt", "success", "model_file"}),
+    ),
+    (re.compile(rf"data/demo_\d+/(actions|states|obs/({_OBSERVATIONS}))"), frozenset({"names"})),
+)
+"""All that an export writes: names of groups and datasets, and of the attributes that they have."""
 
 
 def _begins_as_hdf5(path: Path) -> bool:
@@ -18,17 +39,41 @@ def _begins_as_hdf5(path: Path) -> bool:
         return file.read(len(HDF5_MAGIC)) == HDF5_MAGIC
 
 
-def _is_robomimic_dataset(path: Path) -> bool:
+def _is_our_dataset(path: Path) -> bool:
     if not _begins_as_hdf5(path):
         return False
     try:
         with h5py.File(path, "r", locking=False) as file:
-            return isinstance(file.get("data"), h5py.Group) and {"total", "env_args"} <= set(file["data"].attrs)
-    except (OSError, RuntimeError, KeyError, ValueError):
+            data = file.get("data")
+            if not isinstance(data, h5py.Group) or not {"total", "env_args"} <= set(data.attrs):
+                return False
+            described = json.loads(data.attrs["env_args"])
+            return str(described["env_name"]).startswith("demorec/") and set(described["env_kwargs"]) == ENV_ARGUMENTS
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError, RecursionError):
         return False
 
 
-DATASET = Kind(name="a robomimic dataset (HDF5)", recognises=_is_robomimic_dataset)
+def _strangers(path: Path) -> list[str]:
+    """Groups, datasets and attributes that no export writes."""
+    found: list[str] = []
+
+    def look(name: str, link: object) -> None:
+        if not isinstance(link, h5py.HardLink) or not _PARTS.fullmatch(name):
+            found.append(name)
+            return
+        allowed = next((names for place, names in _ATTRIBUTES if place.fullmatch(name)), frozenset[str]())
+        found.extend(f"attribute {key} of {name}" for key in file[name].attrs if key not in allowed)
+
+    try:
+        with h5py.File(path, "r", locking=False) as file:
+            found += [f"attribute {key}" for key in file.attrs]
+            file.visititems_links(look)
+    except (OSError, RuntimeError, KeyError, ValueError) as error:
+        raise OSError(errno.EIO, in_words(error)) from error
+    return found
+
+
+DATASET = Kind(name="a robomimic dataset (HDF5) by demorec", recognises=_is_our_dataset, strangers=_strangers)
 UNFINISHED = Kind(name="an HDF5 file", recognises=_begins_as_hdf5)
 """What a killed export leaves (`NewFile` sees to its first bytes)."""
 

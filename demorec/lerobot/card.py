@@ -5,6 +5,8 @@ Everything in it is read back from the finished dataset, so it is right after an
 
 from __future__ import annotations
 
+import hashlib
+import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,14 +21,13 @@ from demorec.lerobot.commands import making_commands
 from demorec.lerobot.files import read_table
 from demorec.lerobot.layout import AUTOMATIC_FEATURES, DatasetInfo, Feature
 from demorec.lerobot.options import ExportOptions
-from demorec.lerobot.paths import SIDECAR_DIR
+from demorec.lerobot.paths import CARD_PATH, SIDECAR_DIR
 from demorec.lerobot.reader import read_tasks
 from demorec.lerobot.sidecar import ATTEMPT_SCHEMA
 from demorec.lerobot.thumbnails import THUMBNAILS_PATH, write_thumbnails
 from demorec.lerobot.writer import write_text
 from demorec.scene.features import ACTION, EE_POSE, ENVIRONMENT_STATE, IMAGE_PREFIX, STATE, VELOCITY, ActionKind
 
-CARD_PATH = "README.md"
 SECOND_CARD_PATH = f"{SIDECAR_DIR}/README.md"
 """Where the card goes if the dataset has a README.md that demorec did not write."""
 
@@ -48,7 +49,8 @@ class CardFacts:
     is_collected: bool
 
 
-_MARK = "<!-- written by demorec, renewed at every export -->"
+_MARK = "<!-- written by demorec, which renews it at every export unless it was edited ({digest}) -->\n"
+"""The last line of a card: with it a card that was edited is known from one that was not."""
 _CELLS = 4
 
 _MEANING = {
@@ -78,10 +80,24 @@ def write_card(root: Path, info: DatasetInfo, about: CardFacts) -> None:
     """Write the card and the thumbnails of a finished dataset folder."""
     has_sheet = write_thumbnails(root, info)
     there = root / CARD_PATH
-    is_ours = not there.exists() or _MARK in there.read_text(errors="replace")
-    path = there if is_ours else root / SECOND_CARD_PATH
+    path = root / SECOND_CARD_PATH if has_own_card(root) else there
     path.unlink(missing_ok=True)
-    write_text(path, "\n".join(_card(root, info, about, has_sheet)))
+    write_text(path, _marked("\n".join(_card(root, info, about, has_sheet)) + "\n"))
+
+
+def has_own_card(root: Path) -> bool:
+    """Whether a dataset's card is the user's own: one that `write_card` did not write, or that was edited since."""
+    path = root / CARD_PATH
+    if not os.path.lexists(path):
+        return False
+    if not path.is_file():
+        return True
+    text = path.read_bytes().decode(errors="replace")
+    return text != _marked(text.rpartition("<!--")[0])
+
+
+def _marked(text: str) -> str:
+    return text + _MARK.format(digest=hashlib.sha256(text.encode()).hexdigest()[:16])
 
 
 def _card(root: Path, info: DatasetInfo, about: CardFacts, has_sheet: bool) -> Iterable[str]:
@@ -93,7 +109,7 @@ def _card(root: Path, info: DatasetInfo, about: CardFacts, has_sheet: bool) -> I
     )
     yield from ("---", f"license: {options.license}", "task_categories:", "- robotics")
     yield from ("tags:", "- LeRobot", "- demorec", *([] if about.is_collected else ["- simulation"]))
-    yield from ("configs:", "- config_name: default", "  data_files: data/*/*.parquet", "---", _MARK)
+    yield from ("configs:", "- config_name: default", "  data_files: data/*/*.parquet", "---", "")
     yield from (f"# {options.repo_id}", "")
     whose = (
         f"demonstrations of {info.robot_type}, collected"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 INFO_PATH = "meta/info.json"
+CARD_PATH = "README.md"
 SIDECAR_DIR = "demorec"
 """Folder inside the dataset for what LeRobot has no place for."""
 

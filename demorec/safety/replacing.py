@@ -37,14 +37,15 @@ class Kind:
         name: In a sentence: "a recording".
         is_folder: Whether it is a folder.
         recognises: Whether a file or folder is of this kind, by its content.
-        strangers: Names, relative to such a folder, of what in it is not part of it and would be deleted with it.
+        strangers: Names, relative to such a folder or within such a file, of what in it is not part of it and would be
+            deleted with it.
         advice: What to do where one is there already.
     """
 
     name: str
     recognises: Callable[[Path], bool]
     is_folder: bool = False
-    strangers: Callable[[Path], Sequence[str]] = lambda folder: ()
+    strangers: Callable[[Path], Sequence[str]] = lambda path: ()
     advice: str = "choose another name, or --overwrite to replace it"
 
 
@@ -83,14 +84,8 @@ def check_replaceable(
     Raises:
         ConfigError: Something is there, and the user does not ask for replacing it, or it must never be replaced.
     """
-    if not os.path.lexists(target):
-        return
-    try:
-        reason = _obstacle(target, kind, sources)
-        is_free = not reason and _is_empty(target)
-    except OSError as error:
-        reason, is_free = f"it cannot be read ({error.strerror})", False
-    if is_free:
+    reason = obstacle(target, kind, sources)
+    if not reason and (not os.path.lexists(target) or _is_empty(target)):
         return
     if not overwrite:
         if reason:
@@ -100,8 +95,15 @@ def check_replaceable(
         raise ConfigError(f"This is never replaced, since {reason}: choose another name: {target}")
 
 
+def obstacle(target: Path, kind: Kind, sources: Iterable[Path] = ()) -> str:
+    """Why `target` must not be replaced, as `check_replaceable` tells it; "" when it may be, or nothing is there."""
+    try:
+        return _obstacle(target, kind, sources) if os.path.lexists(target) else ""
+    except OSError as error:
+        return f"it cannot be read ({error.strerror})"
+
+
 def _obstacle(target: Path, kind: Kind, sources: Iterable[Path]) -> str:
-    """Why `target`, which is there, must not be replaced; "" when it may be."""
     if not target.exists():
         return "it is a link to something that is not there"
     reason = use_as_source(target.resolve(), sources)
@@ -110,10 +112,10 @@ def _obstacle(target: Path, kind: Kind, sources: Iterable[Path]) -> str:
     if not kind.is_folder:
         if not target.is_file():
             return f"it is {'a folder' if target.is_dir() else 'no regular file'}, not {kind.name}"
-        return "" if _is_empty(target) or kind.recognises(target) else f"it is not {kind.name}"
-    if not target.is_dir():
+    elif not target.is_dir():
         return f"it is a file, not {kind.name}"
-    reason = protection(target)
+    else:
+        reason = protection(target)
     if reason or _is_empty(target):
         return reason
     if not kind.recognises(target):

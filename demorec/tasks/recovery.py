@@ -16,10 +16,10 @@ from demorec.geometry import wrap_angle
 from demorec.scene.motion import PEAK_VELOCITY, quintic, slowdown
 from demorec.scene.scene import Goal
 from demorec.sim.world import World
-from demorec.tasks.checks import placement_checks, resting_half_height
 from demorec.tasks.grasping import hand_down, hand_yaw, symmetric_yaws
 from demorec.tasks.script import Step
 from demorec.tasks.skills import Expert, GaveUp
+from demorec.tasks.success import placement_checks, resting_half_height
 
 TAKE_OVER = "take_over"
 """Phase in which the arm is stopped and brought to where a script can begin."""

@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from types import SimpleNamespace
@@ -202,6 +203,9 @@ def test_a_run_with_something_foreign_is_not_overwritten(run: Path, made: Path, 
     with pytest.raises(ConfigError, match="not part of a run") as error:
         run_fake(run, num_episodes=2, seed=1, overwrite=True)
     assert foreign in str(error.value)
+    with pytest.raises(ConfigError, match="holds another run") as error:
+        run_fake(run, num_episodes=2, seed=1)
+    assert "--overwrite" not in str(error.value)  # since it would be refused
     assert {name: data for name, data in files_of(run).items() if name != ".lock"} == before
 
 
@@ -302,6 +306,9 @@ def test_an_evaluation_with_something_foreign_is_not_overwritten(evaluation: Pat
     with pytest.raises(ConfigError, match="not part of an evaluation") as error:
         _open(SETTINGS, evaluation, overwrite=True)
     assert foreign in str(error.value)
+    with pytest.raises(ConfigError, match="Another evaluation") as error:
+        _open(replace(SETTINGS, episode_length=7), evaluation, overwrite=False)
+    assert "--overwrite" not in str(error.value)  # since it would be refused
     assert files_of(evaluation) == before
 
 
@@ -506,6 +513,17 @@ def test_reproduce_needs_a_place_beside_its_source(
     assert exit_code("reproduce", place / "runs" / "run", "--out", place / out) == 2
     assert "needs a place of its own" in capsys.readouterr().err
     assert files_of(place / "runs") == before
+
+
+def test_reproduce_advises_nothing_that_it_does_not_have(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = GenerateConfig(seed=1, cameras=())
+    original = SimpleNamespace(config=config, num_episodes=1, versions={}, digests={(0, 0): "x"}, export=None)
+    monkeypatch.setattr(reproducing, "read_original", lambda source: original)
+    assert exit_code("reproduce", tmp_path / "original", "--out", run) == 2
+    said = capsys.readouterr().err
+    assert f"holds another run (seed is 0 there and 1 here): choose another --out: {run}" in said
 
 
 def test_reproduce_leaves_another_dataset_alone(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -66,7 +66,8 @@ def test_no_training_is_offered_that_would_not_start(monkeypatch: pytest.MonkeyP
                 "1 error report",
             ],
         ),
-        (("notes.txt",), ["1 other file"]),
+        (("README.md", "README.md.1"), ["2 edited dataset cards"]),
+        (("notes.txt", "episode_notes.txt", "draft.part", "error_list.txt", "mine/episode_000001.mcap"), []),
     ],
 )
 def test_what_was_set_aside_is_told_by_what_it_is(tmp_path: Path, names: Sequence[str], words: list[str]) -> None:

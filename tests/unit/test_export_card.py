@@ -74,6 +74,19 @@ def test_an_appended_dataset_has_no_such_commands(tmp_path: Path) -> None:
     assert "Made by these commands" not in (tmp_path / "d" / "README.md").read_text()
 
 
+def test_an_edited_card_stays_when_the_dataset_is_appended_to(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "run", (6, 5, 4), cameras=())
+    card, beside = tmp_path / "d" / "README.md", tmp_path / "d" / "demorec" / "README.md"
+    export(run, tmp_path / "d", episodes="0")
+    export(run, tmp_path / "d", episodes="1", append=True)
+    assert "2 scripted demonstrations" in card.read_text()  # nobody has edited it, so it is renewed
+    edited = card.read_text().replace("scripted", "beautiful")
+    card.write_text(edited)
+    export(run, tmp_path / "d", episodes="2", append=True)
+    assert card.read_text() == edited
+    assert "3 scripted demonstrations" in beside.read_text()
+
+
 def test_thumbnails_are_labelled(tmp_path: Path) -> None:
     export(make_run(tmp_path / "run", (31, 16)), tmp_path / "d")
     sheet = np.asarray(Image.open(tmp_path / "d" / "demorec" / "thumbnails.jpg")).astype(int)

@@ -156,6 +156,49 @@ def test_another_hdf5_file_is_not_replaced(run: Path, tmp_path: Path) -> None:
     assert (tmp_path / "d.hdf5").read_bytes() == before
 
 
+def test_the_robomimic_dataset_of_somebody_else_is_not_replaced(run: Path, tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "d.hdf5", "w") as file:
+        data = file.create_group("data")
+        data.attrs["env_args"], data.attrs["total"] = json.dumps({"env_name": "Lift", "type": 1, "env_kwargs": {}}), 5
+        data.create_group("demo_0")["actions"] = np.zeros((5, 7))
+    before = (tmp_path / "d.hdf5").read_bytes()
+    with pytest.raises(ConfigError, match="it is not a robomimic dataset"):
+        export(run, tmp_path / "d.hdf5", "hdf5", overwrite=True)
+    assert (tmp_path / "d.hdf5").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    "addition", ["mine", "mask/10_percent", "data/demo_0/obs/language", "data/demo_0/notes", "data/mine"]
+)
+def test_a_file_that_somebody_has_added_to_is_not_replaced(run: Path, tmp_path: Path, addition: str) -> None:
+    target = tmp_path / "d.hdf5"
+    options = {"privileged": True, "depth": True, "valid_share": 0.5, "overwrite": True}
+    for _ in range(2):  # one of ours is, with all that an export can write
+        export(run, target, "hdf5", **options)
+    with h5py.File(target, "a") as file:
+        file[addition] = np.arange(5)
+    before = target.read_bytes()
+    with pytest.raises(ConfigError, match=f"what is not part of .*{addition}"):
+        export(run, target, "hdf5", **options)
+    assert target.read_bytes() == before
+
+
+@pytest.mark.parametrize("place", ["/", "data", "data/demo_0"])
+def test_a_file_with_a_note_or_a_link_of_somebody_is_not_replaced(run: Path, tmp_path: Path, place: str) -> None:
+    for number, word in enumerate(("note", "link")):
+        target = tmp_path / f"{number}.hdf5"
+        export(run, target, "hdf5", episodes="0")
+        with h5py.File(target, "a") as file:
+            if word == "note":
+                file[place].attrs[word] = "years of work"
+            else:
+                file[place][word] = h5py.SoftLink("/data/demo_0/actions")
+        before = target.read_bytes()
+        with pytest.raises(ConfigError, match=f"what is not part of .*{word}"):
+            export(run, target, "hdf5", overwrite=True)
+        assert target.read_bytes() == before
+
+
 def test_no_times_are_kept(run: Path, tmp_path: Path) -> None:
     """HDF5 knows whole seconds; where it keeps times, as in the last two files, a second later is another file."""
 

@@ -96,6 +96,50 @@ def test_after_a_kill_in_the_export_only_the_runs_own_dataset_is_replaced(run: P
     assert (run / "unfinished" / "dataset").exists() == (not is_ours)
 
 
+@pytest.mark.parametrize("foreign", ["mine.txt", "data/notes.csv", ".git/HEAD"])
+def test_a_dataset_with_files_of_somebody_is_set_aside_when_the_run_has_changed(run: Path, foreign: str) -> None:
+    note = run / "dataset" / foreign
+    note.parent.mkdir(exist_ok=True)
+    note.write_text("years of work")
+    before = files_of(run / "dataset")
+    assert export_run(run, repo_id="me/cubes")[1] is None  # as long as there is nothing to do it stays
+    assert files_of(run / "dataset") == before
+    said: list[str] = []
+    assert export_run(run, repo_id="me/other", says=said.append)[1] is not None
+    (line,) = said
+    assert line.startswith("dataset/ was moved to unfinished/dataset and is made again, since it ")
+    assert files_of(run / "unfinished" / "dataset") == before
+    assert not (run / "dataset" / foreign).exists()
+
+
+@pytest.mark.parametrize("is_known", [True, False])
+def test_an_edited_card_is_kept_when_the_run_has_changed(run: Path, is_known: bool) -> None:
+    if not is_known:  # the run file was lost
+        save_run_file(replace(load_run_file(run), export=None), run)
+        configs = {load_run_file(run).config_digest: {}}
+        (run / "dataset" / "demorec" / "configs.json").write_text(json.dumps(configs))
+    with (run / "dataset" / "README.md").open("a") as card:
+        card.write("my own card\n")
+    for number, name in enumerate(("README.md", "README.md.1")):
+        edited = (run / "dataset" / "README.md").read_bytes()
+        said: list[str] = []
+        export_run(run, repo_id=f"me/other_{number}", says=said.append)
+        assert f"moved to unfinished/{name}" in said[0]
+        assert (run / "unfinished" / name).read_bytes() == edited
+        fresh = (run / "dataset" / "README.md").read_text()
+        assert f"# me/other_{number}\n" in fresh
+        assert "my own card" not in fresh
+        (run / "dataset" / "README.md").write_text("another card of mine")
+    assert not (run / "unfinished" / "dataset").exists()
+
+
+def test_a_card_that_nobody_has_touched_is_replaced_in_silence(run: Path) -> None:
+    said: list[str] = []
+    assert export_run(run, repo_id="me/other", says=said.append)[1] is not None
+    assert not said
+    assert not list((run / "unfinished").glob("*"))
+
+
 def test_a_link_to_nothing_is_told(run: Path) -> None:
     shutil.rmtree(run / "dataset")
     (run / "dataset").symlink_to(run / "nowhere")
