@@ -198,7 +198,8 @@ def _result(result: Result) -> str:
     where = "" if result.frame is None else f" at frame {result.frame}"
     unit = f" {result.unit}" if result.unit else ""
     value = "" if result.value is None else f" {result.value:.4g}{unit}{where}"
-    limit = f" (allowed {result.warn:g}{unit})" if result.level in ("warn", "fail") and result.value is not None else ""
+    is_bad = result.level in ("warn", "fail") and result.value is not None
+    limit = f" (allowed {result.allowed:g}{unit})" if is_bad else ""
     detail = f": {result.detail}" if result.detail else ""
     return f"{result.level:<4}  {result.check}{value}{limit}{detail}"
 

@@ -53,6 +53,11 @@ def test_what_a_failed_attempt_recorded_is_told_and_does_not_fail_the_run(
     assert code == 0
     assert f"fail  failed attempt {run / FAILED}" in out
     assert f"fail  {min(wrong)}" in out
+    failed = [result for result in report.results if result.level == "fail" and result.value is not None]
+    assert any(result.warn < result.fail for result in failed)
+    for result in failed:  # with the limit that it broke
+        (line,) = [line for line in out.splitlines() if f" {result.check} " in line]
+        assert f"(allowed {result.fail:g}" in line
     assert "0 failed" in out
     assert "Not counted: 1 failed attempts that fail checks of what they recorded." in out
     code, out = check(capsys, run, "--only", *wrong, "--json")
