@@ -32,15 +32,18 @@ def set_aside(folder: Path) -> list[str]:
     names = list(files_below(folder / UNFINISHED))
     datasets = {match[1] for name in names if (match := _SET_ASIDE_DATASET.fullmatch(name))}
     others = [name for name in names if not _SET_ASIDE_DATASET.fullmatch(name)]
-    cut = sum(name.endswith(".part") for name in others)
+    parts = [name for name in others if name.endswith(".part")]
+    empty = sum((folder / UNFINISHED / name).stat().st_size == 0 for name in parts)
+    cut = len(parts) - empty
     whole = sum(name.startswith("episode_") for name in others)
     reports = sum(name.startswith("error_") for name in others)
     counted = (
         (len(datasets), "dataset", " that the run did not leave like this"),
         (whole, "recording", " not of this run, or damaged"),
-        (cut, "unfinished recording", " (demorec recover reads what is whole)"),
+        (cut, "unfinished recording", " (demorec recover keeps what is whole)"),
+        (empty, "unfinished recording", " in which nothing was written"),
         (reports, "error report", ""),
-        (len(others) - cut - whole - reports, "other file", ""),
+        (len(others) - len(parts) - whole - reports, "other file", ""),
     )
     return [f"{count} {noun}{'' if count == 1 else 's'}{more}" for count, noun, more in counted if count]
 

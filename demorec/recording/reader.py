@@ -78,7 +78,7 @@ class RecordingReader:
         self.is_recovered = recovered is not None
         self.num_frames = self._container.counts.get(channels.GRIPPER, 0)
         if self.outcome is None and not self.is_recovered:
-            raise RecordingError(f"The recording was never finished: demorec recover makes a readable one: {self.path}")
+            raise RecordingError(f"The recording was never finished; demorec recover keeps what is whole: {self.path}")
         if self.num_frames and len(self._cameras) != len(self.info.scene.cameras):
             raise RecordingError(f"The recording has frames, but none of its scene's cameras was recorded: {self.path}")
         if self.outcome is not None and self.outcome.num_frames != self.num_frames:

@@ -103,3 +103,12 @@ def test_the_closing_table_counts_them_apart(run: Path) -> None:
     found = check_run(result, progress=lambda done, total: None)
     assert found.failed_attempts == 1
     assert not any(failure.startswith(Path(FAILED).name) for failure in found.failures)
+
+
+def test_where_no_chosen_check_applies_nothing_has_passed(capsys: pytest.CaptureFixture[str], run: Path) -> None:
+    code, out = check(capsys, run, "--only", "opens")
+    assert code == 0
+    assert f"skip  run {run}: none of the chosen checks is about a run" in out
+    assert "1 checked, 0 failed, 0 with warnings. Of 1 nothing was measured." in out
+    _, out = check(capsys, run, "--only", "opens", "--json")
+    assert {item["kind"]: item["level"] for item in json.loads(out)} == {"run": "skip", "recording": "pass"}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -11,6 +12,11 @@ from demorec.config import GenerateConfig
 from demorec.geometry import Pose, look_at
 from demorec.plain import digest, from_json, from_plain, to_json
 from demorec.scene.scene import Body, Camera, RobotPlacement, Scene, Shape, Texture
+
+
+@dataclass(frozen=True, kw_only=True)
+class Placed:
+    position: tuple[float, float, float]
 
 
 def _scene() -> Scene:
@@ -65,3 +71,8 @@ def test_nan_is_no_json() -> None:
 def test_the_digest_depends_on_content_only() -> None:
     assert digest(GenerateConfig(seed=1)) == digest(GenerateConfig(seed=1))
     assert digest(GenerateConfig(seed=1)) != digest(GenerateConfig(seed=2))
+
+
+def test_a_list_of_another_length_is_told_with_the_one_that_is_needed() -> None:
+    with pytest.raises(ValueError, match=r"not enough values, expected tuple\[float, float, float\] @ .*position"):
+        from_plain({"position": [0.4, 0.1]}, Placed)
