@@ -33,7 +33,7 @@ def set_aside(folder: Path) -> list[str]:
     datasets = {match[1] for name in names if (match := _SET_ASIDE_DATASET.fullmatch(name))}
     others = [name for name in names if not _SET_ASIDE_DATASET.fullmatch(name)]
     parts = [name for name in others if name.endswith(".part")]
-    empty = sum((folder / UNFINISHED / name).stat().st_size == 0 for name in parts)
+    empty = sum((folder / UNFINISHED / name).lstat().st_size == 0 for name in parts)
     cut = len(parts) - empty
     whole = sum(name.startswith("episode_") for name in others)
     reports = sum(name.startswith("error_") for name in others)
