@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import re
 import reprlib
 from collections.abc import Callable, Mapping
 from numbers import Integral, Real
@@ -25,6 +26,8 @@ MAX_DEPTH = 64
 """Lists and objects within each other: our own data have ten at most, and code that walks deeper ones would recurse."""
 _MAX_DIGITS = 20
 """Of a whole number: 64 bits need no more."""
+_LENGTH = re.compile(r"^(Not enough|Too many) values in .* to structure as (.*)$", re.DOTALL)
+"""What cattrs says of a list that is not as long as it must be."""
 _MAX_TOLD = 8
 """Mistakes that are told at once; a hostile file may have hundreds of thousands."""
 
@@ -119,6 +122,8 @@ def leave_out_default(owner: type, name: str) -> None:
 
 def _in_words(error: BaseException, type_: type | None) -> str:
     words = str(error)
+    if isinstance(error, ValueError) and (length := _LENGTH.search(words)):
+        return f"{length[1].lower()} values, expected {length[2]}"
     return words if isinstance(error, ValueError) and " is no " in words else format_exception(error, type_)
 
 

@@ -170,6 +170,11 @@ class Result:
     detail: str
 
     @property
+    def allowed(self) -> float:
+        """The limit that the value is told with: the one that a failure or a warning broke."""
+        return self.fail if self.level == "fail" else self.warn
+
+    @property
     def is_blocked(self) -> bool:
         """Whether nothing was measured since what it needs is damaged, which another check tells."""
         return self.level == "skip" and self.detail == _BLOCKED

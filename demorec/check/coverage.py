@@ -148,7 +148,7 @@ def draw_coverage(infos: Sequence[EpisodeInfo], path: Path) -> CoveragePicture:
     columns = randomised(infos)
     rows = -(-max(len(columns), 1) // _COLUMNS)
     height = _TOP + max(_SIZE + _PLOT_BELOW, rows * (_PLOT_HEIGHT + _PLOT_BELOW))
-    width = _LEFT + _SIZE + _COLUMNS * (_PLOT_LEFT + _PLOT_WIDTH) + _TOP
+    width = _LEFT + _SIZE + min(len(columns), _COLUMNS) * (_PLOT_LEFT + _PLOT_WIDTH) + _TOP
     image = Image.new("RGB", (width, height), "white")
     draw = ImageDraw.Draw(image)
     _draw_map(draw, infos)

@@ -14,7 +14,7 @@ import numpy as np
 from demorec.check.base import Measurement, check
 from demorec.check.dataset import Dataset
 from demorec.errors import ExportError, MissingDependencyError
-from demorec.lerobot.inspect import episode_digests
+from demorec.lerobot.inspect import dataset_problems, episode_digests
 from demorec.lerobot.reader import PacketReader
 from demorec.lerobot.verify import LEROBOT, lerobot_is_installed
 
@@ -178,7 +178,9 @@ def dataset_opens(dataset: Dataset) -> Measurement:
     if done.returncode != 0:
         lines = [line for line in done.stderr.splitlines() if line.strip()]
         said = re.sub(r"^[\w.]+: ", "", lines[-1])[:200] if lines else f"it ends with the exit status {done.returncode}"
-        return Measurement(value=1, detail=f"LeRobot cannot open it ({said})")
+        # It asks the Hub for files that are missing here, and complains that it may not.
+        problems = dataset_problems(dataset.path, dataset.info)
+        return Measurement(value=1, detail=f"LeRobot cannot open it ({problems[0] if problems else said})")
     told = json.loads(done.stdout.splitlines()[-1])
     same = (told["episodes"], told["frames"]) == (dataset.info.total_episodes, dataset.info.total_frames)
     return Measurement(value=int(not same), detail=f"{told['episodes']} episodes, {told['frames']} frames")

@@ -2,7 +2,7 @@
 
 The model's masses, each at its link's centre of mass, accelerated as the recorded joints say, give the torque of every
 arm joint and the force on the hand (Newton and d'Alembert, without the links' own rotational inertia). What is carried
-adds its weight. That is exact enough where nothing is hit: the medians are told.
+adds its weight. That is exact enough where nothing is hit and the motion is smooth: the medians are told.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from demorec.scene.urdf import parse_xml
 MIN_LOAD = 3.0
 """N m: joints that bear less, root mean square, say nothing about efforts."""
 MIN_FRAMES = 20
-MAX_ACCELERATION = 5.0
-"""m/s^2: in frames in which a link is faster than that, its own rotational inertia, which is left out here, counts, and
-differences between frames say little: exploration noise shakes the arm."""
+MAX_CHANGE = 2.0
+"""m/s^2: where the TCP's acceleration changes by more from one frame to the next, the frames do not tell what it is at
+one of them (noise on the commands shakes the arm within a frame). This leaves a fifth of gravity unknown at most."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -48,7 +48,6 @@ class _Dynamics:
     def __init__(self, episode: RecordedEpisode) -> None:
         self.episode = episode
         self._positions = dict(zip(episode.info.robot.joint_names, episode.columns.joint_position.T, strict=True))
-        self._is_calm = np.ones(episode.num_frames, dtype=np.bool_)
         self.loads = [*self._link_loads(), *self._carried_loads()]
 
     def frames_of(self, link: str) -> Array:
@@ -66,7 +65,6 @@ class _Dynamics:
             point = pose[:, :3, :3] @ (scale * centre) + pose[:, :3, 3]
             acceleration = np.zeros_like(point)
             acceleration[1:-1] = (point[2:] - 2 * point[1:-1] + point[:-2]) * episode.info.fps**2
-            self._is_calm &= np.linalg.norm(acceleration, axis=1) < MAX_ACCELERATION
             joints = frozenset(joint.name for joint in episode.urdf.path_to(name))
             found.append(_Load(point=point, force=mass * (acceleration - gravity), joints=joints))
         return found
@@ -89,14 +87,27 @@ class _Dynamics:
 
     @cached_property
     def is_free(self) -> NDArray[np.bool_]:
-        """(T,) frames in which the hand touches nothing but what it carries, and no link is accelerated fast."""
+        """(T,) frames in which the hand touches nothing but what it carries."""
         c = self.episode.columns
         carries = np.zeros(c.num_frames, dtype=bool)
         for poses in c.object_poses.values():
             carries |= self._carries(poses[:, :3])
-        free = ((c.contact_force == 0) | carries) & self._is_calm
-        free[:1] = free[-1:] = False
-        return np.asarray(free, dtype=np.bool_)
+        return np.asarray((c.contact_force == 0) | carries, dtype=np.bool_)
+
+    @cached_property
+    def is_smooth(self) -> NDArray[np.bool_]:
+        """(T,) frames whose acceleration is told by the frames around them; the two at either end have too few."""
+        point = self.episode.world_from_tcp[:, :3, 3]
+        acceleration = np.diff(point, 2, axis=0) * self.episode.info.fps**2
+        change = np.linalg.norm(np.diff(acceleration, axis=0), axis=1)
+        smooth = np.zeros(len(point), dtype=np.bool_)
+        smooth[2:-2] = np.maximum(change[:-1], change[1:]) < MAX_CHANGE
+        return smooth
+
+    @cached_property
+    def is_judged(self) -> NDArray[np.bool_]:
+        """(T,) frames whose forces are known: the hand is free and moves smoothly."""
+        return self.is_free & self.is_smooth
 
     def below(self, joint: str) -> list[_Load]:
         """What a joint bears."""
@@ -132,17 +143,17 @@ def effort_bears_the_arm(episode: RecordedEpisode) -> Found:
     dynamics = _dynamics(episode)
     if isinstance(dynamics, NotMeasured):
         return dynamics
-    free, found = dynamics.is_free, []
+    judged, found = dynamics.is_judged, []
     for number, name in enumerate(episode.info.robot.arm_joints):
         joint = next(joint for joint in episode.urdf.joints if joint.name == name)
         pose = dynamics.frames_of(joint.child)
         axis = pose[:, :3, :3] @ np.array(joint.axis)
         arms = [np.cross(load.point - pose[:, :3, 3], load.force) for load in dynamics.below(name)]
-        torque = (axis * np.sum(arms, axis=0)).sum(axis=1)[free]
+        torque = (axis * np.sum(arms, axis=0)).sum(axis=1)[judged]
         size = float(np.sqrt(np.median(torque**2)))
         if size < MIN_LOAD:
             continue
-        off = float(np.median(np.abs(episode.columns.joint_effort[free, number] - torque))) / size
+        off = float(np.median(np.abs(episode.columns.joint_effort[judged, number] - torque))) / size
         found.append(Measurement(value=off, detail=f"{name}, which bears {size:.0f} N m"))
     return worst(*found) or NotMeasured(why="no joint of the arm bears a load")
 
@@ -165,7 +176,8 @@ def wrench_bears_the_hand(episode: RecordedEpisode) -> Found:
     force = np.sum([load.force for load in dynamics.below(mount)], axis=0)
     turned = np.einsum("tji,tj->ti", dynamics.frames_of(link)[:, :3, :3], force)
     off = np.linalg.norm(wrench[:, :3] - turned, axis=1) / np.maximum(np.linalg.norm(turned, axis=1), 1e-6)
-    return Measurement(value=float(np.median(off[dynamics.is_free])), detail=f"{int(dynamics.is_free.sum())} frames")
+    judged = off[dynamics.is_judged]
+    return Measurement(value=float(np.median(judged)), detail=f"{len(judged)} frames")
 
 
 def _dynamics(episode: RecordedEpisode) -> _Dynamics | NotMeasured:
@@ -175,9 +187,9 @@ def _dynamics(episode: RecordedEpisode) -> _Dynamics | NotMeasured:
         dynamics = _Dynamics(episode)
     except (SceneError, KeyError) as error:
         return NotMeasured(why=f"the robot's masses are not to be had here: {error}")
-    num_free = int(dynamics.is_free.sum())
-    if num_free < MIN_FRAMES:
-        return NotMeasured(why=f"the hand is free and the arm calm in {num_free} frames")
+    number = int(dynamics.is_judged.sum())
+    if number < MIN_FRAMES:
+        return NotMeasured(why=f"the hand is free and moves smoothly in {number} frames, fewer than {MIN_FRAMES}")
     return dynamics
 
 

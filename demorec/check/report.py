@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 from demorec.check.base import Check, Group, Level, Result, Scope
 from demorec.check.collected import NOT_APPLICABLE, CollectedSubject
@@ -27,7 +26,7 @@ _OF_THE_FILE: tuple[Group, ...] = ("file", "time")
 """Groups of the checks that look at the file itself, not at what was recorded."""
 _WORTH_PROCESSES = {"with pictures": 4, "without": 50}
 """Recordings from which on several processes check faster than one: each takes seconds to start."""
-_SEVERITY: dict[Level, int] = {"skip": 0, "pass": 0, "warn": 1, "fail": 2}
+_SEVERITY: dict[Level, int] = {"skip": 0, "pass": 1, "warn": 2, "fail": 3}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,10 +74,9 @@ class SubjectReport:
     is_failed_attempt: bool = False
 
     @property
-    def level(self) -> Literal["pass", "warn", "fail"]:
-        """The worst."""
-        severity = max((_SEVERITY[result.level] for result in self.results), default=0)
-        return ("pass", "warn", "fail")[severity]
+    def level(self) -> Level:
+        """The worst; "skip" where nothing was measured."""
+        return max((result.level for result in self.results), key=lambda level: _SEVERITY[level], default="skip")
 
     def is_bad(self, *, strict: bool = False) -> bool:
         """Whether it must not be as it is: a check failed, or with `strict` warned.

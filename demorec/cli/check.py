@@ -70,7 +70,9 @@ class Check:
     def run(self) -> int:
         """Check and report."""
         if not self.paths:
-            raise ConfigError("No path is given: name a recording, a run or a dataset, e.g. demorec check recordings.")
+            raise ConfigError(
+                "No path is given: name a recording, a run or a dataset, e.g. demorec check recordings/demo."
+            )
         if self.replay < 0:
             raise OptionError("replay", f"is {self.replay}, it must be 0 or more.")
         if self.coverage_picture is not None:
@@ -142,7 +144,7 @@ class Check:
 
         drawn = draw_coverage(list(_infos(self.paths)), path)
         if not self.json:
-            say(f"Coverage of {drawn.num_episodes} episodes: {drawn.path}")
+            say(f"Coverage of {drawn.num_episodes} episode{'' if drawn.num_episodes == 1 else 's'}: {drawn.path}")
 
 
 def _infos(paths: Sequence[Path]) -> Iterator[EpisodeInfo]:
@@ -182,13 +184,14 @@ def _as_recorded(report: ReplayReport) -> bool:
 def _lines(report: SubjectReport, *, verbose: bool) -> list[str]:
     words: tuple[tuple[Level, str], ...] = (
         ("pass", "passed"),
-        ("warn", "warnings"),
+        ("warn", "with a warning"),
         ("fail", "failed"),
         ("skip", "not measured"),
     )
     blocked = sum(result.is_blocked for result in report.results)
     numbers = {level: report.count(level) - (blocked if level == "skip" else 0) for level, _ in words}
     counts = ", ".join(f"{numbers[level]} {word}" for level, word in words if numbers[level])
+    counts = counts or f"none of the chosen checks is about a {report.kind}"
     kind = "failed attempt" if report.is_failed_attempt else report.kind
     lines = [f"{report.level:<4}  {kind} {report.path}: {counts}"]
     shown = [r for r in report.results if r.level in ("warn", "fail") or (verbose and not r.is_blocked)]
@@ -202,14 +205,18 @@ def _result(result: Result) -> str:
     where = "" if result.frame is None else f" at frame {result.frame}"
     unit = f" {result.unit}" if result.unit else ""
     value = "" if result.value is None else f" {result.value:.4g}{unit}{where}"
-    limit = f" (allowed {result.warn:g}{unit})" if result.level in ("warn", "fail") and result.value is not None else ""
+    is_bad = result.level in ("warn", "fail") and result.value is not None
+    limit = f" (allowed {result.allowed:g}{unit})" if is_bad else ""
     detail = f": {result.detail}" if result.detail else ""
     return f"{result.level:<4}  {result.check}{value}{limit}{detail}"
 
 
 def _summary(reports: Sequence[SubjectReport], failed: int, replays: int, diverged: int) -> str:
     warned = sum(report.level == "warn" for report in reports)
-    text = f"{len(reports)} checked, {failed} failed, {warned} with warnings."
+    unmeasured = sum(report.level == "skip" for report in reports)
+    text = f"{len(reports) - unmeasured} checked, {failed} failed, {warned} with warnings."
+    if unmeasured:
+        text += f" Of {unmeasured} nothing was measured."
     if apart := sum(report.is_failed_attempt and report.level == "fail" and not report.is_bad() for report in reports):
         text += f" Not counted: {apart} failed attempts that fail checks of what they recorded."
     return text + (f" {replays} replayed, {diverged} not as recorded." if replays else "")

@@ -62,6 +62,9 @@ def parse(command: type[Any], args: Sequence[str], *, prog: str, defaults: objec
         SystemExit: 0 after --help, 2 after a wrong flag, which was told.
     """
     shown = [printable(arg) for arg in args]
+    if OTHERS not in command.__dataclass_fields__ and _has_empty_path(args):
+        tell(f"{prog}: one of the paths is empty (an unset variable of the shell?); the current folder is written as .")
+        raise SystemExit(2)
     try:
         return _parse(command, args, prog=prog, defaults=defaults, say_why=shown == list(args))
     except SystemExit as end:
@@ -69,7 +72,15 @@ def parse(command: type[Any], args: Sequence[str], *, prog: str, defaults: objec
             # tyro repeats what it does not understand as it is: it is asked once more, with all of it spelt out.
             _parse(command, shown, prog=prog, defaults=defaults, say_why=True)
             tell(f"{prog}: the flags are wrong, see --help.")
+        for word in shown if end.code else ():
+            if word.startswith("-") and Path(word).exists():
+                tell(f"{prog}: a path that begins with a dash is written ./{word}")
         raise
+
+
+def _has_empty_path(args: Sequence[str]) -> bool:
+    """Whether a word that is no flag's value is empty: Python would take it for the current folder."""
+    return any(not word and not before.startswith("--") for before, word in zip(["", *args], args, strict=False))
 
 
 def _parse(command: type[Any], args: Sequence[str], *, prog: str, defaults: object, say_why: bool) -> Any:

@@ -114,9 +114,10 @@ def print_result(result: RunResult, export: ExportRecord | None, checked: CheckS
         rows.append(("dataset digest", export.dataset_digest))
     if checked is not None:
         verdict = f"{len(checked.failures)} failed" if checked.failures else "none failed"
+        warnings = "warning" if checked.warnings == 1 else "warnings"
         apart = f" (not counted: those of {checked.failed_attempts} failed attempts)" if checked.failed_attempts else ""
         again = f"; {checked.made_again} episodes made again and compared" if checked.made_again else ""
-        rows.append(("checks", f"{verdict}, {checked.warnings} warnings{apart}{again}"))
+        rows.append(("checks", f"{verdict}, {checked.warnings} {warnings}{apart}{again}"))
     width = max(len(name) for name, _ in rows)
     for name, value in rows:
         say(f"{name:<{width}}  {value}")

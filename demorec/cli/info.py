@@ -42,7 +42,9 @@ class Info:
     def run(self) -> int:
         """Read and print; 1 when something among several paths cannot be read."""
         if not self.paths:
-            raise ConfigError("No path is given: name a recording, a run or a dataset, e.g. demorec info recordings.")
+            raise ConfigError(
+                "No path is given: name a recording, a run or a dataset, e.g. demorec info recordings/demo."
+            )
         found = [_describe(path) for path in self.paths]
         if self.json:
             plain = [item for item, _ in found]
@@ -103,7 +105,8 @@ def _recording_lines(summary: RecordingSummary) -> list[str]:
         )
     for check in summary.checks:
         verdict = "passed" if check.passed else "FAILED"
-        facts.append((f"check {check.name}", f"{verdict}: {check.value:.4g} {check.unit} (limit {check.limit:.4g})"))
+        value = f"{check.value:.4g} {check.unit}".rstrip()
+        facts.append((f"check {check.name}", f"{verdict}: {value} (limit {check.limit:.4g})"))
     facts.append(("digest", summary.digest[:16]))
     facts.append(("made with", ", ".join(f"{name} {version}" for name, version in summary.versions.items())))
     streams = [(stream.topic, str(stream.messages), stream.type) for stream in summary.streams]

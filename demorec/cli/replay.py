@@ -68,7 +68,9 @@ class Replay:
     def run(self) -> int:
         """Replay and report."""
         if not self.paths:
-            raise ConfigError("No path is given: name a recording, a run or a dataset, e.g. demorec replay recordings.")
+            raise ConfigError(
+                "No path is given: name a recording, a run or a dataset, e.g. demorec replay recordings/demo."
+            )
         if self.tolerance < 0:
             raise OptionError("tolerance", f"is {self.tolerance}, it must be 0 or more.")
         from demorec.replay import ReplayOptions, is_as_recorded, replay_all

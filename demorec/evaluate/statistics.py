@@ -36,6 +36,8 @@ class Rate:
         return low, high
 
     def __str__(self) -> str:
+        if not self.trials:
+            return "0/0"
         low, high = self.interval
         return f"{self.successes}/{self.trials} = {100 * self.value:.1f} % [{100 * low:.1f}, {100 * high:.1f}]"
 

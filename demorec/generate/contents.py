@@ -26,7 +26,6 @@ _REPORT = re.compile(r"error_episode_\d+\.txt")
 _CARD = re.compile(rf"{CARD_PATH}(\.\d+)?")  # edited by somebody, so that --overwrite does not delete it
 _LEFT = (
     (_RECORDING_ASIDE, "recording", " not of this run, or damaged"),
-    (_PART, "unfinished recording", " (demorec recover reads what is whole)"),
     (_REPORT, "error report", ""),
     (_CARD, "edited dataset card", ""),
 )
@@ -38,8 +37,12 @@ def set_aside(folder: Path) -> list[str]:
     names = list(files_below(folder / UNFINISHED))
     datasets = {match[1] for name in names if (match := _SET_ASIDE_DATASET.fullmatch(name))}
     others = [name for name in names if not _SET_ASIDE_DATASET.fullmatch(name)]
+    parts = [name for name in others if _PART.fullmatch(name)]
+    empty = sum((folder / UNFINISHED / name).lstat().st_size == 0 for name in parts)
     counted = [(len(datasets), "dataset", " that the run did not leave like this")]
     counted += [(sum(bool(kind.fullmatch(name)) for name in others), noun, more) for kind, noun, more in _LEFT]
+    counted += [(len(parts) - empty, "unfinished recording", " (demorec recover keeps what is whole)")]
+    counted += [(empty, "unfinished recording", " in which nothing was written")]
     return [f"{count} {noun}{'' if count == 1 else 's'}{more}" for count, noun, more in counted if count]
 
 

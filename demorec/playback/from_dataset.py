@@ -242,20 +242,19 @@ def _video_batches(root: Path, episode_index: int, key: str, time_ns: NDArray[np
     for path in sorted((root / "videos" / key).glob("*/*.mp4")):
         check_video(path)
     try:
-        chunks = LeRobotReader(root).stream(episode_index)
+        for chunk in LeRobotReader(root).stream(episode_index):
+            if chunk.entity_path.strip("/") != key or chunk.is_static:
+                continue
+            batch = chunk.to_record_batch()
+            frames = batch.column("frame_index").to_pylist()
+            if "VideoStream:is_keyframe" in batch.schema.names:
+                flags = batch.column("VideoStream:is_keyframe").to_pylist()
+                keyframes.update(frame for frame, flag in zip(frames, flags, strict=True) if flag and flag[0])
+            if "VideoStream:sample" in batch.schema.names:
+                blobs = batch.column("VideoStream:sample")
+                samples += [(frame, bytes(blobs[row].values[0].values)) for row, frame in enumerate(frames)]
     except (ValueError, OSError, RuntimeError) as error:
         raise RecordingError(f"Rerun cannot read the dataset ({' '.join(str(error).split())[:200]}): {root}") from error
-    for chunk in chunks:
-        if chunk.entity_path.strip("/") != key or chunk.is_static:
-            continue
-        batch = chunk.to_record_batch()
-        frames = batch.column("frame_index").to_pylist()
-        if "VideoStream:is_keyframe" in batch.schema.names:
-            flags = batch.column("VideoStream:is_keyframe").to_pylist()
-            keyframes.update(frame for frame, flag in zip(frames, flags, strict=True) if flag and flag[0])
-        if "VideoStream:sample" in batch.schema.names:
-            blobs = batch.column("VideoStream:sample")
-            samples += [(frame, bytes(blobs[row].values[0].values)) for row, frame in enumerate(frames)]
     samples.sort()
     first = samples[0][0] if samples else 0
     for start in range(0, len(samples), _PICTURES_AT_ONCE):

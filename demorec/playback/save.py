@@ -85,8 +85,8 @@ def _saving(recording: rr.RecordingStream, target: Path, layout: rr.blueprint.Bl
     recording.send_blueprint(layout, make_active=False, make_default=True)
     try:
         yield
-        data = stream.read()
     finally:
+        data = stream.read()  # in any case: Rerun warns on the terminal of what nobody has read
         recording.disconnect()
     assert data is not None  # there is a layout, at least
     target.write_bytes(data)

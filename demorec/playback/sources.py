@@ -38,7 +38,7 @@ def find_episodes(paths: Sequence[Path], *, include_failures: bool = False) -> l
         RecordingError: A recording is unfinished, or a dataset cannot be read.
     """
     if not paths:
-        raise ConfigError("No path is given: name a recording, a run or a dataset, e.g. demorec view recordings.")
+        raise ConfigError("No path is given: name a recording, a run or a dataset, e.g. demorec view recordings/demo.")
     return [source for path in paths for source in _sources(path, include_failures)]
 
 

@@ -41,7 +41,8 @@ def show(recordings: Sequence[Path]) -> None:
     """
     if not has_display():
         raise ConfigError(
-            "There is no screen to open a window on: use --save x.rrd, --screenshot x.png, or --web for a browser."
+            "There is no screen to open a window on: use --screenshot x.png, --web for a browser, or, unless it is an "
+            ".rrd file already, --save x.rrd."
         )
     command = [
         viewer_program(),

@@ -114,8 +114,7 @@ class Container:
         tail_bytes = _FOOTER_BYTES + len(MAGIC)
         if size < tail_bytes + len(MAGIC) or self._read_at(size - len(MAGIC), len(MAGIC)) != MAGIC:
             raise RecordingError(
-                f"The recording is cut off, its index is missing; demorec recover makes a readable one of it: "
-                f"{self.path}"
+                f"The recording is cut off, its index is missing; demorec recover keeps what is whole: {self.path}"
             )
         footer_start = size - tail_bytes
         footer = self._record_at(footer_start, _FOOTER_BYTES, Opcode.FOOTER, Footer)

@@ -58,7 +58,7 @@ class EpisodeFile:
             metadata.check_seal(metadata.RECOVERED, recovered)
         self.is_recovered = recovered is not None
         if outcome_frames is None and not self.is_recovered:
-            raise RecordingError("The recording was never finished: demorec recover makes a readable one")
+            raise RecordingError("The recording was never finished; demorec recover keeps what is whole")
         if outcome_frames is not None and outcome_frames != num_frames:
             raise RecordingError(f"The recording has {num_frames} frames, but its outcome says {outcome_frames}")
 

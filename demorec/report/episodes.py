@@ -163,4 +163,4 @@ def measured(result: Result) -> tuple[str, str, str]:
     value = "" if result.value is None else f"{result.value:.4g}{unit}"
     frame = "" if result.frame is None else f"frame {result.frame}"
     where = ": ".join(filter(None, (frame, result.detail)))
-    return value, f"{result.warn:.4g}{unit}" if result.level in ("warn", "fail", "pass") else "", where
+    return value, f"{result.allowed:.4g}{unit}" if result.level in ("warn", "fail", "pass") else "", where

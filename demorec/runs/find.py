@@ -49,7 +49,7 @@ _NAMES: dict[Kind, str] = {
     "recordings": "a folder of recordings",
 }
 _ADVICE: dict[Kind, str] = {
-    "unfinished": "; demorec recover makes a readable one of it",
+    "unfinished": "; demorec recover keeps what is whole in it",
     "rrd": "; demorec view shows it by a name that ends in .rrd",
     "hdf5": "; name the run that it was made from",
     "dataset": "; name the run that it was made from",

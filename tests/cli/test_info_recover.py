@@ -218,6 +218,24 @@ def test_info_without_a_path(capsys: pytest.CaptureFixture[str]) -> None:
     assert "No path is given" in capsys.readouterr().err
 
 
+def test_an_empty_path_is_not_the_current_folder(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["info", ""])
+    assert ended.value.code == 2
+    assert "one of the paths is empty" in capsys.readouterr().err
+
+
+def test_a_path_that_looks_like_a_flag_is_told_how_to_be_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "-run").mkdir()
+    with pytest.raises(SystemExit) as ended:
+        main(["info", "-run"])
+    assert ended.value.code == 2
+    assert "is written ./-run" in capsys.readouterr().err
+
+
 def test_recover(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     part = tmp_path / "c.mcap.part"
     part.write_bytes((folder / "c.mcap.part").read_bytes())

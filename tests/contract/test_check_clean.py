@@ -94,13 +94,29 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert (tmp_path / "c.png").is_file()
 
 
-def test_strict_turns_warnings_into_failures(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def cut_short(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """What recover makes of a good recording of which a third, a half, two thirds are left."""
     from demorec.recording import recover
 
-    whole = simulate(tmp_path / "e.mcap", seed=21)
-    (tmp_path / "cut.mcap.part").write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
-    recover(tmp_path / "cut.mcap.part", tmp_path / "cut.mcap")
+    folder = tmp_path_factory.mktemp("cut")
+    data = simulate(folder / "e.mcap", seed=21).read_bytes()
+    files = []
+    for number, share in enumerate((1 / 3, 1 / 2, 2 / 3)):
+        part = folder / f"{number}.mcap.part"
+        part.write_bytes(data[: int(len(data) * share)])
+        files.append(recover(part, folder / f"{number}.mcap").path)
+    return files
+
+
+def test_what_a_crash_left_of_a_good_recording_lacks_its_end_only(cut_short: list[Path]) -> None:
+    for path in cut_short:
+        found = [(r.check, r.level) for r in checked(path).results if r.level in ("warn", "fail")]
+        assert found == [("complete", "warn")], path
+
+
+def test_strict_turns_warnings_into_failures(cut_short: list[Path]) -> None:
     for args, code in (((), 0), (("--strict",), 1)):
         with pytest.raises(SystemExit) as ended:
-            main(["check", str(tmp_path / "cut.mcap"), *args])
+            main(["check", str(cut_short[1]), *args])
         assert int(ended.value.code or 0) == code

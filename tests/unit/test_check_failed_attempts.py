@@ -53,6 +53,11 @@ def test_what_a_failed_attempt_recorded_is_told_and_does_not_fail_the_run(
     assert code == 0
     assert f"fail  failed attempt {run / FAILED}" in out
     assert f"fail  {min(wrong)}" in out
+    failed = [result for result in report.results if result.level == "fail" and result.value is not None]
+    assert any(result.warn < result.fail for result in failed)
+    for result in failed:  # with the limit that it broke
+        (line,) = [line for line in out.splitlines() if f" {result.check} " in line]
+        assert f"(allowed {result.fail:g}" in line
     assert "0 failed" in out
     assert "Not counted: 1 failed attempts that fail checks of what they recorded." in out
     code, out = check(capsys, run, "--only", *wrong, "--json")
@@ -98,3 +103,12 @@ def test_the_closing_table_counts_them_apart(run: Path) -> None:
     found = check_run(result, progress=lambda done, total: None)
     assert found.failed_attempts == 1
     assert not any(failure.startswith(Path(FAILED).name) for failure in found.failures)
+
+
+def test_where_no_chosen_check_applies_nothing_has_passed(capsys: pytest.CaptureFixture[str], run: Path) -> None:
+    code, out = check(capsys, run, "--only", "opens")
+    assert code == 0
+    assert f"skip  run {run}: none of the chosen checks is about a run" in out
+    assert "1 checked, 0 failed, 0 with warnings. Of 1 nothing was measured." in out
+    _, out = check(capsys, run, "--only", "opens", "--json")
+    assert {item["kind"]: item["level"] for item in json.loads(out)} == {"run": "skip", "recording": "pass"}

@@ -59,10 +59,16 @@ def test_no_training_is_offered_that_would_not_start(monkeypatch: pytest.MonkeyP
             ["2 datasets that the run did not leave like this"],
         ),
         (
-            ("episode_000003.mcap", "host-12-0/episode_000004.mcap.part", "error_episode_000004.txt"),
+            (
+                "episode_000003.mcap",
+                "host-12-0/episode_000004.mcap.part",
+                "host-12-0/episode_000005.mcap.part",
+                "error_episode_000004.txt",
+            ),
             [
                 "1 recording not of this run, or damaged",
-                "1 unfinished recording (demorec recover reads what is whole)",
+                "1 unfinished recording (demorec recover keeps what is whole)",
+                "1 unfinished recording in which nothing was written",
                 "1 error report",
             ],
         ),
@@ -74,5 +80,5 @@ def test_what_was_set_aside_is_told_by_what_it_is(tmp_path: Path, names: Sequenc
     for name in names:
         file = tmp_path / "unfinished" / name
         file.parent.mkdir(parents=True, exist_ok=True)
-        file.touch()
+        file.write_bytes(b"" if "000005" in name else b"something")
     assert set_aside(tmp_path) == words

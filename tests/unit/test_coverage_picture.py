@@ -60,3 +60,12 @@ def test_every_axis_is_labelled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     ):
         assert label in written
     assert np.asarray(Image.open(tmp_path / "c.png")).std() > 1
+
+
+def test_without_histograms_there_is_no_empty_half(tmp_path: Path) -> None:
+    info, _, _ = make_episode(num_frames=1)
+    draw_coverage([info] * 4, tmp_path / "c.png")  # too few values for a histogram
+    with Image.open(tmp_path / "c.png") as image:
+        drawn = np.array(image.convert("L")) < 255
+    right = int(np.flatnonzero(drawn.any(axis=0)).max())
+    assert right > 0.85 * drawn.shape[1]

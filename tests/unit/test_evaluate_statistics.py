@@ -52,3 +52,7 @@ def test_cells_cut_each_range_in_equal_parts() -> None:
     assert [(c.low, c.high) for c in found] == [(0.0, 3.0), (3.0, 6.0), (6.0, 9.0)]
     assert [(c.rate.successes, c.rate.trials) for c in found] == [(0, 3), (0, 3), (4, 4)]
     assert np.sum([c.rate.trials for c in found]) == 10
+
+
+def test_a_rate_without_trials_has_no_percentage() -> None:
+    assert str(Rate(successes=0, trials=0)) == "0/0"

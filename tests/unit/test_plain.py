@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -20,6 +21,11 @@ from demorec.scene.scene import (
     Shape,
     Texture,
 )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Placed:
+    position: tuple[float, float, float]
 
 
 def _scene() -> Scene:
@@ -83,3 +89,8 @@ def test_physics_says_its_contact_threshold_only_where_it_is_not_that_of_older_r
     new = Physics(contact_breaking_threshold=CONTACT_BREAKING_THRESHOLD)
     assert to_plain(new)["contact_breaking_threshold"] == 0.05
     assert from_plain(to_plain(new), Physics) == new
+
+
+def test_a_list_of_another_length_is_told_with_the_one_that_is_needed() -> None:
+    with pytest.raises(ValueError, match=r"not enough values, expected tuple\[float, float, float\] @ .*position"):
+        from_plain({"position": [0.4, 0.1]}, Placed)

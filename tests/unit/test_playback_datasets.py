@@ -13,6 +13,7 @@ import pytest
 from rerun.chunk import RrdReader
 from support.export import export
 
+from demorec.errors import RecordingError
 from demorec.geometry import Array
 from demorec.playback.from_dataset import open_dataset_episode
 from demorec.playback.held_objects import held
@@ -103,3 +104,13 @@ def test_what_reruns_reader_says_of_a_dataset_cannot_act_on_a_terminal(dataset: 
     done = subprocess.run([sys.executable, "-c", _READ, spoilt], env=environment, capture_output=True, check=False)
     assert b"odd" in done.stderr
     assert b"\x1b[2J" not in done.stderr
+
+
+def test_a_missing_video_is_one_sentence(dataset: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    spoilt = tmp_path / "d"
+    shutil.copytree(dataset, spoilt)
+    video = next((spoilt / "videos").rglob("*.mp4"))
+    video.unlink()
+    with pytest.raises(RecordingError, match="Failed to read video"):
+        save(find_episodes([spoilt])[0], tmp_path / "x.rrd")
+    assert capfd.readouterr().err == ""  # Rerun's warnings go there, past our own output
