@@ -118,9 +118,9 @@ class Dataset:
 
     @cached_property
     def infos(self) -> list[EpisodeInfo]:
-        """What was known of each episode before its first frame; empty for a dataset of somebody else's."""
+        """What was known of each simulated episode before its first frame; empty for a dataset of somebody else's."""
         try:
-            return [read_episode_info(row["episode_info"]) for row in self.sidecar]
+            return [read_episode_info(row["episode_info"]) for row in self.sidecar if row["episode_info"] is not None]
         except (ValueError, KeyError, TypeError) as error:
             raise ExportError(f"The sidecar's episode_info cannot be used ({in_words(error)}): {self.path}") from error
 

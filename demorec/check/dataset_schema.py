@@ -161,7 +161,7 @@ def _splits(dataset: Dataset) -> Iterator[str]:
 )
 def dataset_description(dataset: Dataset) -> Measurement | None:
     """Robot, rate, names of components and sizes of pictures are those of the scenes that the sidecar keeps."""
-    if not dataset.sidecar:
+    if not dataset.infos:
         return None
     wrong = [
         f"episode {number}: {words}"

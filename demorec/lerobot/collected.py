@@ -165,5 +165,4 @@ def _sidecar_row(recording: CollectedRecording) -> dict[str, Any]:
             }
             for camera in info.cameras
         ],
-        "episode_info": to_json(info),
     }

@@ -60,6 +60,10 @@ def _read_episode(root: Path, episode_index: int) -> PlayedEpisode:
     row = _episode_row(root, episode_index)
     described = DatasetInfo.load(root)
     export = dict(read_json(root / SIDECAR_DIR / "export.json"))
+    if row["episode_info"] is None:
+        raise RecordingError(
+            f"The episodes of this dataset were collected and have no scene to be shown: view the recordings: {root}"
+        )
     info = read_episode_info(row["episode_info"])
     missing = {"observation.state", "action"} - described.features.keys()
     if missing:

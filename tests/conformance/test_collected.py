@@ -13,7 +13,8 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from support.collected import URDF, make_collected, write_collected
+from support.collected import TOP, URDF, make_collected, write_collected
+from support.export import export
 
 from demorec.recording.ros2 import DEFINITIONS
 from demorec.scene.urdf import Urdf
@@ -91,3 +92,10 @@ def test_rerun_shows_joints_videos_and_frames(path: Path, tmp_path: Path) -> Non
     assert "Scalars" in told
     assert "VideoStream" in told
     assert "Transform3D" in told
+
+
+def test_lerobot_reads_the_dataset_as_it_was_recorded(tmp_path: Path) -> None:
+    (tmp_path / "run" / "episodes").mkdir(parents=True)
+    write_collected(tmp_path / "run" / "episodes" / "episode_000000.mcap", make_collected(cameras=(TOP,)))
+    report = export(tmp_path / "run", tmp_path / "d", verify=True)
+    assert (report.num_frames, report.verified_frames, report.not_verified) == (45, 2, "")
