@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from demorec.cli.allow import Allow, allowed_modules
 from demorec.cli.output import say, say_json
+from demorec.cli.paths import refuse_inside
 from demorec.cli.progress import ProgressBar
 from demorec.config import GenerateConfig, VideoConfig
 from demorec.errors import ConfigError, check_option
@@ -95,6 +96,7 @@ class Evaluate:
             allowed=allowed_modules(self.allow),
         )
         out = self.out or Path("evaluations") / self.task.rpartition(":")[2]
+        refuse_inside([out])
         with ProgressBar("evaluating", total=self.num_episodes, unit="rollout") as bar:
 
             def progress(evaluation: Evaluation) -> None:
