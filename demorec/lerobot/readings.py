@@ -19,6 +19,7 @@ from demorec.lerobot.sidecar import AttemptRecord
 from demorec.lerobot.transcode import reason_to_transcode
 from demorec.processes import SPAWN
 from demorec.recording import Recording
+from demorec.scene.episode import Outcome
 from demorec.scene.features import IMAGE_PREFIX
 
 _BYTES_THAT_PAY = 1 << 30
@@ -34,6 +35,7 @@ class Reading:
     Attributes:
         path: The recording.
         attempt: For the success rates.
+        outcome: As recorded; None where the recording ends before it.
         profile: What must agree with all the others.
         features, fps, robot: Of a dataset made from it.
         transcoded: Cameras whose pictures had to be coded anew, with the reason.
@@ -42,6 +44,7 @@ class Reading:
 
     path: Path
     attempt: AttemptRecord
+    outcome: Outcome | None
     profile: Profile
     features: dict[str, Feature]
     fps: int
@@ -69,6 +72,7 @@ def read(source: ExportSource, options: ExportOptions) -> Reading | None:
         return Reading(
             path=source.path,
             attempt=attempt,
+            outcome=recording.outcome,
             profile=Profile.of(recording, options),
             features=features,
             fps=info.fps // stride,
