@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 from tyro.conf import Positional
 
 from demorec.cli.allow import Allow, allowed_modules
-from demorec.cli.output import say, say_json
-from demorec.cli.paths import places_read
+from demorec.cli.output import counted, say, say_json
+from demorec.cli.paths import places_read, refuse_inside
 from demorec.cli.progress import ProgressBar
 from demorec.errors import ConfigError, OptionError
 from demorec.safety.replacing import PICTURE, check_replaceable
@@ -138,6 +138,7 @@ class Check:
         if path.suffix.lower() != ".png":
             raise ConfigError(f"--coverage-picture writes a .png file, found the name {path.name!r}.")
         check_replaceable(path, PICTURE, overwrite=self.overwrite, sources=places_read(self.paths))
+        refuse_inside([path])
 
     def _draw(self, path: Path) -> None:
         from demorec.check.coverage import draw_coverage
@@ -218,7 +219,7 @@ def _summary(reports: Sequence[SubjectReport], failed: int, replays: int, diverg
     if unmeasured:
         text += f" Of {unmeasured} nothing was measured."
     if apart := sum(report.is_failed_attempt and report.level == "fail" and not report.is_bad() for report in reports):
-        text += f" Not counted: {apart} failed attempts that fail checks of what they recorded."
+        text += f" Not counted, since what they recorded fails checks: {counted(apart, 'failed attempt')}."
     return text + (f" {replays} replayed, {diverged} not as recorded." if replays else "")
 
 

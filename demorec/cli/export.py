@@ -10,7 +10,8 @@ from typing import Annotated, Any
 from tyro.conf import Positional, arg
 from tyro.constructors import MISSING_NONPROP
 
-from demorec.cli.output import say
+from demorec.cli.output import counted, say
+from demorec.cli.paths import refuse_inside
 from demorec.cli.progress import ProgressBar
 from demorec.errors import ConfigError
 from demorec.export.options import CommonOptions, ExportReport
@@ -59,17 +60,23 @@ class Export:
             raise ConfigError(
                 f"No recordings are given: name a run, e.g. demorec export {self.format} recordings/cubes."
             )
+        refuse_inside([self.out])
         with ProgressBar("exporting") as bar:
             report = exporter.export(self.sources, self.out, self.options, bar.set)
         say(*_told(report))
         return 0
 
 
+_TAKEN = "taken with --include-failures"
+
+
 def _told(report: ExportReport) -> list[str]:
     added = f", {report.new_episodes} of them new" if report.new_episodes != report.num_episodes else ""
-    lines = [f"{report.num_episodes} episodes, {report.num_frames} frames{added}: {report.path}"]
+    lines = [f"{counted(report.num_episodes, 'episode')}, {report.num_frames} frames{added}: {report.path}"]
     if report.skipped_failures:
-        lines.append(f"{report.skipped_failures} failed attempts left out (--include-failures takes them).")
+        lines.append(f"{counted(report.skipped_failures, 'failed attempt')} left out ({_TAKEN}).")
+    if report.skipped_unknown:
+        lines.append(f"{counted(report.skipped_unknown, 'recording')} of unknown outcome left out ({_TAKEN}).")
     if report.left_out:
         lines.append(f"Left out, since the dataset does not have them: {', '.join(report.left_out)}.")
     lines += [f"Pictures coded anew: camera {what}." for what in report.transcoded]

@@ -12,6 +12,7 @@ from tyro.conf import arg
 
 from demorec.cli.config_file import config_path, with_file_values
 from demorec.cli.output import tell
+from demorec.cli.paths import refuse_inside
 from demorec.config import GenerateConfig
 from demorec.errors import ConfigError
 from demorec.generate.options import RunOptions, default_out, default_repo_id
@@ -70,6 +71,8 @@ class Generate:
             out=self.options.out or default_out(self.episodes.task),
             repo_id=self.options.repo_id or default_repo_id(self.episodes.task),
         )
+        assert options.out is not None
+        refuse_inside([options.out])
         if self.dry_run:
             from demorec.cli.generate_report import print_estimate
             from demorec.generate.estimate import estimate

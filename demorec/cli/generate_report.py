@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
-from demorec.cli.output import say, tell
+from demorec.cli.output import counted, say, tell
 from demorec.cli.progress import duration
 from demorec.generate.contents import set_aside
 from demorec.generate.estimate import Estimate
@@ -91,7 +91,10 @@ def print_result(result: RunResult, export: ExportRecord | None, checked: CheckS
     frames = sum(a.num_frames for a in run.successes)
     size = sum(a.num_bytes for a in run.successes)
     rows = [
-        ("episodes", f"{len(run.successes)} of {run.num_episodes} asked, {len(result.made)} attempts made now"),
+        (
+            "episodes",
+            f"{len(run.successes)} of {run.num_episodes} asked, {counted(len(result.made), 'attempt')} made now",
+        ),
         ("success", f"{first_tries} of {tried} at the first try" + _failures(run)),
         ("frames", f"{frames} ({frames / run.config.fps:.1f} s at {run.config.fps} fps)"),
         ("recordings", f"{megabytes(size)} in {folder / EPISODES}"),
@@ -105,7 +108,7 @@ def print_result(result: RunResult, export: ExportRecord | None, checked: CheckS
     if result.made:
         wall = result.session.wall_seconds
         rate = sum(a.success for a in result.made) / wall * 60
-        made = f"{wall:.1f} s for making episodes with {_workers(result.session.workers)}, {rate:.1f} a minute"
+        made = f"{wall:.1f} s for making episodes with {counted(result.session.workers, 'worker')}, {rate:.1f} a minute"
         rows.append(("wall time", f"{made}; export and checks are extra"))
     if aside := set_aside(folder):
         rows.append(("set aside", f"{', '.join(aside)}: {folder / UNFINISHED}"))
@@ -114,10 +117,13 @@ def print_result(result: RunResult, export: ExportRecord | None, checked: CheckS
         rows.append(("dataset digest", export.dataset_digest))
     if checked is not None:
         verdict = f"{len(checked.failures)} failed" if checked.failures else "none failed"
-        warnings = "warning" if checked.warnings == 1 else "warnings"
-        apart = f" (not counted: those of {checked.failed_attempts} failed attempts)" if checked.failed_attempts else ""
-        again = f"; {checked.made_again} episodes made again and compared" if checked.made_again else ""
-        rows.append(("checks", f"{verdict}, {checked.warnings} {warnings}{apart}{again}"))
+        apart = (
+            f" (not counted: those of {counted(checked.failed_attempts, 'failed attempt')})"
+            if checked.failed_attempts
+            else ""
+        )
+        again = f"; {counted(checked.made_again, 'episode')} made again and compared" if checked.made_again else ""
+        rows.append(("checks", f"{verdict}, {counted(checked.warnings, 'warning')}{apart}{again}"))
     width = max(len(name) for name, _ in rows)
     for name, value in rows:
         say(f"{name:<{width}}  {value}")
@@ -164,10 +170,6 @@ def megabytes(count: float) -> str:
     return f"{count / 1e3:.1f} kB"
 
 
-def _workers(count: int) -> str:
-    return f"{count} worker" if count == 1 else f"{count} workers"
-
-
 def _failures(run: RunFile) -> str:
     causes = Counter(f"{a.phase}: {a.reason}" for a in run.failures)
     if not causes:
@@ -190,7 +192,7 @@ def print_estimate(estimate: Estimate, options: RunOptions) -> None:
     each = sum(estimate.cpu_seconds.values())
     stages = ", ".join(f"{stage} {seconds:.2f}" for stage, seconds in estimate.cpu_seconds.items())
     cores = available_cores()
-    workers = _workers(estimate.workers)
+    workers = counted(estimate.workers, "worker")
     if options.executor == "local" and estimate.workers > cores:
         workers += f" on {cores} cores: at least {duration(estimate.seconds * estimate.workers / cores)}"
     sizes = f"recording {megabytes(estimate.num_bytes)}"

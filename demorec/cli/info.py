@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from tyro.conf import Positional
 
-from demorec.cli.output import say, say_json
+from demorec.cli.output import counted, say, say_json
 from demorec.cli.table import aligned, size_in_words
 from demorec.errors import ConfigError, ExportError, RecordingError, in_words, resource_error, without_path
 from demorec.lerobot.paths import INFO_PATH
@@ -157,7 +157,7 @@ def _run_lines(path: Path, run: RunFile) -> list[str]:
     facts = [
         ("run", f"{path} ({'complete' if run.is_complete else 'unfinished'})"),
         ("task", f"{config.task} with {config.robot}, seed {config.seed}"),
-        ("episodes", f"{len(run.successes)} of {run.num_episodes}, {len(run.failures)} failed attempts"),
+        ("episodes", f"{len(run.successes)} of {run.num_episodes}, {counted(len(run.failures), 'failed attempt')}"),
         ("frames", f"{frames} ({frames / config.fps:.1f} s at {config.fps} Hz)"),
         ("size", size_in_words(sum(attempt.num_bytes for attempt in run.attempts))),
         ("cameras", _run_cameras(config)),

@@ -44,6 +44,11 @@ def tell(*lines: str) -> None:
         _write(sys.stderr, lines)
 
 
+def counted(count: int, noun: str) -> str:
+    """A number of things: "1 episode", "2 episodes"."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
 def _write(stream: TextIO, lines: tuple[str, ...]) -> None:
     text = "".join(f"{printable(line)}\n" for line in lines)
     encoding = stream.encoding or "utf-8"

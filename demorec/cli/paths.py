@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from demorec.errors import ConfigError
-from demorec.runs.find import EPISODE_FOLDERS, find
-from demorec.runs.run_file import DATASET, EPISODES, FAILED
+from demorec.lerobot.kind import DATASET as DATASET_KIND
+from demorec.runs.find import EPISODE_FOLDERS, EVALUATION_NAME, find
+from demorec.runs.run_file import DATASET, EPISODES, FAILED, RUN_NAME, UNFINISHED
 from demorec.safety.replacing import use_as_source
+
+_PARTS = (EPISODES, FAILED, UNFINISHED)
 
 
 def places_read(paths: Sequence[Path]) -> list[Path]:
@@ -32,6 +35,24 @@ def refuse_sources(paths: Sequence[Path], targets: Sequence[Path]) -> None:
         reason = use_as_source(target.resolve(), sources)
         if reason:
             raise ConfigError(f"No new recording can be made here, since {reason}: choose another --out: {target}")
+    refuse_inside(targets)
+
+
+def refuse_inside(targets: Iterable[Path]) -> None:
+    """Raise ConfigError when something new would lie inside of a dataset, or in a part of a run or an evaluation.
+
+    Whatever a person puts there is foreign to it, and would keep it from being replaced ever after.
+    """
+    for target in targets:
+        resolved = target.resolve()
+        for place in (resolved, *resolved.parents):
+            whole = place.parent
+            is_part = place.name in _PARTS and any((whole / name).is_file() for name in (RUN_NAME, EVALUATION_NAME))
+            if is_part or (place != resolved and DATASET_KIND.recognises(place)):
+                raise ConfigError(
+                    f"Nothing else is written into {'a run' if is_part else 'a dataset'}, since it could not be "
+                    f"replaced then: choose a place outside of {place}: {target}"
+                )
 
 
 def run_of(recording: Path) -> Path | None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 from tqdm import tqdm
 
-from demorec.cli.output import tell
+from demorec.cli.output import counted, tell
 
 if TYPE_CHECKING:
     from demorec.runs.run_file import Attempt, RunFile
@@ -154,7 +154,7 @@ class RunProgress:
             self._bar.advance()
         else:
             self._failed += 1
-            self._bar.note(f"{self._failed} failed attempts")
+            self._bar.note(counted(self._failed, "failed attempt"))
 
     def says(self, message: str) -> None:
         """Something that a person should know."""

@@ -8,8 +8,8 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from demorec.cli.allow import Allow, allowed_modules
-from demorec.cli.output import say
-from demorec.cli.paths import places_read
+from demorec.cli.output import counted, say
+from demorec.cli.paths import places_read, refuse_inside
 from demorec.cli.progress import ProgressBar
 from demorec.errors import ConfigError, check_option
 from demorec.runs.find import EPISODE_FOLDERS, expect
@@ -63,7 +63,7 @@ class Report:
         with ProgressBar("reading", unit="item") as bar:
             report = gather(self.path, options, bar.set)
         size = write_page(report, self.out)
-        say(f"{len(report.episodes)} episodes, {size / 1e6:.1f} MB: {self.out}")
+        say(f"{counted(len(report.episodes), 'episode')}, {size / 1e6:.1f} MB: {self.out}")
         return 0
 
     def _validate(self) -> None:
@@ -76,3 +76,4 @@ class Report:
         if not self.out.absolute().parent.is_dir():
             raise ConfigError(f"--out: there is no folder {self.out.parent}.")
         check_replaceable(self.out, REPORT, overwrite=self.overwrite, sources=places_read([self.path]))
+        refuse_inside([self.out])

@@ -10,6 +10,7 @@ from tyro.conf import Positional
 
 from demorec.cli.allow import Allow, allowed_modules
 from demorec.cli.output import say, tell
+from demorec.cli.paths import refuse_inside
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,6 +49,7 @@ class Reproduce:
             out=self.out, workers=self.workers, executor=self.executor, address=self.address, export=False
         )
         options.validate()
+        refuse_inside([self.out])
         with RunProgress() as progress:
             found = reproduce(self.source, options, progress=progress, allowed=allowed_modules(self.allow))
         if not isinstance(found, Comparison):

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from demorec.cli.allow import Allow, allowed_modules
+from demorec.cli.paths import refuse_inside
 from demorec.cli.progress import ProgressBar
 from demorec.config import GenerateConfig, VideoConfig
 from demorec.errors import check_option
@@ -64,6 +65,7 @@ class RolloutFlags:
         check_option("num_episodes", self.num_episodes, 1, 1_000_000)
         if self.workers is not None:
             check_option("workers", self.workers, 1, 1024)
+        refuse_inside([out])
         from demorec.evaluate.rollouts import evaluate, settings_for
         from demorec.generate.options import available_cores
         from demorec.loop.actions import check_action_kind

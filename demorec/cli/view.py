@@ -13,7 +13,7 @@ from tyro.conf import Positional
 
 from demorec.cli.allow import Allow, allowed_modules
 from demorec.cli.output import say, tell
-from demorec.cli.paths import places_read
+from demorec.cli.paths import places_read, refuse_inside
 from demorec.errors import ConfigError, check_option
 from demorec.runs.find import expect
 from demorec.safety.replacing import PICTURE, RERUN_FILE, check_replaceable
@@ -139,6 +139,7 @@ class View:
         kinds += [] if self.screenshot is None else [(self.screenshot, PICTURE)]
         for target, kind in kinds:
             check_replaceable(target, kind, overwrite=self.overwrite, sources=places_read(self.paths))
+        refuse_inside(target for target, _ in kinds)
 
     def _show_rrd(self) -> int:
         others = [path for path in self.paths if path.suffix != ".rrd"]

@@ -13,7 +13,15 @@ from demorec.export.options import CommonOptions
 from demorec.recording import Recording
 from demorec.registry import nearest_match
 from demorec.scene.episode import POLICY_PHASE, EpisodeColumns
-from demorec.scene.features import ACTION, ENVIRONMENT_STATE, ObservationRows, action_vectors, observation_vectors
+from demorec.scene.features import (
+    ACTION,
+    DEPTH_SUFFIX,
+    ENVIRONMENT_STATE,
+    IMAGE_PREFIX,
+    ObservationRows,
+    action_vectors,
+    observation_vectors,
+)
 
 REWARD, DONE, SUCCESS = "next.reward", "next.done", "next.success"
 INTERVENTION = "intervention"
@@ -70,10 +78,17 @@ def feature_columns(recording: Recording, options: CommonOptions) -> FeatureColu
     where the robot shall be when the next observation is taken.
 
     Raises:
+        ConfigError: The options ask for depth pictures that were not recorded.
         ExportError: The recording has no frames, or a value that is not finite, with which no policy can be trained.
         RecordingError: It is damaged.
     """
     info = recording.info
+    for camera in recording.cameras if options.depth else ():
+        if options.takes(IMAGE_PREFIX + camera + DEPTH_SUFFIX) and not recording.has_depth(camera):
+            raise ConfigError(
+                f"--depth needs recordings with depth pictures (generate --depth), and the camera {camera!r} has none: "
+                f"leave it out: {recording.path}"
+            )
     if recording.num_frames == 0:
         raise ExportError(f"The recording has no frames: {recording.path}")
     stride = frame_stride(info.fps, options.fps)

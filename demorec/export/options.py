@@ -61,6 +61,7 @@ class ExportReport:
         num_episodes, num_frames: In the dataset now.
         new_episodes, new_frames: Added by this export.
         skipped_failures: Failed episodes that were left out.
+        skipped_unknown: Episodes that were left out since their recordings end before the outcome.
         transcoded: Cameras whose pictures had to be coded anew, with the reason.
         left_out: Features that the dataset appended to does not have.
         verified_frames: Frames that were compared through LeRobot; 0 when not asked for, or without LeRobot.
@@ -75,6 +76,7 @@ class ExportReport:
     new_episodes: int
     new_frames: int
     skipped_failures: int = 0
+    skipped_unknown: int = 0
     transcoded: tuple[str, ...] = ()
     left_out: tuple[str, ...] = ()
     verified_frames: int = 0

@@ -6,11 +6,13 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from demorec.errors import ConfigError, ExportError
+from demorec.errors import ConfigError
 from demorec.export.options import CommonOptions, parse_episodes
 from demorec.plain import digest
 from demorec.recording import AnyRecording, CollectedRecording, open_recording
 from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings
+from demorec.scene.collected import CollectedOutcome
+from demorec.scene.episode import Outcome
 from demorec.scene.features import ENVIRONMENT_STATE, IMAGE_PREFIX, observation_names
 
 
@@ -151,10 +153,11 @@ class Intake:
 
     Attributes:
         skipped_failures: Failed attempts that were left out so far.
+        skipped_unknown: Recordings that were left out since they end before their outcome.
     """
 
     def __init__(self, found: Sequence[ExportSource], options: CommonOptions) -> None:
-        self.skipped_failures = 0
+        self.skipped_failures = self.skipped_unknown = 0
         self._found = found
         self._options = options
         self._first: tuple[Profile, Path] | None = None
@@ -163,28 +166,32 @@ class Intake:
         """Note a recording that goes in.
 
         Raises:
-            ExportError: It does not go together with the first one.
+            ConfigError: It does not go together with the first one.
         """
         if self._first is None:
             self._first = profile, path
         elif profile != self._first[0]:
             _refuse_differences(*self._first, (source.path for source in self._found), self._options)
 
-    def leave_out(self) -> None:
-        """Note a failed attempt that only counts for the success rate."""
-        self.skipped_failures += 1
+    def leave_out(self, outcome: Outcome | CollectedOutcome | None) -> None:
+        """Note a failed attempt, or one of unknown outcome, that only counts for the success rate."""
+        if outcome is None:
+            self.skipped_unknown += 1
+        else:
+            self.skipped_failures += 1
 
     def check(self) -> None:
         """Raise ConfigError when not one recording has gone in."""
         if self._first is None:
             raise ConfigError(
-                f"Nothing to export: of {len(self._found)} recordings, {self.skipped_failures} are failed attempts and "
-                "the others are not among the wanted episodes (--include-failures, --episodes)."
+                f"Nothing to export. Recordings: {len(self._found)}, of failed attempts: {self.skipped_failures}, "
+                f"of unknown outcome: {self.skipped_unknown} (--include-failures takes both); the others are not among "
+                "the wanted --episodes."
             )
 
 
 def _refuse_differences(profile: Profile, reference: Path, paths: Iterable[Path], options: CommonOptions) -> None:
-    """Raise ExportError with every difference between the reference and any of the recordings.
+    """Raise ConfigError with every difference between the reference and any of the recordings.
 
     Called only when one is known to differ: then all headers are read, so that the user hears of everything at once.
     """
@@ -195,7 +202,7 @@ def _refuse_differences(profile: Profile, reference: Path, paths: Iterable[Path]
                 files_by_difference.setdefault(difference, []).append(path.name)
     if files_by_difference:
         told = "; ".join(f"{difference} ({_some(files)})" for difference, files in files_by_difference.items())
-        raise ExportError(
+        raise ConfigError(
             f"These recordings do not go into one dataset with {reference.name}: {told}. Export them separately."
         )
 

@@ -22,9 +22,13 @@ from demorec.config import EpisodePlan
 from demorec.generate.executor import SINGLE_THREADED, Lost, Report, attempt_episode
 from demorec.processes import SPAWN
 
+_OF_THE_GROUP = frozenset({signal.SIGINT, signal.SIGTERM})
+_LEAVE = signal.SIGUSR1
+"""With it the driver asks a worker to leave its attempt where it is."""
+
 
 class _Interrupted(BaseException):
-    """Raised in a worker by SIGTERM; passes every `except Exception`, so that the writer leaves its part file."""
+    """Raised in a worker that shall leave its attempt; passes every `except Exception`: the part file stays."""
 
 
 @dataclass(eq=False)
@@ -101,7 +105,8 @@ class LocalExecutor:
     def interrupt(self) -> None:
         """Ask every worker to leave its attempt where it is and end."""
         for worker in self._live:
-            worker.process.terminate()
+            if worker.process.pid is not None and worker.process.is_alive():
+                os.kill(worker.process.pid, _LEAVE)
 
     def close(self) -> None:
         """End every worker: idle ones by word, busy ones by SIGKILL (their part files stay)."""
@@ -130,7 +135,7 @@ class LocalExecutor:
         process = SPAWN.Process(
             target=_worker_main, args=(theirs, self._maker, self._folder), name="demorec-worker", daemon=True
         )
-        with _environment(SINGLE_THREADED), _blocked(signal.SIGINT):
+        with _environment(SINGLE_THREADED), _blocked(_OF_THE_GROUP):
             process.start()
         theirs.close()  # else the pipe would never report that the worker is gone
         worker = _Worker(process=process, pipe=ours)
@@ -146,11 +151,12 @@ class LocalExecutor:
 
 
 def _worker_main(pipe: Connection[Report, EpisodePlan | None], maker: str, folder: Path) -> None:
-    """Life of a worker: plans in, reports out, until None, SIGTERM or the driver's death."""
-    # Ctrl-C reaches the whole process group; it is the driver who decides what it means.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
-    signal.signal(signal.SIGTERM, _raise_interrupted)
+    """Life of a worker: plans in, reports out, until None, the signal to leave, or the driver's death."""
+    # Both may reach the whole process group (Ctrl-C, timeout); it is the driver who decides what they mean.
+    for number in _OF_THE_GROUP:
+        signal.signal(number, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, _OF_THE_GROUP)
+    signal.signal(_LEAVE, _raise_interrupted)
     try:
         while (plan := pipe.recv()) is not None:
             pipe.send(attempt_episode(maker, plan, folder))
@@ -162,7 +168,7 @@ def _worker_main(pipe: Connection[Report, EpisodePlan | None], maker: str, folde
 
 
 def _raise_interrupted(number: int, frame: FrameType | None) -> None:
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    signal.signal(_LEAVE, signal.SIG_IGN)
     raise _Interrupted
 
 
@@ -189,10 +195,10 @@ def _environment(variables: dict[str, str]) -> Iterator[None]:
 
 
 @contextmanager
-def _blocked(number: signal.Signals) -> Iterator[None]:
-    """Hold a signal back, here and in a child that starts inside, until each is ready for it."""
-    signal.pthread_sigmask(signal.SIG_BLOCK, {number})
+def _blocked(numbers: frozenset[signal.Signals]) -> Iterator[None]:
+    """Hold signals back, here and in a child that starts inside, until each is ready for them."""
+    signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
     try:
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {number})
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, numbers)

@@ -70,7 +70,7 @@ def _write(
                     intake.take(source.path, Profile.of(recording, options))
                     writer.add(recording)
                 else:
-                    intake.leave_out()
+                    intake.leave_out(recording.outcome)
         if progress is not None:
             progress(done, len(found))
     intake.check()
@@ -82,4 +82,5 @@ def _write(
         new_episodes=writer.num_episodes,
         new_frames=writer.num_frames,
         skipped_failures=intake.skipped_failures,
+        skipped_unknown=intake.skipped_unknown,
     )

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from demorec.errors import ExportError, in_words
+from demorec.errors import ConfigError, ExportError, in_words
 from demorec.lerobot.facts import facts_of
 from demorec.lerobot.files import open_table, read_json, read_table
 from demorec.lerobot.layout import AUTOMATIC_FEATURES, STATS_PATH, TASKS_PATH, DatasetInfo, Feature, FilePosition
@@ -129,7 +129,7 @@ def features_to_append(existing: Existing, offered: dict[str, Feature], *, fps: 
     """Check that the recordings can give every feature of the dataset; return those that it does not have.
 
     Raises:
-        ExportError: All differences in one message.
+        ConfigError: All differences in one message.
     """
     info = existing.info
     wrong = []
@@ -145,7 +145,7 @@ def features_to_append(existing: Existing, offered: dict[str, Feature], *, fps: 
         else:
             wrong += [f"{name}: {difference}" for difference in _feature_differences(feature, offered[name])]
     if wrong:
-        raise ExportError(
+        raise ConfigError(
             f"These recordings cannot be appended, since the dataset differs: {'; '.join(wrong)}. "
             f"Export into a new folder, or with other options: {existing.root}"
         )

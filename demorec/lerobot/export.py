@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from demorec.errors import ConfigError, ExportError
+from demorec.errors import ConfigError
 from demorec.export.options import ExportReport, ProgressCallback
 from demorec.export.sources import ExportSource, Intake, find_recordings, places_of
 from demorec.export.staging import CODED, staged_folder
@@ -45,9 +45,9 @@ def export_lerobot(
         progress: Called after every recording.
 
     Raises:
-        ConfigError: Options that contradict each other, nothing to export, something in the way at `out`, or episodes
-            to be appended that the dataset has already.
-        ExportError: Recordings that differ, a full disk, a failed verification. What was at `out` is still there
+        ConfigError: Options that contradict each other or ask for what was not recorded, nothing to export, recordings
+            that differ, something in the way at `out`, or episodes to be appended that the dataset has already.
+        ExportError: A full disk, a failed verification. What was at `out` is still there
             then.
         RecordingError: A recording is damaged.
     """
@@ -137,6 +137,7 @@ class _Export:
             new_episodes=finished.total_episodes - start.num_episodes,
             new_frames=finished.total_frames - start.num_frames,
             skipped_failures=self._intake.skipped_failures,
+            skipped_unknown=self._intake.skipped_unknown,
             transcoded=tuple(self._transcoded),
             left_out=self._left_out,
             digest=combined_digest(finished, [*self._before, *self._digests]),
@@ -168,7 +169,7 @@ class _Export:
             return () if first.prepared is None else tuple(first.prepared.data.facts)
         has_progress = set(STAGE_COLUMNS) <= set(self._existing.facts)
         if has_progress != self._options.progress:
-            raise ExportError(
+            raise ConfigError(
                 f"These recordings cannot be appended, since the dataset {'has' if has_progress else 'lacks'} the "
                 f"stages of --progress: export {'with' if has_progress else 'without'} it: {self._existing.root}"
             )
@@ -181,7 +182,7 @@ class _Export:
         """The same, each counted and held against the others before it is written."""
         for reading in found:
             if reading.prepared is None:
-                self._intake.leave_out()
+                self._intake.leave_out(reading.outcome)
             else:
                 self._intake.take(reading.path, reading.profile)
             yield reading

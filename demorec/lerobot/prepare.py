@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from demorec.errors import ExportError
+from demorec.errors import ConfigError
 from demorec.export.columns import (
     DONE,
     INTERVENTION,
@@ -116,7 +116,8 @@ def prepare_episode(recording: AnyRecording, options: ExportOptions, *, code_dep
     """Read a recording into memory, as the dataset wants it; depth videos, which must be coded, only with `code_depth`.
 
     Raises:
-        ExportError: It has no frames, or a kind of picture is missing that was asked for.
+        ConfigError: A kind of picture is missing that was asked for.
+        ExportError: It has no frames.
         RecordingError: It is damaged.
     """
     if isinstance(recording, CollectedRecording):
@@ -161,7 +162,7 @@ def _language(recording: Recording, columns: FeatureColumns, options: ExportOpti
         return EpisodeLanguage()
     cameras = [camera for camera in recording.cameras if options.takes(IMAGE_PREFIX + camera)]
     if "vqa" in (options.language or ()) and not any(map(recording.has_segmentation, cameras)):
-        raise ExportError(
+        raise ConfigError(
             "Questions about pictures (vqa) need recordings with segmentation (generate --segmentation), leave them "
             f"out: {recording.path}"
         )
@@ -181,12 +182,12 @@ def _boxes(recording: Recording, columns: FeatureColumns, cameras: Sequence[str]
     """Camera feature -> what it sees, of the cameras that have segmentation.
 
     Raises:
-        ExportError: None has.
+        ConfigError: None has.
     """
     scene = recording.info.scene
     found = [camera for camera in scene.cameras if camera.name in cameras and recording.has_segmentation(camera.name)]
     if not found:
-        raise ExportError(
+        raise ConfigError(
             f"Boxes need recordings with segmentation (generate --segmentation), leave them out: {recording.path}"
         )
     return {

@@ -18,6 +18,7 @@ from demorec.lerobot.prepare import PreparedEpisode, dataset_features, prepare_e
 from demorec.lerobot.sidecar import AttemptRecord
 from demorec.processes import SPAWN
 from demorec.recording import CollectedRecording, open_recording
+from demorec.scene.episode import Outcome
 
 _BYTES_THAT_PAY = 1 << 30
 """Reading is so quick that starting processes pays from about a gigabyte of recordings on (benchmarks/export.py)."""
@@ -32,6 +33,7 @@ class Reading:
     Attributes:
         path: The recording.
         attempt: For the success rates.
+        outcome: As recorded; None where the recording ends before it.
         profile: What must agree with all the others.
         features, fps, robot: Of a dataset made from it.
         transcoded: Cameras whose pictures had to be coded anew, with the reason.
@@ -41,6 +43,7 @@ class Reading:
 
     path: Path
     attempt: AttemptRecord
+    outcome: Outcome | CollectedOutcome | None
     profile: Profile
     features: dict[str, Feature]
     fps: int
@@ -66,6 +69,7 @@ def read(source: ExportSource, options: ExportOptions) -> Reading | None:
         return Reading(
             path=source.path,
             attempt=attempt,
+            outcome=recording.outcome,
             profile=Profile.of(recording, options),
             features=features,
             fps=info.fps // frame_stride(info.fps, options.fps),

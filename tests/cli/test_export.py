@@ -22,7 +22,7 @@ def test_an_export(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert exit_code("export", "lerobot", run, "--out", out, "--repo-id", "me/cubes", "--no-verify") == 0
     printed = capsys.readouterr()
     assert "2 episodes, 15 frames" in printed.out
-    assert "1 failed attempts left out" in printed.out
+    assert "1 failed attempt left out" in printed.out
     assert dataset_digest(out) in printed.out
     assert printed.err == ""  # quiet without a terminal
     assert "# me/cubes" in (out / "README.md").read_text()

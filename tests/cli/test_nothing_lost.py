@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -19,6 +19,7 @@ from support.export import export, files_of, make_run
 from support.generate import run_fake
 from support.recording import write_episode
 
+from demorec.cli.paths import refuse_inside
 from demorec.config import GenerateConfig
 from demorec.errors import ConfigError, DemorecError
 from demorec.evaluate.rollouts import Settings, _open
@@ -473,6 +474,42 @@ def test_a_coverage_picture_is_replaced_on_request(place: Path) -> None:
         exit_code("check", place / "alone.mcap", "--only", "opens", "--coverage-picture", target, *flags)
         assert target.read_bytes().startswith(b"\x89PNG")
     assert not [path for path in place.iterdir() if path.name.endswith("demorec-part")]
+
+
+INSIDE: dict[str, Sequence[str]] = {
+    "view --save": ("runs/other/episodes/v.rrd", "runs/other/failed/v.rrd", "dataset/v.rrd", "dataset/data/v.rrd"),
+    "view --screenshot": ("runs/other/unfinished/v.png", "evaluation/episodes/v.png"),
+    "check --coverage-picture": ("runs/other/episodes/v.png", "dataset/v.png"),
+    "report --out": ("runs/other/episodes/v.html", "dataset/v.html"),
+    "render --out": ("runs/other/episodes", "dataset", "evaluation/failed", "runs/other/episodes/x.mcap"),
+    "replay --out": ("runs/other/episodes", "dataset/deep/er", "evaluation/failed"),
+    "export lerobot --out": ("runs/other/episodes/x", "runs/other/unfinished", "dataset/inner", "dataset/a/b"),
+    "export hdf5 --out": ("runs/other/failed/x.hdf5", "dataset/x.hdf5"),
+}
+
+
+@pytest.mark.parametrize(("command", "target"), [(row, target) for row in INSIDE for target in INSIDE[row]])
+def test_nothing_is_written_into_another_run_or_dataset(
+    place: Path, command: str, target: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It would be foreign there, and keep --overwrite from replacing the whole."""
+    for whole, mark in (("runs/other", "run.json"), ("evaluation", "evaluation.json")):
+        for part in ("episodes", "failed", "unfinished"):
+            (place / whole / part).mkdir(parents=True)
+        (place / whole / mark).write_text("{}")
+    before = files_of(place)
+    *words, flag = command.split()
+    (place / target).parent.mkdir(parents=True, exist_ok=True)
+    assert exit_code(*words, place / "alone.mcap", flag, place / target) == 2
+    assert "Nothing else is written into" in capsys.readouterr().err
+    assert files_of(place) == before
+
+
+def test_what_is_made_beside_the_parts_of_a_run_is_taken(place: Path) -> None:
+    (place / "runs/run/run.json").write_text("{}")
+    for target in (place / "runs/run/v.rrd", place / "v.rrd"):
+        assert exit_code("view", place / "alone.mcap", "--save", target) == 0
+    refuse_inside([place / "runs/run/dataset", place / "dataset", place / "renders/episodes/a.mcap"])
 
 
 # The rule itself.

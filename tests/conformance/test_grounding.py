@@ -13,7 +13,7 @@ from support.check import simulate_run
 from support.export import export, files_of, make_run
 from support.language import NOUNS, language_of, meant, phrases
 
-from demorec.errors import ConfigError, ExportError
+from demorec.errors import ConfigError
 from demorec.geometry import rotation_from_quat
 from demorec.language.masks import outline_area, run_lengths
 from demorec.lerobot import dataset_digest
@@ -269,9 +269,9 @@ def test_without_segmentation_there_are_traces_and_no_questions(tmp_path: Path) 
     export(run, tmp_path / "told", language=())
     (frames,) = language_of(tmp_path / "told")
     assert {row["style"] for _, rows in frames for row in rows} <= {"trace"}
-    with pytest.raises(ExportError, match="need recordings with segmentation"):
+    with pytest.raises(ConfigError, match="need recordings with segmentation"):
         export(run, tmp_path / "asked", language=("vqa",))
-    with pytest.raises(ExportError, match="need recordings with segmentation"):
+    with pytest.raises(ConfigError, match="need recordings with segmentation"):
         export(run, tmp_path / "boxed", boxes=True)
     with pytest.raises(ConfigError, match="--boxes are written for a whole dataset"):
         export(run, tmp_path / "told", boxes=True, append=True)

@@ -15,7 +15,7 @@ from support.check import simulate_run
 from support.export import data_table, episode_rows, export, files_of
 from support.language import active, language_of, meant, phrases
 
-from demorec.errors import ConfigError, ExportError
+from demorec.errors import ConfigError
 from demorec.geometry import Pose
 from demorec.language.kinds import STATES
 from demorec.language.situation import nouns_of, place_of
@@ -228,7 +228,7 @@ def test_the_same_seed_says_the_same_and_nothing_else_of_the_dataset_changes(
 def test_appending_needs_language_where_the_dataset_has_it(runs: list[Path], tmp_path: Path) -> None:
     out = tmp_path / "grown"
     export(runs[0], out, language=())
-    with pytest.raises(ExportError, match="language_persistent"):
+    with pytest.raises(ConfigError, match="language_persistent"):
         export(runs[1], out, append=True)
     report = export(runs[1], out, append=True, language=())
     assert report.digest == dataset_digest(out)
@@ -358,11 +358,11 @@ def test_lerobots_tools_keep_the_words(runs: list[Path], tmp_path: Path) -> None
 def test_progress_goes_on_where_a_dataset_ends(runs: list[Path], tmp_path: Path) -> None:
     out = tmp_path / "grown"
     export(runs[0], out, progress=True)
-    with pytest.raises(ExportError, match="has the stages of --progress: export with it"):
+    with pytest.raises(ConfigError, match="has the stages of --progress: export with it"):
         export(runs[1], out, append=True)
     export(runs[1], out, append=True, progress=True)
     export(runs[:2], tmp_path / "at_once", progress=True)
     assert (out / "sarm_progress.parquet").read_bytes() == (tmp_path / "at_once" / "sarm_progress.parquet").read_bytes()
     export(runs[0], tmp_path / "plain")
-    with pytest.raises(ExportError, match="lacks the stages of --progress: export without it"):
+    with pytest.raises(ConfigError, match="lacks the stages of --progress: export without it"):
         export(runs[1], tmp_path / "plain", append=True, progress=True)

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 from support.export import export, files_of, make_run
+from support.recording import make_episode
 
 from demorec.cli.flags import _field_texts
 from demorec.config import VideoConfig
-from demorec.errors import ConfigError, DemorecError, ExportError, RecordingError
+from demorec.errors import ConfigError, DemorecError, RecordingError
 from demorec.export.options import CommonOptions
+from demorec.recording import EpisodeWriter
+from demorec.recording.recover import recover
 from demorec.tables import EXPORTERS
 
 pytestmark = pytest.mark.parametrize("exporter", EXPORTERS.names())
@@ -51,6 +55,20 @@ def test_the_wanted_episodes_go_in_and_nothing_else_changes(exporter: str, run: 
 def test_failed_attempts_go_in_when_asked_for(exporter: str, run: Path, tmp_path: Path) -> None:
     report = export(run, tmp_path / "d", exporter, include_failures=True)
     assert (report.num_episodes, report.num_frames, report.skipped_failures) == (4, 27, 0)
+
+
+def test_a_recovered_recording_is_no_failed_attempt(exporter: str, run: Path, tmp_path: Path) -> None:
+    sources = [run / "episodes" / "episode_000000.mcap", tmp_path / "recovered.mcap"]
+    info, frames, _ = make_episode(num_frames=70, episode_index=7)
+    with suppress(InterruptedError), EpisodeWriter(tmp_path / "cut.mcap", info) as writer:
+        for frame in frames:
+            writer.write(frame)
+        raise InterruptedError
+    recover(tmp_path / "cut.mcap.part", sources[1])
+    report = export(sources, tmp_path / "d", exporter)
+    assert (report.num_episodes, report.skipped_failures, report.skipped_unknown) == (1, 0, 1)
+    with pytest.raises(ConfigError, match="of failed attempts: 0, of unknown outcome: 1"):
+        export(sources[1:], tmp_path / "e", exporter)
 
 
 def test_the_same_recordings_give_the_same_bytes(exporter: str, run: Path, tmp_path: Path) -> None:
@@ -95,7 +113,7 @@ def test_what_is_no_dataset_is_never_replaced(exporter: str, run: Path, tmp_path
         ({"fps": 0}, ConfigError, "at least 1"),
         ({"features": ("observation.stat",)}, ConfigError, "Did you mean 'observation.state'"),
         ({"features": ("observation.environment_state",)}, ConfigError, "only --privileged adds it"),
-        ({"depth": True}, RecordingError, "no depth pictures"),
+        ({"depth": True}, ConfigError, "needs recordings with depth pictures"),
     ],
 )
 def test_a_refused_export_leaves_nothing(
@@ -113,7 +131,7 @@ def test_a_refused_export_leaves_nothing(
 
 def test_recordings_that_differ_are_refused(exporter: str, run: Path, tmp_path: Path) -> None:
     other = make_run(tmp_path / "other", (4,), video=VideoConfig(), width=48)
-    with pytest.raises(ExportError, match=r"do not go into one dataset.*48x48 instead of 64x48"):
+    with pytest.raises(ConfigError, match=r"do not go into one dataset.*48x48 instead of 64x48"):
         export([run, other], tmp_path / "d", exporter)
     assert [path.name for path in tmp_path.iterdir()] == ["other"]
 

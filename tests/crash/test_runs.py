@@ -319,6 +319,21 @@ def test_the_first_interrupt_lets_current_episodes_end(
     assert run_fake(out).run.digest == reference.run.digest
 
 
+def test_a_signal_to_the_whole_group_is_left_to_the_driver(tmp_path: Path) -> None:
+    """As `timeout` sends it; the workers get it first, so that they would be lost if they listened to it."""
+    out = tmp_path / "run"
+    process = driver(out, "make_slowly", 8, grace_s=PATIENCE_S)
+    wait_for(lambda: num_finished(out) >= 1)
+    for child in [*workers_of(process), psutil.Process(process.pid)]:
+        child.send_signal(signal.SIGTERM)
+    told, _ = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 130
+    assert "made again" not in told
+    run = load_run_file(out)
+    assert run.sessions[-1].lost_workers == 0
+    assert len(run.successes) == num_finished(out) < 8
+
+
 @pytest.mark.parametrize("maker", [pytest.param("make_for_ever", marks=pytest.mark.slow), "make_stubbornly"])
 def test_after_the_first_interrupt_nothing_goes_on_for_long(tmp_path: Path, maker: str) -> None:
     out = tmp_path / "run"

@@ -68,7 +68,8 @@ def make_for_ever(plan: EpisodePlan, folder: Path) -> Attempt:
 
 def make_stubbornly(plan: EpisodePlan, folder: Path) -> Attempt:
     """Never ends by itself and does not listen."""
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    for number in (signal.SIGTERM, signal.SIGUSR1):
+        signal.signal(number, signal.SIG_IGN)
     return make_for_ever(plan, folder)
 
 

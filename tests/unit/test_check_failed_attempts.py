@@ -59,7 +59,7 @@ def test_what_a_failed_attempt_recorded_is_told_and_does_not_fail_the_run(
         (line,) = [line for line in out.splitlines() if f" {result.check} " in line]
         assert f"(allowed {result.fail:g}" in line
     assert "0 failed" in out
-    assert "Not counted: 1 failed attempts that fail checks of what they recorded." in out
+    assert "Not counted, since what they recorded fails checks: 1 failed attempt." in out
     code, out = check(capsys, run, "--only", *wrong, "--json")
     assert code == 0
     assert [item["failed_attempt"] for item in json.loads(out) if item["kind"] == "recording"] == [True]

@@ -264,7 +264,7 @@ def test_all_differences_are_told_at_once(run: Path, tmp_path: Path) -> None:
     write_episode(tmp_path / "slow.mcap", num_frames=8, fps=15)
     write_episode(tmp_path / "large.mcap", num_frames=8, width=80, video=VideoConfig(codec="av1"))
     write_episode(tmp_path / "blind.mcap", num_frames=8, cameras=("front",))
-    with pytest.raises(ExportError) as error:
+    with pytest.raises(ConfigError) as error:
         export([run, tmp_path / "slow.mcap", tmp_path / "large.mcap", tmp_path / "blind.mcap"], tmp_path / "d")
     text = str(error.value)
     for part in (
@@ -344,7 +344,7 @@ def test_append_refuses_what_does_not_fit_and_says_all(run: Path, tmp_path: Path
     out = tmp_path / "d"
     export(run, out, episodes="0", action="ee", privileged=True)
     before = files_of(out)
-    with pytest.raises(ExportError) as error:
+    with pytest.raises(ConfigError) as error:
         export(run, out, append=True, fps=15)
     text = str(error.value)
     assert "fps is 30, the recordings give 15" in text
@@ -395,7 +395,7 @@ def test_only_the_chosen_features(tmp_path: Path, chosen: tuple[str, ...]) -> No
 
 def test_recordings_may_differ_in_what_is_left_out(run: Path, tmp_path: Path) -> None:
     other = make_run(tmp_path / "other", (6,), width=80, height=48)
-    with pytest.raises(ExportError, match="size of camera front is 80x48"):
+    with pytest.raises(ConfigError, match="size of camera front is 80x48"):
         export([run, other], tmp_path / "d")
     assert export([run, other], tmp_path / "d", features=("observation.velocity",)).num_episodes == 5
 
@@ -474,7 +474,7 @@ def test_depth_is_kept_to_the_step_of_its_codes(tmp_path: Path) -> None:
     feature = info(tmp_path / "d")["features"]["observation.images.front_depth"]
     assert feature["info"]["is_depth_map"] is True
     assert feature["shape"] == [48, 64, 1]
-    with pytest.raises(RecordingError, match="no depth"):
+    with pytest.raises(ConfigError, match="needs recordings with depth"):
         export(make_run(tmp_path / "run", (5,)), tmp_path / "e", depth=True)
 
 

@@ -234,7 +234,7 @@ def test_the_command(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[st
     printed = capsys.readouterr()
     assert printed.out.splitlines()[:2] == [
         f"3 episodes, 20 frames: {out}",
-        "1 failed attempts left out (--include-failures takes them).",
+        "1 failed attempt left out (taken with --include-failures).",
     ]
     assert "choose another name, or --overwrite" in printed.err
     assert "Did you mean 'hdf5'?" in printed.err

@@ -116,7 +116,7 @@ def test_a_dataset_with_files_of_somebody_is_set_aside_when_the_run_has_changed(
 def test_an_edited_card_is_kept_when_the_run_has_changed(run: Path, is_known: bool) -> None:
     if not is_known:  # the run file was lost
         save_run_file(replace(load_run_file(run), export=None), run)
-        configs = {load_run_file(run).config_digest: {}}
+        configs: dict[str, object] = {load_run_file(run).config_digest: {}}
         (run / "dataset" / "demorec" / "configs.json").write_text(json.dumps(configs))
     with (run / "dataset" / "README.md").open("a") as card:
         card.write("my own card\n")
