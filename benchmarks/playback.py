@@ -79,6 +79,7 @@ def measure_saving(path: Path, rounds: int) -> None:
         target = Path(folder) / "x.rrd"
         save(source, target)  # meshes into the cache, libraries into memory
         with source.open() as episode:
+            assert isinstance(episode, PlayedEpisode)
             num_frames, num_samples = episode.num_frames, len(episode.curves["position"].time_ns)
             for _ in range(rounds):
                 columns.append(_cpu(lambda: as_columns(episode, target)))

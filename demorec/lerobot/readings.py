@@ -18,6 +18,7 @@ from demorec.lerobot.prepare import PreparedEpisode, dataset_features, prepare_e
 from demorec.lerobot.sidecar import AttemptRecord
 from demorec.processes import SPAWN
 from demorec.recording import CollectedRecording, open_recording
+from demorec.scene.collected import CollectedOutcome
 from demorec.scene.episode import Outcome
 
 _BYTES_THAT_PAY = 1 << 30

@@ -12,6 +12,7 @@ from support.viewer import need_vulkan
 from demorec.cli import run_command
 from demorec.cli.view import View
 from demorec.errors import DemorecError, RecordingError
+from demorec.playback.episode import PlayedEpisode
 from demorec.playback.glyphs import BOX, DRAWABLE, DrawableText
 from demorec.playback.layout import episode_layout
 from demorec.playback.scene import log_episode, new_recording
@@ -56,6 +57,7 @@ def test_all_text_of_a_layout_is_drawable(foreign: Path) -> None:
     (source,) = find_episodes([foreign])
     text = DrawableText()
     with text.source(source).open() as episode:
+        assert isinstance(episode, PlayedEpisode)
         written = [
             summary(episode),
             episode.name,
