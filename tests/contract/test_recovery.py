@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 from support.sim import episode
-from support.tasks import tasks_with_long_ones_slow
+from support.tasks import tasks_with_slow_ones
 
 from demorec.geometry import Array, Pose, quat_multiply
 from demorec.loop import Episode, ScriptAgent, Session, make_world
@@ -133,7 +133,7 @@ def test_a_bystander_in_the_hand_is_put_back() -> None:
 
 @pytest.mark.slow  # every task is simulated twice; pick_place above is quick
 @pytest.mark.parametrize("share", [0.25, 0.5, 0.75])
-@pytest.mark.parametrize("task", tasks_with_long_ones_slow())
+@pytest.mark.parametrize("task", tasks_with_slow_ones())
 def test_every_task_goes_on_from_the_middle_of_its_script(task: str, share: float) -> None:
     prepared = episode(1, task=task, variation="mild")
     with make_world(prepared.info) as world:
