@@ -17,7 +17,7 @@ from demorec.scene.scene import Camera
 
 NEAREST = 0.3
 """Metres: nearer to a camera there is little that a shifted camera would see shifted."""
-UNRELATED = 20.0
+UNRELATED = 16.0
 """Root mean square difference of all pictures from the drawn ones, of 255, from which on they show something else."""
 
 

@@ -24,11 +24,6 @@ _PART = re.compile(rf"[^/]+-\d+-\d+/{_NAME}\.part")  # of a worker: host, proces
 _RECORDING_ASIDE = re.compile(rf"{_NAME}(\.\d+)?")  # since it was damaged or of another run
 _REPORT = re.compile(r"error_episode_\d+\.txt")
 _CARD = re.compile(rf"{CARD_PATH}(\.\d+)?")  # edited by somebody, so that --overwrite does not delete it
-_LEFT = (
-    (_RECORDING_ASIDE, "recording", " not of this run, or damaged"),
-    (_REPORT, "error report", ""),
-    (_CARD, "edited dataset card", ""),
-)
 _SET_ASIDE_DATASET = re.compile(rf"({DATASET_FOLDER}(?:\.\d+)?)/(.*)")
 
 
@@ -39,11 +34,19 @@ def set_aside(folder: Path) -> list[str]:
     others = [name for name in names if not _SET_ASIDE_DATASET.fullmatch(name)]
     parts = [name for name in others if _PART.fullmatch(name)]
     empty = sum((folder / UNFINISHED / name).lstat().st_size == 0 for name in parts)
-    counted = [(len(datasets), "dataset", " that the run did not leave like this")]
-    counted += [(sum(bool(kind.fullmatch(name)) for name in others), noun, more) for kind, noun, more in _LEFT]
-    counted += [(len(parts) - empty, "unfinished recording", " (demorec recover keeps what is whole)")]
-    counted += [(empty, "unfinished recording", " in which nothing was written")]
+    counted = [
+        (len(datasets), "dataset", " that the run did not leave like this"),
+        (_number(_RECORDING_ASIDE, others), "recording", " not of this run, or damaged"),
+        (len(parts) - empty, "unfinished recording", " (demorec recover keeps what is whole)"),
+        (empty, "unfinished recording", " in which nothing was written"),
+        (_number(_REPORT, others), "error report", ""),
+        (_number(_CARD, others), "edited dataset card", ""),
+    ]
     return [f"{count} {noun}{'' if count == 1 else 's'}{more}" for count, noun, more in counted if count]
+
+
+def _number(kind: re.Pattern[str], names: list[str]) -> int:
+    return sum(bool(kind.fullmatch(name)) for name in names)
 
 
 def foreign_recordings(folder: Path, place: str, *, known: frozenset[str] = frozenset()) -> Iterator[str]:

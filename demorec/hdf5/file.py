@@ -17,7 +17,9 @@ from demorec.safety.files import HDF5_MAGIC, open_regular
 from demorec.safety.replacing import Kind
 
 ENV_ARGUMENTS = frozenset({"robot", "fps", "physics_hz", "cameras", "action", "privileged"})
-"""What `env_args` says of an environment of ours, by which our files are known."""
+"""What `env_args` says of every environment of ours, by which our files are known."""
+PICTURE_ARGUMENTS = frozenset({"width", "height"})
+"""What it says of environments with cameras beside."""
 _OBSERVATIONS = r"robot0_(joint_pos|joint_vel|gripper_qpos|gripper_qvel|eef_pos|eef_quat)|object|[^/]+_(image|depth)"
 _PARTS = re.compile(
     r"data|mask|mask/(train|valid)|data/demo_\d+(/(actions|states|rewards|dones|obs))?"
@@ -48,7 +50,8 @@ def _is_our_dataset(path: Path) -> bool:
             if not isinstance(data, h5py.Group) or not {"total", "env_args"} <= set(data.attrs):
                 return False
             described = json.loads(data.attrs["env_args"])
-            return str(described["env_name"]).startswith("demorec/") and set(described["env_kwargs"]) == ENV_ARGUMENTS
+            given = set(described["env_kwargs"])
+            return str(described["env_name"]).startswith("demorec/") and given - PICTURE_ARGUMENTS == ENV_ARGUMENTS
     except (OSError, RuntimeError, KeyError, ValueError, TypeError, RecursionError):
         return False
 

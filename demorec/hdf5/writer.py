@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.export.columns import DONE, REWARD, SUCCESS, check_feature_names, feature_columns, frame_stride
-from demorec.hdf5.file import ENV_ARGUMENTS, NewFile
+from demorec.hdf5.file import ENV_ARGUMENTS, PICTURE_ARGUMENTS, NewFile
 from demorec.hdf5.options import Hdf5Options
 from demorec.recording import Recording, channels
 from demorec.scene.episode import EpisodeColumns, EpisodeInfo
@@ -160,7 +160,7 @@ class RobomimicWriter:
             "action": options.action,
             "privileged": options.privileged,
         }
-        assert arguments.keys() == ENV_ARGUMENTS
+        assert arguments.keys() - PICTURE_ARGUMENTS == ENV_ARGUMENTS
         described = {"env_name": environment_name(info.task), "type": _GYM, "env_kwargs": arguments}
         self._data.attrs["env_args"] = json.dumps(described)
         self._data.attrs["task"], self._data.attrs["fps"] = info.task, fps

@@ -140,12 +140,11 @@ class RecordingReader(EpisodeFile):
 
     def events(self) -> Iterator[tuple[int, Event]]:
         """(time_ns, event) in order of time; changes of phase are in `columns().phase`."""
-        block = self._container.blocks((channels.EVENTS,))[channels.EVENTS]
-        for time_ns, data in zip(block.time_ns.tolist(), block.messages(), strict=True):
+        for message in self._container.messages((channels.EVENTS,)):
             with damage_as_recording_error(self.path):
-                event = messages.read_log(data)
+                event = messages.read_log(message.data)
             if event.name != channels.PHASE_EVENT:
-                yield time_ns, event
+                yield message.time_ns, event
 
     def packets(self, camera: str) -> Iterator[VideoPacket]:
         """The coded pictures of a camera, one a frame, in order."""

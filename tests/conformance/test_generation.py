@@ -164,7 +164,7 @@ def test_the_command_does_it_all_and_says_so(
             generate_dataset_main(args)
         told = capsys.readouterr().out
         assert ended.value.code == 0
-        assert f"1 of 1 asked, {made} attempts made now" in told
+        assert f"1 of 1 asked, {made} attempt{'s' if made != 1 else ''} made now" in told
         assert load_run_file(out).digest in told
         for word in ("success", "frames", "recordings", "dataset", "simulation", "rendering", "export", "checks"):
             assert word in told

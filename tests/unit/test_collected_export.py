@@ -113,7 +113,7 @@ def test_options_that_a_collected_episode_cannot_serve(tmp_path: Path, options: 
 def test_episodes_of_other_kinds_do_not_mix(tmp_path: Path) -> None:
     run = run_of(tmp_path / "run", complete(num_frames=5))
     write_episode(tmp_path / "run" / "episodes" / "episode_000001.mcap", num_frames=5)
-    with pytest.raises(ExportError, match="kind of episode is simulated instead of collected"):
+    with pytest.raises(ConfigError, match="kind of episode is simulated instead of collected"):
         export(run, tmp_path / "d")
 
 

@@ -294,4 +294,4 @@ def test_refusals(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str])
         assert words in capsys.readouterr().err
     write_episode(tmp_path / "one.mcap", num_frames=3, cameras=())
     assert exit_code("report", tmp_path / "one.mcap", "--no-checks", "--out", tmp_path / "x.html") == 0
-    assert capsys.readouterr().out.startswith("1 episodes, ")
+    assert capsys.readouterr().out.startswith("1 episode, ")
