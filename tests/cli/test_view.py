@@ -155,6 +155,7 @@ def test_the_viewer_shows_a_run(run_folder: Path, tmp_path: Path) -> None:
     assert np.abs(before.astype(int) - after).mean() > 1.0, "the video stands still"
 
 
+@pytest.mark.slow
 @pytest.mark.viewer
 @pytest.mark.parametrize("codec", [pytest.param("av1", marks=pytest.mark.slow), "jpeg"])
 def test_the_viewer_shows_the_colours_that_were_recorded(codec: Literal["av1", "jpeg"], tmp_path: Path) -> None:
@@ -208,6 +209,7 @@ def test_a_screenshot_of_a_comparison(run_folder: Path, tmp_path: Path) -> None:
     assert num_colors(pixels((tmp_path / "c.png").read_bytes())) > 200
 
 
+@pytest.mark.slow
 @pytest.mark.viewer
 def test_episodes_arrive_while_the_viewer_is_open(
     run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

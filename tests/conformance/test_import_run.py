@@ -288,6 +288,7 @@ def trossen_dataset(tmp_path_factory: pytest.TempPathFactory) -> tuple[bags.Note
     return notes, folder / "dataset"
 
 
+@pytest.mark.slow
 def test_a_lerobot_dataset_of_a_bag(trossen_dataset: tuple[bags.Notes, Path]) -> None:
     """As LeRobot reads it: float32 as the bag has it, and the row's message found by the plainest search."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset

@@ -331,6 +331,7 @@ def test_episodes_are_filtered_by_what_is_known_of_them(runs: list[Path], datase
         assert (row["success_checks/distance_to_goal"] is None) == (info.task == "tutorial")
 
 
+@pytest.mark.slow
 def test_lerobots_tools_keep_the_words(runs: list[Path], tmp_path: Path) -> None:
     from lerobot.datasets import LeRobotDataset
     from lerobot.datasets.aggregate import aggregate_datasets

@@ -247,6 +247,7 @@ def test_an_episode_that_was_edited_with_its_digest(run: Path, tmp_path: Path) -
     assert level_of(spoilt, "run_dataset_content", "run") == "fail"
 
 
+@pytest.mark.slow
 def test_deep_makes_the_episodes_of_a_dataset_again(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
     def told(*flags: str) -> tuple[object, list[str]]:
         with pytest.raises(SystemExit) as ended:

@@ -91,6 +91,7 @@ def test_the_example_makes_checks_and_replays_a_dataset(
     assert "Note: the source of my_robots has changed since this was recorded." in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_the_robot_does_a_task_and_replays(folder: Path, tmp_path: Path) -> None:
     path = simulate(tmp_path / "e.mcap", robot=XARM6, cameras=("my_robots:TOP",), renderer="tiny", width=32, height=32)
     with Recording(path) as opened:

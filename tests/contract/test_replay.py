@@ -82,6 +82,7 @@ def test_states(recorded: Path) -> None:
     assert report.success is None
 
 
+@pytest.mark.slow
 def test_noise_delay_and_rate_change_the_motion(recorded: Path) -> None:
     plain = _replay(recorded)
     noisy, again, other = (_replay(recorded, noise=0.01, seed=seed) for seed in (1, 1, 2))
@@ -163,6 +164,7 @@ def test_datasets_of_every_kind_of_action(action: str, quiet_run: Path, tmp_path
     assert exit_code("replay", tmp_path / "ds", "--episodes", "1") == 0
 
 
+@pytest.mark.slow
 def test_a_dataset_with_noise_still_succeeds(tmp_path: Path) -> None:
     run = simulate_run(tmp_path / "run", 2, seed=3)
     export_lerobot([run], tmp_path / "ds", ExportOptions(verify=False, fps=10))

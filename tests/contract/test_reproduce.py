@@ -36,6 +36,7 @@ def one_bit(source: Path) -> bytes:
     return spoilt
 
 
+@pytest.mark.slow
 def test_what_is_no_longer_what_was_made(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     spoilt = tmp_path / "run"
     shutil.copytree(run, spoilt)

@@ -121,6 +121,7 @@ def test_a_character_without_a_glyph_is_named(tmp_path: Path) -> None:
         v.save_picture(tmp_path / "x.png")
 
 
+@pytest.mark.slow
 @pytest.mark.viewer
 def test_a_failed_episode_with_a_chinese_instruction_is_photographed(
     foreign: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]

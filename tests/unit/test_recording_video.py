@@ -31,6 +31,7 @@ for codec in ("h264", "av1", "jpeg"):
 """
 
 
+@pytest.mark.slow
 def test_packets_do_not_depend_on_what_was_in_the_memory() -> None:
     """glibc fills fresh memory with a pattern of our choice: an encoder that reads it before setting it gives itself
     away (x264 with its macroblock tree does)."""
