@@ -128,7 +128,7 @@ def write_table(largest: Mapping[str, float], *, seed: int, episodes: int) -> No
         seed=seed,
         date=datetime.datetime.now(datetime.UTC).date().isoformat(),
         episodes=episodes,
-        settings="all tasks, robots and variations; 64 to 640 pixels, 10 to 60 fps, three codecs, depth and labels",
+        settings="an episode each of settings across tasks, robots, variations, sizes, rates, codecs; not yet all",
         margin=before.calibration.margin,
     )
     checks = {

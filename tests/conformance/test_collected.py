@@ -94,6 +94,7 @@ def test_rerun_shows_joints_videos_and_frames(path: Path, tmp_path: Path) -> Non
     assert "Transform3D" in told
 
 
+@pytest.mark.slow
 def test_lerobot_reads_the_dataset_as_it_was_recorded(tmp_path: Path) -> None:
     (tmp_path / "run" / "episodes").mkdir(parents=True)
     write_collected(tmp_path / "run" / "episodes" / "episode_000000.mcap", make_collected(cameras=(TOP,)))

@@ -102,6 +102,7 @@ def answers(dataset: Path, style: str) -> list[tuple[int, str, str, Row]]:
     return found
 
 
+@pytest.mark.slow
 def test_lerobots_validator_knows_every_question(dataset: Path, tmp_path: Path) -> None:
     from lerobot.annotations.steerable_pipeline.reader import iter_episodes
     from lerobot.annotations.steerable_pipeline.staging import EpisodeStaging

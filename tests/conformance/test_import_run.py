@@ -305,6 +305,7 @@ def test_a_lerobot_dataset_of_a_bag(trossen_dataset: tuple[bags.Notes, Path]) ->
             assert item[feature].numpy().tobytes() == told[-1].body["positions"].tobytes()
 
 
+@pytest.mark.slow
 def test_kept_packets_are_in_the_dataset_byte_for_byte(trossen_dataset: tuple[bags.Notes, Path]) -> None:
     notes, folder = trossen_dataset
     (video,) = (folder / "videos/observation.images.high").rglob("*.mp4")

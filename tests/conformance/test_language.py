@@ -33,7 +33,7 @@ MISSING = ("pick_place", "stack", "sort_by_color")
 """Tasks whose episode begins with a deliberate miss."""
 PLAIN = Ranges(miss_probability=0.0)
 
-pytestmark = pytest.mark.usefixtures("hf_datasets_cache")
+pytestmark = [pytest.mark.usefixtures("hf_datasets_cache"), pytest.mark.slow]
 
 
 @pytest.fixture(scope="module")

@@ -60,7 +60,7 @@ def picture(item: dict[str, Any], camera: str) -> np.ndarray[Any, Any]:
     return np.asarray(item[f"observation.images.{camera}"].numpy().transpose(1, 2, 0))
 
 
-@pytest.mark.parametrize("backend", ["pyav", "torchcodec"])
+@pytest.mark.parametrize("backend", ["pyav", pytest.param("torchcodec", marks=pytest.mark.slow)])
 def test_lerobot_reads_every_frame_as_it_was_recorded(run: Path, dataset: Path, backend: str) -> None:
     if backend == "torchcodec":
         try:
@@ -116,6 +116,7 @@ def test_windows_in_time_stop_at_the_ends_of_an_episode(run: Path, dataset: Path
             assert np.array_equal(image, pictures[held - first])
 
 
+@pytest.mark.slow
 def test_a_loader_with_worker_processes_sees_every_frame_once(dataset: Path) -> None:
     import torch
 
@@ -180,6 +181,7 @@ def test_depth_is_read_as_metres(tmp_path: Path) -> None:
     assert found.meta.stats["observation.images.front_depth"]["min"].reshape(-1)[0] == pytest.approx(values[0])
 
 
+@pytest.mark.slow
 def test_depth_without_its_colour_is_verified(tmp_path: Path) -> None:
     run = make_run(tmp_path / "run", (6, 5), depth=True)
     options = ExportOptions(

@@ -75,6 +75,7 @@ def test_a_failed_attempt_comes_out_the_same(tmp_path: Path, workshop: Workshop)
     assert deep_check(path, workshop).level == "pass"
 
 
+@pytest.mark.slow
 def test_a_rendering_comes_out_the_same(blind: Path, tmp_path: Path, workshop: Workshop) -> None:
     path = tmp_path / "rendered.mcap"
     rerender(blind, path, RerenderOptions(cameras=("front",), width=64, height=64, looks=3))
@@ -352,6 +353,7 @@ def test_a_few_pictures_among_many(filmed: Path, tmp_path: Path, workshop: Works
     assert all(d.is_coding or d.field == "picture" or d.stream.endswith("/histogram") for d in report.differences)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stream", [stream for stream in CODED if "image" not in stream])
 def test_a_coded_picture_of_another_frame(stream: str, filmed: Path, tmp_path: Path, workshop: Workshop) -> None:
     """The stamp is right, the bytes are whole, the picture is that of five frames before."""
@@ -403,6 +405,7 @@ def test_a_damaged_file_among_good_ones(blind: Path, tmp_path: Path, workshop: W
     assert "cut off" in reports[0].error
 
 
+@pytest.mark.slow
 def test_a_run_makes_a_sample_again(tmp_path: Path) -> None:
     """What generate-dataset does at the end: the second and the fourth of four episodes."""
     folder = simulate_run(tmp_path / "run", 4, seed=7, fps=FPS)

@@ -41,7 +41,7 @@ def test_every_task_replays_to_the_bit(task: str, tmp_path: Path) -> None:
     assert report.success == report.recorded_success
 
 
-@pytest.mark.parametrize("fps", [10, 60])
+@pytest.mark.parametrize("fps", [pytest.param(10, marks=pytest.mark.slow), 60])
 def test_other_rates_replay_to_the_bit(fps: int, tmp_path: Path) -> None:
     assert _replay(simulate(tmp_path / "e.mcap", fps=fps, seed=5)).is_identical
 
@@ -150,7 +150,9 @@ def quiet_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return simulate_run(tmp_path_factory.mktemp("quiet") / "run", 2, seed=3, variation="none")
 
 
-@pytest.mark.parametrize("action", ["joint", "joint_increment", "ee", "ee_delta"])
+@pytest.mark.parametrize(
+    "action", ["joint", "ee_delta", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("joint_increment", "ee"))]
+)
 def test_datasets_of_every_kind_of_action(action: str, quiet_run: Path, tmp_path: Path) -> None:
     export_lerobot([quiet_run], tmp_path / "ds", ExportOptions(verify=False, action=action))  # type: ignore[arg-type]
     from demorec.cli.replay import demonstrations
@@ -172,6 +174,7 @@ def test_a_dataset_with_noise_still_succeeds(tmp_path: Path) -> None:
     assert exit_code("check", tmp_path / "ds", "--no-pictures", "--replay", "2") == 0
 
 
+@pytest.mark.slow
 def test_what_a_dataset_differs_in_is_in_its_total(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = simulate_run(tmp_path / "run", 1, seed=5)
     export_lerobot([run], tmp_path / "d", ExportOptions(verify=False))

@@ -47,6 +47,7 @@ def test_own_cameras_and_looks_give_the_recorded_pictures_again(filmed: Path, tm
         assert b.info.origin == f"render of {a.digest()[:16]}"
 
 
+@pytest.mark.slow
 def test_calibration_errors_are_kept(tmp_path: Path) -> None:
     # The recorded extrinsics are off on purpose; the pictures must come from where the cameras were.
     source = simulate(tmp_path / "e.mcap", seed=2, cameras=("front",), width=64, height=64, variation="full")
@@ -55,6 +56,7 @@ def test_calibration_errors_are_kept(tmp_path: Path) -> None:
     assert not report.differing
 
 
+@pytest.mark.slow
 def test_other_cameras_sizes_and_looks_pass_the_checks(filmed: Path, tmp_path: Path) -> None:
     (tmp_path / "cameras.toml").write_text(SIDE)
     out = tmp_path / "out"

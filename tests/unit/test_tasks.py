@@ -187,10 +187,10 @@ def test_a_deliberate_miss_is_flagged_and_mended() -> None:
 @pytest.mark.parametrize(
     ("index", "task", "offset"),
     [
-        (0, "pick_place", 0.0),
-        (1, "pick_place", 0.005),
+        pytest.param(0, "pick_place", 0.0, marks=pytest.mark.slow),
+        pytest.param(1, "pick_place", 0.005, marks=pytest.mark.slow),
         (2, "pick_place", -0.015),  # against the miss, as far as is allowed
-        (3, "pick_place", -0.005),
+        pytest.param(3, "pick_place", -0.005, marks=pytest.mark.slow),
         (4, "pick_shapes", 0.005),
         (6, "pick_from_clutter", -0.005),
     ],
@@ -210,6 +210,7 @@ def test_a_deliberate_miss_touches_nothing(robot: str, task: str, index: int, of
         assert np.abs(opened.observation.object_poses[name].position - start.position).max() < 3e-4, name
 
 
+@pytest.mark.slow
 def test_several_objects_are_missed_once() -> None:
     frames, outcome = run(behave(episode(1, task="sort_by_color"), miss_x=0.03))
     assert outcome.success
