@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from itertools import islice
 from pathlib import Path
@@ -16,7 +17,7 @@ from demorec.recording.pixels import PixelCounter, PixelStatistics
 from demorec.recording.video import Rgb, VideoPacket, VideoSettings, decode
 
 
-class EpisodeFile:
+class EpisodeFile(ABC):
     """Context manager over the file of one episode.
 
     Attributes:
@@ -47,9 +48,9 @@ class EpisodeFile:
         """Close the file; harmless when called twice."""
         self._container.close()
 
+    @abstractmethod
     def _read_metadata(self) -> None:
         """Read what is known without reading messages."""
-        raise NotImplementedError
 
     def _check_end(self, num_frames: int, outcome_frames: int | None) -> None:
         """Note whether it was recovered; RecordingError unless its end is that of so many frames."""
@@ -71,13 +72,13 @@ class EpisodeFile:
             for topic in sorted(container.channels)
         }
 
+    @abstractmethod
     def video_settings(self, camera: str) -> VideoSettings:
         """How the pictures of a camera were coded."""
-        raise NotImplementedError
 
+    @abstractmethod
     def packets(self, camera: str) -> Iterator[VideoPacket]:
         """The coded pictures of a camera, in order."""
-        raise NotImplementedError
 
     def images(self, camera: str) -> Iterator[Rgb]:
         """The decoded pictures of a camera, (H, W, 3) uint8 RGB, in order."""
