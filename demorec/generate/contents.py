@@ -7,12 +7,13 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
+from demorec.errors import ConfigError
 from demorec.generate.survey import recordings_of
 from demorec.lerobot.kind import DATASET, is_dataset_file
 from demorec.lerobot.paths import CARD_PATH
 from demorec.lerobot.sidecar import CONFIGS_PATH
 from demorec.runs.run_file import DATASET as DATASET_FOLDER
-from demorec.runs.run_file import EPISODES, FAILED, RUN_NAME, UNFINISHED
+from demorec.runs.run_file import EPISODES, FAILED, RUN_NAME, UNFINISHED, RunFile
 from demorec.safety.replacing import RECORDING, Kind, files_below, json_object
 
 PARTS = (RUN_NAME, EPISODES, FAILED, UNFINISHED, DATASET_FOLDER)
@@ -77,6 +78,25 @@ def is_dataset_of_run(dataset: Path, config_digest: str) -> bool:
         and not DATASET.strangers(dataset)
         and set(json_object(dataset / CONFIGS_PATH)) == {config_digest}
     )
+
+
+def check_dataset_place(folder: Path, run: RunFile) -> None:
+    """Refuse what keeps a run's dataset from its place. Only reads.
+
+    Args:
+        folder: Of the run.
+        run: What is known of it; without a line about its dataset where run.json was lost.
+
+    Raises:
+        ConfigError: A dataset that the run did not make, or a link to nothing, is there.
+    """
+    dataset = folder / DATASET_FOLDER
+    if not os.path.lexists(dataset):
+        return
+    if not dataset.exists():
+        raise ConfigError(f"The dataset is a link to something that is not there, mend or remove it: {dataset}")
+    if run.export is None and not is_dataset_of_run(dataset, run.config_digest):
+        raise ConfigError(f"A dataset that this run did not make is in the way: move it elsewhere: {dataset}")
 
 
 def _recognises(folder: Path) -> bool:

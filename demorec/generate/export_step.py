@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from demorec.errors import ConfigError, DemorecError, resource_error
-from demorec.generate.contents import is_dataset_of_run
+from demorec.errors import DemorecError, resource_error
+from demorec.generate.contents import check_dataset_place, is_dataset_of_run
 from demorec.lerobot import ExportOptions, ExportReport, dataset_digest, export_lerobot
 from demorec.lerobot.card import has_own_card
 from demorec.lerobot.inspect import check_tables
@@ -60,18 +59,12 @@ def export_run(
     with run_lock(folder):
         run = load_run_file(folder)
         present = run.export
-        if os.path.lexists(target):
-            if not target.exists():
-                raise ConfigError(f"The dataset is a link to something that is not there, mend or remove it: {target}")
-            if present is None:  # run.json was lost, or the dataset is somebody's
-                if not is_dataset_of_run(target, run.config_digest):
-                    raise ConfigError(
-                        f"A dataset that this run did not make is in the way: move it elsewhere: {target}"
-                    )
-            elif not _is_as_made(target, present, run):
+        check_dataset_place(folder, run)
+        if target.exists():
+            if present and not _is_as_made(target, present, run):
                 aside = _move_aside(target, folder)
                 says(f"{DATASET}/ is not as the run made it (damaged, or changed since); it was moved to {aside}.")
-            elif (present.run_digest, present.repo_id) == (run.digest, repo_id) and present.dataset_digest:
+            elif present and (present.run_digest, present.repo_id) == (run.digest, repo_id) and present.dataset_digest:
                 return present, None
             _keep_what_is_not_ours(target, folder, says)
         elif present is not None and present.dataset_digest:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from demorec.config import GenerateConfig, deciding_versions
 from demorec.errors import ConfigError, DemorecError, GenerationError, resource_error
-from demorec.generate.contents import PARTS, RUN
+from demorec.generate.contents import PARTS, RUN, check_dataset_place
 from demorec.generate.executor import peak_memory
 from demorec.generate.observer import RunObserver, RunResult
 from demorec.generate.options import RunOptions, available_cores
@@ -198,7 +198,9 @@ def _check_request(path: Path, asked: RunFile, options: RunOptions, *, inspect: 
         check_replaceable(path, RUN, overwrite=True)
         return True
     _refuse_strangers(path)
-    _known_run(path, asked, inspect=inspect)
+    run, _ = _known_run(path, asked, inspect=inspect)
+    if options.export:
+        check_dataset_place(path, run)
     return False
 
 

@@ -167,6 +167,17 @@ def test_a_folder_with_other_files_is_refused_even_with_overwrite(tmp_path: Path
     assert (tmp_path / "thesis.tex").read_text() == "mine"
 
 
+def test_a_dataset_of_somebody_else_is_refused_before_any_episode_is_made(tmp_path: Path) -> None:
+    info = tmp_path / "run/dataset/meta/info.json"
+    info.parent.mkdir(parents=True)
+    info.write_text('{"codebase_version": "v3.0"}')
+    with pytest.raises(ConfigError, match="dataset that this run did not make is in the way"):
+        run_fake(tmp_path / "run")
+    assert [path for path in (tmp_path / "run").rglob("*") if path.is_file()] == [info]
+    assert run_fake(tmp_path / "run", export=False).run.is_complete
+    assert info.read_text() == '{"codebase_version": "v3.0"}'
+
+
 @pytest.mark.parametrize("damage", ["truncate", "flip", "swap", "empty"])
 def test_damaged_recordings_are_set_aside_and_made_again(finished: Path, reference: RunResult, damage: str) -> None:
     files = sorted((finished / "episodes").glob("*"))

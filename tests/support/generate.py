@@ -57,6 +57,7 @@ def run_fake(
     seed: int = 0,
     recycle_after: int = 500,
     overwrite: bool = False,
+    export: bool = True,
     progress: NoProgress | None = None,
     episodes: list[int] | None = None,
 ) -> RunResult:
@@ -64,7 +65,12 @@ def run_fake(
     return generate(
         GenerateConfig(seed=seed, cameras=()),
         RunOptions(
-            out=out, num_episodes=num_episodes, workers=workers, recycle_after=recycle_after, overwrite=overwrite
+            out=out,
+            num_episodes=num_episodes,
+            workers=workers,
+            recycle_after=recycle_after,
+            overwrite=overwrite,
+            export=export,
         ),
         progress=progress,
         maker=f"support.makers:{maker}",
