@@ -42,6 +42,7 @@ def instead(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[], None]], N
     return lambda function: monkeypatch.setattr(lerobot_train, "main", function)
 
 
+@pytest.mark.slow
 def test_flags_go_on_and_the_reader_is_replaced_meanwhile(
     dataset: Path, instead: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -54,6 +54,7 @@ def test_the_run_is_what_was_asked_for(reference: RunResult) -> None:
     assert all(value > 0 for seconds in (first, *later) for value in seconds.values())
 
 
+@pytest.mark.slow
 def test_two_workers_in_reversed_order_make_the_same_bytes(tmp_path: Path, reference: RunResult) -> None:
     result = make(tmp_path / "run", workers=2, episodes=list(reversed(range(NUM_EPISODES))))
     assert result.run.digest == reference.run.digest

@@ -324,6 +324,7 @@ def channels_swapped(picture: Any) -> Any:
     return picture[..., ::-1]
 
 
+@pytest.mark.slow
 def test_a_few_pictures_among_many(filmed: Path, tmp_path: Path, workshop: Workshop) -> None:
     """All are coded a second time, as by a program that edits videos: only the spoilt ones show something else."""
     faults = {6: brighter, 11: torn, 16: blurred, 21: shifted, 26: green, 31: patched, 36: channels_swapped}

@@ -108,6 +108,7 @@ def test_options_that_cannot_be(recorded: Path) -> None:
         _replay(recorded, export_hz=7)
 
 
+@pytest.mark.slow
 def test_a_recording_of_the_replay(tmp_path: Path) -> None:
     source = simulate(tmp_path / "e.mcap", seed=11, cameras=("front",), width=64, height=64)
     assert exit_code("replay", source, "--out", tmp_path / "out") == 0
@@ -151,7 +152,7 @@ def quiet_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize(
-    "action", ["joint", "ee_delta", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("joint_increment", "ee"))]
+    "action", ["joint", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("joint_increment", "ee", "ee_delta"))]
 )
 def test_datasets_of_every_kind_of_action(action: str, quiet_run: Path, tmp_path: Path) -> None:
     export_lerobot([quiet_run], tmp_path / "ds", ExportOptions(verify=False, action=action))  # type: ignore[arg-type]

@@ -37,6 +37,11 @@ class TestEveryTask(TaskContract):
     def test_its_recording_passes_every_check_and_replays_to_the_bit(self, tmp_path: Path) -> None:
         super().test_its_recording_passes_every_check_and_replays_to_the_bit(tmp_path)
 
+    # So do `test_determinism.py`, for both arms, and the environments' tests.
+    @pytest.mark.slow
+    def test_an_episode_repeats_to_the_bit(self) -> None:
+        super().test_an_episode_repeats_to_the_bit()
+
 
 def test_instructions_come_in_several_wordings() -> None:
     for task in TASKS.names():

@@ -141,6 +141,7 @@ def test_pictures_that_compress_well_are_no_bomb(tmp_path: Path) -> None:
             limits.check_chunk(place.uncompressed_size, place.length)
 
 
+@pytest.mark.slow
 def test_metadata_of_two_hundred_megabytes_are_not_read(good: Path, commands: Commands, tmp_path: Path) -> None:
     path = tmp_path / "large.mcap"
     values = {"info": "x" * (200 << 20)}

@@ -36,7 +36,9 @@ def exit_code(context: Any, *arguments: Any, **limits: int) -> int:
     return int(process.exitcode)
 
 
-@pytest.mark.parametrize("mode", ["new", "overwrite", pytest.param("append", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "mode", ["new", *(pytest.param(mode, marks=pytest.mark.slow) for mode in ("overwrite", "append"))]
+)
 def test_killed_at_any_moment(context: Any, run: Path, tmp_path: Path, mode: str) -> None:
     out = tmp_path / "d"
     before: dict[str, bytes] = {}

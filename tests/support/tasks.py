@@ -8,8 +8,9 @@ import pytest
 
 from demorec.tables import TASKS
 
-QUICK_TASKS = ("pick_place", "pick_from_clutter", "pick_shapes", "tutorial")
-"""One cube, bodies around it, other shapes, an own script; `tests/contract/test_tasks.py` runs every task always."""
+QUICK_TASKS = ("pick_from_clutter", "tutorial")
+"""Many bodies, an own script. Most other tests take one cube (`pick_place`); `tests/contract/test_tasks.py` runs every
+task always."""
 
 
 def tasks_with_slow_ones() -> list[Any]:
