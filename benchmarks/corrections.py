@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
@@ -25,7 +26,7 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import torch
-from learning import ACTION, ENVIRONMENT, STATE, Data, Variant, command, statistics, train
+from learning import ACTION, ENVIRONMENT, STATE, SWITCHED_OFF, Data, Variant, command, statistics, train
 
 from demorec.config import GenerateConfig
 from demorec.evaluate.correction import read_takeover
@@ -36,6 +37,9 @@ from demorec.evaluate.statistics import Rate, cells
 INTERVENTION = "intervention"
 CORRECTION_SEED = 1
 """Root of the scenes that are corrected; those of the demonstrations have 0."""
+_ABSOLUTE = re.compile(r"tcp\.[xy]|\w+(\.goal)?\.[xy]|.*\.pose\..*|\w+\.pos")
+"""Components that say where on the table something is, or how the arm stands. A hundred demonstrations are too few to
+learn that these do not matter, so that the policy is not shown them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,7 +86,7 @@ def export(run: Path, dataset: Path, args: argparse.Namespace, episodes: str) ->
     dataset.parent.mkdir(parents=True, exist_ok=True)
     command(
         *("demorec", "export", "lerobot", run, "--out", dataset, "--action", args.action, "--episodes", episodes),
-        *("--privileged", "--intervention", "--features", ENVIRONMENT),
+        *("--privileged", "--intervention", "--features", ENVIRONMENT, INTERVENTION),
     )
 
 
@@ -104,7 +108,7 @@ def correct(policy: Path, wanted: int, first_scene_seed: int, args: argparse.Nam
     return dataset
 
 
-def load(datasets: list[Path]) -> Data:
+def load(datasets: list[Path], *, relative: bool) -> Data:
     """All frames in which the expert acts; a stretch of them ends where it hands back."""
     parts: dict[str, list[np.ndarray[Any, Any]]] = defaultdict(list)
     for number, dataset in enumerate(datasets):
@@ -120,19 +124,21 @@ def load(datasets: list[Path]) -> Data:
             parts[name].append(values[acts])
     stretch = np.concatenate(parts.pop("stretch"))
     columns = {name: torch.from_numpy(np.concatenate(values)) for name, values in parts.items()}
-    return Data(
-        columns=columns,
-        end=torch.from_numpy(np.searchsorted(stretch, stretch, side="right")),
-        stats={name: statistics(values) for name, values in columns.items()},
-    )
+    stats = {name: statistics(values) for name, values in columns.items()}
+    features = json.loads((datasets[0] / "meta" / "info.json").read_text())["features"]
+    for name in (STATE, ENVIRONMENT) if relative else ():
+        for i, component in enumerate(features[name]["names"]):
+            if _ABSOLUTE.fullmatch(component):
+                stats[name]["std"][i] = SWITCHED_OFF
+    return Data(columns=columns, end=torch.from_numpy(np.searchsorted(stretch, stretch, side="right")), stats=stats)
 
 
 def stage(arm: str, datasets: list[Path], corrected: int, seed: int, args: argparse.Namespace) -> tuple[Stage, Path]:
     """Train on datasets and try what came out; the policy's folder, too."""
     count = args.episodes + (args.corrected if arm == "plain" else 0)
-    label = args.label if arm == "corrected" else f"{args.action}_{args.steps}"
+    label = f"{args.label}_{args.rules}" if arm == "corrected" else args.label
     out = args.out / "policies" / f"{arm}_{count}_{corrected}_{label}_{seed}"
-    data = load(datasets)
+    data = load(datasets, relative=args.relative)
     if not (out / "training.json").exists():
         print(f"training {out.name} on {len(data.end)} frames", flush=True)
         train(data, args.variant, args, seed=seed, out=out)
@@ -162,7 +168,7 @@ def stages(seed: int, args: argparse.Namespace) -> Iterator[Stage]:
     datasets, done = [plain], 0
     for number in range(args.rounds):
         wanted = round(args.corrected * (number + 1) / args.rounds) - done
-        out = args.out / "corrected" / f"{args.label}_{seed}_{number}"
+        out = args.out / "corrected" / f"{args.label}_{args.rules}_{seed}_{number}"
         scene_seed = CORRECTION_SEED + seed * args.rounds + number
         datasets.append(correct(policy, wanted, scene_seed, args, out))
         done += wanted
@@ -235,6 +241,7 @@ def main() -> None:
     parser.add_argument("--scenes", type=int, default=150, help="held-out scenes of each policy")
     parser.add_argument("--action", default="ee_delta")
     parser.add_argument("--execute", type=int, default=16, help="actions of the chunk of 16 that are executed")
+    parser.add_argument("--relative", action="store_true", help="hide where on the table things are")
     parser.add_argument("--steps", type=int, default=3000)
     parser.add_argument("--batch-size", type=int, default=128)
     parser.add_argument("--learning-rate", type=float, default=5e-4)
@@ -248,7 +255,8 @@ def main() -> None:
     args.device = "cpu"
     args.variant = Variant(about="", action=args.action, execute=args.execute)
     handed = "back" if args.hand_back else "finished"
-    args.label = f"{args.action}_{args.steps}_{args.stray_metres:g}_{handed}{'' if args.noise else '_clean'}"
+    args.label = f"{args.action}_{args.execute}_{args.steps}{'_relative' if args.relative else ''}"
+    args.rules = f"{args.stray_metres:g}_{handed}{'' if args.noise else '_clean'}"
     args.out.mkdir(parents=True, exist_ok=True)
     rows: dict[tuple[str, int, int], list[Stage]] = defaultdict(list)
     started = time.process_time()
