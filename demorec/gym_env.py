@@ -28,7 +28,7 @@ from demorec.loop.actions import ActionDecoder, action_bounds, check_action_kind
 from demorec.render import Renderer
 from demorec.render.painter import Painter
 from demorec.scene import features
-from demorec.scene.episode import POLICY_PHASE, CameraImages, EpisodeInfo, Frame, Observation, SuccessCheck
+from demorec.scene.episode import POLICY_PHASE, Action, CameraImages, EpisodeInfo, Frame, Observation, SuccessCheck
 from demorec.scene.features import ActionKind, ObservationRows
 from demorec.scene.scene import Scene
 from demorec.scene.variation import Preset
@@ -254,18 +254,23 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
 
     def step(self, action: NDArray[np.floating]) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """One control step; ValueError for an action of a wrong shape or with a value that is no number."""
+        command = self.command_for(action)
+        return self.act(Decision(action=command, command=command, phase=POLICY_PHASE))
+
+    def command_for(self, action: NDArray[np.floating]) -> Action:
+        """What `step` would send now; errors as there. Deltas go on from here, unless `act` sends something else."""
         if self._session is None:
             raise RuntimeError("the environment has no episode yet: call reset first")
         values = np.asarray(action, dtype=np.float64)
         if values.shape != self.action_space.shape or not np.isfinite(values).all():
             raise ValueError(f"An action has shape {self.action_space.shape} and finite values, found {values!r}.")
-        command = self._decoder.command(values)
-        return self.act(Decision(action=command, command=command, phase=POLICY_PHASE))
+        return self._decoder.command(values)
 
     def act(self, decision: Decision) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """One control step as `step` makes it, decided by somebody else than a policy; its command is sent as it is."""
+        """One control step as `step` makes it, whoever decided it; its command is sent as it is."""
         if self._session is None:
             raise RuntimeError("the environment has no episode yet: call reset first")
+        self._decoder.follow(decision.command)
         frame = self._session.frame(decision)
         self._session.step(frame.command)
         self._situation = self._look(self._session, frame)

@@ -48,6 +48,7 @@ COMMANDS: Registry[type[Command]] = Registry(
         "train": "demorec.cli.train:Train",
         "evaluate": "demorec.cli.evaluate:Evaluate",
         "correct": "demorec.cli.correct:Correct",
+        "improve": "demorec.cli.improve:Improve",
         "reproduce": "demorec.cli.reproduce:Reproduce",
         "recover": "demorec.cli.recover:Recover",
         "list": "demorec.cli.list_rows:ListRows",

@@ -52,7 +52,7 @@ def _told(evaluation: Evaluation, out: Path) -> Iterator[str]:
 
     config = evaluation.settings.config
     found = [read_takeover(out / rollout.file) for rollout in evaluation.rollouts]
-    reasons = Counter(taken.reason for taken in found if taken is not None)
+    reasons = Counter(reason for taken in found if taken is not None for reason in taken.reasons)
     frames = sum(taken.num_frames for taken in found if taken is not None)
     total = sum(rollout.num_frames for rollout in evaluation.rollouts)
     yield f"policy        {evaluation.settings.policy_type} {evaluation.settings.policy_digest}"

@@ -22,6 +22,8 @@ class Train:
 
     frame_cache_mb: int = 256
     """Decoded frames that each process keeps, in MB of 2^20 bytes; a small dataset is then decoded only once."""
+    expert_only: bool = False
+    """Of corrected episodes (demorec correct, export --intervention) learn from the expert's frames alone."""
     others: tuple[str, ...] = ()
     """What goes to lerobot-train."""
 
@@ -32,5 +34,10 @@ class Train:
         def say_what_is_replaced() -> None:
             tell("demorec train: FastDataset reads in place of LeRobotDataset; all else is lerobot-train.")
 
-        train(self.others, frame_cache_bytes=self.frame_cache_mb << 20, on_replaced=say_what_is_replaced)
+        train(
+            self.others,
+            frame_cache_bytes=self.frame_cache_mb << 20,
+            on_replaced=say_what_is_replaced,
+            expert_only=self.expert_only,
+        )
         return 0

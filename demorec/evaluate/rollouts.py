@@ -21,25 +21,27 @@ from typing import Any
 
 from demorec.config import EpisodePlan, GenerateConfig, deciding_versions
 from demorec.errors import ConfigError, DemorecError, in_words
-from demorec.evaluate.correction import Correction, Watch, correcting_behaviour
+from demorec.evaluate.correction import correcting_behaviour
 from demorec.evaluate.moments import TakeOver
 from demorec.evaluate.policy import Policy, check_steps, find_checkpoint, policy_summary, trained_action
 from demorec.evaluate.progress import EvaluationObserver, factors_of
 from demorec.evaluate.statistics import Rate
+from demorec.evaluate.turns import Turns
 from demorec.generate.contents import foreign_recordings
 from demorec.generate.executor import Lost, Raised
 from demorec.generate.local import LocalExecutor
 from demorec.generate.plan import plain_differences
 from demorec.gym_env import DemorecEnv
-from demorec.loop import prepare
+from demorec.loop import make_world, prepare
 from demorec.plain import from_plain, to_plain
 from demorec.recording import EpisodeWriter
 from demorec.runs.find import EVALUATION_NAME
 from demorec.runs.run_file import EPISODES, FAILED, Attempt
 from demorec.safety.own_versions import version_differences
 from demorec.safety.replacing import Kind, check_replaceable, json_object, obstacle, replaced_parts, settle_parts
-from demorec.scene.episode import Frame, Outcome
+from demorec.scene.episode import Outcome
 from demorec.scene.features import ENVIRONMENT_STATE, IMAGE_PREFIX, ActionKind
+from demorec.sim.world import World
 from demorec.tables import camera_name
 
 MAKE_ROLLOUT = "demorec.evaluate.rollouts:make_rollout"
@@ -205,57 +207,42 @@ def load_evaluation(folder: Path) -> Evaluation:
 
 def make_rollout(plan: EpisodePlan, folder: Path) -> Attempt:
     """Run the policy once and record it; the work of a worker (see `demorec.generate.executor.Maker`)."""
-    env, policy = _stage.set(folder)
+    env, policy, world = _stage.set(folder)
     settings = _stage.settings
     observation, _ = env.reset(seed=plan.episode_index)
-    policy.reset(plan.episode_index)
     info = replace(env.info, origin=f"rollout of {settings.policy_type} {settings.policy_digest}")
-    watch = None
     if settings.takeover is not None:
-        behaviour = {**info.behaviour, **correcting_behaviour(env.episode).as_mapping()}
+        behaviour = {**info.behaviour, **correcting_behaviour(env.episode, noise=settings.takeover.noise).as_mapping()}
         info = replace(info, origin=info.origin.replace("rollout", "correction", 1), behaviour=behaviour)
-        watch = Watch(settings.takeover, env.episode, max_frames=env.max_episode_steps)
+    turns = Turns(env, policy, observation, seed=plan.episode_index, rules=settings.takeover, rehearsal_world=world)
     progress = EvaluationObserver(info.scene)
     name = f"episode_{plan.episode_index:06d}.mcap"
     path = folder / name
     with EpisodeWriter(path, info, video=plan.config.video, overwrite=True) as recording:
-        terminated = truncated = False
-        correction: Correction | None = None
-        while not terminated and (watch is not None or not truncated):
-            why = "" if watch is None else watch.reason(env.situation)
-            if why:
-                correction = Correction(env=env, reason=why)
-                break
-            observation, _, terminated, truncated, _ = env.step(policy.act(observation, info.instruction))
-            recording.write(_last_frame(env))
+        for frame in turns.frames():
+            recording.write(frame)
             progress.watch(env.world)
-        for decision in () if correction is None else correction.decisions():
-            _, _, terminated, _, _ = env.act(decision)
-            recording.write(_last_frame(env))
-            progress.watch(env.world)
-            if terminated:
-                break
         after = env.situation
-        phase, reason = ("", "") if terminated else progress.failure(after)
-        if correction is not None and not terminated and correction.gave_up[1]:
-            phase, reason = correction.gave_up
+        phase, reason = ("", "") if turns.success else progress.failure(after)
+        if not turns.success and turns.gave_up[1]:
+            phase, reason = turns.gave_up
         outcome = Outcome(
-            success=terminated,
+            success=turns.success,
             checks=after.checks,
             failure_phase=phase,
             failure_reason=reason,
             num_frames=after.frame_index,
-            num_retries=0 if correction is None else correction.num_retries,
+            num_retries=turns.num_retries,
             final_state_digest=env.world.state_digest(),
         )
         stats = recording.finish(outcome)
-    file = f"{EPISODES if terminated else FAILED}/{name}"
+    file = f"{EPISODES if turns.success else FAILED}/{name}"
     path.replace(folder / file)
     return Attempt(
         episode_index=plan.episode_index,
         attempt=info.attempt,
         seed=plan.config.seed,
-        success=terminated,
+        success=turns.success,
         file=file,
         sha256="",
         digest=outcome.final_state_digest[:16],
@@ -266,25 +253,21 @@ def make_rollout(plan: EpisodePlan, folder: Path) -> Attempt:
     )
 
 
-def _last_frame(env: DemorecEnv) -> Frame:
-    frame = env.situation.last_frame
-    assert frame is not None  # since it is no situation after a reset
-    return frame
-
-
 class _Stage:
-    """The environment and the policy of this process, kept from one rollout to the next."""
+    """The environment, the policy and the world for rehearsals of this process, kept from one rollout to the next."""
 
     def __init__(self) -> None:
         self._folder: Path | None = None
-        self._made: tuple[DemorecEnv, Policy] | None = None
+        self._made: tuple[DemorecEnv, Policy, World | None] | None = None
         self.settings: Settings
 
-    def set(self, folder: Path) -> tuple[DemorecEnv, Policy]:
+    def set(self, folder: Path) -> tuple[DemorecEnv, Policy, World | None]:
         """Those of the evaluation in `folder`."""
         if self._made is None or self._folder != folder:
             if self._made is not None:
                 self._made[0].close()
+                if self._made[2] is not None:
+                    self._made[2].close()
             self.settings = load_evaluation(folder).settings
             env = DemorecEnv(
                 config=self.settings.config,
@@ -293,7 +276,8 @@ class _Stage:
                 episode_length=self.settings.episode_length,
             )
             policy = Policy(find_checkpoint(Path(self.settings.policy)), action_steps=self.settings.action_steps)
-            self._folder, self._made = folder, (env, policy)
+            world = None if self.settings.takeover is None else make_world(env.info)
+            self._folder, self._made = folder, (env, policy, world)
         return self._made
 
 

@@ -73,6 +73,7 @@ class ActionDecoder:
         self._max_step = np.array(world.robot.velocity_limit) / world.fps
         self._joint_target: Array = world.arm.target.copy()
         self._tcp_target: Pose = world.observe().base_from_tcp
+        self._given: Action | None = None
 
     def command(self, values: Array) -> Action:
         """The command for an action (D,), float64."""
@@ -82,9 +83,15 @@ class ActionDecoder:
             wanted = np.clip(wanted, self._joint_target - self._max_step, self._joint_target + self._max_step)
             gripper = float(np.clip(gripper, 0.0, self._robot.gripper.max_width))
         self._joint_target = wanted
-        return Action(
+        self._given = Action(
             joint_target=wanted, gripper_target=gripper, base_from_tcp_target=self._kinematics.forward(wanted)
         )
+        return self._given
+
+    def follow(self, command: Action) -> None:
+        """Go on from a command that somebody else has sent; nothing changes after one that was decoded here."""
+        if command is not self._given:
+            self._joint_target, self._tcp_target = command.joint_target, command.base_from_tcp_target
 
     def _wanted(self, values: Array) -> Array:
         if self._kind == "joint":

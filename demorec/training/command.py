@@ -17,12 +17,19 @@ class TrainingError(DemorecError):
     """lerobot-train did not come to its end."""
 
 
-def train(arguments: Sequence[str], *, frame_cache_bytes: int, on_replaced: Callable[[], None]) -> None:
+def train(
+    arguments: Sequence[str],
+    *,
+    frame_cache_bytes: int,
+    on_replaced: Callable[[], None],
+    expert_only: bool = False,
+) -> None:
     """Run lerobot-train in this process.
 
     Args:
         arguments: As for lerobot-train.
         frame_cache_bytes: Limit of the decoded frames that each process keeps.
+        expert_only: As of `FastDataset`.
         on_replaced: Called when the first dataset is opened by `FastDataset`: streamed ones are not.
 
     Raises:
@@ -42,7 +49,7 @@ def train(arguments: Sequence[str], *, frame_cache_bytes: int, on_replaced: Call
         from lerobot.scripts import lerobot_train
     except ImportError as error:
         raise MissingDependencyError("Training", error.name or "lerobot", "pip install 'demorec[train]'") from error
-    with _reading_fast(frame_cache_bytes, on_replaced), _called_as(PROGRAM, arguments):
+    with _reading_fast(frame_cache_bytes, on_replaced, expert_only=expert_only), _called_as(PROGRAM, arguments):
         try:
             lerobot_train.main()
         except SystemExit as ended:  # its parser exits with 1 for some wrong requests and with 2 for others
@@ -56,7 +63,7 @@ def train(arguments: Sequence[str], *, frame_cache_bytes: int, on_replaced: Call
 
 
 @contextmanager
-def _reading_fast(frame_cache_bytes: int, on_replaced: Callable[[], None]) -> Iterator[None]:
+def _reading_fast(frame_cache_bytes: int, on_replaced: Callable[[], None], *, expert_only: bool) -> Iterator[None]:
     """LeRobot's factory of datasets makes `FastDataset`s meanwhile."""
     from lerobot.datasets import factory
 
@@ -70,7 +77,7 @@ def _reading_fast(frame_cache_bytes: int, on_replaced: Callable[[], None]) -> It
         if not is_told:
             on_replaced()
             is_told = True
-        return FastDataset(*args, frame_cache_bytes=frame_cache_bytes, **kwargs)
+        return FastDataset(*args, frame_cache_bytes=frame_cache_bytes, expert_only=expert_only, **kwargs)
 
     factory.LeRobotDataset = open_dataset
     try:

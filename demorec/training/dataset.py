@@ -7,7 +7,9 @@ from typing import Any
 
 from lerobot.datasets import LeRobotDataset
 
+from demorec.errors import ConfigError
 from demorec.training.reader import FastReader, Item
+from demorec.training.stretches import INTERVENTION
 
 DEFAULT_CACHE_BYTES = 256 << 20
 
@@ -21,14 +23,30 @@ class FastDataset(LeRobotDataset):  # type: ignore[misc]
     Args:
         *args: As of `LeRobotDataset`.
         frame_cache_bytes: Limit of the decoded frames that each process keeps for later batches, in bytes; 0 for none.
+        expert_only: Of episodes that an expert corrected (the column `intervention`), learn from what the expert did
+            alone: a frame of the policy gives one of the expert's instead, all of these equally often, and no window
+            of actions goes on into frames of the policy.
         **kwargs: As of `LeRobotDataset`.
+
+    Raises:
+        ConfigError: Only the expert's frames are wanted, and the dataset does not tell which these are.
     """
 
     _frame_cache_bytes = DEFAULT_CACHE_BYTES
+    _expert_only = False
 
-    def __init__(self, *args: Any, frame_cache_bytes: int = DEFAULT_CACHE_BYTES, **kwargs: Any) -> None:
+    def __init__(
+        self, *args: Any, frame_cache_bytes: int = DEFAULT_CACHE_BYTES, expert_only: bool = False, **kwargs: Any
+    ) -> None:
         super().__init__(*args, **kwargs)
         self._frame_cache_bytes = frame_cache_bytes
+        self._expert_only = expert_only
+        if expert_only and INTERVENTION not in self.meta.features:
+            raise ConfigError(
+                f"The dataset does not tell which frames are the expert's: export it with --intervention: {self.root}"
+            )
+        if expert_only and self.reader is not None:
+            self.reader._expert_only = True
 
     def __getitems__(self, indices: Sequence[int]) -> list[Item]:
         """The items of a batch, in the given order: what `DataLoader` calls; errors as of an item."""
@@ -42,6 +60,6 @@ class FastDataset(LeRobotDataset):  # type: ignore[misc]
     def _ensure_reader(self) -> FastReader:
         reader = super()._ensure_reader()
         if not isinstance(reader, FastReader):
-            reader = FastReader(reader, self._frame_cache_bytes)
+            reader = FastReader(reader, self._frame_cache_bytes, expert_only=self._expert_only)
             self.reader = reader
         return reader

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from demorec.training.columns import Column, numbers
 from demorec.training.pictures import PictureReader
+from demorec.training.stretches import STRETCH_COLUMNS, Stretches
 
 Rows = NDArray[np.int64]
 Item = dict[str, Any]
@@ -28,11 +29,13 @@ class FastReader(DatasetReader):  # type: ignore[misc]
     Args:
         reader: LeRobot's, ready to read or not; its settings and its table are taken over.
         cache_bytes: Limit of the decoded frames that each process keeps.
+        expert_only: As of `FastDataset`.
     """
 
-    def __init__(self, reader: DatasetReader, cache_bytes: int) -> None:
+    def __init__(self, reader: DatasetReader, cache_bytes: int, *, expert_only: bool = False) -> None:
         self.__dict__.update(vars(reader))
         self._cache_bytes = cache_bytes
+        self._expert_only = expert_only
         self._tables: _Tables | None = None
         self._pictures: PictureReader | None = None
         self._process = 0
@@ -57,11 +60,13 @@ class FastReader(DatasetReader):  # type: ignore[misc]
         """
         tables = self._current_tables()
         rows = np.array([_row(index, len(self.hf_dataset)) for index in indices], np.int64)
+        if tables.stretches is not None:
+            rows = tables.stretches.shown[rows]
         episodes, absolute = (tables.numbers[name].take(rows) for name in ("episode_index", "index"))
         windows: dict[str, Rows] = {}
         padding: dict[str, Sequence[torch.Tensor]] = {}
         for key, deltas in (self.delta_indices or {}).items():
-            windows[key], is_pad = tables.window(absolute, episodes, deltas)
+            windows[key], is_pad = tables.window(rows, absolute, episodes, deltas)
             padding[f"{key}_is_pad"] = torch.from_numpy(is_pad).unbind(0)
         values = {name: self._values(tables, name, windows.get(name, rows)) for name in tables.names}
         for key in windows.keys() - values.keys() - set(self._meta.video_keys):
@@ -160,6 +165,7 @@ class _Tables:
         video_file: Video feature -> number of the file of each episode, (E,).
         video_start_s: Video feature -> where each episode begins in its file, in seconds, (E,) float64.
         tasks: Instructions by task index.
+        stretches: Where the expert acts, if only that counts.
     """
 
     def __init__(self, reader: FastReader) -> None:
@@ -171,6 +177,10 @@ class _Tables:
         self.tasks = meta.tasks.index.tolist()
         episodes = _columns(meta.episodes, meta.episodes.column_names)
         self._starts, self._ends = (_array(episodes[f"dataset_{end}_index"]) for end in ("from", "to"))
+        self.stretches = None
+        if reader._expert_only:
+            of_row = {name: self.numbers[name].take(np.arange(len(self.source))) for name in STRETCH_COLUMNS}
+            self.stretches = Stretches(**of_row)
         self._row_of: Rows | None = None
         if reader._absolute_to_relative_idx is not None:
             absolute = self.numbers["index"].take(np.arange(len(self.source)))
@@ -185,14 +195,19 @@ class _Tables:
             self.video_paths[key] = [reader.root / meta.get_video_file_path(int(episode), key) for episode in first]
             self.video_start_s[key] = _array(episodes[f"videos/{key}/from_timestamp"]).astype(np.float64)
 
-    def window(self, absolute: Rows, episodes: Rows, deltas: Iterable[int]) -> tuple[Rows, NDArray[np.bool_]]:
-        """Rows beside those of a batch, held at the ends of their episodes, and which of them lie beyond: (B, T).
+    def window(
+        self, rows_now: Rows, absolute: Rows, episodes: Rows, deltas: Iterable[int]
+    ) -> tuple[Rows, NDArray[np.bool_]]:
+        """Rows beside those of a batch, held at the ends of their episodes (or of the expert's stretches), and which
+        of them lie beyond: (B, T).
 
         Raises:
             KeyError: A chosen episode lacks rows in the table.
         """
         wanted = absolute[:, None] + np.array(list(deltas), np.int64)
         first, end = self._starts[episodes][:, None], self._ends[episodes][:, None]
+        if self.stretches is not None:
+            first, end = self.stretches.first[rows_now][:, None], self.stretches.end[rows_now][:, None]
         rows = np.clip(wanted, first, end - 1)
         is_beyond = (wanted < first) | (wanted >= end)
         if self._row_of is None:  # the table has all episodes, so that row and index are the same

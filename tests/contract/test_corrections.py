@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -15,20 +15,24 @@ from support.recording import write_episode
 from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.config import EpisodePlan, GenerateConfig
 from demorec.evaluate import rollouts
-from demorec.evaluate.correction import Watch, read_takeover
+from demorec.evaluate.correction import read_takeover
 from demorec.evaluate.moments import TakeOver
 from demorec.evaluate.rollouts import Evaluation, Settings, make_rollout
+from demorec.evaluate.turns import Turns
+from demorec.evaluate.watch import Watch
 from demorec.geometry import Array, Pose
-from demorec.gym_env import Situation
-from demorec.loop import prepare
+from demorec.gym_env import DemorecEnv, Situation
+from demorec.loop import ScriptAgent, Session, make_world, prepare
 from demorec.plain import to_plain
 from demorec.recording import Recording
 from demorec.replay import ReplayOptions, open_file, replay_all
 from demorec.runs.find import EVALUATION_NAME
 from demorec.runs.run_file import Attempt
-from demorec.scene.episode import POLICY_PHASE, Observation
+from demorec.scene.episode import POLICY_PHASE, Action, Frame, Observation
 
 FPS = 30
+UNSEEN = Action(joint_target=np.zeros(7), gripper_target=0.0, base_from_tcp_target=Pose())
+"""A command that no rule but straying looks at."""
 
 
 class Lazy:
@@ -58,7 +62,7 @@ def rollout(tmp_path_factory: pytest.TempPathFactory) -> tuple[Attempt, Path]:
         policy_digest="0",
         config=GenerateConfig(cameras=(), split="train"),
         action="joint",
-        takeover=TakeOver(stuck_seconds=1.0),
+        takeover=TakeOver(stuck_seconds=1.0, stray_metres=0.0, stray_radians=0.0, noise=False),
     )
     (folder / EVALUATION_NAME).write_text(json.dumps(to_plain(Evaluation(settings=settings))))
     for place in ("episodes", "failed"):
@@ -88,7 +92,7 @@ def test_a_stuck_policy_is_corrected_and_the_episode_replays(rollout: tuple[Atte
     assert event.message == "the expert takes over: the policy is stuck"
     taken = read_takeover(path)
     assert taken is not None
-    assert (taken.reason, taken.num_frames) == ("the policy is stuck", len(phases) - handover)
+    assert (taken.reasons, taken.num_frames) == (("the policy is stuck",), len(phases) - handover)
     options = ReplayOptions()
     report, _ = next(iter(replay_all([open_file(path, options)], options)))
     assert report.is_identical, report
@@ -162,7 +166,7 @@ def situations(speed: float) -> list[Situation]:
 def test_the_moment(takeover: TakeOver, speed: float, expected: tuple[int, str]) -> None:
     episode = prepare(EpisodePlan(config=GenerateConfig(cameras=()), episode_index=0))
     watch = Watch(takeover, episode, max_frames=300)
-    told = enumerate(map(watch.reason, situations(speed)))
+    told = enumerate(watch.reason(situation, UNSEEN) for situation in situations(speed))
     assert next((frame, reason) for frame, reason in told if reason) == expected
 
 
@@ -173,9 +177,70 @@ def test_random_moments_are_those_of_the_episode_and_as_many_as_asked_for() -> N
         episode = prepare(EpisodePlan(config=GenerateConfig(cameras=()), episode_index=index))
         for _ in range(2):
             watch = Watch(rules, episode, max_frames=300)
-            moments.append(next((frame, why) for frame, why in enumerate(map(watch.reason, seen)) if why))
+            moments.append(next((frame, why) for frame, s in enumerate(seen) if (why := watch.reason(s, UNSEEN))))
     assert moments[::2] == moments[1::2]
     random = [frame for frame, why in moments[::2] if why == "a random moment"]
     assert 75 < len(random) < 125  # 100 +- 3.5 standard deviations of the binomial distribution
     assert min(random) < 30
     assert max(random) > 270
+
+
+class Wanderer:
+    """Does what the expert does in a scene, but from a frame on goes sideways for half a second."""
+
+    def __init__(self, actions: Array, *, astray_from: int, drift: float) -> None:
+        self._actions, self._from, self._drift = actions, astray_from, drift
+        self._frame = -1
+
+    def reset(self, seed: int) -> None:
+        """All that it knows is which frame it is."""
+
+    def act(self, observation: dict[str, Any], instruction: str) -> Array:
+        self._frame += 1
+        action: Array = self._actions[min(self._frame, len(self._actions) - 1)].copy()
+        if self._from <= self._frame < self._from + FPS // 2:
+            action[1] += self._drift * (self._frame - self._from)  # metres
+        return action
+
+
+@pytest.fixture(scope="module")
+def expert_poses() -> Array:
+    """(T, 8) what the expert commands in scene 3 without noise, as of --action ee."""
+    config = GenerateConfig(cameras=(), split="train")
+    episode = prepare(EpisodePlan(config=config, episode_index=3))
+    episode = replace(episode, behaviour=replace(episode.behaviour, action_noise=0.0))
+    with make_world(episode.info) as world:
+        frames = list(Session.of_episode(world, episode).run(ScriptAgent(episode)))
+    return np.array([[*f.action.base_from_tcp_target.vector(), f.action.gripper_target] for f in frames])
+
+
+def act_in_turns(policy: Any, rules: TakeOver) -> tuple[Turns, list[Frame]]:
+    env = DemorecEnv(config=GenerateConfig(cameras=(), split="train"), action="ee")
+    observation, _ = env.reset(seed=3)
+    with make_world(env.info) as world:
+        turns = Turns(env, policy, observation, seed=3, rules=rules, rehearsal_world=world)
+        frames = list(turns.frames())
+    env.close()
+    return turns, frames
+
+
+def test_who_does_as_the_expert_does_is_left_alone(expert_poses: Array) -> None:
+    turns, frames = act_in_turns(Wanderer(expert_poses, astray_from=10_000, drift=0.0), TakeOver(stray_metres=0.02))
+    assert turns.success
+    assert {frame.phase for frame in frames} == {POLICY_PHASE}
+
+
+@pytest.mark.parametrize("hand_back", [False, True])
+def test_who_strays_is_corrected(expert_poses: Array, hand_back: bool) -> None:
+    """It leaves the way at frame 20 by 1 cm a frame: beyond 5 cm from frame 26 on, for 6 frames at frame 31."""
+    rules = TakeOver(stray_metres=0.05, stray_seconds=0.2, hand_back=hand_back)
+    turns, frames = act_in_turns(Wanderer(expert_poses, astray_from=20, drift=0.01), rules)
+    assert turns.success
+    phases = [frame.phase for frame in frames]
+    assert phases.index("take_over") in range(29, 34)
+    events = [event for frame in frames for event in frame.events if event.name in ("take_over", "hand_back")]
+    assert events[0].message == "the expert takes over: the policy strays"
+    assert (POLICY_PHASE in phases[phases.index("take_over") :]) == hand_back
+    assert [event.name for event in events[:2]] == ["take_over", "hand_back"][: 1 + hand_back]
+    before = frames[phases.index("take_over") - 1]
+    assert np.array_equal(before.action.joint_target, before.command.joint_target)  # what it did is what it said

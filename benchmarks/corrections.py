@@ -1,0 +1,279 @@
+"""What corrections do for a policy, against equally many new plain demonstrations.
+
+    python benchmarks/corrections.py --out outputs/corrections --plot outputs/corrections/corrections.png
+    python benchmarks/corrections.py --seeds 1 --scenes 50 --rounds 1     # a first look
+
+A policy learns from --episodes plain demonstrations. Then, in --rounds, it acts in scenes of the training's part of the
+table, the expert takes over where it strays, and the policy is trained anew on everything, until --corrected episodes
+have been corrected; only the expert's frames are learned from. Beside it a policy learns from as many plain
+demonstrations in all. Every training seed has its own policies, and so its own corrections. Trainings are those of
+benchmarks/learning.py: LeRobot's ACT from numbers in memory, one thread. Scenes are held out. What is in --out already
+(runs, corrections, datasets, policies, evaluations) is used again, so that the same command goes on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import torch
+from learning import ACTION, ENVIRONMENT, STATE, SWITCHED_OFF, Data, Variant, command, statistics, train
+
+from demorec.config import GenerateConfig
+from demorec.evaluate.correction import read_takeover
+from demorec.evaluate.moments import TakeOver
+from demorec.evaluate.rollouts import Evaluation, evaluate, settings_for
+from demorec.evaluate.statistics import Rate, cells
+
+INTERVENTION = "intervention"
+CORRECTION_SEED = 1
+"""Root of the scenes that are corrected; those of the demonstrations have 0."""
+_ABSOLUTE = re.compile(r"tcp\.[xy]|\w+(\.goal)?\.[xy]|.*\.pose\..*|\w+\.pos")
+"""Components that say where on the table something is, or how the arm stands. A hundred demonstrations are too few to
+learn that these do not matter, so that the policy is not shown them."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stage:
+    """One policy of one training seed, tried.
+
+    Attributes:
+        arm: "plain", "corrected" or, before both, "start".
+        corrected: Episodes that the expert has corrected so far.
+        demonstrations: Plain ones.
+        frames: Learned from.
+        evaluation: On the held-out scenes.
+        cpu_seconds: Of the training.
+    """
+
+    arm: str
+    corrected: int
+    demonstrations: int
+    frames: int
+    evaluation: Evaluation
+    cpu_seconds: float
+
+    @property
+    def row(self) -> tuple[str, int, int]:
+        """Which row of the table it belongs to."""
+        return self.arm, self.demonstrations, self.corrected
+
+
+def demonstrations(args: argparse.Namespace, count: int) -> Path:
+    """Dataset of the first `count` plain demonstrations."""
+    run = args.out / "run"
+    command(
+        *("generate-dataset", "--out", run, "--task", args.task, "--num-episodes", str(count), "--split", "train"),
+        *("--workers", "1", "--no-export", "--cameras", "none"),
+    )
+    dataset = Path(args.out / "datasets" / f"plain_{count}_{args.action}")
+    if not dataset.exists():
+        export(run, dataset, args, f"0:{count}")
+    return dataset
+
+
+def export(run: Path, dataset: Path, args: argparse.Namespace, episodes: str) -> None:
+    """To LeRobot, numbers alone."""
+    dataset.parent.mkdir(parents=True, exist_ok=True)
+    command(
+        *("demorec", "export", "lerobot", run, "--out", dataset, "--action", args.action, "--episodes", episodes),
+        *("--privileged", "--intervention", "--features", ENVIRONMENT, INTERVENTION),
+    )
+
+
+def correct(policy: Path, wanted: int, first_scene_seed: int, args: argparse.Namespace, out: Path) -> Path:
+    """Dataset of `wanted` corrected episodes: new scenes until the expert has taken over in so many."""
+    dataset = out.with_name(f"{out.name}_{args.action}")
+    if dataset.exists():
+        return dataset
+    config = GenerateConfig(task=args.task, split="train", seed=first_scene_seed, cameras=())
+    rules = TakeOver(stray_metres=args.stray_metres, noise=args.noise, hand_back=args.hand_back)
+    settings = replace(settings_for(policy, config, action=args.action), takeover=rules)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    tried, corrected = 0, list[int]()
+    while len(corrected) < wanted:
+        tried += max(5, wanted - len(corrected))
+        rollouts = evaluate(settings, out, num_episodes=tried, workers=1).rollouts
+        corrected = [r.episode_index for r in rollouts if r.success and read_takeover(out / r.file) is not None]
+    export(out, dataset, args, ",".join(map(str, corrected[:wanted])))
+    return dataset
+
+
+def load(datasets: list[Path], *, relative: bool) -> Data:
+    """All frames in which the expert acts; a stretch of them ends where it hands back."""
+    parts: dict[str, list[np.ndarray[Any, Any]]] = defaultdict(list)
+    for number, dataset in enumerate(datasets):
+        tables = [pq.read_table(path) for path in sorted((dataset / "data").rglob("*.parquet"))]
+        episode = np.concatenate([t["episode_index"].to_numpy() for t in tables])
+        acts = np.concatenate([t[INTERVENTION].to_numpy(zero_copy_only=False) for t in tables]).astype(bool)
+        acts |= ~np.isin(episode, episode[acts])  # of a plain demonstration all frames are the expert's
+        begins = np.diff(episode, prepend=-1) != 0
+        begins[1:] |= acts[1:] != acts[:-1]
+        parts["stretch"].append((np.cumsum(begins) + 1_000_000 * number)[acts])
+        for name in (STATE, ACTION, ENVIRONMENT):
+            values = np.concatenate([np.stack(t[name].to_numpy()) for t in tables]).astype(np.float32)
+            parts[name].append(values[acts])
+    stretch = np.concatenate(parts.pop("stretch"))
+    columns = {name: torch.from_numpy(np.concatenate(values)) for name, values in parts.items()}
+    stats = {name: statistics(values) for name, values in columns.items()}
+    features = json.loads((datasets[0] / "meta" / "info.json").read_text())["features"]
+    for name in (STATE, ENVIRONMENT) if relative else ():
+        for i, component in enumerate(features[name]["names"]):
+            if _ABSOLUTE.fullmatch(component):
+                stats[name]["std"][i] = SWITCHED_OFF
+    return Data(columns=columns, end=torch.from_numpy(np.searchsorted(stretch, stretch, side="right")), stats=stats)
+
+
+def stage(arm: str, datasets: list[Path], corrected: int, seed: int, args: argparse.Namespace) -> tuple[Stage, Path]:
+    """Train on datasets and try what came out; the policy's folder, too."""
+    count = args.episodes + (args.corrected if arm == "plain" else 0)
+    label = f"{args.label}_{args.rules}" if arm == "corrected" else args.label
+    out = args.out / "policies" / f"{arm}_{count}_{corrected}_{label}_{seed}"
+    data = load(datasets, relative=args.relative)
+    if not (out / "training.json").exists():
+        print(f"training {out.name} on {len(data.end)} frames", flush=True)
+        train(data, args.variant, args, seed=seed, out=out)
+    seconds = float(json.loads((out / "training.json").read_text())["cpu_seconds"])
+    config = GenerateConfig(task=args.task, split="eval", seed=0, cameras=())
+    settings = settings_for(out, config, action=args.action)
+    where = args.out / "evaluations" / out.name
+    where.parent.mkdir(parents=True, exist_ok=True)
+    found = evaluate(settings, where, num_episodes=args.scenes, workers=1)
+    print(f"{out.name:<40} {found.rate}", flush=True)
+    made = Stage(
+        arm=arm,
+        corrected=corrected,
+        demonstrations=count,
+        frames=len(data.end),
+        evaluation=found,
+        cpu_seconds=seconds,
+    )
+    return made, out
+
+
+def stages(seed: int, args: argparse.Namespace) -> Iterator[Stage]:
+    """All policies of one training seed."""
+    plain = demonstrations(args, args.episodes)
+    start, policy = stage("start", [plain], 0, seed, args)
+    yield start
+    datasets, done = [plain], 0
+    for number in range(args.rounds):
+        wanted = round(args.corrected * (number + 1) / args.rounds) - done
+        out = args.out / "corrected" / f"{args.label}_{args.rules}_{seed}_{number}"
+        scene_seed = CORRECTION_SEED + seed * args.rounds + number
+        datasets.append(correct(policy, wanted, scene_seed, args, out))
+        done += wanted
+        corrected, policy = stage("corrected", datasets, done, seed, args)
+        yield corrected
+    more = demonstrations(args, args.episodes + args.corrected)
+    yield stage("plain", [more], 0, seed, args)[0]
+
+
+def rate(found: list[Stage]) -> Rate:
+    """Of all trainings of a row together."""
+    rates = [s.evaluation.rate for s in found]
+    return Rate(successes=sum(r.successes for r in rates), trials=sum(r.trials for r in rates))
+
+
+def plot(rows: dict[tuple[str, int, int], list[Stage]], path: Path) -> None:
+    """Success over corrected episodes, beside plain demonstrations, and by cell before and after."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, (curve, bars) = plt.subplots(1, 2, figsize=(11, 4.6), width_ratios=(2, 3), layout="constrained")
+    ways: tuple[tuple[str, str, Callable[[Stage], int]], ...] = (
+        ("corrected", "corrected episodes", lambda s: s.corrected),
+        ("plain", "plain demonstrations", lambda s: s.demonstrations - first),
+    )
+    first = min(count for _, count, _ in rows)
+    for color, (arm, label, added) in enumerate(ways):
+        points = sorted((added(found[0]), rate(found)) for row, found in rows.items() if row[0] in (arm, "start"))
+        x = [count for count, _ in points]
+        y = [100 * r.value for _, r in points]
+        below = [100 * (r.value - r.interval[0]) for _, r in points]
+        above = [100 * (r.interval[1] - r.value) for _, r in points]
+        curve.errorbar(x, y, yerr=[below, above], marker="o", capsize=3, color=f"C{color}", label=label)
+        for found in (f for row, f in rows.items() if row[0] in (arm, "start")):
+            for one in found:
+                curve.plot(added(one), 100 * one.evaluation.rate.value, ".", color=f"C{color}", alpha=0.4)
+    curve.set_xlabel(f"episodes added to {first} demonstrations")
+    curve.set_ylabel("held-out scenes solved, % (bar: 95 % interval)")
+    curve.set_ylim(0, 102)
+    curve.legend(fontsize=8, loc="lower right")
+    last = max(row[2] for row in rows)
+    shown = {arm: found for (arm, _, count), found in rows.items() if arm != "corrected" or count == last}
+    for number, (arm, found) in enumerate(shown.items()):
+        factors = [factor for one in found for factor in one.evaluation.factors]
+        successes = [r.success for one in found for r in one.evaluation.rollouts]
+        parts = cells(factors, successes)
+        places = np.arange(len(parts)) + 0.26 * (number - 1)
+        bars.bar(places, [100 * part.rate.value for part in parts], 0.24, color=("C7", "C0", "C1")[number], label=arm)
+        bars.set_xticks(
+            range(len(parts)), [f"{p.factor} {p.low:.3g}..{p.high:.3g}" for p in parts], rotation=90, fontsize=6
+        )
+    bars.set_ylim(0, 102)
+    bars.legend(fontsize=8, loc="lower right")
+    for axes in (curve, bars):
+        for side in ("top", "right"):
+            axes.spines[side].set_visible(False)
+    figure.savefig(path, dpi=110)
+
+
+def main() -> None:
+    """Make what is missing and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--task", default="pick_place")
+    parser.add_argument("--episodes", type=int, default=100, help="plain demonstrations at the start")
+    parser.add_argument("--corrected", type=int, default=100, help="corrected episodes in all")
+    parser.add_argument("--rounds", type=int, default=2)
+    parser.add_argument("--seeds", type=int, default=3, help="trainings, each with corrections of its own")
+    parser.add_argument("--scenes", type=int, default=150, help="held-out scenes of each policy")
+    parser.add_argument("--action", default="ee_delta")
+    parser.add_argument("--execute", type=int, default=16, help="actions of the chunk of 16 that are executed")
+    parser.add_argument("--relative", action="store_true", help="hide where on the table things are")
+    parser.add_argument("--steps", type=int, default=3000)
+    parser.add_argument("--batch-size", type=int, default=128)
+    parser.add_argument("--learning-rate", type=float, default=5e-4)
+    parser.add_argument("--stray-metres", type=float, default=TakeOver.stray_metres)
+    parser.add_argument("--hand-back", action="store_true")
+    parser.add_argument("--no-noise", dest="noise", action="store_false")
+    parser.add_argument("--out", type=Path, default=Path("outputs/corrections"))
+    parser.add_argument("--plot", type=Path, help="also draw the table into this PNG")
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    args.device = "cpu"
+    args.variant = Variant(about="", action=args.action, execute=args.execute)
+    handed = "back" if args.hand_back else "finished"
+    args.label = f"{args.action}_{args.execute}_{args.steps}{'_relative' if args.relative else ''}"
+    args.rules = f"{args.stray_metres:g}_{handed}{'' if args.noise else '_clean'}"
+    args.out.mkdir(parents=True, exist_ok=True)
+    rows: dict[tuple[str, int, int], list[Stage]] = defaultdict(list)
+    started = time.process_time()
+    for seed in range(args.seeds):
+        for made in stages(seed, args):
+            rows[made.row].append(made)
+    print(f"\n{'arm':<10} {'plain':>6} {'corrected':>9} {'frames':>8} {'by training':>16} {'train CPU s':>11}  success")
+    for (arm, plain, corrected), found in rows.items():
+        print(
+            f"{arm:<10} {plain:>6} {corrected:>9} {np.mean([s.frames for s in found]):>8.0f} "
+            f"{' '.join(str(s.evaluation.rate.successes) for s in found):>16} "
+            f"{np.mean([s.cpu_seconds for s in found]):>11.0f}  {rate(found)}"
+        )
+    print(f"CPU seconds of this process, workers not counted: {time.process_time() - started:.0f}")
+    if args.plot is not None:
+        plot(rows, args.plot)
+
+
+if __name__ == "__main__":
+    main()

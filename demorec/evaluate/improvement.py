@@ -1,0 +1,288 @@
+"""A policy that gets better in rounds: train, let the expert correct it, train again on everything.
+
+    OUT/improve.json                what decides the result
+    OUT/round_00/dataset            the plain demonstrations; from round 1 on also all corrected episodes
+    OUT/round_00/train              output folder of lerobot-train, training.log beside it
+    OUT/round_00/training.json      the training came to its end: which policy came out
+    OUT/round_00/evaluation         the policy on held-out scenes
+    OUT/round_01/corrections        the policy of the round before, corrected by the expert
+
+What is there is used again, so that the same command goes on where the last one stopped, whatever stopped it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from demorec.config import GenerateConfig, deciding_versions
+from demorec.errors import ConfigError, DemorecError, in_words
+from demorec.evaluate.correction import read_takeover
+from demorec.evaluate.moments import TakeOver
+from demorec.evaluate.policy import find_checkpoint, policy_summary
+from demorec.evaluate.rollouts import Evaluation, evaluate, load_evaluation, settings_for
+from demorec.evaluate.statistics import Rate
+from demorec.generate.plan import plain_differences
+from demorec.lerobot.export import export_lerobot
+from demorec.lerobot.options import ExportOptions
+from demorec.plain import to_plain
+from demorec.processes import start_program
+from demorec.runs.lock import LOCK_NAME, run_lock
+from demorec.runs.run_file import free_name, load_run_file
+from demorec.scene.features import ActionKind
+
+SETTINGS_NAME, TRAINED_NAME, LOG_NAME = "improve.json", "training.json", "training.log"
+_CONFIG_NAME = "train_config.json"
+"""In which lerobot-train keeps its settings, in each checkpoint."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """What decides the result.
+
+    Attributes:
+        demonstrations: A run of plain demonstrations.
+        config_path: Settings for lerobot-train; the rounds put their own dataset, output folder and seed into them.
+        words: Further flags of lerobot-train.
+        num_rounds: Rounds of corrections.
+        num_episodes: Scenes in which the policy of a round is corrected.
+        num_scenes: Held-out scenes on which each policy is tried.
+        seed: Of the trainings; the scenes of round k have the root seed `seed` + k.
+        action, privileged, features: As of the export.
+        takeover: When the expert takes over.
+    """
+
+    demonstrations: Path
+    config_path: Path
+    words: tuple[str, ...] = ()
+    num_rounds: int
+    num_episodes: int
+    num_scenes: int
+    seed: int
+    action: ActionKind
+    privileged: bool
+    features: tuple[str, ...]
+    takeover: TakeOver
+
+
+@dataclass(frozen=True, kw_only=True)
+class Round:
+    """A round that is done.
+
+    Attributes:
+        number: From 0, the training on plain demonstrations alone.
+        demonstrations: Plain ones that were learned from.
+        corrections: Corrected episodes that were learned from.
+        rate: Of the policy on the held-out scenes.
+        cpu_seconds: Of the training; of its last part, where it was interrupted.
+    """
+
+    number: int
+    demonstrations: int
+    corrections: int
+    rate: Rate
+    cpu_seconds: float
+
+
+class Improvement:
+    """Rounds in one folder.
+
+    Args:
+        plan: What to do.
+        out: Where.
+        workers: Processes that simulate.
+        tell: Is given a line at every step.
+    """
+
+    def __init__(self, plan: Plan, out: Path, *, workers: int, tell: Callable[[str], None]) -> None:
+        self._plan, self._out, self._workers, self._tell = plan, out, workers, tell
+        run = load_run_file(plan.demonstrations)
+        self._config = replace(run.config, sampling="random")
+        self._num_demonstrations = len(run.successes)
+
+    def rounds(self) -> Iterator[Round]:
+        """Do what is missing, and give each round once it is done.
+
+        Raises:
+            ConfigError: Another improvement, or something else, is in the folder; or what it needs is missing.
+            DemorecError: A training or a rollout failed.
+        """
+        self._out.mkdir(parents=True, exist_ok=True)
+        with run_lock(self._out):
+            self._settle()
+            for number in range(self._plan.num_rounds + 1):
+                yield self._round(number)
+
+    def policy(self, number: int) -> Path:
+        """Output folder of a round's training."""
+        return self._folder(number) / "train"
+
+    def _settle(self) -> None:
+        """Write down what decides, or compare it with what is written there.
+
+        How many rounds and held-out scenes there are may change.
+        """
+        path = self._out / SETTINGS_NAME
+        plan = to_plain(replace(self._plan, num_rounds=0, num_scenes=0))
+        try:
+            settings = json.loads(self._plan.config_path.read_text())
+        except (OSError, ValueError) as error:
+            raise ConfigError(
+                f"The settings of the training cannot be read ({in_words(error)}): {self._plan.config_path}"
+            ) from error
+        found = {**plan, "training": settings, "versions": deciding_versions(self._config)}
+        for name in ("demonstrations", "config_path"):
+            del found[name]  # what they hold counts, not where they lie
+        found["config"] = to_plain(self._config)
+        if not path.exists():
+            if strangers := [each.name for each in self._out.iterdir() if each.name != LOCK_NAME]:
+                raise ConfigError(
+                    f"The folder holds something else ({strangers[0]}), choose another --out: {self._out}"
+                )
+            _write_json(path, found)
+            return
+        try:
+            before = json.loads(path.read_text())
+        except (OSError, ValueError) as error:
+            raise DemorecError(f"{SETTINGS_NAME} is damaged ({in_words(error)}): {path}") from error
+        if lines := plain_differences(before, json.loads(json.dumps(found))):
+            raise ConfigError(
+                f"Another improvement is in this folder ({'; '.join(lines)}): choose another --out: {self._out}"
+            )
+
+    def _round(self, number: int) -> Round:
+        folder = self._folder(number)
+        folder.mkdir(exist_ok=True)
+        if number > 0:
+            self._tell(f"round {number}: the expert corrects the policy of round {number - 1}")
+            self._correct(number)
+        dataset = self._dataset(number)
+        self._tell(f"round {number}: training, {folder / LOG_NAME} tells how it goes")
+        seconds = self._train(number, dataset)
+        self._tell(f"round {number}: {self._plan.num_scenes} held-out scenes")
+        config = replace(self._config, split="eval", seed=0)
+        tried = self._act(self.policy(number), config, folder / "evaluation", self._plan.num_scenes)
+        return Round(
+            number=number,
+            demonstrations=self._num_demonstrations,
+            corrections=sum(len(self._corrected(k)) for k in range(1, number + 1)),
+            rate=tried.rate,
+            cpu_seconds=seconds,
+        )
+
+    def _folder(self, number: int) -> Path:
+        return self._out / f"round_{number:02d}"
+
+    def _act(
+        self, policy: Path, config: GenerateConfig, out: Path, count: int, takeover: TakeOver | None = None
+    ) -> Evaluation:
+        own = tuple(name for name in config.cameras if ":" in name)  # the others are named by the policy itself
+        settings = settings_for(policy, replace(config, cameras=own), action=self._plan.action)
+        return evaluate(replace(settings, takeover=takeover), out, num_episodes=count, workers=self._workers)
+
+    def _correct(self, number: int) -> None:
+        """The policy of the round before acts and is corrected, in scenes that no round had."""
+        config = replace(self._config, seed=self._plan.seed + number)
+        self._act(
+            self.policy(number - 1), config, self._corrections(number), self._plan.num_episodes, self._plan.takeover
+        )
+
+    def _corrections(self, number: int) -> Path:
+        return self._folder(number) / "corrections"
+
+    def _corrected(self, number: int) -> list[int]:
+        """Episodes of a round's corrections in which the expert took over and succeeded."""
+        out = self._corrections(number)
+        rollouts = load_evaluation(out).rollouts
+        return [r.episode_index for r in rollouts if r.success and read_takeover(out / r.file) is not None]
+
+    def _dataset(self, number: int) -> Path:
+        """All that a round learns from."""
+        dataset = self._folder(number) / "dataset"
+        if dataset.exists():
+            return dataset
+        part = dataset.with_name("dataset.part")
+        options = ExportOptions(
+            repo_id="local/improve",
+            action=self._plan.action,
+            privileged=self._plan.privileged,
+            features=(*self._plan.features, "intervention") if self._plan.features else (),
+            intervention=True,
+            verify=False,
+        )
+        export_lerobot((self._plan.demonstrations,), part, replace(options, overwrite=True))
+        for k in range(1, number + 1):
+            if chosen := self._corrected(k):
+                episodes = ",".join(map(str, chosen))
+                more = replace(options, append=True, episodes=episodes)
+                export_lerobot((self._corrections(k),), part, more)
+        part.replace(dataset)
+        return dataset
+
+    def _train(self, number: int, dataset: Path) -> float:
+        """Train unless that is done; CPU seconds."""
+        folder = self._folder(number)
+        done, train = folder / TRAINED_NAME, self.policy(number)
+        if done.exists():
+            found = json.loads(done.read_text())
+            _, digest = policy_summary(find_checkpoint(train))
+            if found.get("policy_digest") != digest:
+                raise DemorecError(f"The policy is not the one that was trained here (its digest differs): {train}")
+            return float(found["cpu_seconds"])
+        checkpoint = train / "checkpoints" / "last" / "pretrained_model" / _CONFIG_NAME
+        if checkpoint.exists():
+            words = [f"--config_path={checkpoint}", "--resume=true"]
+        else:
+            if train.exists():  # no checkpoint yet, and lerobot-train begins in no folder that is there
+                train.rename(free_name(folder / "train.unfinished"))
+            words = [
+                f"--config_path={self._plan.config_path}",
+                f"--dataset.root={dataset}",
+                "--dataset.repo_id=local/improve",
+                f"--output_dir={train}",
+                f"--seed={self._plan.seed}",
+                *self._plan.words,
+            ]
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        _run_training(words, folder / LOG_NAME)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        seconds = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+        _, digest = policy_summary(find_checkpoint(train))
+        _write_json(done, {"policy_digest": digest, "cpu_seconds": round(seconds, 1)})
+        return seconds
+
+
+def _run_training(words: Sequence[str], log: Path) -> None:
+    """demorec train in a process of its own, which ends with this one.
+
+    Raises:
+        DemorecError: It failed.
+    """
+    command = [sys.executable, "-m", "demorec", "train", "--expert-only", *words]
+    with log.open("ab") as file:
+        process = start_program(command, stdout=file, stderr=subprocess.STDOUT)
+        try:
+            code = process.wait()
+        except BaseException:
+            process.terminate()
+            process.wait()
+            raise
+    if code:
+        lines = log.read_text(errors="replace").strip().splitlines() or ["nothing was said"]
+        raise DemorecError(f"The training failed ({lines[-1].strip()}), all that it said is in {log}")
+
+
+def _write_json(path: Path, plain: dict[str, Any]) -> None:
+    part = path.with_name(f"{path.name}.part")
+    with part.open("w") as file:
+        json.dump(plain, file, indent=1)
+        file.flush()
+        os.fsync(file.fileno())
+    part.replace(path)

@@ -1,0 +1,72 @@
+"""What of corrected episodes a policy learns from, when it learns from the expert alone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.export import export
+from support.recording import make_episode
+
+from demorec.errors import ConfigError
+from demorec.export import columns
+from demorec.recording import EpisodeWriter
+from demorec.training.stretches import INTERVENTION, Stretches
+
+
+def stretches() -> Stretches:
+    """A demonstration of three frames, then a corrected episode: policy 2, expert 3, policy 1, expert 2."""
+    acts = [0, 0, 0, 0, 0, 1, 1, 1, 0, 1, 1]
+    return Stretches(index=np.arange(11) + 100, episode_index=np.repeat([4, 5], [3, 8]), intervention=np.array(acts))
+
+
+def test_only_frames_of_the_expert_are_shown_each_about_as_often() -> None:
+    found = stretches()
+    expert = [0, 1, 2, 5, 6, 7, 9, 10]
+    assert found.shown[expert].tolist() == expert
+    shown_instead = found.shown[[3, 4, 8]].tolist()
+    assert set(shown_instead) <= set(expert)
+    assert len(set(shown_instead)) == 3
+    assert found.first.tolist() == [100] * 3 + [103] * 2 + [105] * 3 + [108] + [109] * 2
+    assert found.end.tolist() == [103] * 3 + [105] * 2 + [108] * 3 + [109] + [111] * 2
+
+
+def test_the_column_has_the_name_that_the_export_gives_it() -> None:
+    assert INTERVENTION == columns.INTERVENTION
+
+
+def write(path: Path, episode_index: int, phases: Sequence[str]) -> None:
+    info, frames, outcome = make_episode(num_frames=len(phases), cameras=(), episode_index=episode_index)
+    with EpisodeWriter(path, info) as writer:
+        for frame, phase in zip(frames, phases, strict=True):
+            writer.write(replace(frame, phase=phase))
+        writer.finish(outcome)
+
+
+@pytest.mark.usefixtures("hf_datasets_cache")
+def test_a_dataset_shows_the_expert_alone(tmp_path: Path) -> None:
+    from demorec.training import FastDataset
+
+    policy = ["policy"] * 3
+    (tmp_path / "run").mkdir()
+    for number, phases in enumerate((["expert"] * 6, [*policy, "expert", "expert", *policy, "expert"])):
+        write(tmp_path / "run" / f"episode_{number:06d}.mcap", number, phases)
+    export(tmp_path / "run", tmp_path / "d", intervention=True)
+    settings: dict[str, Any] = {"delta_timestamps": {"action": [0.0, 1 / 30, 2 / 30]}}
+    everything = FastDataset("local/d", root=tmp_path / "d", **settings)
+    experts = FastDataset("local/d", root=tmp_path / "d", expert_only=True, **settings)
+    assert len(experts) == len(everything) == 15
+    of_expert = {0, 1, 2, 3, 4, 5, 9, 10, 14}
+    for item in (experts[index] for index in range(15)):
+        assert int(item["index"]) in of_expert
+    assert experts[9]["action_is_pad"].tolist() == [False, False, True]  # the policy goes on there
+    assert everything[9]["action_is_pad"].tolist() == [False, False, False]
+    assert experts[9]["action"][2].tolist() == everything[10]["action"][0].tolist()  # held, as at an episode's end
+    assert experts[0]["action_is_pad"].tolist() == [False, False, False]
+    export(tmp_path / "run", tmp_path / "silent")
+    with pytest.raises(ConfigError, match="--intervention"):
+        FastDataset("local/d", root=tmp_path / "silent", expert_only=True)
