@@ -68,9 +68,9 @@ def seen_things(labels: NDArray[np.int32], values: dict[str, int]) -> dict[str, 
     # Bodies that are spoken of have no links, so that their numbers are the labels themselves.
     by_column = labels.T.ravel()
     known = {value: name for name, value in values.items()}
-    pixels = np.flatnonzero(np.isin(by_column, list(known)))
+    pixels = np.flatnonzero((by_column >= min(known, default=0)) & (by_column <= max(known, default=-1)))
     shown = by_column[pixels]
-    found = {known[value]: pixels[shown == value] for value in np.unique(shown).tolist()}
+    found = {known[value]: pixels[shown == value] for value in np.flatnonzero(np.bincount(shown)) if value in known}
     return {name: Seen(name=name, pixels=found[name], height=len(labels)) for name in values if name in found}
 
 

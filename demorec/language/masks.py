@@ -57,7 +57,7 @@ def seen_objects(
     row_of = {int(frame): row for row, frame in enumerate(rows.tolist())}
     values = body_values(recording)
     bodies = {body.name: body for body in recording.info.scene.bodies}
-    for frame, labels in recording.segmentation_at(camera.name, row_of):
+    for _, frame, labels in recording.segmentation_at([camera.name], row_of):
         extrinsics = columns.world_from_camera[camera.name][frame]
         for name, seen in seen_things(labels, values).items():
             body = bodies[name]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -21,7 +21,7 @@ from demorec.language.referring import phrases_for
 from demorec.language.situation import Situation, Thing, situation
 from demorec.recording import Recording
 from demorec.scene.episode import EpisodeColumns
-from demorec.scene.scene import Camera
+from demorec.scene.scene import Camera, Scene
 
 ANSWERS = {
     "bbox": {"detections"},
@@ -66,28 +66,46 @@ class Trace:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class _Moment:
+    """Where all things are at one moment, and what they are called, whatever camera looks at them."""
+
+    positions: dict[str, Array]
+    now: Situation
+    _phrases: dict[str, list[str]] = field(default_factory=dict)
+
+    def phrases(self, name: str) -> list[str]:
+        """Phrases for a thing without the robot's left and right, which a camera may see the other way round."""
+        if name not in self._phrases:
+            told = phrases_for(name, self.now)
+            self._phrases[name] = [phrase for phrase in told if not _SIDES & set(phrase.split())]
+        return self._phrases[name]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class _View:
     """One picture with all that is known of it."""
 
     camera: Camera
     world_from_camera: Array
     seen: dict[str, Seen]
-    positions: dict[str, Array]
-    now: Situation
+    moment: _Moment
+
+    @property
+    def now(self) -> Situation:
+        """All things as they are."""
+        return self.moment.now
 
     @cached_property
     def clear(self) -> dict[str, str]:
         """Name -> phrase of each thing that is visible enough to be spoken of, in words that mean it alone."""
-        phrases = {name: self.phrases(name) for name, thing in self.seen.items() if thing.num_pixels >= MIN_PIXELS}
+        phrases = {
+            name: self.moment.phrases(name) for name, thing in self.seen.items() if thing.num_pixels >= MIN_PIXELS
+        }
         return {name: found[0] for name, found in phrases.items() if found}
-
-    def phrases(self, name: str) -> list[str]:
-        """Phrases for a thing without the robot's left and right, which the camera may see the other way round."""
-        return [phrase for phrase in phrases_for(name, self.now) if not _SIDES & set(phrase.split())]
 
     def middle(self, name: str) -> Array:
         """(2,) where the middle of a thing is in the picture, px."""
-        return np.asarray(project(self.camera, self.world_from_camera, self.positions[name][np.newaxis])[0])
+        return np.asarray(project(self.camera, self.world_from_camera, self.moment.positions[name][np.newaxis])[0])
 
 
 def asked_rows(rows: NDArray[np.intp], fps: int) -> list[int]:
@@ -110,29 +128,39 @@ def questions(
         RecordingError: The recording is damaged.
     """
     anchors = {int(rows[row]): row for row in asked_rows(rows, fps)}
+    chosen = {
+        camera.name: (number, camera)
+        for number, camera in enumerate(recording.info.scene.cameras)
+        if camera.name in cameras and recording.has_segmentation(camera.name)
+    }
+    if not chosen:
+        return
     values = body_values(recording)
-    for number, camera in enumerate(recording.info.scene.cameras):
-        if camera.name not in cameras or not recording.has_segmentation(camera.name):
-            continue
-        for turn, (frame, labels) in enumerate(recording.segmentation_at(camera.name, anchors)):
-            view = _view(recording, columns, camera, frame, seen_things(labels, values))
-            asked = _ask(view, turn + number)
-            if asked is not None:
-                text, answer = asked
-                yield Question(row=anchors[frame], camera=camera.name, text=text, answer=json.dumps(answer))
+    moments: dict[int, _Moment] = {}
+    found: dict[str, list[Question | None]] = {name: [] for name in chosen}
+    for name, frame, labels in recording.segmentation_at(list(chosen), anchors):
+        if frame not in moments:
+            moments[frame] = _moment(recording.info.scene, columns, frame)
+        number, camera = chosen[name]
+        view = _View(
+            camera=camera,
+            world_from_camera=columns.world_from_camera[name][frame],
+            seen=seen_things(labels, values),
+            moment=moments[frame],
+        )
+        asked = _ask(view, len(found[name]) + number)
+        found[name].append(
+            asked and Question(row=anchors[frame], camera=name, text=asked[0], answer=json.dumps(asked[1]))
+        )
+    for told in found.values():
+        yield from (question for question in told if question is not None)
 
 
-def _view(recording: Recording, columns: EpisodeColumns, camera: Camera, frame: int, seen: dict[str, Seen]) -> _View:
+def _moment(scene: Scene, columns: EpisodeColumns, frame: int) -> _Moment:
     poses = {name: values[frame] for name, values in columns.object_poses.items()}
-    positions = {body.name: body.world_from_body.position for body in recording.info.scene.bodies}
+    positions = {body.name: body.world_from_body.position for body in scene.bodies}
     positions |= {name: np.asarray(pose[:3]) for name, pose in poses.items()}
-    return _View(
-        camera=camera,
-        world_from_camera=columns.world_from_camera[camera.name][frame],
-        seen=seen,
-        positions=positions,
-        now=situation(recording.info.scene, poses),
-    )
+    return _Moment(positions=positions, now=situation(scene, poses))
 
 
 def _ask(view: _View, turn: int) -> tuple[str, dict[str, Any]] | None:
@@ -182,7 +210,7 @@ def _attribute(view: _View, turn: int) -> tuple[str, dict[str, Any]] | None:
     found = []
     for name in view.clear:
         thing = view.now.thing(name)
-        plain = [phrase for phrase in view.phrases(name) if thing.color not in phrase.split()]
+        plain = [phrase for phrase in view.moment.phrases(name) if thing.color not in phrase.split()]
         if thing.color and plain:
             found.append((plain[0], thing.color))
     if not found:
@@ -245,13 +273,13 @@ def traces(
     """
     info = recording.info
     steps = np.linspace(0.0, _TRACE_SECONDS * info.fps, _TRACE_POINTS + 1).round().astype(int)
+    world_from_tcp = info.scene.robot.world_from_base.apply(columns.base_from_tcp[:, :3])
     for camera in info.scene.cameras:
         if camera.name not in cameras:
             continue
         for row in asked_rows(rows, fps):
             frame = int(rows[row])
-            times = np.minimum(frame + steps, columns.num_frames - 1)
-            tcp = info.scene.robot.world_from_base.apply(columns.base_from_tcp[times, :3])
+            tcp = world_from_tcp[np.minimum(frame + steps, columns.num_frames - 1)]
             pixels: list[list[int]] = []
             for point in project(camera, columns.world_from_camera[camera.name][frame], tcp):
                 if (pixel := pixel_of(camera, point)) is None:

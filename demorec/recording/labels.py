@@ -40,8 +40,8 @@ def to_labels(segmentation: NDArray[np.int32]) -> NDArray[np.uint16]:
 
 def from_labels(labels: NDArray[np.uint16]) -> NDArray[np.int32]:
     """Inverse of `to_labels`."""
-    values = labels.astype(np.int64)
-    return np.where(labels > 0, ((values >> 8) - 1) + ((values & 255) << _LINK_SHIFT), BACKGROUND).astype(np.int32)
+    values = labels.astype(np.int32)
+    return ((values >> 8) - 1) + ((values & 255) << _LINK_SHIFT)  # the background, 0, becomes -1 by itself
 
 
 def encode_labels(segmentation: NDArray[np.int32]) -> bytes:

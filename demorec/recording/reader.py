@@ -41,6 +41,9 @@ class RecordingReader(EpisodeFile):
         RecordingError: No recording, cut off, damaged, or of an unknown format version; so do all methods.
     """
 
+    _said: tuple[tuple[int, bytes], ...] | None = None
+    """(time_ns, message) of all events, once `columns` has come by them: they lie among the numbers in the file."""
+
     def _read_metadata(self) -> None:
         found = self._container.metadata(metadata.EPISODE)
         if found is None and metadata.COLLECTED in self._container.metadata_names:
@@ -96,7 +99,9 @@ class RecordingReader(EpisodeFile):
         streams = frame_streams(self.info)
         times = self._frame_times()
         topics = [stream.topic for stream in streams]
-        blocks = self._container.blocks((*topics, channels.PHASE, channels.DELIBERATE_MISS))
+        blocks = self._container.blocks((*topics, channels.PHASE, channels.DELIBERATE_MISS, channels.EVENTS))
+        said = blocks[channels.EVENTS]
+        self._said = tuple(zip(said.time_ns.tolist(), said.messages(), strict=True))
         joint_states = blocks[channels.JOINT_STATES]  # there may be more of these between the frames
         blocks[channels.JOINT_STATES] = joint_states.select(np.isin(joint_states.time_ns, times))
         with damage_as_recording_error(self.path):
@@ -140,11 +145,12 @@ class RecordingReader(EpisodeFile):
 
     def events(self) -> Iterator[tuple[int, Event]]:
         """(time_ns, event) in order of time; changes of phase are in `columns().phase`."""
-        for message in self._container.messages((channels.EVENTS,)):
+        read = ((message.time_ns, message.data) for message in self._container.messages((channels.EVENTS,)))
+        for time_ns, data in read if self._said is None else self._said:
             with damage_as_recording_error(self.path):
-                event = messages.read_log(message.data)
+                event = messages.read_log(data)
             if event.name != channels.PHASE_EVENT:
-                yield message.time_ns, event
+                yield time_ns, event
 
     def packets(self, camera: str) -> Iterator[VideoPacket]:
         """The coded pictures of a camera, one a frame, in order."""
@@ -188,22 +194,39 @@ class RecordingReader(EpisodeFile):
 
     def segmentation(self, camera: str) -> Iterator[NDArray[np.int32]]:
         """Segmentation pictures, (H, W) int32 as in `CameraImages`, one a frame; `segment_names` tells what is what."""
-        if not self.has_segmentation(camera):
-            raise RecordingError(f"The recording has no segmentation pictures of the camera {camera!r}: {self.path}")
-        topic, size = channels.camera_topic(camera, "segmentation"), self._size(camera)
-        for _, labels in self._pictures(topic, lambda data: decode_labels(messages.read_compressed_image(data), size)):
+        for _, labels in self._pictures(self._segmentation_topic(camera), lambda data: self._decoded(data, camera)):
             yield labels
 
-    def segmentation_at(self, camera: str, frames: Collection[int]) -> Iterator[tuple[int, NDArray[np.int32]]]:
-        """(frame, segmentation picture) of some frames, in order; the other pictures are not unpacked."""
+    def segmentation_at(
+        self, cameras: Sequence[str], frames: Collection[int]
+    ) -> Iterator[tuple[str, int, NDArray[np.int32]]]:
+        """(camera, frame, segmentation picture) of some frames, read in one pass; the other pictures stay packed.
+
+        Those of one camera come in the order of its frames; how those of several cameras alternate is not said.
+        """
+        topics = {camera: self._segmentation_topic(camera) for camera in cameras}
+        times, counts = self._frame_times(), dict.fromkeys(cameras, 0)
+        for blocks in self._container.blocks_by_chunk(topics.values()):
+            for camera, topic in topics.items():
+                block, first = blocks.get(topic), counts[camera]
+                if block is None:
+                    continue
+                counts[camera] += len(block)
+                if not np.array_equal(block.time_ns, times[first : counts[camera]]):
+                    raise RecordingError(f"Pictures of {topic} are not at the times of the frames: {self.path}")
+                for index in [index for index in range(len(block)) if first + index in frames]:
+                    yield camera, first + index, self._decoded(next(block.select(np.array([index])).messages()), camera)
+        for camera, count in counts.items():
+            self._check_num_pictures(topics[camera], count)
+
+    def _segmentation_topic(self, camera: str) -> str:
         if not self.has_segmentation(camera):
             raise RecordingError(f"The recording has no segmentation pictures of the camera {camera!r}: {self.path}")
-        topic, size = channels.camera_topic(camera, "segmentation"), self._size(camera)
-        for frame, (_, data) in enumerate(self._pictures(topic, lambda data: data)):
-            if frame in frames:
-                with damage_as_recording_error(self.path):
-                    labels = decode_labels(messages.read_compressed_image(data), size)
-                yield frame, labels
+        return channels.camera_topic(camera, "segmentation")
+
+    def _decoded(self, message: bytes, camera: str) -> NDArray[np.int32]:
+        with damage_as_recording_error(self.path):
+            return decode_labels(messages.read_compressed_image(message), self._size(camera))
 
     def _size(self, camera: str) -> tuple[int, int]:
         """(height, width) of all pictures of a camera."""
@@ -231,6 +254,9 @@ class RecordingReader(EpisodeFile):
                 picture = read(message.data)
             yield message.time_ns, picture
             count += 1
+        self._check_num_pictures(topic, count)
+
+    def _check_num_pictures(self, topic: str, count: int) -> None:
         if count != self.num_frames:
             raise RecordingError(
                 f"The recording has {self.num_frames} frames, but {count} pictures on {topic}: {self.path}"

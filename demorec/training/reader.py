@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from demorec.training.columns import Column, numbers
 from demorec.training.pictures import PictureReader
+from demorec.training.statements import Statements, is_statements
 from demorec.training.stretches import STRETCH_COLUMNS, Stretches
 
 Rows = NDArray[np.int64]
@@ -98,6 +99,8 @@ class FastReader(DatasetReader):  # type: ignore[misc]
         """A feature's value for each item: of its row (B,), or stacked of the rows of its window (B, T)."""
         if name in tables.numbers:
             return list(tables.numbers[name].tensor(rows).unbind(0))
+        if name in tables.statements and rows.ndim == 1:
+            return tables.statements[name].take(rows)
         once, places = np.unique(rows, return_inverse=True) if rows.ndim > 1 else (rows, None)
         values: list[Any] = tables.others[name][once.tolist()][name]
         if places is None:
@@ -161,6 +164,7 @@ class _Tables:
         names: Its columns in order.
         numbers: Those that are arrays.
         others: The rest, each as a table that LeRobot's conversion is applied to: pictures, texts, gaps.
+        statements: Those of them that are language columns.
         video_paths: Video feature -> its files.
         video_file: Video feature -> number of the file of each episode, (E,).
         video_start_s: Video feature -> where each episode begins in its file, in seconds, (E,) float64.
@@ -171,9 +175,13 @@ class _Tables:
     def __init__(self, reader: FastReader) -> None:
         meta, self.source = reader._meta, reader.hf_dataset
         self.names = self.source.column_names
-        found = {name: numbers(column) for name, column in _columns(self.source, self.names).items()}
+        columns = _columns(self.source, self.names)
+        found = {name: numbers(column) for name, column in columns.items()}
         self.numbers: dict[str, Column] = {name: column for name, column in found.items() if column is not None}
         self.others = {name: self.source.select_columns([name]) for name in self.names if name not in self.numbers}
+        self.statements = {
+            name: Statements(table) for name, table in self.others.items() if is_statements(columns[name])
+        }
         self.tasks = meta.tasks.index.tolist()
         episodes = _columns(meta.episodes, meta.episodes.column_names)
         self._starts, self._ends = (_array(episodes[f"dataset_{end}_index"]) for end in ("from", "to"))

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import pickle
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from support.docs import run_examples
 from support.export import export, make_run
@@ -115,6 +118,28 @@ def test_torchcodec_gives_equal_items_too(kind: str, roots: dict[str, Path]) -> 
     _, plain = pair(roots[kind])
     as_bytes = kind == "ours"
     assert_same(*pair(roots[kind], video_backend="torchcodec", delta_timestamps=windows(plain), return_uint8=as_bytes))
+
+
+def test_language_is_equal(tmp_path: Path) -> None:
+    root = tmp_path / "spoken"
+    export(make_run(tmp_path / "run", (5, 6)), root, language=())
+    path = next((root / "data").glob("*/*.parquet"))
+    table = pq.read_table(path)
+    rows = table.column("language_events").to_pylist()
+    call = {"type": "function", "function": {"name": "say", "arguments": {"text": "Yes, the red one."}}}
+    rows[3] = [
+        {"role": "user", "content": "No, the red one.", "style": "interjection", "camera": None, "tool_calls": None},
+        {"role": "assistant", "content": None, "style": None, "camera": None, "tool_calls": [json.dumps(call)]},
+    ]
+    fields = dict.fromkeys(("role", "content", "style", "camera"), pa.string()) | {"tool_calls": pa.list_(pa.string())}
+    column = pa.array(rows, pa.list_(pa.struct(list(fields.items()))))
+    pq.write_table(table.set_column(table.column_names.index("language_events"), "language_events", column), path)
+    fast, slow = pair(root)
+    assert_same(fast, slow)
+    assert fast[3]["language_events"][1]["tool_calls"] == [call]
+    assert len(fast[3]["language_persistent"]) > 3
+    assert list(fast[3]["language_persistent"][0])[3] == "timestamp"
+    assert fast[3]["language_persistent"][0] is not fast[4]["language_persistent"][0]
 
 
 def test_some_episodes_only(roots: dict[str, Path]) -> None:

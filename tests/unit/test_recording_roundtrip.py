@@ -143,6 +143,20 @@ def test_depth_and_segmentation(tmp_path: Path) -> None:
     assert names[2 + (1 << 24)] == "panda/panda_link1"
 
 
+def test_segmentation_of_several_cameras_in_one_pass(tmp_path: Path) -> None:
+    path = write_episode(tmp_path / "a.mcap", num_frames=70, cameras=("front", "wrist"), segmentation=True)
+    chosen = {0, 31, 32, 69}
+    with Recording(path) as recording:
+        assert len(list(recording._container.blocks_by_chunk(["/camera/front/segmentation"]))) > 1
+        found = list(recording.segmentation_at(["wrist", "front"], chosen))
+        for camera in ("front", "wrist"):
+            wanted = [labels for frame, labels in enumerate(recording.segmentation(camera)) if frame in chosen]
+            pictures = [(frame, labels) for name, frame, labels in found if name == camera]
+            assert [frame for frame, _ in pictures] == sorted(chosen)
+            assert all(np.array_equal(a, b) for (_, a), b in zip(pictures, wanted, strict=True))
+        assert len(found) == 2 * len(chosen)
+
+
 def test_without_depth_it_says_so(tmp_path: Path) -> None:
     with Recording(write_episode(tmp_path / "a.mcap", num_frames=3)) as recording:
         assert not recording.has_depth("front")
@@ -181,6 +195,8 @@ def test_events(tmp_path: Path) -> None:
     expected = [(frame.time_ns, event) for frame in frames for event in frame.events]
     assert {event.level for _, event in expected} == {"info", "warning"}
     with Recording(path) as recording:
+        assert list(recording.events()) == expected
+        recording.columns()  # comes by them
         assert list(recording.events()) == expected
 
 
