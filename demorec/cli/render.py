@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -21,6 +22,7 @@ from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings
 from demorec.safety.user_modules import modules_of
 
 if TYPE_CHECKING:
+    from demorec.render.warm import WarmRenderer
     from demorec.replay.rerender import RerenderOptions, RerenderReport
 
 
@@ -169,18 +171,30 @@ def _jobs(paths: Sequence[Path], out: Path) -> list[tuple[Path, Path]]:
 def _rendered(
     jobs: Sequence[tuple[Path, Path]], options: RerenderOptions, overwrite: bool, workers: int
 ) -> Iterator[RerenderReport]:
-    from demorec.replay.rerender import rerender
-
     if workers <= 1:
         for source, target in jobs:
-            yield rerender(source, target, options, overwrite=overwrite)
+            yield _draw(source, target, options, overwrite)
         return
     # Spawned, as renderers and decoders do not survive a fork.
     with ProcessPoolExecutor(max_workers=workers, mp_context=SPAWN) as pool:
-        futures = [pool.submit(rerender, source, target, options, overwrite=overwrite) for source, target in jobs]
+        futures = [pool.submit(_draw, source, target, options, overwrite) for source, target in jobs]
         try:
             for future in futures:
                 yield future.result()
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
+
+
+def _draw(source: Path, target: Path, options: RerenderOptions, overwrite: bool) -> RerenderReport:
+    from demorec.replay.rerender import rerender
+
+    return rerender(source, target, options, overwrite=overwrite, renderers=_renderers())
+
+
+@cache
+def _renderers() -> WarmRenderer:
+    """Of this process, which draws one recording after the other."""
+    from demorec.render.warm import WarmRenderer
+
+    return WarmRenderer()

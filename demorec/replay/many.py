@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,13 +10,14 @@ from demorec.config import VideoConfig
 from demorec.errors import ConfigError
 from demorec.plain import from_plain
 from demorec.recording import EpisodeWriter
+from demorec.render.warm import WarmRenderer
 from demorec.replay.demonstration import Demonstration, ReplayOptions
 from demorec.replay.drive import ReplayReport, replay
 from demorec.replay.rerender import recorded_view, view_painter
 from demorec.safety.files import make_folder
 from demorec.scene.assets import allow_models
 from demorec.sim.world import World
-from demorec.tables import RENDERERS, TASKS
+from demorec.tables import TASKS
 
 
 def replay_all(
@@ -40,6 +40,7 @@ def replay_all(
     allow_models(options.allowed)
     world: World | None = None
     key: object = None
+    renderers = WarmRenderer()
     try:
         for demonstration in demonstrations:
             info = demonstration.info
@@ -54,15 +55,22 @@ def replay_all(
             if out is None:
                 yield replay(demonstration, world, options)[0], None
             else:
-                report, path = record_replay(demonstration, world, options, out, overwrite=overwrite)
+                report, path = record_replay(demonstration, world, renderers, options, out, overwrite=overwrite)
                 yield report, None if demonstration.source is None else (demonstration.source, path)
     finally:
+        renderers.close()
         if world is not None:
             world.close()
 
 
 def record_replay(
-    demonstration: Demonstration, world: World, options: ReplayOptions, out: Path, *, overwrite: bool
+    demonstration: Demonstration,
+    world: World,
+    renderers: WarmRenderer,
+    options: ReplayOptions,
+    out: Path,
+    *,
+    overwrite: bool,
 ) -> tuple[ReplayReport, Path]:
     """Replay and record it, with pictures of the recording's cameras, into a file of the same name in `out`.
 
@@ -78,12 +86,10 @@ def record_replay(
     make_folder(out)
     info = replace(d.info, fps=d.fps, origin=f"replay of {d.digest[:16]}")
     video = from_plain(config.get("video", {}), VideoConfig)
-    with ExitStack() as stack:
-        painter = None
-        if info.scene.cameras:
-            renderer = stack.enter_context(RENDERERS.load(str(config.get("renderer", "raster")))())
-            painter = view_painter(renderer, view, config)
-        writer = stack.enter_context(EpisodeWriter(path, info, video=video, overwrite=overwrite))
+    painter = None
+    if info.scene.cameras:
+        painter = view_painter(renderers.of(str(config.get("renderer", "raster"))), view, config)
+    with EpisodeWriter(path, info, video=video, overwrite=overwrite) as writer:
         report, outcome = replay(d, world, options, painter=painter, sink=writer.write)
         writer.finish(outcome)
     return report, path

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from demorec.registry import nearest_match
 from demorec.render import Renderer
 from demorec.render.painter import Painter
 from demorec.render.recorded import RecordedWorld
+from demorec.render.warm import WarmRenderer
 from demorec.safety.files import make_folder
 from demorec.safety.user_modules import split_name
 from demorec.scene.assets import allow_models
@@ -288,7 +290,14 @@ def drawing_config(info: EpisodeInfo, options: RerenderOptions) -> dict[str, Any
     return config
 
 
-def rerender(source: Path, out: Path, options: RerenderOptions, *, overwrite: bool = False) -> RerenderReport:
+def rerender(
+    source: Path,
+    out: Path,
+    options: RerenderOptions,
+    *,
+    overwrite: bool = False,
+    renderers: WarmRenderer | None = None,
+) -> RerenderReport:
     """Draw a recording anew, unless `out` is what the same call has made before.
 
     Args:
@@ -296,6 +305,7 @@ def rerender(source: Path, out: Path, options: RerenderOptions, *, overwrite: bo
         out: The file to be made.
         options: What is to change.
         overwrite: Whether `out` may be replaced; it is drawn then, whatever is there.
+        renderers: The caller's, warm from one recording to the next; None makes and frees one.
 
     Raises:
         RecordingError: The source is damaged or empty.
@@ -328,10 +338,10 @@ def rerender(source: Path, out: Path, options: RerenderOptions, *, overwrite: bo
                 info.robot, view.scene, joint_position=columns.joint_position, object_poses=columns.object_poses
             )
             with (
-                RENDERERS.load(str(config.get("renderer", "raster")))() as renderer,
+                nullcontext(renderers) if renderers is not None else WarmRenderer() as warm,
                 EpisodeWriter(out, new_info, video=video, overwrite=overwrite) as writer,
             ):
-                painter = view_painter(renderer, view, config)
+                painter = view_painter(warm.of(str(config.get("renderer", "raster"))), view, config)
                 painter.setup(world)
                 for frame in frames_of(recording, columns):
                     world.frame = frame.frame_index
