@@ -8,7 +8,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from demorec.cli.output import say, tell
+from demorec.cli.output import counted, say, tell
 from demorec.config import VideoConfig
 from demorec.errors import ConfigError
 
@@ -64,6 +64,7 @@ class Import:
         made = [episode for episode in episodes if episode.episode_index is not None]
         dropped = f", {len(episodes) - len(made)} dropped" if len(made) < len(episodes) else ""
         findings = sum(len(report.findings) for report in result.reports)
-        say(f"{len(made)} episodes, {sum(row.num_frames for row in made)} frames{dropped}: {self.out}")
-        say(f"{findings} findings in the bags, see above and demorec check." if findings else "Nothing odd was found.")
+        say(f"{counted(len(made), 'episode')}, {sum(row.num_frames for row in made)} frames{dropped}: {self.out}")
+        odd = f"{counted(findings, 'finding')} in the bags, see above and demorec check."
+        say(odd if findings else "Nothing odd was found.")
         return 0

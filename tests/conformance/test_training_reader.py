@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from support.collected import TOP, make_collected, write_collected
 from support.docs import run_examples
 from support.export import export, make_run
 from support.training import CAMERA, assert_same_item, write_by_lerobot
@@ -115,6 +116,16 @@ def test_torchcodec_gives_equal_items_too(kind: str, roots: dict[str, Path]) -> 
     _, plain = pair(roots[kind])
     as_bytes = kind == "ours"
     assert_same(*pair(roots[kind], video_backend="torchcodec", delta_timestamps=windows(plain), return_uint8=as_bytes))
+
+
+def test_a_dataset_of_collected_episodes_is_read_equally(tmp_path: Path) -> None:
+    (tmp_path / "run" / "episodes").mkdir(parents=True)
+    for index, length in enumerate((20, 33)):
+        given = make_collected(cameras=(TOP,), num_frames=length, episode_index=index)
+        write_collected(tmp_path / "run" / "episodes" / f"episode_{index:06d}.mcap", given)
+    export(tmp_path / "run", tmp_path / "d")
+    fast, slow = pair(tmp_path / "d")
+    assert_same(fast, slow)
 
 
 def test_some_episodes_only(roots: dict[str, Path]) -> None:
