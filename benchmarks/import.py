@@ -2,20 +2,30 @@
 
     python benchmarks/import.py                              a small sample
     python benchmarks/import.py --seconds 30 --rounds 5 --pictures h264 jpeg
-    python benchmarks/import.py --growth 1 2 4               peak memory for bags that many times as long
+    python benchmarks/import.py --growth 1 5 20              peak memory for bags of that many gigabytes
+    python benchmarks/import.py --forge /tmp/forge/bin/python    against forge-robotics, too
+
+forge-robotics is no dependency: it is run by the Python of an environment of its own that has
+"forge-robotics[mcap,lerobot,video]", Pillow and opencv-python-headless. Where it fails on a bag, its own words stand in
+place of figures.
 
 The bag is written by `mcap` and `rosbags`: two joint topics at 200 Hz and two 640x480 cameras. Each round runs the
 candidates one after the other in processes of their own; loading libraries is not counted.
-LeRobot's writer is given frames that were decoded by the same reader as ours, aligned as ours.
+LeRobot's writer is given frames that were decoded by the same reader as ours, aligned as ours. "decoding and coding" is
+what no import of JPEG pictures into videos can do without: each picture decoded by Pillow and coded by libx264, as our
+export codes it.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import multiprocessing
 import resource
 import shutil
 import statistics
+import struct
+import subprocess
 import sys
 import tempfile
 from dataclasses import dataclass
@@ -151,6 +161,52 @@ def lerobots(bag: Path, out: Path, mapping: Path) -> None:
     dataset.finalize()
 
 
+def decoding_and_coding(bag: Path) -> None:
+    """Every picture of the bag decoded and coded once as the export codes it, and nothing else."""
+    from demorec.config import VideoConfig
+    from demorec.ingest.bag import open_bag
+    from demorec.ingest.picture_messages import decode_picture
+    from demorec.ingest.streams import BagDecoder
+    from demorec.recording.video import make_encoder
+
+    decoder = BagDecoder()
+    encoders = {topic: make_encoder(video=VideoConfig(), width=WIDTH, height=HEIGHT, fps=FPS) for topic in CAMERAS}
+    for message in open_bag(bag).messages([], CAMERAS):
+        encoders[message.channel.topic].encode(decode_picture(decoder.values(message)))
+    for encoder in encoders.values():
+        encoder.finish()
+
+
+FORGE = """
+import json, resource, sys
+import av, cv2, datasets, pyarrow.parquet
+import forge.formats.lerobot_v3, forge.formats.mcap, mcap_ros2.decoder
+from forge.convert.converter import convert
+def used():
+    usages = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(usage.ru_utime + usage.ru_stime for usage in usages)
+begin = used()
+result = convert(sys.argv[1], sys.argv[2], target_format="lerobot-v3", fps=30.0)
+peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss << 10
+errors = [str(error) for error in result.errors]
+print(json.dumps({"cpu": used() - begin, "peak": peak, "frames": result.total_frames, "errors": errors}))
+"""
+
+
+def forges(python: Path, bag: Path, out: Path) -> Cost | str:
+    """The bag to a LeRobot dataset by forge-robotics; its words where it fails."""
+    shutil.rmtree(out, ignore_errors=True)
+    command = [str(python), "-c", FORGE, str(bag), str(out)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    shutil.rmtree(out, ignore_errors=True)
+    if done.returncode:
+        return done.stderr.strip().splitlines()[-1]
+    told = json.loads(done.stdout.splitlines()[-1])
+    if told["errors"] or not told["frames"]:
+        return "; ".join(told["errors"]) or "no frames"
+    return Cost(cpu=told["cpu"], peak=told["peak"])
+
+
 def _child(candidate: str, bag: Path, out: Path, mapping: Path, answer: multiprocessing.queues.Queue[Cost]) -> None:
 
     import demorec.ingest.import_run
@@ -159,6 +215,8 @@ def _child(candidate: str, bag: Path, out: Path, mapping: Path, answer: multipro
     begin = _used()
     if candidate == "lerobot":
         lerobots(bag, out, mapping)
+    elif candidate == "decoding and coding":
+        decoding_and_coding(bag)
     else:
         ours(bag, out, mapping, exports=candidate == "import and export")
     answer.put(Cost(cpu=_used() - begin, peak=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss << 10))
@@ -188,33 +246,89 @@ def measure(candidate: str, bag: Path, folder: Path) -> Cost:
     return cost
 
 
+def grow(path: Path, pictures: str, gigabytes: float) -> Path:
+    """A bag of that size: a piece of ten seconds again and again, each time ten seconds later."""
+    from mcap.reader import make_reader
+    from mcap.writer import CompressionType, Writer
+
+    piece = make_bag(path.with_suffix(".piece"), 10.0, pictures)
+    with piece.open("rb") as source, path.open("wb") as target:
+        writer = Writer(target, compression=CompressionType.NONE)
+        writer.start()
+        schemas: dict[int, int] = {}
+        channels: dict[int, int] = {}
+        messages = list(make_reader(source).iter_messages())
+        shift = 0
+        while target.tell() < gigabytes * 1e9:
+            for schema, channel, message in messages:
+                assert schema is not None
+                if channel.id not in channels:
+                    schemas[schema.id] = writer.register_schema(schema.name, schema.encoding, schema.data)
+                    channels[channel.id] = writer.register_channel(
+                        channel.topic, channel.message_encoding, schemas[schema.id]
+                    )
+                seconds, nanoseconds = struct.unpack_from("<iI", message.data, 4)  # of the header, after CDR's own
+                data = bytearray(message.data)
+                struct.pack_into("<iI", data, 4, seconds + shift, nanoseconds)
+                log_ns = message.log_time + shift * bags.NS
+                writer.add_message(channels[channel.id], log_ns, bytes(data), log_ns)
+            shift += 10
+        writer.finish()
+    piece.unlink()
+    return path
+
+
+def table(pictures: str, bag: Path, options: argparse.Namespace, folder: Path) -> None:
+    """Measure all candidates on a bag in turn and print the medians."""
+    candidates = ["import", "import and export", "lerobot"]
+    candidates += ["decoding and coding"] if pictures == "jpeg" else []
+    costs: dict[str, list[Cost]] = {candidate: [] for candidate in candidates}
+    told = ""
+    for _ in range(options.rounds):
+        for candidate in candidates:
+            costs[candidate].append(measure(candidate, bag, folder))
+        if options.forge is not None:
+            cost = forges(options.forge, bag, folder / "forge")
+            if isinstance(cost, str):
+                told = cost
+            else:
+                costs.setdefault("forge", []).append(cost)
+    frames, size = int(options.seconds * FPS), bag.stat().st_size
+    print(f"{pictures}, {size / 1e6:.1f} MB, {frames} frames, two cameras 640x480")
+    print(f"  {'':19} {'CPU ms/frame':>13} {'CPU s/GB':>9} {'of lerobot':>11}")
+    medians = {candidate: statistics.median(cost.cpu for cost in found) for candidate, found in costs.items()}
+    for candidate, cpu in medians.items():
+        ratio = medians["lerobot"] / cpu
+        print(f"  {candidate:19} {1e3 * cpu / frames:13.3f} {cpu / size * 1e9:9.1f} {ratio:10.1f}x")
+    if pictures == "jpeg":
+        share = medians["decoding and coding"] / medians["import and export"]
+        print(f"  decoding and coding take {share:.0%} of import and export")
+    if told:
+        print(f"  forge fails: {told}")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=4.0, help="of the bag")
-    parser.add_argument("--rounds", type=int, default=2)
+    parser.add_argument("--rounds", type=int, default=2, help="0 for --growth alone")
     parser.add_argument("--pictures", nargs="+", choices=("h264", "jpeg"), default=["h264", "jpeg"])
-    parser.add_argument("--growth", type=int, nargs="*", default=[], help="lengths for which peak memory is measured")
+    parser.add_argument(
+        "--growth", type=float, nargs="*", default=[], help="gigabytes of bags whose peak memory is measured"
+    )
+    parser.add_argument("--forge", type=Path, help="Python of an environment with forge-robotics, to compare with it")
+    parser.add_argument("--folder", type=Path, help="where the bags go (default: the system's folder)")
     options = parser.parse_args()
-    candidates: tuple[str, ...] = ("import", "import and export", "lerobot")
-    with tempfile.TemporaryDirectory(prefix="demorec-import-") as name:
+    with tempfile.TemporaryDirectory(prefix="demorec-import-", dir=options.folder) as name:
         folder = Path(name)
-        for pictures in options.pictures:
-            bag = make_bag(folder / f"{pictures}.mcap", options.seconds, pictures)
-            frames, size = int(options.seconds * FPS), bag.stat().st_size
-            costs: dict[str, list[Cost]] = {candidate: [] for candidate in candidates}
-            for _ in range(options.rounds):
-                for candidate in candidates:
-                    costs[candidate].append(measure(candidate, bag, folder))
-            print(f"{pictures}, {size / 1e6:.1f} MB, {frames} frames, two cameras 640x480")
-            print(f"  {'':18} {'CPU ms/frame':>13} {'CPU s/GB':>9} {'against lerobot':>16}")
-            base = statistics.median(cost.cpu for cost in costs["lerobot"])
-            for candidate in candidates:
-                cpu = statistics.median(cost.cpu for cost in costs[candidate])
-                print(f"  {candidate:18} {1e3 * cpu / frames:13.3f} {cpu / size * 1e9:9.1f} {base / cpu:15.1f}x")
-        for factor in options.growth:
-            bag = make_bag(folder / "long.mcap", options.seconds * factor, options.pictures[0])
+        for pictures in options.pictures if options.rounds else ():
+            table(pictures, make_bag(folder / f"{pictures}.mcap", options.seconds, pictures), options, folder)
+        for gigabytes in options.growth:
+            bag = grow(folder / "long.mcap", options.pictures[0], gigabytes)
             cost = measure("import", bag, folder)
-            print(f"growth {factor}: {bag.stat().st_size / 1e6:.0f} MB, peak {cost.peak / 1e6:.0f} MB")
+            print(
+                f"{bag.stat().st_size / 1e9:.1f} GB: peak {cost.peak / 1e6:.0f} MB, "
+                f"{cost.cpu / bag.stat().st_size * 1e9:.1f} CPU s/GB"
+            )
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ from demorec.check.base import NotMeasured
 from demorec.check.dataset_drawn import compare_beginning
 from demorec.check.dataset_video import EpisodePictures, episode_pictures
 from demorec.check.drawn import Comparison
-from demorec.errors import ExportError, in_words
+from demorec.errors import ConfigError, ExportError, in_words
 from demorec.lerobot.files import read_table
 from demorec.lerobot.language import COLUMNS, SpokenEpisode, spoken_episodes
 from demorec.lerobot.layout import AUTOMATIC_FEATURES, DatasetInfo
@@ -123,6 +123,14 @@ class Dataset:
             return [read_episode_info(row["episode_info"]) for row in self.sidecar if row["episode_info"] is not None]
         except (ValueError, KeyError, TypeError) as error:
             raise ExportError(f"The sidecar's episode_info cannot be used ({in_words(error)}): {self.path}") from error
+
+    def check_simulated(self) -> None:
+        """Raise ConfigError for a dataset of collected episodes, which no simulator can make or replay."""
+        if any(row["episode_info"] is None for row in self.sidecar):
+            raise ConfigError(
+                "The episodes of this dataset were collected from another robot or program and have no scene: "
+                f"{self.path}"
+            )
 
     def described(self) -> list[tuple[Rows, EpisodeInfo]]:
         """(rows, info) of each episode that the sidecar describes."""

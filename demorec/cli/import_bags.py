@@ -8,26 +8,33 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from demorec.cli.output import say, tell
+from demorec.cli.output import counted, say, tell
 from demorec.config import VideoConfig
 from demorec.errors import ConfigError
+
+_LEROBOT = Path("lerobot")
+"""As the first word: what follows is a dataset."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Import:
-    """Make a run of another robot's bags: MCAP files, .db3 files and rosbag2 folders, without ROS.
+    """Make a run of another robot's bags (MCAP, .db3, rosbag2 folders; without ROS) or of a LeRobot dataset.
 
     A mapping (TOML) says which topics become which features; --suggest writes one from what is in a bag. Every row
     holds messages that are in the bag and says how old they are; what is missing or too old is an error, or drops the
     episode, as the mapping says. Coded pictures stay as they are. The same command again goes on.
 
+    A LeRobot dataset (v3.0, whoever wrote it) needs no mapping: its features keep their names, its numbers every bit,
+    and its video packets stay as they are where each episode begins with a keyframe.
+
     Examples:
       demorec import --suggest monday.mcap > robot.toml
       demorec import monday.mcap tuesday/ --mapping robot.toml --out runs/robot
+      demorec import lerobot datasets/cups --out runs/cups
     """
 
     bags: Positional[tuple[Path, ...]]
-    """Bags; each is an episode, or several, as the mapping says."""
+    """Bags; each is an episode, or several, as the mapping says. Or the word lerobot and a dataset."""
     mapping: Path | None = None
     """What of the bags becomes what; an import needs it."""
     out: Path | None = None
@@ -41,6 +48,8 @@ class Import:
         """Import, or suggest a mapping, and say what was found."""
         if not self.bags:
             raise ConfigError("No bag is given: name one, e.g. demorec import --suggest monday.mcap.")
+        if self.bags[0] == _LEROBOT:
+            return self._import_dataset()
         if self.suggest:
             from demorec.ingest.suggest import suggested_mapping
 
@@ -64,6 +73,26 @@ class Import:
         made = [episode for episode in episodes if episode.episode_index is not None]
         dropped = f", {len(episodes) - len(made)} dropped" if len(made) < len(episodes) else ""
         findings = sum(len(report.findings) for report in result.reports)
-        say(f"{len(made)} episodes, {sum(row.num_frames for row in made)} frames{dropped}: {self.out}")
-        say(f"{findings} findings in the bags, see above and demorec check." if findings else "Nothing odd was found.")
+        say(f"{counted(len(made), 'episode')}, {sum(row.num_frames for row in made)} frames{dropped}: {self.out}")
+        odd = f"{counted(findings, 'finding')} in the bags, see above and demorec check."
+        say(odd if findings else "Nothing odd was found.")
+        return 0
+
+    def _import_dataset(self) -> int:
+        if len(self.bags) != 2 or self.out is None:
+            raise ConfigError(
+                "Name one dataset and --out after the word lerobot: demorec import lerobot datasets/cups --out "
+                "runs/cups. A bag of that name is given with its folder."
+            )
+        if self.suggest or self.mapping is not None:
+            raise ConfigError("A LeRobot dataset names its features itself: leave --mapping and --suggest out.")
+        from demorec.ingest.dataset_import import import_lerobot
+
+        self.video.validate()
+        result = import_lerobot(self.bags[1], self.out, video=self.video)
+        say(*(f"camera {name}: {told}" for name, told in result.cameras.items()))
+        say(*(f"{name} is left out: {reason}." for name, reason in result.left_out.items()))
+        if there := result.num_episodes - result.num_new:
+            tell(f"{there} of {counted(result.num_episodes, 'episode')} had been imported before.")
+        say(f"{counted(result.num_episodes, 'episode')}, {result.num_frames} frames: {self.out}")
         return 0

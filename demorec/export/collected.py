@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +12,7 @@ from demorec.errors import ConfigError, ExportError
 from demorec.export.columns import DONE, check_feature_names
 from demorec.export.options import CommonOptions
 from demorec.recording import CollectedRecording
+from demorec.recording.video import Rgb
 from demorec.scene.collected import NO_PICTURE, CollectedColumns
 from demorec.scene.features import IMAGE_PREFIX
 
@@ -117,3 +118,19 @@ def shown_pictures(
             )
         numbers[frame] = before
     return numbers
+
+
+def shown_images(recording: CollectedRecording, camera: str, numbers: NDArray[np.int64]) -> Iterator[Rgb]:
+    """The decoded pictures that frames show, one a frame, of which `numbers` never decrease.
+
+    Raises:
+        ExportError: They do.
+    """
+    if (np.diff(numbers) < 0).any():
+        raise ExportError(f"The pictures of the camera {camera} are not in the order of the frames: {recording.path}")
+    images = enumerate(recording.images(camera))
+    number, picture = next(images)
+    for wanted in numbers.tolist():
+        while number < wanted:
+            number, picture = next(images)
+        yield picture

@@ -184,6 +184,10 @@ def _read_dataset(source: Path) -> Original:
         configs = read_json(source / CONFIGS_PATH)
         made_with = read_json(source / EXPORT_PATH)
         rows = _rows(source)
+        if any(row["episode_info"] is None for row in rows):
+            raise ConfigError(
+                f"The episodes of this dataset were collected from another robot or program, not generated: {source}"
+            )
         if len(configs) != 1:
             raise ConfigError(
                 f"The dataset was made from {len(configs)} different runs: reproduce each of them from its own folder: "

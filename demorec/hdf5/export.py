@@ -19,7 +19,7 @@ from demorec.export.sources import (
 from demorec.hdf5.file import DATASET, UNFINISHED, NewFile
 from demorec.hdf5.options import Hdf5Options
 from demorec.hdf5.writer import RobomimicWriter
-from demorec.recording import Recording
+from demorec.recording import open_recording
 from demorec.safety.replacing import check_replaceable, written_whole
 
 
@@ -64,7 +64,7 @@ def _write(
     options = writer.options
     intake = Intake(found, options)
     for done, source in enumerate(found, start=1):
-        with Recording(source.path) as recording:
+        with open_recording(source.path) as recording:
             if is_among_episodes(recording, options):
                 if goes_in(source, recording, options):
                     intake.take(source.path, Profile.of(recording, options))

@@ -20,18 +20,19 @@ ENV_ARGUMENTS = frozenset({"robot", "fps", "physics_hz", "cameras", "action", "p
 """What `env_args` says of every environment of ours, by which our files are known."""
 PICTURE_ARGUMENTS = frozenset({"width", "height"})
 """What it says of environments with cameras beside."""
+COLLECTED_ENVIRONMENT = "demorec/collected"
+"""What stands for an environment in files of collected episodes, which have none."""
+COLLECTED_ARGUMENTS = frozenset({"robot", "fps", "cameras", "observations"})
+"""What `env_args` says beside it."""
 _OBSERVATIONS = r"robot0_(joint_pos|joint_vel|gripper_qpos|gripper_qvel|eef_pos|eef_quat)|object|[^/]+_(image|depth)"
-_PARTS = re.compile(
-    r"data|mask|mask/(train|valid)|data/demo_\d+(/(actions|states|rewards|dones|obs))?"
-    rf"|data/demo_\d+/obs/({_OBSERVATIONS})"
-)
+_PARTS = r"data|mask|mask/(train|valid)|data/demo_\d+(/(actions|states|rewards|dones|obs))?|data/demo_\d+/obs/({names})"
 _ATTRIBUTES = (
-    (re.compile("data"), frozenset({"env_args", "total", "task", "fps"})),
+    ("data", frozenset({"env_args", "total", "task", "fps"})),
     (
-        re.compile(r"data/demo_\d+"),
-        frozenset({"num_samples", "instruction", "episode_index", "attempt", "success", "model_file"}),
+        r"data/demo_\d+",
+        frozenset({"num_samples", "instruction", "episode_index", "attempt", "success", "model_file", "origin"}),
     ),
-    (re.compile(rf"data/demo_\d+/(actions|states|obs/({_OBSERVATIONS}))"), frozenset({"names"})),
+    (r"data/demo_\d+/(actions|states|obs/({names}))", frozenset({"names"})),
 )
 """All that an export writes: names of groups and datasets, and of the attributes that they have."""
 
@@ -51,6 +52,8 @@ def _is_our_dataset(path: Path) -> bool:
                 return False
             described = json.loads(data.attrs["env_args"])
             given = set(described["env_kwargs"])
+            if described["env_name"] == COLLECTED_ENVIRONMENT:
+                return given == COLLECTED_ARGUMENTS
             return str(described["env_name"]).startswith("demorec/") and given - PICTURE_ARGUMENTS == ENV_ARGUMENTS
     except (OSError, RuntimeError, KeyError, ValueError, TypeError, RecursionError):
         return False
@@ -61,19 +64,30 @@ def _strangers(path: Path) -> list[str]:
     found: list[str] = []
 
     def look(name: str, link: object) -> None:
-        if not isinstance(link, h5py.HardLink) or not _PARTS.fullmatch(name):
+        if not isinstance(link, h5py.HardLink) or not parts.fullmatch(name):
             found.append(name)
             return
-        allowed = next((names for place, names in _ATTRIBUTES if place.fullmatch(name)), frozenset[str]())
+        allowed = next((names for place, names in attributes if place.fullmatch(name)), frozenset[str]())
         found.extend(f"attribute {key} of {name}" for key in file[name].attrs if key not in allowed)
 
     try:
         with h5py.File(path, "r", locking=False) as file:
+            names = _observation_pattern(file)
+            parts = re.compile(_PARTS.replace("{names}", names))
+            attributes = [(re.compile(place.replace("{names}", names)), keys) for place, keys in _ATTRIBUTES]
             found += [f"attribute {key}" for key in file.attrs]
             file.visititems_links(look)
-    except (OSError, RuntimeError, KeyError, ValueError) as error:
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
         raise OSError(errno.EIO, in_words(error)) from error
     return found
+
+
+def _observation_pattern(file: h5py.File) -> str:
+    """The observations that the export has written: of collected episodes the file itself names them."""
+    described = json.loads(file["data"].attrs["env_args"])
+    if described["env_name"] != COLLECTED_ENVIRONMENT:
+        return _OBSERVATIONS
+    return "|".join(re.escape(str(name)) for name in described["env_kwargs"]["observations"])
 
 
 DATASET = Kind(name="a robomimic dataset (HDF5) by demorec", recognises=_is_our_dataset, strangers=_strangers)

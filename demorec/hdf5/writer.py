@@ -7,7 +7,7 @@ observations are those of robosuite's environments, which robomimic's example co
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from fractions import Fraction
 from itertools import islice
@@ -17,9 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.export.columns import DONE, REWARD, SUCCESS, check_feature_names, feature_columns, frame_stride
+from demorec.hdf5.collected import collected_attributes, write_collected
 from demorec.hdf5.file import ENV_ARGUMENTS, PICTURE_ARGUMENTS, NewFile
 from demorec.hdf5.options import Hdf5Options
-from demorec.recording import Recording, channels
+from demorec.hdf5.streams import GYM, add_pictures, add_vectors
+from demorec.recording import AnyRecording, CollectedRecording, Recording, channels
 from demorec.scene.episode import EpisodeColumns, EpisodeInfo
 from demorec.scene.features import (
     ACTION,
@@ -33,9 +35,6 @@ from demorec.scene.features import (
     observation_names,
 )
 from demorec.tables import environment_name
-
-_GYM = 2
-"""`EnvType.GYM_TYPE` of robomimic."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,34 +72,44 @@ class RobomimicWriter:
         self._file = file
         self._data = file.root.create_group("data")
 
-    def add(self, recording: Recording) -> None:
+    def add(self, recording: AnyRecording) -> None:
         """Append an episode: numbers at once, pictures one by one."""
+        demo = self._data.create_group(f"demo_{self.num_episodes}")
+        if isinstance(recording, CollectedRecording):
+            num_frames = write_collected(demo, recording, self.options)
+            described = collected_attributes(recording, self.options)
+        else:
+            num_frames = self._write_simulated(demo, recording)
+            described = self._attributes(recording)
+        if self.num_episodes == 0:
+            self._data.attrs.update(described)
+        self.num_episodes += 1
+        self.num_frames += num_frames
+        self._file.flush()
+
+    def _write_simulated(self, demo: h5py.Group, recording: Recording) -> int:
+        """Fill in the group of an episode; how many frames it has."""
         info, options = recording.info, self.options
         names = observation_names(info.robot, info.scene, privileged=options.privileged)
         self._check_feature_names(recording, names)
         columns = feature_columns(recording, options)
-        demo = self._data.create_group(f"demo_{self.num_episodes}")
         demo.attrs["num_samples"] = len(columns.rows)
         demo.attrs["instruction"] = info.instruction
         demo.attrs["episode_index"], demo.attrs["attempt"] = info.episode_index, info.attempt
         demo.attrs["success"] = recording.outcome is not None and recording.outcome.success
         if channels.description_topic() in recording.topics:
             demo.attrs["model_file"] = recording.description()
-        _add_vectors(demo, "actions", columns.features[ACTION], action_names(info.robot, options.action))
-        _add_vectors(demo, "states", *_states(columns.recorded, columns.rows, info))
+        add_vectors(demo, "actions", columns.features[ACTION], action_names(info.robot, options.action))
+        add_vectors(demo, "states", *_states(columns.recorded, columns.rows, info))
         demo["rewards"] = columns.features[REWARD]
         demo["dones"] = columns.features[DONE].astype(np.int64)
         observations = demo.create_group("obs")
         for row in _OBSERVATIONS:
             if row.feature in names and options.takes(row.feature):
                 values = columns.features[row.feature][:, row.components]
-                _add_vectors(observations, row.name, values, names[row.feature][row.components])
+                add_vectors(observations, row.name, values, names[row.feature][row.components])
         self._add_pictures(observations, recording, len(columns.rows))
-        if self.num_episodes == 0:
-            self._describe(recording)
-        self.num_episodes += 1
-        self.num_frames += len(columns.rows)
-        self._file.flush()
+        return len(columns.rows)
 
     def finish(self) -> None:
         """Write what is known of all episodes together: their number of samples, and who is for validation."""
@@ -118,35 +127,21 @@ class RobomimicWriter:
         check_feature_names(self.options, [*names, *pictures, *depth, ACTION, REWARD, DONE, SUCCESS])
 
     def _add_pictures(self, observations: h5py.Group, recording: Recording, count: int) -> None:
-        options = self.options
+        options, level = self.options, self.options.compression
         stride = frame_stride(recording.info.fps, options.fps)
         for camera in recording.cameras:
             settings = recording.video_settings(camera)
             size = settings.height, settings.width
             if options.takes(IMAGE_PREFIX + camera):
-                stored = self._pictures(observations, f"{camera}_image", (count, *size, 3), np.uint8)
+                stored = add_pictures(observations, f"{camera}_image", (count, *size, 3), np.uint8, level)
                 for index, picture in enumerate(islice(recording.images(camera), 0, None, stride)):
                     stored[index] = picture
             if options.depth and options.takes(IMAGE_PREFIX + camera + DEPTH_SUFFIX):
-                stored = self._pictures(observations, f"{camera}_depth", (count, *size, 1), np.float32)
+                stored = add_pictures(observations, f"{camera}_depth", (count, *size, 1), np.float32, level)
                 for index, metres in enumerate(islice(recording.depth(camera), 0, None, stride)):
                     stored[index] = metres[..., np.newaxis]
 
-    def _pictures(
-        self, observations: h5py.Group, name: str, shape: tuple[int, ...], kind: type[np.generic]
-    ) -> h5py.Dataset:
-        """An empty stream of pictures, each a compressed chunk of its own, so that one is read by itself."""
-        level = self.options.compression
-        return observations.create_dataset(
-            name,
-            shape,
-            kind,
-            chunks=(1, *shape[1:]),
-            compression="gzip" if level else None,
-            compression_opts=level or None,
-        )
-
-    def _describe(self, recording: Recording) -> None:
+    def _attributes(self, recording: Recording) -> dict[str, str | int]:
         """The attributes of `data` that robomimic makes an environment from, and what else holds for all episodes."""
         info, options = recording.info, self.options
         fps = info.fps // frame_stride(info.fps, options.fps)
@@ -161,9 +156,8 @@ class RobomimicWriter:
             "privileged": options.privileged,
         }
         assert arguments.keys() - PICTURE_ARGUMENTS == ENV_ARGUMENTS
-        described = {"env_name": environment_name(info.task), "type": _GYM, "env_kwargs": arguments}
-        self._data.attrs["env_args"] = json.dumps(described)
-        self._data.attrs["task"], self._data.attrs["fps"] = info.task, fps
+        described = {"env_name": environment_name(info.task), "type": GYM, "env_kwargs": arguments}
+        return {"env_args": json.dumps(described), "task": info.task, "fps": fps}
 
 
 def _states(
@@ -179,8 +173,3 @@ def _states(
     names = [f"{joint}.{what}" for what in ("pos", "vel") for joint in joints]
     names += [f"{body}.{axis}" for body in columns.object_poses for axis in ("x", "y", "z", "qx", "qy", "qz", "qw")]
     return np.concatenate(parts, axis=1)[rows], tuple(names)
-
-
-def _add_vectors(group: h5py.Group, name: str, values: NDArray[np.generic], components: Sequence[str]) -> None:
-    stored = group.create_dataset(name, data=values)
-    stored.attrs["names"] = json.dumps(components)

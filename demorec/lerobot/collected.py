@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from demorec.config import VideoConfig
-from demorec.errors import ExportError
-from demorec.export.collected import check_options, collected_data, shown_pictures, wanted_cameras
+from demorec.export.collected import check_options, collected_data, shown_images, shown_pictures, wanted_cameras
 from demorec.export.columns import DONE
 from demorec.lerobot.layout import AUTOMATIC_FEATURES, Feature
 from demorec.lerobot.mp4 import CodedVideo
@@ -20,7 +18,7 @@ from demorec.lerobot.transcode import video_info
 from demorec.lerobot.writer import EpisodeData
 from demorec.plain import to_json
 from demorec.recording import CollectedRecording, VideoSettings
-from demorec.recording.video import Rgb, make_encoder
+from demorec.recording.video import make_encoder
 from demorec.scene.features import IMAGE_PREFIX
 
 _MP4_CODECS = {"h265": "hevc"}
@@ -123,22 +121,6 @@ def _transcoded(
     units += encoder.finish()
     lengths = [len(unit) for unit in units]
     return CodedVideo.of_access_units(encoder.settings.codec, settings.width, settings.height, b"".join(units), lengths)
-
-
-def shown_images(recording: CollectedRecording, camera: str, numbers: NDArray[np.int64]) -> Iterator[Rgb]:
-    """The decoded pictures that frames show, one a frame, of which `numbers` never decrease.
-
-    Raises:
-        ExportError: They do.
-    """
-    if (np.diff(numbers) < 0).any():
-        raise ExportError(f"The pictures of the camera {camera} are not in the order of the frames: {recording.path}")
-    images = enumerate(recording.images(camera))
-    number, picture = next(images)
-    for wanted in numbers.tolist():
-        while number < wanted:
-            number, picture = next(images)
-        yield picture
 
 
 def _sidecar_row(recording: CollectedRecording) -> dict[str, Any]:

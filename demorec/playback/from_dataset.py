@@ -20,6 +20,8 @@ from demorec.lerobot.files import check_video, read_json, read_table
 from demorec.lerobot.language import COLUMNS, spoken_episodes
 from demorec.lerobot.layout import DatasetInfo, Feature
 from demorec.lerobot.paths import SIDECAR_DIR
+from demorec.playback.collected import PlayedCollected
+from demorec.playback.collected_dataset import collected_of_dataset
 from demorec.playback.episode import Box, Curves, PlayedEpisode, Video, VideoBatch
 from demorec.playback.held_objects import held_object_poses
 from demorec.scene.assets import asset_path
@@ -29,7 +31,7 @@ from demorec.scene.kinematics import ArmKinematics
 from demorec.scene.validity import read_episode_info
 
 _PICTURES_AT_ONCE = 256
-_CODECS = {"h264": "h264", "av1": "av1"}
+_CODECS = {"h264": "h264", "hevc": "h265", "av1": "av1"}
 
 
 def dataset_episodes(root: Path) -> list[int]:
@@ -42,7 +44,7 @@ def dataset_episodes(root: Path) -> list[int]:
 
 
 @contextmanager
-def open_dataset_episode(root: Path, episode_index: int) -> Iterator[PlayedEpisode]:
+def open_dataset_episode(root: Path, episode_index: int) -> Iterator[PlayedEpisode | PlayedCollected]:
     """One episode of a dataset.
 
     Raises:
@@ -56,25 +58,25 @@ def open_dataset_episode(root: Path, episode_index: int) -> Iterator[PlayedEpiso
     yield episode
 
 
-def _read_episode(root: Path, episode_index: int) -> PlayedEpisode:
+def _read_episode(root: Path, episode_index: int) -> PlayedEpisode | PlayedCollected:
     row = _episode_row(root, episode_index)
     described = DatasetInfo.load(root)
-    export = dict(read_json(root / SIDECAR_DIR / "export.json"))
+    columns = [name for name, feature in described.features.items() if feature.is_numeric]
     if row["episode_info"] is None:
-        raise RecordingError(
-            f"The episodes of this dataset were collected and have no scene to be shown: view the recordings: {root}"
-        )
+        data = _data(root, episode_index, columns)
+        time_ns = _times(len(data["index"]), described)
+        videos = _videos(root, episode_index, time_ns, described.features)
+        return collected_of_dataset(root, row, described, data, time_ns, videos)
+    export = dict(read_json(root / SIDECAR_DIR / "export.json"))
     info = read_episode_info(row["episode_info"])
     missing = {"observation.state", "action"} - described.features.keys()
     if missing:
         raise RecordingError(f"The dataset has no {' and no '.join(sorted(missing))}, so it cannot be shown: {root}")
-    columns = [name for name, feature in described.features.items() if feature.is_numeric]
     data = _data(root, episode_index, columns)
     num_frames = len(data["action"])
     if not num_frames or data["observation.state"].shape[1] != len(info.robot.arm_joints) + 1:
         raise RecordingError(f"The dataset has no rows of episode {episode_index}, or of another robot: {root}")
-    fps = int(described.fps)
-    time_ns = np.array([frame_time_ns(index, fps) for index in range(num_frames)], dtype=np.int64)
+    time_ns = _times(num_frames, described)
     num_arm = len(info.robot.arm_joints)
     state = data["observation.state"]
     base_from_tcp = data["observation.ee_pose"] if "observation.ee_pose" in data else _tcp_poses(info, state)
@@ -100,6 +102,11 @@ def _read_episode(root: Path, episode_index: int) -> PlayedEpisode:
         statements=_statements(root, episode_index, described, time_ns),
         boxes=_boxes(root, described, data["index"][:, 0]),
     )
+
+
+def _times(num_frames: int, described: DatasetInfo) -> NDArray[np.int64]:
+    """(T,) of the frames, since the first one."""
+    return np.array([frame_time_ns(index, int(described.fps)) for index in range(num_frames)], dtype=np.int64)
 
 
 def _rows(root: Path, table: str, columns: list[str] | None, episode_index: int | None = None) -> list[dict[str, Any]]:

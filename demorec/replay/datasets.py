@@ -34,6 +34,7 @@ def dataset_demonstrations(
     dataset = Dataset(path)
     if not dataset.sidecar:
         raise ConfigError(f"The dataset does not say how its scenes were (no demorec/episodes): {path}")
+    dataset.check_simulated()
     numbers = [number for number in range(len(dataset.rows)) if wanted(number)]
     if limit is not None and len(numbers) > limit:
         numbers = [numbers[k * len(numbers) // limit] for k in range(limit)]

@@ -157,6 +157,16 @@ def _episode(
             num_frames=place.length,
             fps=fps,
         )
+    if row["episode_info"] is None:  # collected: there is no scene, no seed and no phase
+        return ReportedEpisode(
+            name=name,
+            source=str(row["source"]),
+            instruction=", ".join(place.tasks),
+            success=row["success"],
+            failure_reason=str(row["failure_reason"]),
+            num_frames=place.length,
+            fps=fps,
+        )
     try:
         return ReportedEpisode(
             name=name,

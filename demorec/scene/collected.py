@@ -78,7 +78,10 @@ class CollectedCamera:
 
 @dataclass(frozen=True, kw_only=True)
 class SourceFile:
-    """A file that an episode was read from: its name without folders, and the SHA-256 (hex) of its bytes."""
+    """A file that an episode was read from: its name, and the SHA-256 (hex) of its bytes.
+
+    The name is without folders, but for the files of a dataset: their places in there.
+    """
 
     name: str
     sha256: str

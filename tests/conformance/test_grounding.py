@@ -281,6 +281,7 @@ def test_without_segmentation_there_are_traces_and_no_questions(tmp_path: Path) 
 def test_playback_has_the_words_and_the_boxes(dataset: Path, tmp_path: Path) -> None:
     from rerun.chunk import RrdReader
 
+    from demorec.playback.episode import PlayedEpisode
     from demorec.playback.from_dataset import open_dataset_episode
     from demorec.playback.save import save
     from demorec.playback.sources import find_episodes
@@ -288,6 +289,7 @@ def test_playback_has_the_words_and_the_boxes(dataset: Path, tmp_path: Path) -> 
     (frames,) = language_of(dataset)
     subtasks = {row["timestamp"]: row["content"] for row in frames[0][0] if row["style"] == "subtask"}
     with open_dataset_episode(dataset, 0) as episode:
+        assert isinstance(episode, PlayedEpisode)
         shown = {time_ns: text for time_ns, kind, text in episode.statements if kind == "subtask"}
         assert [round(time_ns / 1e9, 3) for time_ns in shown] == [round(time, 3) for time in subtasks]
         assert list(shown.values()) == list(subtasks.values())

@@ -11,6 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from support.collected import TOP, make_collected, write_collected
 from support.docs import run_examples
 from support.export import export, make_run
 from support.training import CAMERA, assert_same_item, write_by_lerobot
@@ -140,6 +141,16 @@ def test_language_is_equal(tmp_path: Path) -> None:
     assert len(fast[3]["language_persistent"]) > 3
     assert list(fast[3]["language_persistent"][0])[3] == "timestamp"
     assert fast[3]["language_persistent"][0] is not fast[4]["language_persistent"][0]
+
+
+def test_a_dataset_of_collected_episodes_is_read_equally(tmp_path: Path) -> None:
+    (tmp_path / "run" / "episodes").mkdir(parents=True)
+    for index, length in enumerate((20, 33)):
+        given = make_collected(cameras=(TOP,), num_frames=length, episode_index=index)
+        write_collected(tmp_path / "run" / "episodes" / f"episode_{index:06d}.mcap", given)
+    export(tmp_path / "run", tmp_path / "d")
+    fast, slow = pair(tmp_path / "d")
+    assert_same(fast, slow)
 
 
 def test_some_episodes_only(roots: dict[str, Path]) -> None:

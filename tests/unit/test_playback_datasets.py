@@ -15,6 +15,7 @@ from support.export import export
 
 from demorec.errors import RecordingError
 from demorec.geometry import Array
+from demorec.playback.episode import PlayedEpisode
 from demorec.playback.from_dataset import open_dataset_episode
 from demorec.playback.held_objects import held
 from demorec.playback.save import save
@@ -40,6 +41,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_what_the_hand_holds_moves_with_it(dataset: Path, recorded: Array) -> None:
     with open_dataset_episode(dataset, 0) as episode:
+        assert isinstance(episode, PlayedEpisode)
         drawn = episode.object_poses["red_cube"]
     assert np.ptp(recorded[:, 2]) > 0.1  # lifted
     assert drawn.shape == recorded.shape
@@ -52,6 +54,7 @@ def test_what_the_hand_holds_moves_with_it(dataset: Path, recorded: Array) -> No
 def test_recorded_object_poses_are_shown_where_a_dataset_has_them(tmp_path: Path, recorded: Array) -> None:
     export(SAMPLE, tmp_path / "cubes", privileged=True)
     with open_dataset_episode(tmp_path / "cubes", 0) as episode:
+        assert isinstance(episode, PlayedEpisode)
         np.testing.assert_allclose(episode.object_poses["red_cube"], recorded, atol=1e-6)
 
 

@@ -28,6 +28,7 @@ def deep_dataset_checks(path: Path, *, allowed: Sequence[str] = ()) -> Iterator[
     try:
         if not dataset.sidecar:
             raise ConfigError(f"The dataset does not say how its episodes were made (no demorec/episodes): {path}")
+        dataset.check_simulated()
         options = export_options(path)
         for episode, info in zip(dataset_episodes(dataset), dataset.infos, strict=True):
             yield _report(path / f"episode {episode.number}", episode, info, options, workshop, allowed)

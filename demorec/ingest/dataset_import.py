@@ -1,0 +1,278 @@
+"""LeRobot datasets become runs: every episode a recording, its numbers to the bit, its packets as they are.
+
+The same command again goes on: episodes that are there are not written.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.config import VideoConfig
+from demorec.errors import ConfigError
+from demorec.ingest.channel import BagError
+from demorec.ingest.dataset_pictures import DatasetCamera, ImageCamera, VideoCamera
+from demorec.lerobot.layout import AUTOMATIC_FEATURES, DatasetInfo, Feature
+from demorec.lerobot.paths import INFO_PATH
+from demorec.lerobot.reader import EpisodePlace, RowReader, episode_places, read_tasks
+from demorec.recording import CollectedRecording, CollectedWriter
+from demorec.runs.collected import open_collected_run
+from demorec.runs.find import expect
+from demorec.runs.run_file import sha256_of
+from demorec.scene.collected import (
+    CollectedCamera,
+    CollectedFeature,
+    CollectedFrame,
+    CollectedInfo,
+    CollectedOutcome,
+    Origin,
+    Sample,
+    SourceFile,
+)
+from demorec.scene.episode import frame_time_ns
+from demorec.scene.features import IMAGE_PREFIX
+
+_SUCCESS = "next.success"
+_TIME_TOLERANCE_S = 1e-4
+"""By which LeRobot lets a row's time be off the grid."""
+_UNNAMED_ROBOT = "unknown"
+
+
+@dataclass(frozen=True, kw_only=True)
+class DatasetImport:
+    """What an import made.
+
+    Attributes:
+        num_episodes, num_frames: In the run.
+        num_new: Episodes that were written now; the others were there.
+        cameras: Camera -> what became of its pictures, in words.
+        left_out: Feature -> why it is in no recording.
+    """
+
+    num_episodes: int
+    num_frames: int
+    num_new: int
+    cameras: Mapping[str, str]
+    left_out: Mapping[str, str]
+
+
+def import_lerobot(root: Path, out: Path, *, video: VideoConfig | None = None) -> DatasetImport:
+    """Import a LeRobot v3.0 dataset, whoever wrote it, into a run.
+
+    Args:
+        root: The dataset's folder.
+        out: The run's folder; one that the same dataset began is continued.
+        video: How pictures are coded that cannot be kept.
+
+    Raises:
+        ConfigError: This is no dataset, it has what no recording can hold, or the folder holds something else.
+        BagError, ExportError: It is damaged, or not at its rate.
+        RecordingError: A number is not finite, or the disk is full.
+    """
+    expect(root, "dataset")
+    dataset = _Dataset.opened(root)
+    num_new = num_frames = 0
+    with open_collected_run(out, recovers=False) as folder:
+        for place in dataset.places:
+            info, rows = dataset.episode(place)
+            num_frames += place.length
+            target = folder.path_of(place.episode_index)
+            if not _is_there(target, info):
+                folder.check_fits(info)
+                _write(target, info, rows, dataset.pictures(place), video or VideoConfig())
+                folder.add(target)
+                num_new += 1
+    return DatasetImport(
+        num_episodes=len(dataset.places),
+        num_frames=num_frames,
+        num_new=num_new,
+        cameras={name: camera.told for name, camera in dataset.cameras.items()},
+        left_out=dataset.left_out,
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Rows:
+    """The numbers of an episode of T frames: feature -> (T, D), and how it ended."""
+
+    num_frames: int
+    features: Mapping[str, NDArray[np.float32] | NDArray[np.float64]]
+    success: bool | None
+
+
+@dataclass(kw_only=True, eq=False)
+class _Dataset:
+    """A dataset opened for import; episodes must be asked for in their order."""
+
+    root: Path
+    info: DatasetInfo
+    places: list[EpisodePlace]
+    tasks: list[str]
+    features: tuple[CollectedFeature, ...]
+    cameras: dict[str, DatasetCamera]
+    left_out: dict[str, str]
+    reader: RowReader
+    _digests: dict[Path, str] = field(default_factory=dict)
+
+    @classmethod
+    def opened(cls, root: Path) -> _Dataset:
+        info = DatasetInfo.load(root)
+        places = list(episode_places(root, info))
+        if not places:
+            raise ConfigError(f"The dataset has no episodes: {root}")
+        features, cameras = list[CollectedFeature](), dict[str, DatasetCamera]()
+        left_out = dict[str, str]()
+        for name, feature in info.features.items():
+            if reason := _why_left_out(name, feature):
+                left_out[name] = reason
+            elif feature.dtype in ("video", "image"):
+                camera = _camera_name(name)
+                if camera in cameras:
+                    raise ConfigError(f"Two cameras of the dataset would be called {camera!r}: {root}")
+                cameras[camera] = _camera(root, info, name, places)
+            elif name not in AUTOMATIC_FEATURES and name != _SUCCESS:
+                features.append(_feature(name, feature))
+        columns = [*(feature.name for feature in features), "timestamp", "task_index"]
+        columns += [_SUCCESS] if _SUCCESS in info.features else []
+        if missing := [name for name in columns if name not in info.features]:
+            raise BagError(f"The dataset has no {', '.join(missing)}: {root}")
+        wanted = {name: info.features[name] for name in columns}
+        return cls(
+            root=root,
+            info=info,
+            places=places,
+            tasks=read_tasks(root),
+            features=tuple(features),
+            cameras=cameras,
+            left_out=left_out,
+            reader=RowReader(root, replace(info, features=wanted)),
+        )
+
+    def episode(self, place: EpisodePlace) -> tuple[CollectedInfo, _Rows]:
+        """What is known of an episode, and its numbers."""
+        columns = self.reader.read(place)
+        number, fps = place.episode_index, int(self.info.fps)
+        off = np.abs(columns["timestamp"][:, 0].astype(np.float64) - np.arange(place.length) / fps)
+        if len(wrong := np.flatnonzero(~(off <= _TIME_TOLERANCE_S))):
+            raise BagError(
+                f"Row {wrong[0]} of episode {number} is at {columns['timestamp'][wrong[0], 0]:.4f} s, which is no "
+                f"multiple of 1/{fps} s: {self.root}"
+            )
+        tasks = list(dict.fromkeys(columns["task_index"][:, 0].tolist()))
+        if any(not 0 <= task < len(self.tasks) for task in tasks):
+            raise BagError(f"Episode {number} names a task that is not in the table of tasks: {self.root}")
+        info = CollectedInfo(
+            episode_index=number,
+            instruction="; ".join(" ".join(self.tasks[task].split()) for task in tasks),
+            robot=self.info.robot_type or _UNNAMED_ROBOT,
+            fps=fps,
+            features=self.features,
+            cameras=tuple(
+                CollectedCamera(
+                    name=name, width=camera.width, height=camera.height, kept=camera.kept, source=camera.key
+                )
+                for name, camera in self.cameras.items()
+            ),
+            origin=Origin(kind="import", files=tuple(self._files(place))),
+            versions={"demorec": version("demorec"), "av": version("av")},
+        )
+        for feature in self.features:
+            if columns[feature.name].dtype != feature.dtype:
+                raise BagError(
+                    f"The column {feature.name} holds {columns[feature.name].dtype}, not {feature.dtype}: {self.root}"
+                )
+        success = bool(columns[_SUCCESS][-1, 0]) if _SUCCESS in columns and place.length else None
+        features = {feature.name: columns[feature.name] for feature in self.features}
+        return info, _Rows(num_frames=place.length, features=features, success=success)
+
+    def pictures(self, place: EpisodePlace) -> dict[str, Iterator[bytes | NDArray[np.uint8]]]:
+        """Camera -> its pictures in an episode, one a frame."""
+        return {name: camera.pictures(place) for name, camera in self.cameras.items()}
+
+    def _files(self, place: EpisodePlace) -> Iterator[SourceFile]:
+        """What an episode was read from, by its place in the dataset."""
+        paths = [INFO_PATH, place.data.path(self.info.data_path)]
+        paths += [
+            place.videos[camera.key][0].path(self.info.video_path or "", camera.key)
+            for camera in self.cameras.values()
+            if camera.key in place.videos
+        ]
+        for name in paths:
+            path = self.root / name
+            if path not in self._digests:
+                self._digests[path] = sha256_of(path)
+            yield SourceFile(name=name, sha256=self._digests[path])
+
+
+def _why_left_out(name: str, feature: Feature) -> str:
+    """Why a feature is in no recording, "" for one that is."""
+    if name in AUTOMATIC_FEATURES or name == _SUCCESS:
+        return ""
+    if name.startswith("next."):
+        return "it tells of the next frame, which the recording has itself"
+    if feature.is_depth:
+        return "recordings of other robots have no place for depth"
+    if feature.dtype not in ("video", "image", "float32", "float64"):
+        return f"it is {feature.dtype}, and recordings of other robots hold float32 and float64"
+    if feature.is_numeric and feature.dtype != "image" and len(feature.shape) > 1:
+        return f"it is an array of {'x'.join(map(str, feature.shape))}, and recordings of other robots hold vectors"
+    return ""
+
+
+def _feature(name: str, feature: Feature) -> CollectedFeature:
+    count = int(np.prod(feature.shape))
+    names = tuple(name.replace(",", " ") for name in feature.names or ())
+    if len(names) != count or len(set(names)) != count or not all(text and text.isprintable() for text in names):
+        names = tuple(str(number) for number in range(count))
+    return CollectedFeature(
+        name=name, dtype="float32" if feature.dtype == "float32" else "float64", names=names, source=name
+    )
+
+
+def _camera_name(name: str) -> str:
+    """ "top" for "observation.images.top", "image" for "observation.image"."""
+    return name.removeprefix(IMAGE_PREFIX).removeprefix("observation.").replace(".", "_")
+
+
+def _camera(root: Path, info: DatasetInfo, name: str, places: list[EpisodePlace]) -> DatasetCamera:
+    if info.features[name].is_video:
+        return VideoCamera(root, info, name, places)
+    camera = ImageCamera(root=root, info=info, key=name)
+    camera.measure(places[0])
+    return camera
+
+
+def _is_there(path: Path, info: CollectedInfo) -> bool:
+    """Whether an earlier start of the same import has written an episode; ConfigError for another recording."""
+    if not path.exists():
+        return False
+    with CollectedRecording(path) as recording:
+        if recording.info == info and recording.outcome is not None:
+            return True
+    raise ConfigError(f"Another recording is there already: choose another --out: {path}")
+
+
+def _write(
+    path: Path,
+    info: CollectedInfo,
+    rows: _Rows,
+    pictures: Mapping[str, Iterator[bytes | NDArray[np.uint8]]],
+    video: VideoConfig,
+) -> None:
+    """Record an episode: whole, or not at all."""
+    writer = CollectedWriter(path, info, video=video)
+    try:
+        for number in range(rows.num_frames):
+            time_ns = frame_time_ns(number, info.fps)
+            shown = {name: writer.picture(name, time_ns, next(images)) for name, images in pictures.items()}
+            samples = {name: Sample(stamp_ns=time_ns, vector=values[number]) for name, values in rows.features.items()}
+            writer.write(CollectedFrame(time_ns=time_ns, samples=samples, pictures=shown))
+        writer.finish(CollectedOutcome(success=rows.success, num_frames=rows.num_frames))
+    except BaseException:
+        writer.discard()
+        raise

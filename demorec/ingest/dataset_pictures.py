@@ -1,0 +1,233 @@
+"""The pictures of a LeRobot dataset's camera, whoever wrote it: packets as they are where they can be, else pixels.
+
+A dataset's video holds many episodes. Its packets can be cut out where each episode begins with a keyframe and no
+picture is shown in another order than it was coded in.
+"""
+
+from __future__ import annotations
+
+import io
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, cast
+
+import av
+import numpy as np
+import pyarrow as pa
+from av.bitstream import BitStreamFilterContext
+from numpy.typing import NDArray
+from PIL import Image
+
+from demorec.config import MAX_PIXELS
+from demorec.errors import in_words
+from demorec.ingest.channel import BagError
+from demorec.lerobot.files import check_video, open_table
+from demorec.lerobot.layout import VIDEO_PATH, DatasetInfo
+from demorec.lerobot.reader import EpisodePlace
+from demorec.recording.video import is_keyframe
+
+_CODECS: dict[str, Literal["h264", "h265", "av1"]] = {"h264": "h264", "hevc": "h265", "av1": "av1", "libdav1d": "av1"}
+_TO_START_CODES = {"h264": "h264_mp4toannexb", "h265": "hevc_mp4toannexb"}
+_TEMPORAL_DELIMITER = b"\x12\x00"
+"""In front of every temporal unit of AV1 (its specification, section 7.5); mp4 files leave it out."""
+Picture = bytes | NDArray[np.uint8]
+
+
+class DatasetCamera(ABC):
+    """Pictures of one feature. Episodes must be asked for in their order.
+
+    Attributes:
+        key: Of the feature.
+        width, height: Pixels.
+        kept: The codec of packets that stay as they are; "" for pixels, which are coded once.
+        told: What becomes of the pictures, in words.
+    """
+
+    key: str
+    width: int
+    height: int
+    kept: Literal["", "h264", "h265", "av1"] = ""
+    told: str
+
+    @abstractmethod
+    def pictures(self, place: EpisodePlace) -> Iterator[Picture]:
+        """One a frame of the episode: a packet where they are kept, else (H, W, 3) uint8 RGB.
+
+        Raises:
+            BagError, ExportError: They cannot be read, are of another size, or end too early.
+        """
+
+
+class VideoCamera(DatasetCamera):
+    """Pictures in mp4 files.
+
+    Args:
+        root: The dataset's folder.
+        info: Of it.
+        key: Of the feature.
+        places: All episodes: whether packets can be kept is decided once for all of them.
+    """
+
+    def __init__(self, root: Path, info: DatasetInfo, key: str, places: Iterable[EpisodePlace]) -> None:
+        self.key = key
+        self._root, self._template = root, info.video_path or VIDEO_PATH
+        self._path: Path | None = None
+        self._shown: Iterator[Picture] = iter(())
+        self._next = 0
+        codec, reason = self._look(list(places))
+        self.kept = "" if reason else codec
+        self.told = f"{codec}, coded once, since {reason}" if reason else f"{codec} kept as it is"
+
+    def pictures(self, place: EpisodePlace) -> Iterator[Picture]:
+        """As of `DatasetCamera`."""
+        path, first = self._place(place)
+        if path != self._path:
+            self._path, self._next = path, 0
+            self._shown = self._packets(path) if self.kept else self._pixels(path)
+        if first < self._next:
+            raise BagError(f"Episode {place.episode_index} overlaps the one before it: {path}")
+        for number in range(self._next, first + place.length):
+            picture = next(self._shown, None)
+            if picture is None:
+                raise BagError(
+                    f"Episode {place.episode_index} has {place.length} frames, but the video ends after "
+                    f"{max(0, number - first)} of its pictures: {path}"
+                )
+            self._next = number + 1
+            if number >= first:
+                yield picture
+
+    def _place(self, place: EpisodePlace) -> tuple[Path, int]:
+        """File of an episode, and the number of its first picture there."""
+        position, first = place.videos[self.key]
+        return self._root / position.path(self._template, self.key), first
+
+    def _look(self, places: list[EpisodePlace]) -> tuple[Literal["h264", "h265", "av1"], str]:
+        """The codec, and why its packets cannot be kept, "" if they can; sets the size."""
+        firsts: dict[Path, set[int]] = {}
+        for place in places:
+            path, first = self._place(place)
+            firsts.setdefault(path, set()).add(first)
+        codecs, sizes, reason = set(), set(), ""
+        for path, beginnings in firsts.items():
+            with _opened(path) as (container, stream):
+                codecs.add(_codec(stream, path))
+                sizes.add((stream.codec_context.width, stream.codec_context.height))
+                if any(packet.size and packet.pts != packet.dts for packet in container.demux(stream)):
+                    reason = reason or "pictures are not shown in the order in which they were coded"
+            if not reason:
+                for number, packet in enumerate(self._packets(path)):
+                    if number in beginnings and not is_keyframe(next(iter(codecs)), packet):
+                        reason = "an episode does not begin with a keyframe"
+                        break
+        if len(codecs) != 1 or len(sizes) != 1:
+            raise BagError(f"The videos of {self.key} are of several codecs or sizes: {self._root}")
+        self.width, self.height = sizes.pop()
+        return codecs.pop(), reason
+
+    def _packets(self, path: Path) -> Iterator[bytes]:
+        """Access units with start codes, and with parameter sets in front of keyframes; temporal units of AV1."""
+        with _opened(path) as (container, stream):
+            name = _TO_START_CODES.get(_codec(stream, path))
+            convert = None if name is None else BitStreamFilterContext(name, stream)
+            for packet in container.demux(stream):
+                if not packet.size:
+                    continue
+                if convert is None:
+                    data = bytes(packet)
+                    yield data if data.startswith(_TEMPORAL_DELIMITER) else _TEMPORAL_DELIMITER + data
+                else:
+                    yield b"".join(bytes(part) for part in convert.filter(packet))
+
+    def _pixels(self, path: Path) -> Iterator[NDArray[np.uint8]]:
+        with _opened(path) as (container, stream):
+            for frame in container.decode(stream):
+                if (frame.width, frame.height) != (self.width, self.height):
+                    raise BagError(f"The video changes its size to {frame.width}x{frame.height}: {path}")
+                yield cast(NDArray[np.uint8], frame.to_ndarray(format="rgb24"))
+
+
+def _codec(stream: av.video.stream.VideoStream, path: Path) -> Literal["h264", "h265", "av1"]:
+    name = stream.codec_context.name
+    if name not in _CODECS:
+        raise BagError(f"The video's codec is {name}; h264, hevc and av1 are read: {path}")
+    return _CODECS[name]
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[tuple[av.container.InputContainer, av.video.stream.VideoStream]]:
+    """A video within bounds; BagError when it cannot be read, in the block too."""
+    check_video(path)
+    try:
+        with av.open(str(path), format="mp4") as container:
+            stream = container.streams.video[0]
+            stream.thread_type = "NONE"
+            # A few bytes can announce pictures of gigabytes.
+            stream.codec_context.options = {"max_pixels": str(MAX_PIXELS)}
+            yield container, stream
+    except (OSError, IndexError, av.FFmpegError) as error:
+        raise BagError(f"The video cannot be read ({in_words(error)}): {path}") from error
+
+
+@dataclass(kw_only=True, eq=False)
+class ImageCamera(DatasetCamera):
+    """Pictures in the rows of the data files, PNG or JPEG."""
+
+    root: Path
+    info: DatasetInfo
+    key: str
+    width: int = 0
+    height: int = 0
+    told: str = "pictures of their own, coded once"
+
+    def __post_init__(self) -> None:
+        self._path: Path | None = None
+        self._rows: Iterator[tuple[int, Any]] = iter(())
+
+    def measure(self, place: EpisodePlace) -> None:
+        """Take the size from the first picture of an episode."""
+        first = next(self.pictures(place), None)
+        if isinstance(first, np.ndarray):
+            self.height, self.width = first.shape[:2]
+        self._path = None
+
+    def pictures(self, place: EpisodePlace) -> Iterator[Picture]:
+        """As of `DatasetCamera`."""
+        path = self.root / place.data.path(self.info.data_path)
+        if path != self._path:
+            self._path, self._rows = path, _image_rows(path, self.key)
+        found = 0
+        while found < place.length:
+            index, value = next(self._rows, (-1, None))
+            if index < 0:
+                raise BagError(f"Episode {place.episode_index} has {place.length} frames, but {found} pictures: {path}")
+            if index == place.from_index + found:
+                found += 1
+                yield self._decoded(value, path)
+
+    def _decoded(self, value: Any, path: Path) -> NDArray[np.uint8]:
+        data = value.get("bytes") if isinstance(value, dict) else None
+        try:
+            if not data:
+                raise ValueError("it is not in the table")
+            with Image.open(io.BytesIO(data), formats=("PNG", "JPEG")) as image:
+                if image.width * image.height > MAX_PIXELS or image.mode not in ("RGB", "RGBA", "L", "P", "1"):
+                    raise ValueError(f"{image.width}x{image.height} pixels of the kind {image.mode}")
+                picture = np.asarray(image.convert("RGB"))
+        except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+            raise BagError(f"A picture of {self.key} cannot be read ({in_words(error)}): {path}") from error
+        if self.width and picture.shape[:2] != (self.height, self.width):
+            raise BagError(f"The pictures of {self.key} change their size: {path}")
+        return picture
+
+
+def _image_rows(path: Path, key: str) -> Iterator[tuple[int, Any]]:
+    """(index, picture) of each row."""
+    try:
+        for batch in open_table(path, ["index", key]).iter_batches(batch_size=16, columns=["index", key]):
+            yield from zip(batch.column("index").to_pylist(), batch.column(key).to_pylist(), strict=True)
+    except (OSError, ValueError, pa.ArrowException) as error:
+        raise BagError(f"The table cannot be read ({in_words(error)}): {path}") from error

@@ -1,0 +1,75 @@
+"""Episodes of datasets that were made of collected episodes: what a dataset keeps of them, to be played."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.geometry import Array
+from demorec.lerobot.layout import AUTOMATIC_FEATURES, DatasetInfo
+from demorec.lerobot.reader import read_tasks
+from demorec.plain import from_json
+from demorec.playback.collected import PlayedCollected
+from demorec.playback.episode import Curves, Video
+from demorec.scene.collected import CollectedCamera, CollectedFeature, CollectedInfo, CollectedOutcome, Origin
+
+_TASK, _DONE = "task_index", "next.done"
+
+
+def collected_of_dataset(
+    root: Path,
+    row: Mapping[str, Any],
+    described: DatasetInfo,
+    data: Mapping[str, Array],
+    time_ns: NDArray[np.int64],
+    videos: Mapping[str, Video],
+) -> PlayedCollected:
+    """An episode as its dataset knows it: at the dataset's rate, and without the robot's model, which it does not keep.
+
+    Args:
+        root: The dataset's folder.
+        row: Of the episode, in the sidecar.
+        described: info.json.
+        data: Feature -> (T, D) of the episode's rows.
+        time_ns: (T,) of the rows.
+        videos: Camera -> coded pictures.
+
+    Raises:
+        RecordingError, ExportError, ValueError, KeyError, TypeError: Its tables hold something odd.
+    """
+    number, num_frames = int(row["episode_index"]), len(time_ns)
+    names = {
+        name: described.features[name].names or tuple(str(index) for index in range(values.shape[1]))
+        for name, values in data.items()
+        if name not in AUTOMATIC_FEATURES and name != _DONE
+    }
+    tasks = read_tasks(root)
+    return PlayedCollected(
+        name=f"episode_{number:06d}",
+        group=root.resolve().name,
+        identity=hashlib.sha256(f"{root.resolve()} {number}".encode()).hexdigest()[:16],
+        source=str(row["source"]),
+        info=CollectedInfo(
+            episode_index=number,
+            instruction=tasks[int(data[_TASK][0, 0])] if num_frames else "",
+            robot=described.robot_type or "",
+            fps=int(described.fps),
+            features=tuple(CollectedFeature(name=name, dtype="float32", names=parts) for name, parts in names.items()),
+            cameras=tuple(
+                CollectedCamera(name=camera["name"], width=camera["width"], height=camera["height"])
+                for camera in row["cameras"]
+                if camera["name"] in videos
+            ),
+            origin=from_json(row["origin"], Origin),
+        ),
+        outcome=CollectedOutcome(success=row["success"], num_frames=num_frames, reason=row["failure_reason"]),
+        time_ns=time_ns,
+        joint_position={},
+        curves={name: Curves(time_ns=time_ns, values=data[name], names=parts) for name, parts in names.items()},
+        videos=videos,
+    )

@@ -1,0 +1,246 @@
+"""Datasets of LeRobot's own writer become runs, and are the same again when they are exported: PyArrow and av judge."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from numpy.typing import NDArray
+from support.export import data_table, export
+from support.training import CAMERA, write_by_lerobot
+
+from demorec.check.report import CheckOptions, Subject, check_subject
+from demorec.cli import main
+from demorec.errors import ConfigError, DemorecError
+from demorec.ingest.dataset_import import import_lerobot
+from demorec.playback.sources import find_episodes
+from demorec.recording import CollectedRecording
+from demorec.runs.collected import load_collected_run
+
+pytestmark = pytest.mark.usefixtures("hf_datasets_cache")
+LENGTHS = (14, 9, 11)
+VECTORS = ("observation.state", "observation.single", "action")
+NAME = CAMERA.removeprefix("observation.images.")
+
+
+@pytest.fixture(scope="module", params=["video", "image", "long_gops"])
+def imported(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path, Path]:
+    """How pictures are kept, a dataset by LeRobot, and the run that was made of it."""
+    from lerobot.configs import RGBEncoderConfig
+
+    kind = str(request.param)
+    folder = tmp_path_factory.mktemp(kind)
+    arguments: dict[str, Any] = {"stored_as": "image"} if kind == "image" else {}
+    if kind == "long_gops":
+        arguments["rgb_encoder"] = RGBEncoderConfig(vcodec="h264", g=12, extra_options={"bf": "2"})
+    write_by_lerobot(folder / "dataset", LENGTHS, **arguments)
+    import_lerobot(folder / "dataset", folder / "run")
+    return kind, folder / "dataset", folder / "run"
+
+
+def recordings(run: Path) -> list[Path]:
+    return sorted((run / "episodes").glob("*.mcap"))
+
+
+def columns_of(dataset: Path, name: str) -> NDArray[np.generic]:
+    """(T, D) of all data files, by PyArrow."""
+    parts = [pq.read_table(file).column(name).to_pylist() for file in sorted((dataset / "data").rglob("*.parquet"))]
+    rows = [row for part in parts for row in part]
+    return np.array(rows).reshape(len(rows), -1)
+
+
+def shown_by(dataset: Path) -> list[NDArray[np.uint8]]:
+    """All pictures of the camera in order, by av."""
+    pictures: list[NDArray[np.uint8]] = []
+    for file in sorted((dataset / "videos" / CAMERA).rglob("*.mp4")):
+        with av.open(str(file)) as container:
+            shown = (frame.to_ndarray(format="rgb24") for frame in container.decode(video=0))
+            pictures += [np.asarray(picture, dtype=np.uint8) for picture in shown]
+    return pictures
+
+
+def test_numbers_and_tasks_are_those_of_the_dataset(imported: tuple[str, Path, Path]) -> None:
+    _, dataset, run = imported
+    assert [line.num_frames for line in load_collected_run(run).episodes] == list(LENGTHS)
+    begin = 0
+    for number, file in enumerate(recordings(run)):
+        with CollectedRecording(file) as recording:
+            columns, end = recording.columns(), begin + LENGTHS[number]
+            for name in VECTORS:
+                expected = columns_of(dataset, name)[begin:end].astype(columns.features[name].dtype)
+                np.testing.assert_array_equal(columns.features[name], expected)
+            assert columns.features["observation.single"].dtype == np.float64
+            assert recording.info.instruction == ("push it", "pull it")[number % 2]
+            assert columns.time_ns.tolist() == [round(index * 1e9 / 30) for index in range(LENGTHS[number])]
+            begin = end
+
+
+def test_pictures_are_kept_or_coded_once(imported: tuple[str, Path, Path]) -> None:
+    kind, dataset, run = imported
+    found = []
+    for file in recordings(run):
+        with CollectedRecording(file) as recording:
+            assert recording.info.cameras[0].kept == ("av1" if kind == "video" else "")
+            found += list(recording.images(NAME))
+    if kind == "image":
+        rows = [
+            row for file in sorted((dataset / "data").rglob("*.parquet")) for row in pq.read_table(file).to_pylist()
+        ]
+        expected = [np.asarray(_opened(row[CAMERA]["bytes"])) for row in rows]
+    else:
+        expected = shown_by(dataset)
+    assert len(found) == len(expected) == sum(LENGTHS)
+    if kind == "video":
+        assert all(np.array_equal(a, b) for a, b in zip(found, expected, strict=True))
+    else:  # each is nearer to its own picture than to that of the frame before, by far
+        for index in range(1, len(found)):
+            own, before = (np.abs(found[index].astype(int) - expected[k]).mean() for k in (index, index - 1))
+            assert own < before / 2, index
+
+
+def _opened(data: bytes) -> Any:
+    import io
+
+    from PIL import Image
+
+    return Image.open(io.BytesIO(data)).convert("RGB")
+
+
+def test_the_packets_are_those_of_the_video(imported: tuple[str, Path, Path]) -> None:
+    kind, dataset, run = imported
+    if kind != "video":
+        pytest.skip("pictures are coded once")
+    packets = []
+    for file in sorted((dataset / "videos" / CAMERA).rglob("*.mp4")):
+        with av.open(str(file)) as container:
+            packets += [bytes(packet) for packet in container.demux(video=0) if packet.size]
+    found = []
+    for path in recordings(run):
+        with CollectedRecording(path) as recording:
+            found += [packet.data.removeprefix(b"\x12\x00") for packet in recording.packets(NAME)]
+    assert found == packets
+
+
+def test_exported_again_it_has_equal_numbers(imported: tuple[str, Path, Path], tmp_path: Path) -> None:
+    kind, dataset, run = imported
+    report = export(run, tmp_path / "again")
+    assert (report.num_episodes, report.transcoded) == (3, ())
+    table = data_table(tmp_path / "again")
+    for name in VECTORS:
+        again = np.array(table.column(name).to_pylist()).reshape(sum(LENGTHS), -1)
+        np.testing.assert_array_equal(again, columns_of(dataset, name).astype(np.float32))
+    if kind == "video":
+        assert all(np.array_equal(a, b) for a, b in zip(shown_by(tmp_path / "again"), shown_by(dataset), strict=True))
+
+
+def test_it_can_be_checked_and_viewed(imported: tuple[str, Path, Path]) -> None:
+    _, _, run = imported
+    report = check_subject(Subject(path=recordings(run)[0], kind="recording"), CheckOptions())
+    failed = [result.check for result in report.results if result.level == "fail"]
+    assert not failed
+    with find_episodes([run])[0].open() as episode:
+        assert NAME in episode.videos
+
+
+def test_the_same_command_again_goes_on(imported: tuple[str, Path, Path], tmp_path: Path) -> None:
+    _, dataset, run = imported
+    shutil.copytree(run, tmp_path / "run")
+    recordings(tmp_path / "run")[1].unlink()
+    before = [path.read_bytes() for path in recordings(run)]
+    assert import_lerobot(dataset, tmp_path / "run").num_new == 1
+    assert [path.read_bytes() for path in recordings(tmp_path / "run")] == before
+
+
+def test_our_own_dataset_comes_back_to_the_bit(tmp_path: Path) -> None:
+    from support.collected import TOP, make_collected, write_collected
+
+    from demorec.lerobot import dataset_digest
+
+    (tmp_path / "run" / "episodes").mkdir(parents=True)
+    for index, length in enumerate((20, 33)):
+        given = make_collected(cameras=(TOP,), num_frames=length, episode_index=index, success=None)
+        write_collected(tmp_path / "run" / "episodes" / f"episode_{index:06d}.mcap", given)
+    export(tmp_path / "run", tmp_path / "a")
+    result = import_lerobot(tmp_path / "a", tmp_path / "again")
+    assert (result.num_episodes, result.cameras) == (2, {"top": "h264 kept as it is"})
+    export(tmp_path / "again", tmp_path / "b")
+    assert dataset_digest(tmp_path / "b") == dataset_digest(tmp_path / "a")
+
+
+def _off_the_grid(dataset: Path) -> None:
+    file = sorted((dataset / "data").rglob("*.parquet"))[0]
+    table = pq.read_table(file)
+    times = table.column("timestamp").to_pylist()
+    times[2] += 0.01
+    column = table.schema.get_field_index("timestamp")
+    kind = table.schema.field(column)
+    changed = table.set_column(column, kind, pa.array(times, type=kind.type))
+    pq.write_table(changed, file)
+
+
+def _no_video(dataset: Path) -> None:
+    for file in (dataset / "videos").rglob("*.mp4"):
+        file.write_bytes(file.read_bytes()[:1000])
+
+
+def _odd_name(dataset: Path) -> None:
+    path = dataset / "meta" / "info.json"
+    info = json.loads(path.read_text())
+    info["features"]["frames"] = info["features"].pop("action")
+    path.write_text(json.dumps(info))
+
+
+FAULTS: dict[str, tuple[Callable[[Path], object], str]] = {
+    "times": (_off_the_grid, "no multiple of 1/30 s"),
+    "video": (_no_video, "video"),
+    "column": (_odd_name, "frames"),
+    "tasks": (lambda dataset: (dataset / "meta" / "tasks.parquet").unlink(), "tasks.parquet"),
+    "info": (lambda dataset: (dataset / "meta" / "info.json").write_text("{}"), "damaged"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_what_cannot_be_imported_is_one_sentence(fault: str, imported: tuple[str, Path, Path], tmp_path: Path) -> None:
+    kind, dataset, _ = imported
+    if kind == "image" and fault == "video":
+        pytest.skip("there is no video")
+    shutil.copytree(dataset, tmp_path / "d")
+    change, words = FAULTS[fault]
+    change(tmp_path / "d")
+    with pytest.raises(DemorecError, match=words) as refused:
+        import_lerobot(tmp_path / "d", tmp_path / "run")
+    assert "\n" not in str(refused.value)
+    assert not recordings(tmp_path / "run") or fault in ("times", "video")
+
+
+def test_the_command(imported: tuple[str, Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _, dataset, run = imported
+    for args, code, words in (
+        (["lerobot", dataset, "--out", run], 0, "3 of 3 episodes had been imported before."),
+        (["lerobot", dataset], 2, "--out"),
+        (["lerobot", dataset, "--out", tmp_path / "x", "--mapping", "a.toml"], 2, "leave --mapping"),
+        (["lerobot", tmp_path / "nothing", "--out", tmp_path / "x"], 2, "no such file"),
+        (["lerobot", run, "--out", tmp_path / "x"], 2, "found a run"),
+    ):
+        with pytest.raises(SystemExit) as ended:
+            main(["import", *map(str, args)])
+        printed = capsys.readouterr()
+        assert (ended.value.code, words in printed.out + printed.err) == (code, True), printed
+    assert not (tmp_path / "x").exists()
+
+
+def test_another_dataset_is_refused(imported: tuple[str, Path, Path], tmp_path: Path) -> None:
+    _, dataset, run = imported
+    shutil.copytree(dataset, tmp_path / "d")
+    path = tmp_path / "d" / "meta" / "info.json"
+    path.write_text(path.read_text().replace('"robot_type": null', '"robot_type": "so101"'))
+    with pytest.raises(ConfigError, match="choose another --out"):
+        import_lerobot(tmp_path / "d", run)
