@@ -53,6 +53,7 @@ class Stage:
         frames: Learned from.
         evaluation: On the held-out scenes.
         cpu_seconds: Of the training.
+        losses: Of the training, as (update, L1 of the normalised actions).
     """
 
     arm: str
@@ -61,6 +62,7 @@ class Stage:
     frames: int
     evaluation: Evaluation
     cpu_seconds: float
+    losses: tuple[tuple[int, float], ...]
 
     @property
     def row(self) -> tuple[str, int, int]:
@@ -142,7 +144,7 @@ def stage(arm: str, datasets: list[Path], corrected: int, seed: int, args: argpa
     if not (out / "training.json").exists():
         print(f"training {out.name} on {len(data.end)} frames", flush=True)
         train(data, args.variant, args, seed=seed, out=out)
-    seconds = float(json.loads((out / "training.json").read_text())["cpu_seconds"])
+    training = json.loads((out / "training.json").read_text())
     config = GenerateConfig(task=args.task, split="eval", seed=0, cameras=())
     settings = settings_for(out, config, action=args.action)
     where = args.out / "evaluations" / out.name
@@ -155,7 +157,8 @@ def stage(arm: str, datasets: list[Path], corrected: int, seed: int, args: argpa
         demonstrations=count,
         frames=len(data.end),
         evaluation=found,
-        cpu_seconds=seconds,
+        cpu_seconds=training["cpu_seconds"],
+        losses=tuple((point["step"], point["loss"]) for point in training["curve"]),
     )
     return made, out
 
@@ -185,13 +188,22 @@ def rate(found: list[Stage]) -> Rate:
 
 
 def plot(rows: dict[tuple[str, int, int], list[Stage]], path: Path) -> None:
-    """Success over corrected episodes, beside plain demonstrations, and by cell before and after."""
+    """Success over corrected episodes, beside plain demonstrations; training losses; success by cell."""
     import matplotlib as mpl
 
     mpl.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, (curve, bars) = plt.subplots(1, 2, figsize=(11, 4.6), width_ratios=(2, 3), layout="constrained")
+    figure = plt.figure(figsize=(11, 7.6), layout="constrained")
+    grid = figure.add_gridspec(2, 2)
+    curve, losses, bars = (figure.add_subplot(place) for place in (grid[0, 0], grid[0, 1], grid[1, :]))
+    for number, ((arm, count, corrected), found) in enumerate(rows.items()):
+        label = f"{arm}: {count} plain, {corrected} corrected"
+        losses.plot(*zip(*found[0].losses, strict=True), color=f"C{number + 2}", label=label)
+    losses.set_yscale("log")
+    losses.set_xlabel("updates (first training of each)")
+    losses.set_ylabel("loss (L1, normalised actions)")
+    losses.legend(fontsize=8)
     ways: tuple[tuple[str, str, Callable[[Stage], int]], ...] = (
         ("corrected", "corrected episodes", lambda s: s.corrected),
         ("plain", "plain demonstrations", lambda s: s.demonstrations - first),
@@ -208,7 +220,7 @@ def plot(rows: dict[tuple[str, int, int], list[Stage]], path: Path) -> None:
             for one in found:
                 curve.plot(added(one), 100 * one.evaluation.rate.value, ".", color=f"C{color}", alpha=0.4)
     curve.set_xlabel(f"episodes added to {first} demonstrations")
-    curve.set_ylabel("held-out scenes solved, % (bar: 95 % interval)")
+    curve.set_ylabel("solved, % (bar: 95 % interval)")
     curve.set_ylim(0, 102)
     curve.legend(fontsize=8, loc="lower right")
     last = max(row[2] for row in rows)
@@ -223,8 +235,9 @@ def plot(rows: dict[tuple[str, int, int], list[Stage]], path: Path) -> None:
             range(len(parts)), [f"{p.factor} {p.low:.3g}..{p.high:.3g}" for p in parts], rotation=90, fontsize=6
         )
     bars.set_ylim(0, 102)
-    bars.legend(fontsize=8, loc="lower right")
-    for axes in (curve, bars):
+    bars.set_ylabel("solved, %")
+    bars.legend(fontsize=8, loc="lower left", bbox_to_anchor=(0, 1), ncols=3)
+    for axes in (curve, losses, bars):
         for side in ("top", "right"):
             axes.spines[side].set_visible(False)
     figure.savefig(path, dpi=110)

@@ -246,8 +246,7 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         session = Session(self._world, info.scene, self.episode.task, painter=painter)
         session.reset()
         self._session = session
-        self._viewer = None
-        self._held = 0
+        self._viewer, self._held = None, 0
         self._decoder = ActionDecoder(self._world, self._action_kind)
         self._situation = self._look(session, None)
         return self._observation(self._situation), {"is_success": False, "episode_index": index}
@@ -276,9 +275,8 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         self._situation = self._look(self._session, frame)
         success = self._situation.is_success
         truncated = not success and self._session.frame_index >= self._max_episode_steps
-        reward = 1.0 if success else 0.0
         information = {"is_success": success, "episode_index": self.episode.plan.episode_index}
-        return self._observation(self._situation), reward, success, truncated, information
+        return self._observation(self._situation), float(success), success, truncated, information
 
     def render(self) -> NDArray[np.uint8] | None:
         """(H, W, 3) uint8 picture of the present state from `render_camera`; None without a render mode."""

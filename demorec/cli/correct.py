@@ -21,13 +21,14 @@ if TYPE_CHECKING:
 class Correct(RolloutFlags):
     """Let a policy act until it strays, and the scripted expert finish from there: demonstrations of what it lacks.
 
-    The expert takes over when the policy is stuck, has had its time, or at a random moment. It stops the arm, brings
-    what the hand holds to its goal or opens it, and does what is left of the task. Every episode is one recording, in
-    which the phase "policy" says who acted; it replays like any other. The same command again goes on where it stopped.
+    The expert takes over when the policy strays from what the expert would do, is stuck, has had its time, or at a
+    random moment. It stops the arm, brings what the hand holds to its goal or opens it, and does what is left of the
+    task, or hands back. Every episode is one recording, in which the phase "policy" says who acted; it replays like any
+    other. The same command again goes on where it stopped. demorec improve does it in rounds with trainings.
 
     Examples:
       demorec correct --policy outputs/train --num-episodes 100 --seed 1 --out fix1
-      demorec correct --policy outputs/train --random-share 0.5 --stuck-seconds 0
+      demorec correct --policy outputs/train --stray-metres 0.1 --hand-back
       demorec export lerobot fix1 --out datasets/fix1 --intervention
     """
 

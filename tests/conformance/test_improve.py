@@ -125,10 +125,16 @@ def test_what_is_not_its_own_is_refused(
     assert "The settings of the training cannot be read" in capsys.readouterr().err
 
 
+HEARING_CTRL_C = (
+    "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); from demorec.cli import main; main()"
+)
+"""The command, which hears Ctrl-C even where the tests are a shell's background job and do not."""
+
+
 def killed_when(words: list[str], path: Path, *, signal_number: int) -> None:
     """Run the command until something is at a path, and kill it; nothing of it goes on then."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "demorec", *words],
+        [sys.executable, "-c", HEARING_CTRL_C, *words],
         env={**os.environ, "OMP_NUM_THREADS": "1"},
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
@@ -137,7 +143,7 @@ def killed_when(words: list[str], path: Path, *, signal_number: int) -> None:
         assert process.poll() is None, f"it ended before {path} was there"
         time.sleep(0.02)
     process.send_signal(signal_number)
-    assert process.wait(60) != 0
+    assert process.wait(60) == (130 if signal_number == signal.SIGINT else -signal_number)
 
 
 def told_rounds(told: str) -> list[str]:

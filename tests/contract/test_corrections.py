@@ -29,6 +29,7 @@ from demorec.replay import ReplayOptions, open_file, replay_all
 from demorec.runs.find import EVALUATION_NAME
 from demorec.runs.run_file import Attempt
 from demorec.scene.episode import POLICY_PHASE, Action, Frame, Observation
+from demorec.scene.features import ActionKind
 
 FPS = 30
 UNSEEN = Action(joint_target=np.zeros(7), gripper_target=0.0, base_from_tcp_target=Pose())
@@ -55,20 +56,25 @@ class Lazy:
 @pytest.fixture(scope="module")
 def rollout(tmp_path_factory: pytest.TempPathFactory) -> tuple[Attempt, Path]:
     """One rollout of the lazy policy, which is stuck after half a second, and its recording."""
-    folder = tmp_path_factory.mktemp("corrections")
+    rules = TakeOver(stuck_seconds=1.0, stray_metres=0.0, stray_radians=0.0, noise=False)
+    return roll_out(tmp_path_factory.mktemp("corrections"), Lazy(), rules, action="joint")
+
+
+def roll_out(folder: Path, policy: Any, rules: TakeOver, *, action: ActionKind) -> tuple[Attempt, Path]:
+    """What a worker of `demorec correct` does with scene 3, and the recording that it leaves."""
     settings = Settings(
         policy="p",
         policy_type="lazy",
         policy_digest="0",
         config=GenerateConfig(cameras=(), split="train"),
-        action="joint",
-        takeover=TakeOver(stuck_seconds=1.0, stray_metres=0.0, stray_radians=0.0, noise=False),
+        action=action,
+        takeover=rules,
     )
     (folder / EVALUATION_NAME).write_text(json.dumps(to_plain(Evaluation(settings=settings))))
     for place in ("episodes", "failed"):
         (folder / place).mkdir()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rollouts, "Policy", Lazy)
+        patch.setattr(rollouts, "Policy", lambda *args, **kwargs: policy)
         patch.setattr(rollouts, "find_checkpoint", lambda path: path)
         patch.setattr(rollouts, "_stage", rollouts._Stage())
         attempt = make_rollout(EpisodePlan(config=settings.config, episode_index=3), folder)
@@ -244,3 +250,27 @@ def test_who_strays_is_corrected(expert_poses: Array, hand_back: bool) -> None:
     assert [event.name for event in events[:2]] == ["take_over", "hand_back"][: 1 + hand_back]
     before = frames[phases.index("take_over") - 1]
     assert np.array_equal(before.action.joint_target, before.command.joint_target)  # what it did is what it said
+
+
+def test_who_is_handed_back_to_is_told_and_the_episode_replays(expert_poses: Array, tmp_path: Path) -> None:
+    """With noise on what the expert sends: labels and commands differ in its frames alone."""
+    rules = TakeOver(hand_back=True)
+    attempt, path = roll_out(tmp_path, Wanderer(expert_poses, astray_from=20, drift=0.01), rules, action="ee")
+    assert attempt.success
+    with Recording(path) as recording:
+        columns = recording.columns()
+        assert recording.info.behaviour["action_noise"] > 0.0
+    by_policy = np.array([phase == POLICY_PHASE for phase in columns.phase])
+    turns = np.flatnonzero(np.diff(by_policy)) + 1
+    assert len(turns) >= 2  # policy, expert, policy
+    assert by_policy[0]
+    differs = (columns.action_joint_target != columns.command_joint_target).any(axis=1)
+    assert not differs[by_policy].any()
+    options = ReplayOptions()
+    report, _ = next(iter(replay_all([open_file(path, options)], options)))
+    assert report.is_identical, report
+    export(path, tmp_path / "dataset", intervention=True)
+    assert data_table(tmp_path / "dataset").column("intervention").to_pylist() == (~by_policy).tolist()
+    checked = check_subject(Subject(path=path, kind="recording"), CheckOptions())
+    failed = [result.check for result in checked.results if result.level == "fail"]
+    assert failed == ["action_acceleration"]  # the wanderer jumps to where it would be, once it is handed back to
