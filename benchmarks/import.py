@@ -187,7 +187,8 @@ def used():
     return sum(usage.ru_utime + usage.ru_stime for usage in usages)
 begin = used()
 result = convert(sys.argv[1], sys.argv[2], target_format="lerobot-v3", fps=30.0)
-peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss << 10
+(line,) = [line for line in open("/proc/self/status") if line.startswith("VmHWM")]
+peak = int(line.split()[1]) << 10
 errors = [str(error) for error in result.errors]
 print(json.dumps({"cpu": used() - begin, "peak": peak, "frames": result.total_frames, "errors": errors}))
 """
@@ -219,7 +220,7 @@ def _child(candidate: str, bag: Path, out: Path, mapping: Path, answer: multipro
         decoding_and_coding(bag)
     else:
         ours(bag, out, mapping, exports=candidate == "import and export")
-    answer.put(Cost(cpu=_used() - begin, peak=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss << 10))
+    answer.put(Cost(cpu=_used() - begin, peak=_peak()))
 
 
 def _used() -> float:
@@ -227,6 +228,12 @@ def _used() -> float:
         usage.ru_utime + usage.ru_stime
         for usage in (resource.getrusage(resource.RUSAGE_SELF), resource.getrusage(resource.RUSAGE_CHILDREN))
     )
+
+
+def _peak() -> int:
+    """Bytes of memory that this process held at most; getrusage would tell of the parent's, too."""
+    (line,) = [line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM")]
+    return int(line.split()[1]) << 10
 
 
 def measure(candidate: str, bag: Path, folder: Path) -> Cost:
