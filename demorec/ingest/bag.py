@@ -22,6 +22,7 @@ from demorec.errors import ConfigError, resource_error
 from demorec.ingest.channel import BagError, BagMessage
 from demorec.ingest.mcap_bag import read_mcap
 from demorec.ingest.sqlite_bag import SQLITE_MAGIC, read_sqlite
+from demorec.lerobot.paths import INFO_PATH
 from demorec.recording.limits import Limits
 from demorec.safety.files import MCAP_MAGIC, open_regular, read_text_limited
 
@@ -101,7 +102,7 @@ def open_bag(path: Path) -> Bag:
     """The bag at a path; nothing of its messages is read.
 
     Raises:
-        ConfigError: There is none.
+        ConfigError: There is none, or a dataset.
         BagError: It is of no kind that is read.
     """
     try:
@@ -147,6 +148,10 @@ def _folder(path: Path) -> Bag:
         mode = str(information.get("compression_mode") or "").lower()
         compression = str(information.get("compression_format") or "")
     except FileNotFoundError:
+        if (path / INFO_PATH).is_file():
+            raise ConfigError(
+                f"This is a LeRobot dataset, no bag: demorec import lerobot {path} --out RUN makes a run of it: {path}"
+            ) from None
         raise BagError(f"The folder holds no {METADATA}, so it is no bag of rosbag2: {path}") from None
     except (OSError, UnicodeDecodeError, YAMLError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise BagError(f"The bag's {METADATA} cannot be read: {path}") from error

@@ -20,7 +20,7 @@ from demorec.ingest.dataset_pictures import DatasetCamera, ImageCamera, VideoCam
 from demorec.lerobot.layout import AUTOMATIC_FEATURES, DatasetInfo, Feature
 from demorec.lerobot.paths import INFO_PATH
 from demorec.lerobot.reader import EpisodePlace, RowReader, episode_places, read_tasks
-from demorec.recording import CollectedRecording, CollectedWriter
+from demorec.recording import CollectedWriter
 from demorec.runs.collected import open_collected_run
 from demorec.runs.find import expect
 from demorec.runs.run_file import sha256_of
@@ -81,8 +81,8 @@ def import_lerobot(root: Path, out: Path, *, video: VideoConfig | None = None) -
         for place in dataset.places:
             info, rows = dataset.episode(place)
             num_frames += place.length
-            target = folder.path_of(place.episode_index)
-            if not _is_there(target, info):
+            if not folder.has(info):
+                target = folder.path_of(place.episode_index)
                 folder.check_fits(info)
                 _write(target, info, rows, dataset.pictures(place), video or VideoConfig())
                 folder.add(target)
@@ -125,6 +125,8 @@ class _Dataset:
         places = list(episode_places(root, info))
         if not places:
             raise ConfigError(f"The dataset has no episodes: {root}")
+        if empty := [place.episode_index for place in places if place.length < 1]:
+            raise BagError(f"Episode {empty[0]} of the dataset has no frames: {root}")
         features, cameras = list[CollectedFeature](), dict[str, DatasetCamera]()
         left_out = dict[str, str]()
         for name, feature in info.features.items():
@@ -214,7 +216,7 @@ def _why_left_out(name: str, feature: Feature) -> str:
     if name in AUTOMATIC_FEATURES or name == _SUCCESS:
         return ""
     if name.startswith("next."):
-        return "it tells of the next frame, which the recording has itself"
+        return "recordings of other robots have no place for it"
     if feature.is_depth:
         return "recordings of other robots have no place for depth"
     if feature.dtype not in ("video", "image", "float32", "float64"):
@@ -245,16 +247,6 @@ def _camera(root: Path, info: DatasetInfo, name: str, places: list[EpisodePlace]
     camera = ImageCamera(root=root, info=info, key=name)
     camera.measure(places[0])
     return camera
-
-
-def _is_there(path: Path, info: CollectedInfo) -> bool:
-    """Whether an earlier start of the same import has written an episode; ConfigError for another recording."""
-    if not path.exists():
-        return False
-    with CollectedRecording(path) as recording:
-        if recording.info == info and recording.outcome is not None:
-            return True
-    raise ConfigError(f"Another recording is there already: choose another --out: {path}")
 
 
 def _write(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -114,15 +114,14 @@ class VideoCamera(DatasetCamera):
         codecs, sizes, reason = set(), set(), ""
         for path, beginnings in firsts.items():
             with _opened(path) as (container, stream):
-                codecs.add(_codec(stream, path))
+                codec, convert = _codec(stream, path), _converter(stream, path)
+                codecs.add(codec)
                 sizes.add((stream.codec_context.width, stream.codec_context.height))
-                if any(packet.size and packet.pts != packet.dts for packet in container.demux(stream)):
-                    reason = reason or "pictures are not shown in the order in which they were coded"
-            if not reason:
-                for number, packet in enumerate(self._packets(path)):
-                    if number in beginnings and not is_keyframe(next(iter(codecs)), packet):
-                        reason = "an episode does not begin with a keyframe"
-                        break
+                for number, packet in enumerate(packet for packet in container.demux(stream) if packet.size):
+                    if packet.pts != packet.dts:
+                        reason = reason or "pictures are not shown in the order in which they were coded"
+                    elif number in beginnings and not is_keyframe(codec, convert(packet)):
+                        reason = reason or "an episode does not begin with a keyframe"
         if len(codecs) != 1 or len(sizes) != 1:
             raise BagError(f"The videos of {self.key} are of several codecs or sizes: {self._root}")
         self.width, self.height = sizes.pop()
@@ -131,16 +130,10 @@ class VideoCamera(DatasetCamera):
     def _packets(self, path: Path) -> Iterator[bytes]:
         """Access units with start codes, and with parameter sets in front of keyframes; temporal units of AV1."""
         with _opened(path) as (container, stream):
-            name = _TO_START_CODES.get(_codec(stream, path))
-            convert = None if name is None else BitStreamFilterContext(name, stream)
+            convert = _converter(stream, path)
             for packet in container.demux(stream):
-                if not packet.size:
-                    continue
-                if convert is None:
-                    data = bytes(packet)
-                    yield data if data.startswith(_TEMPORAL_DELIMITER) else _TEMPORAL_DELIMITER + data
-                else:
-                    yield b"".join(bytes(part) for part in convert.filter(packet))
+                if packet.size:
+                    yield convert(packet)
 
     def _pixels(self, path: Path) -> Iterator[NDArray[np.uint8]]:
         with _opened(path) as (container, stream):
@@ -155,6 +148,15 @@ def _codec(stream: av.video.stream.VideoStream, path: Path) -> Literal["h264", "
     if name not in _CODECS:
         raise BagError(f"The video's codec is {name}; h264, hevc and av1 are read: {path}")
     return _CODECS[name]
+
+
+def _converter(stream: av.video.stream.VideoStream, path: Path) -> Callable[[av.Packet], bytes]:
+    """What makes of a sample of an mp4 file what recordings hold: start codes, or a temporal delimiter, in front."""
+    name = _TO_START_CODES.get(_codec(stream, path))
+    if name is None:
+        return lambda packet: _TEMPORAL_DELIMITER + bytes(packet).removeprefix(_TEMPORAL_DELIMITER)
+    bits = BitStreamFilterContext(name, stream)
+    return lambda packet: b"".join(bytes(part) for part in bits.filter(packet))
 
 
 @contextmanager

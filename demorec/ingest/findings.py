@@ -137,6 +137,8 @@ def _value_findings(stream: Stream, line: Timeline) -> Iterator[tuple[str, str]]
         yield "zeros", "all numbers are 0"
         return
     yield from _still_findings(values, names, line)
+    for start in stream.layout.quaternions:
+        _follow_signs(values[:, start : start + 4])
     steps = np.abs(np.diff(values, axis=0))
     for column, name in enumerate(names):
         usual = float(np.percentile(steps[:, column], 90))
@@ -145,6 +147,12 @@ def _value_findings(stream: Stream, line: Timeline) -> Iterator[tuple[str, str]]
             at = (line.times_ns[largest + 1] - line.times_ns[0]) / NS
             yield "jump", f"{name!r} jumps by {steps[largest, column]:.3g} at {at:.2f} s, usual are {usual:.2g}"
             break
+
+
+def _follow_signs(quaternions: NDArray[np.float64]) -> None:
+    """Give each of (T, 4), in place, the sign that is nearer to the one before: both mean the same rotation."""
+    flips = np.where((quaternions[1:] * quaternions[:-1]).sum(axis=1) < 0, -1.0, 1.0)
+    quaternions[1:] *= np.cumprod(flips)[:, np.newaxis]
 
 
 def _still_findings(values: NDArray[np.float64], names: tuple[str, ...], line: Timeline) -> Iterator[tuple[str, str]]:

@@ -24,7 +24,6 @@ from demorec.ingest.mapping import BagMapping, read_mapping
 from demorec.ingest.report import BagReport, EpisodeReport, all_findings, stream_reports
 from demorec.ingest.rows import EpisodeRows, NoRowsError, Timelines
 from demorec.ingest.streams import BagDecoder, BagStreams, read_streams
-from demorec.recording import CollectedRecording
 from demorec.runs.collected import CollectedFolder, differences, open_collected_run
 from demorec.scene.collected import CollectedInfo
 
@@ -135,7 +134,7 @@ class _Import:
             episodes.append(episode)
             reports.append(_made(episode, begin))
         self._check_alike(episodes)
-        self._write([episode for episode in episodes if not _is_there(episode)])
+        self._write([episode for episode in episodes if not self._folder.has(episode.info)])
         return BagReport(
             name=self._bag.path.name,
             files=tuple(self._files.items()),
@@ -227,16 +226,6 @@ class _Import:
 
 def _wants(episode: _Episode, topic: str, number: int) -> bool:
     return any(plan.topic == topic and number in plan.numbers for plan in episode.plans.values())
-
-
-def _is_there(episode: _Episode) -> bool:
-    """Whether an earlier start of the same import has written an episode; ConfigError for another recording."""
-    if not episode.path.exists():
-        return False
-    with CollectedRecording(episode.path) as recording:
-        if recording.info == episode.info and recording.outcome is not None:
-            return True
-    raise ConfigError(f"Another recording is there already: choose another --out: {episode.path}")
 
 
 def _made(episode: _Episode, begin_ns: int) -> EpisodeReport:

@@ -212,6 +212,16 @@ class CollectedFolder:
                 f"{self.path}"
             )
 
+    def has(self, info: CollectedInfo) -> bool:
+        """Whether an earlier start of the same import has written an episode; ConfigError for another recording."""
+        path = self.path_of(info.episode_index)
+        if not path.exists():
+            return False
+        with CollectedRecording(path) as recording:
+            if recording.info == info and recording.outcome is not None:
+                return True
+        raise ConfigError(f"Another recording is there already: choose another --out: {path}")
+
     def add(self, recording: Path) -> CollectedEpisode:
         """Take a finished recording into run.json."""
         line = collected_line(recording)

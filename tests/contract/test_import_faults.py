@@ -25,8 +25,8 @@ def notes() -> bags.Notes:
     return bags.so101(2.0)
 
 
-def _findings(bag: Path, tmp_path: Path) -> set[str]:
-    mapping = read_mapping(bag_mappings.write_mapping(MAPPING, tmp_path / "robot.toml"))
+def _findings(bag: Path, tmp_path: Path, text: str = MAPPING) -> set[str]:
+    mapping = read_mapping(bag_mappings.write_mapping(text, tmp_path / "robot.toml"))
     streams = read_streams(open_bag(bag), mapping)
     return {finding.kind for finding in all_findings(streams, Timelines(streams, mapping), mapping)}
 
@@ -71,6 +71,19 @@ def test_a_clean_bag_gives_no_finding(seed: int, tmp_path: Path) -> None:
     )
     bag = bags.write_mcap(bags.in_order(resting if seed % 2 else notes), tmp_path / "bag.mcap")
     assert _findings(bag, tmp_path) == set()
+
+
+def test_a_quaternion_of_the_other_sign_is_no_jump(tmp_path: Path) -> None:
+    """Both mean the same rotation, and drivers send either."""
+
+    def turned(number: int, note: bags.Note) -> bags.Note:
+        pose = note.body["pose"]
+        orientation = {axis: -value for axis, value in pose["orientation"].items()}
+        return bags.with_body(note, pose={**pose, "orientation": orientation}) if number % 90 > 60 else note
+
+    notes = bags.changed(bags.franka(2.0), "/franka_robot_state_broadcaster/current_pose", turned)
+    bag = bags.write_mcap(bags.in_order(notes), tmp_path / "bag.mcap")
+    assert _findings(bag, tmp_path, bag_mappings.FRANKA) == set()
 
 
 CHECK_OF = {"drops": "import_times", "stuck": "import_numbers", "frozen": "import_pictures"}

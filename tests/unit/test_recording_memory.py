@@ -9,10 +9,12 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pytest
+from support.collected import TOP, make_collected
 from support.recording import make_episode
 
-from demorec.recording import EpisodeWriter, Recording
+from demorec.recording import CollectedRecording, CollectedWriter, EpisodeWriter, Recording
 from demorec.scene.episode import frame_time_ns
 
 READERS: dict[str, Callable[[Recording], Iterable[object]]] = {
@@ -68,3 +70,20 @@ def test_memory_does_not_grow_with_length(
         print(", ".join(f"{name} {short >> 10} and {long >> 10} kB" for name, (_, short, long) in peaks.items()))
     for name, (_, short, long) in peaks.items():
         assert long < 1.3 * short + 200_000, name
+
+
+def test_numbers_of_a_collected_episode_are_read_without_its_pictures(tmp_path: Path) -> None:
+    given = make_collected(cameras=(replace(TOP, kept="jpeg"),), num_frames=120)
+    noise = np.random.default_rng(0)
+    num_bytes = 0
+    with CollectedWriter(tmp_path / "a.mcap", given.info) as writer:
+        for number, frame in enumerate(given.frames):
+            num_bytes += 200_000
+            assert writer.picture("top", frame.time_ns, noise.bytes(200_000)) == number
+            writer.write(frame)
+        writer.finish(given.outcome)
+    with CollectedRecording(tmp_path / "a.mcap") as recording:
+        # A chunk has the pictures of a second, and is there compressed and unpacked.
+        assert peak_bytes(recording.columns) < num_bytes * 0.7
+        stamps = recording.columns().picture_stamps["top"].tolist()
+    assert stamps == [frame.time_ns for frame in given.frames]

@@ -106,10 +106,7 @@ class CollectedRecording(EpisodeFile):
         features = {name: self._feature(stream, blocks[stream.topic], time_ns) for name, stream in streams.items()}
         stamps = {name: rows[:, index].copy() for index, name in enumerate(streams)}
         pictures = {name: rows[:, len(streams) + index].copy() for index, name in enumerate(self.cameras)}
-        # One camera after the other: all their pictures need not be in memory together.
-        picture_stamps = {
-            name: self._container.blocks((topic,))[topic].time_ns for name, topic in picture_topics.items()
-        }
+        picture_stamps = {name: self._stamps(topic) for name, topic in picture_topics.items()}
         for name, numbers in pictures.items():
             count = len(picture_stamps[name])
             if len(numbers) and not NO_PICTURE <= int(numbers.min()) <= int(numbers.max()) < count:
@@ -119,6 +116,10 @@ class CollectedRecording(EpisodeFile):
         return CollectedColumns(
             time_ns=time_ns, features=features, stamps=stamps, pictures=pictures, picture_stamps=picture_stamps
         )
+
+    def _stamps(self, topic: str) -> NDArray[np.int64]:
+        """(N,) of the messages of a topic, one chunk of them in memory at a time: pictures may take gigabytes."""
+        return np.fromiter((message.time_ns for message in self._container.messages((topic,))), dtype=np.int64)
 
     def _feature(self, stream: FeatureStream, block: Block, time_ns: NDArray[np.int64]) -> NDArray[np.generic]:
         if not np.array_equal(block.time_ns, time_ns):
