@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from demorec.errors import ConfigError, OptionError, check_option
-from demorec.plain import from_plain
+from demorec.plain import from_plain, leave_out_default
 from demorec.safety.user_modules import modules_of
 from demorec.scene.variation import PRESET_NAMES, Preset, Ranges
 
@@ -95,6 +95,8 @@ class GenerateConfig:
     """How much episodes differ beside their layout: none; mild adds action noise with clean labels; full all."""
     ranges: Ranges = field(default_factory=Ranges)
     """Single ranges in place of those of --variation (auto: as --variation says)."""
+    interject: bool = False
+    """The expert goes for a wrong thing at first and is corrected in words, where the scene has a thing to mistake."""
     sampling: Literal["random", "sobol", "lhs"] = "random"
     """How layouts cover the table: independently, or evenly by a Sobol sequence or Latin hypercubes."""
     sampling_block: int = 50
@@ -181,6 +183,9 @@ class GenerateConfig:
         check_option("max_attempts", self.max_attempts, 1, 100)
         check_option("max_episode_seconds", self.max_episode_seconds, 1.0, 3600.0)
         self.video.validate()
+
+
+leave_out_default(GenerateConfig, "interject")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -23,7 +23,7 @@ from demorec.language.referring import references
 from demorec.language.situation import COLORS, Situation, place_of, situation
 from demorec.lerobot.boxes import BOXES_DIR, read_boxes
 from demorec.lerobot.language import COLUMNS, SpokenEpisode
-from demorec.scene.episode import EpisodeInfo
+from demorec.scene.episode import CORRECTED_PHASE, MISTAKEN_PHASE, EpisodeInfo
 
 Row = dict[str, Any]
 _ABOUT_PICTURES = ("vqa", "trace")
@@ -142,6 +142,7 @@ def dataset_language_truth(dataset: Dataset) -> Measurement | None:
         faults = [
             *_wrong_phases(episode, row, dataset.info.fps),
             *_wrong_words(episode, row, info, start),
+            *_wrong_interjections(episode, row, info, start, dataset.info.fps),
             *_wrong_answers(episode, number, start, boxes),
         ]
         wrong += [f"episode {number}: {text}" for text in faults]
@@ -171,6 +172,7 @@ def _wrong_words(episode: SpokenEpisode, row: Row, info: EpisodeInfo, start: Sit
     objects = {goal.object for goal in scene.goals}
     things = objects | {place_of(scene, goal) for goal in scene.goals} - {""}
     movable = {body.name for body in scene.movable}
+    spoken = things | (movable if any(phase["name"] == MISTAKEN_PHASE for phase in row["phases"]) else set())
     for entry in episode.persistent:
         text = entry.get("content") or ""
         if entry.get("style") == "task_aug" and text != info.instruction:
@@ -179,10 +181,48 @@ def _wrong_words(episode: SpokenEpisode, row: Row, info: EpisodeInfo, start: Sit
             if not all(found) or not things <= named or not named <= things | movable:
                 yield f"{text[:60]!r} is not the task, or could mean something else"
         elif entry.get("style") in ("subtask", "plan", "memory") and objects:
-            kinds = {(start.thing(name).color, noun) for name in things for noun in start.thing(name).nouns}
+            kinds = {(start.thing(name).color, noun) for name in spoken for noun in start.thing(name).nouns}
             for words in _colored(text, start):
                 if words not in kinds:
                     yield f"{text[:60]!r} speaks of a {' '.join(words)}, which is not part of the task"
+
+
+def _wrong_interjections(
+    episode: SpokenEpisode, row: Row, info: EpisodeInfo, start: Situation, fps: int
+) -> Iterator[str]:
+    """Interjections come where the expert listens, say what is meant and what was mistaken, and renew the plan."""
+    said = {
+        frame: told
+        for frame, rows in episode.events.items()
+        if (told := [entry for entry in rows if entry.get("style") in ("interjection", None)])
+    }
+    listens = [phase["from"] for phase in row["phases"] if phase["name"] == CORRECTED_PHASE]
+    if said and sorted(said) != listens:
+        yield f"interjections at {sorted(said)}, but the expert listens at {listens}"
+        return
+    states = {(entry.get("style"), round(entry["timestamp"] * fps)): entry for entry in episode.persistent}
+    plans = [frame for style, frame in states if style == "plan"]
+    for frame, told in said.items():
+        wanted = {goal.object for goal in info.scene.goals[:1]}
+        before = states.get(("subtask", row["phases"][0]["from"]), {})
+        mistaken = _named(before.get("content") or "", start)
+        if mistaken & wanted:
+            yield f"the subtask before the interjection at frame {frame} names what is meant"
+        if [entry.get("style") for entry in told] != ["interjection", None]:
+            yield f"the interjection at frame {frame} and its answer are not both there"
+            return
+        named = _named(told[0].get("content") or "", start)
+        if not wanted <= named or (before and not named <= wanted | mistaken):
+            yield f"the interjection at frame {frame} names {', '.join(sorted(named)) or 'nothing'}"
+        if _named("".join(told[1].get("tool_calls") or ()), start) != wanted:
+            yield f"the answer at frame {frame} does not name what is meant"
+        if plans and frame not in plans:
+            yield f"the interjection at frame {frame} does not renew the plan"
+
+
+def _named(text: str, start: Situation) -> set[str]:
+    """Names of all things that a text refers to."""
+    return {name for _, names in references(text, start) for name in names}
 
 
 def _colored(text: str, start: Situation) -> Iterator[tuple[str, str]]:

@@ -14,14 +14,27 @@ import numpy as np
 
 from demorec.check.base import Found, Measurement, NotMeasured, check
 from demorec.check.episode import RecordedEpisode
-from demorec.scene.episode import POLICY_PHASE
+from demorec.scene.episode import CORRECTED_PHASE, INTERJECTION_EVENT, MISTAKEN_PHASE, POLICY_PHASE
 from demorec.tables import TASKS
 
-OPEN_PHASES = {"approach", "descend", "release", "retreat", "verify", "recover", "open", "above_cube"}
+OPEN_PHASES = {
+    MISTAKEN_PHASE,
+    CORRECTED_PHASE,
+    "approach",
+    "descend",
+    "release",
+    "retreat",
+    "verify",
+    "recover",
+    "open",
+    "above_cube",
+}
 CLOSED_PHASES = {"close", "lift", "transport", "lower", "hold", "carry"}
 UPWARD, DOWNWARD, STANDING = {"lift", "retreat", "hold"}, {"descend", "lower"}, {"close", "release"}
 NEXT = {
-    "": {"approach", "perceive", "open"},
+    "": {"approach", "perceive", "open", MISTAKEN_PHASE},
+    MISTAKEN_PHASE: {CORRECTED_PHASE},
+    CORRECTED_PHASE: {"approach", "open"},
     "perceive": set(),
     "approach": {"descend"},
     "descend": {"close"},
@@ -128,6 +141,10 @@ def story(episode: RecordedEpisode) -> Found:
     else:
         off = [a for a, time in zip(approaches, grasps, strict=True) if int(episode.frame_times[a]) != time]
         wrong += [f"the grasp of frame {a} is announced at another" for a in off]
+    corrected = [stretch.first for stretch in stretches if stretch.phase == CORRECTED_PHASE]
+    told = [time_ns for time_ns, event in episode.recording.events() if event.name == INTERJECTION_EVENT]
+    if [int(episode.frame_times[frame]) for frame in corrected] != told:
+        wrong.append(f"{len(told)} interjections at other frames than those where the expert listens ({corrected})")
     outcome, goals = episode.recording.outcome, episode.info.scene.goals
     if outcome is not None and outcome.success and len(approaches) != len(goals) + outcome.num_retries:
         wrong.append(f"{len(approaches)} approaches for {len(goals)} goals and {outcome.num_retries} retries")

@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from demorec.geometry import Array
+from demorec.language.interjections import interjection
 from demorec.language.kinds import KINDS, Kind
 from demorec.language.questions import questions, traces
+from demorec.language.referring import phrase_for
 from demorec.language.situation import Situation, situation
 from demorec.language.subtasks import GoalWords, goal_words, memories, plan, subtask, tcp_motion
 from demorec.language.tries import Story, story_of
 from demorec.language.wordings import task_wordings
 from demorec.recording import Recording
-from demorec.scene.episode import EpisodeColumns
+from demorec.scene.episode import MISTAKEN_PHASE, EpisodeColumns
 from demorec.scene.scene import Scene
 from demorec.seeding import generator
 
@@ -70,6 +72,7 @@ def narrate(
         "task_aug": told.wordings,
         "vqa": lambda: told.questions(cameras),
         "trace": lambda: told.traces(cameras),
+        "interjection": told.interjections,
     }
     statements = [statement for kind in KINDS if kind in kinds for statement in found[kind]()]
     return sorted(statements, key=lambda statement: statement.row)
@@ -108,6 +111,8 @@ class _Told:
         for number, first, _ in self._stretch_rows():
             stretch = self._story.stretches[number]
             words = self._words[stretch.attempt.first]
+            if stretch.phase == MISTAKEN_PHASE:
+                words = self._mistaken(words)
             text = subtask(stretch, words, self._info.instruction, is_dropped=is_dropped)
             yield Statement(row=first, kind="subtask", role="assistant", text=text)
 
@@ -117,12 +122,40 @@ class _Told:
                 continue
             row = 0 if index == 0 else self._row_of(attempt.first)
             if row < len(self._rows):
+                remaining = self._remaining(attempt.first, attempt.goal)
+                if row == 0:
+                    remaining[0] = self._mistaken(remaining[0])
                 text = plan(
-                    self._remaining(attempt.first, attempt.goal),
+                    remaining,
                     is_dropped=self._story.is_dropped,
                     is_retry=attempt.number > 0,
                 )
                 yield Statement(row=row, kind="plan", role="assistant", text=text)
+
+        correction = self._story.correction
+        if correction is not None and self._story.tries[0].goal is not None:
+            goal = self._story.tries[0].goal
+            text = plan(self._remaining(correction.frame, goal), is_dropped=self._story.is_dropped, is_retry=False)
+            yield Statement(row=self._row_of(correction.frame), kind="plan", role="assistant", text=text)
+
+    def _mistaken(self, words: GoalWords) -> GoalWords:
+        """The same, spoken before the interjection: of the thing that was mistaken."""
+        correction = self._story.correction
+        if correction is None:
+            return words
+        return replace(words, object=phrase_for(correction.mistaken, self._situation(0)))
+
+    def interjections(self) -> Iterator[Statement]:
+        correction, info = self._story.correction, self._info
+        if correction is None or (row := self._row_of(correction.frame)) >= len(self._rows):
+            return
+        rng = generator(
+            root_seed=info.root_seed, episode_index=info.episode_index, attempt=info.attempt, purpose="interjection"
+        )
+        told = interjection(correction, self._situation(correction.frame), rng)
+        if told is not None:
+            yield Statement(row=row, kind="interjection", role="user", text=told[0])
+            yield Statement(row=row, kind="interjection", role="assistant", text=told[1])
 
     def _remaining(self, frame: int, goal: int) -> list[GoalWords]:
         now = self._situation(frame)

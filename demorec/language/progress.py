@@ -15,10 +15,19 @@ from numpy.typing import NDArray
 
 from demorec.geometry import Array
 from demorec.language.tries import Story, Stretch
+from demorec.scene.episode import CORRECTED_PHASE, MISTAKEN_PHASE
 
 _STAGES = ("approach", "descend", "close", "lift", "transport", "lower", "release", "retreat")
-_ALSO = {"open": "approach", "above_cube": "approach", "hold": "lift", "carry": "transport", "recover": "approach"}
-"""The tutorial's words for the same, and what a failure leads back to."""
+_ALSO = {
+    "open": "approach",
+    "above_cube": "approach",
+    "hold": "lift",
+    "carry": "transport",
+    "recover": "approach",
+    MISTAKEN_PHASE: "approach",
+    CORRECTED_PHASE: "approach",
+}
+"""The tutorial's words for the same, and what a failure or a correction leads back to."""
 _PICK = ("approach", "descend", "close", "lift")
 WHOLE_TASK = "task"
 """The only stage of an episode whose phases nobody knows."""

@@ -11,9 +11,12 @@ from demorec.geometry import Array
 from demorec.language.referring import phrase_for
 from demorec.language.situation import Situation, nouns_of, place_of
 from demorec.language.tries import Story, Stretch, Try
+from demorec.scene.episode import CORRECTED_PHASE, MISTAKEN_PHASE
 from demorec.scene.scene import Scene
 
 _SENTENCES = {
+    MISTAKEN_PHASE: "move above {object}",
+    CORRECTED_PHASE: "stop and listen",
     "open": "open the gripper",
     "approach": "move above {object}",
     "above_cube": "move above {object}",

@@ -13,6 +13,7 @@ from typing import Literal
 import numpy as np
 
 from demorec.geometry import Pose
+from demorec.language.interjections import Correction, correction_of
 from demorec.recording import Recording
 from demorec.scene.episode import EpisodeColumns
 from demorec.scene.scene import Goal, Scene
@@ -67,10 +68,12 @@ class Story:
     Attributes:
         tries: In order of time.
         stretches: In order of time; every frame is in exactly one.
+        correction: The interjection, if there is one: it comes before all tries.
     """
 
     tries: tuple[Try, ...]
     stretches: tuple[Stretch, ...]
+    correction: Correction | None = None
 
     @property
     def is_dropped(self) -> bool:
@@ -102,7 +105,7 @@ def story_of(recording: Recording, columns: EpisodeColumns) -> Story:
         )
         for start, end in pairwise([*first, len(phases)])
     ]
-    return Story(tries=tuple(tries), stretches=tuple(stretches))
+    return Story(tries=tuple(tries), stretches=tuple(stretches), correction=correction_of(recording, columns))
 
 
 def _tries(recording: Recording, columns: EpisodeColumns, scene: Scene) -> list[Try]:

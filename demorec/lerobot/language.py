@@ -50,24 +50,27 @@ class LanguageRow:
 
     Attributes:
         role: "user" or "assistant".
-        content: What is said.
-        style: LeRobot's word for its kind.
+        content: What is said; None for what a tool says.
+        style: LeRobot's word for its kind, None for what a tool says.
         timestamp: From when on it holds, seconds; None for an event.
         camera: Feature that the words are about, None for all but those that are about one picture.
+        spoken: What the tool `say` is told to say to the user, "" for nothing.
     """
 
     role: str
-    content: str
-    style: str
+    content: str | None
+    style: str | None
     timestamp: float | None = None
     camera: str | None = None
+    spoken: str = ""
 
     def to_json(self) -> dict[str, Any]:
-        """The entry as LeRobot gives it."""
+        """The entry as the column has it; calls of tools are JSON there."""
         row: dict[str, Any] = {"role": self.role, "content": self.content, "style": self.style}
         if self.timestamp is not None:
             row["timestamp"] = self.timestamp
-        return {**row, "camera": self.camera, "tool_calls": None}
+        call = {"type": "function", "function": {"name": "say", "arguments": {"text": self.spoken}}}
+        return {**row, "camera": self.camera, "tool_calls": [json.dumps(call)] if self.spoken else None}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,6 +96,8 @@ def episode_language(statements: Sequence[Statement], *, fps: int) -> EpisodeLan
             persistent.append(replace(said, timestamp=float(np.float32(statement.row / fps))))
         else:
             camera = None if statement.camera is None else IMAGE_PREFIX + statement.camera
+            if statement.kind == "interjection" and statement.role == "assistant":  # LeRobot's form of an answer
+                said = replace(said, content=None, style=None, spoken=statement.text)
             events.setdefault(statement.row, []).append(replace(said, camera=camera))
     return EpisodeLanguage(persistent=tuple(persistent), events={row: tuple(told) for row, told in events.items()})
 
@@ -122,12 +127,15 @@ def language_arrays(language: EpisodeLanguage, frames: int) -> dict[str, pa.Arra
 
 def _structs(rows: Sequence[LanguageRow], kind: pa.StructType) -> pa.StructArray:
     found = [row.to_json() for row in rows]
-    arrays = [
-        pa.nulls(len(found), part.type)
-        if part.name == "tool_calls"
-        else pa.array([row[part.name] for row in found], part.type)
-        for part in kind
-    ]
+    arrays = []
+    for part in kind:
+        values = [row[part.name] for row in found]
+        if part.name != "tool_calls":
+            arrays.append(pa.array(values, part.type))
+        elif not any(values):
+            arrays.append(pa.nulls(len(found), part.type))
+        else:  # pyarrow makes none of JSON from Python's lists
+            arrays.append(pa.array(values, pa.list_(pa.string())).cast(part.type))
     return pa.StructArray.from_arrays(arrays, fields=list(kind))
 
 
@@ -167,9 +175,19 @@ def column_digests(column: pa.Array) -> NDArray[np.str_]:
 
 
 def _digest(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Of the entries that are there; an empty list of tool calls is as good as none."""
+    """Of the entries that are there; an empty list of tool calls is as good as none, and JSON is what it says."""
     told = [{name: value for name, value in row.items() if value is not None and value != []} for row in rows]
+    for row in told:
+        if "tool_calls" in row:
+            row["tool_calls"] = [_parsed(call) for call in row["tool_calls"]]
     return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
+
+
+def _parsed(call: Any) -> Any:
+    try:
+        return json.loads(call)
+    except (TypeError, ValueError, RecursionError):
+        return call
 
 
 @dataclass(kw_only=True)

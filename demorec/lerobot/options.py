@@ -18,7 +18,7 @@ class ExportOptions(CommonOptions):
 
     language: tuple[str, ...] | None = None
     """Add LeRobot's language columns: say in words what the robot does, from what was recorded. Named kinds alone
-    (subtask plan memory motion task_aug vqa trace), or all that the recordings support."""
+    (subtask plan memory motion task_aug vqa trace interjection), or all that the recordings support."""
     progress: bool = False
     """Add how far each frame has come (0 to 1) and the stages of the task, where LeRobot's sample weighting and SARM
     look for them."""

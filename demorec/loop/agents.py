@@ -10,6 +10,7 @@ from demorec.loop.noise import ActionNoise
 from demorec.loop.prepare import Episode
 from demorec.scene.episode import Action, Event
 from demorec.sim.world import World
+from demorec.tasks.interjection import mistake
 from demorec.tasks.script import Step
 from demorec.tasks.skills import Expert, GaveUp
 
@@ -79,6 +80,8 @@ class ScriptAgent:
     def _steps(self, expert: Expert) -> Iterator[Step]:
         """The script; when the expert gives up, one step more, which carries the events that say why."""
         try:
+            if self._episode.interjection is not None:
+                yield from mistake(expert, self._episode.interjection)
             yield from self._episode.task.script(expert)
         except GaveUp as error:
             self._gave_up = error

@@ -23,6 +23,7 @@ from demorec.seeding import Purpose, generator
 from demorec.sim.world import World
 from demorec.tables import CAMERAS, RENDERERS, TASKS, camera_name, load_robot
 from demorec.tasks.base import Task
+from demorec.tasks.interjection import Interjection, draw_interjection
 from demorec.tasks.sampling import Sampler, stratified_point
 from demorec.tasks.script import Behaviour
 from demorec.tasks.vary import calibration_errors, draw_behaviour, vary_cameras, vary_looks, vary_physics
@@ -41,6 +42,7 @@ class Episode:
         behaviour: How the expert does it.
         cameras: Where the cameras really are: `info.scene.cameras` holds the same with the calibration error.
         true_from_recorded: Camera name -> calibration error, of the cameras that have one.
+        interjection: What the expert mistakes at first, or None.
     """
 
     plan: EpisodePlan
@@ -49,6 +51,7 @@ class Episode:
     behaviour: Behaviour
     cameras: tuple[Camera, ...] = ()
     true_from_recorded: Mapping[str, Pose] = field(default_factory=dict)
+    interjection: Interjection | None = None
 
     def rng(self, purpose: Purpose) -> np.random.Generator:
         """A fresh stream of this attempt."""
@@ -135,6 +138,7 @@ def prepare(plan: EpisodePlan) -> Episode:
         behaviour=behaviour,
         cameras=cameras,
         true_from_recorded={name: error for name, error in errors.items() if error != Pose()},
+        interjection=draw_interjection(scene, _rng(plan, "interjection")) if config.interject else None,
     )
 
 

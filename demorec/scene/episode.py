@@ -21,6 +21,10 @@ from demorec.scene.scene import Scene
 
 POLICY_PHASE = "policy"
 """Phase of the frames in which a policy acts, or somebody else who tells no phase; all others are the expert's."""
+MISTAKEN_PHASE, CORRECTED_PHASE = "mistake", "correct"
+"""Phases of an episode with an interjection: the wrong thing is gone for; what was said is listened to."""
+INTERJECTION_EVENT = "interjection"
+"""Event between these two: "NAME is meant, not NAME"."""
 
 FORMAT_VERSION = 2
 """Of the recordings. A reader knows every version up to this one; `recordings/sample/` holds a file of each."""
