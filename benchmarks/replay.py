@@ -3,7 +3,9 @@
     python benchmarks/replay.py --episodes 100 --pictures 2
 
 CPU seconds of this process. Ratios are taken within one interleaved run: each episode is generated, checked,
-replayed and (the first few) drawn anew, one after the other.
+replayed and (the first few) drawn anew, one after the other. World and renderer are kept from one episode to the next,
+as the workers of `generate-dataset` and `demorec render` do; "as it was" has libswscale convert the pictures for the
+coder, and a new renderer for each recording that is drawn anew.
 """
 
 from __future__ import annotations
@@ -12,27 +14,40 @@ import argparse
 import tempfile
 import time
 from collections import defaultdict
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
+
+import av
 
 from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.config import EpisodePlan, GenerateConfig
-from demorec.loop import ScriptAgent, Session, make_renderer, make_world, prepare
-from demorec.recording import EpisodeWriter, Recording
+from demorec.loop import ScriptAgent, Session, Workshop, prepare
+from demorec.recording import EpisodeWriter, Recording, video
+from demorec.render.warm import WarmRenderer
 from demorec.replay import ReplayOptions, open_file, replay_all
 from demorec.replay.rerender import RerenderOptions, rerender
 
 
-def generate(path: Path, config: GenerateConfig, index: int) -> None:
+def generate(path: Path, config: GenerateConfig, index: int, workshop: Workshop) -> None:
     episode = prepare(EpisodePlan(config=config, episode_index=index))
-    with (
-        make_world(episode.info) as world,
-        make_renderer(episode.info) as renderer,
-        EpisodeWriter(path, episode.info, video=config.video) as writer,
-    ):
+    world, renderer = workshop.equip(episode.info)
+    with EpisodeWriter(path, episode.info, video=config.video) as writer:
         session = Session.of_episode(world, episode, renderer)
         for frame in session.run(ScriptAgent(episode)):
             writer.write(frame)
         writer.finish(session.outcome)
+
+
+@contextmanager
+def libswscale() -> Iterator[None]:
+    """Pictures are given to the coders as they are, which have libswscale convert them."""
+    own = video.coder_frame
+    video.coder_frame = lambda picture: av.VideoFrame.from_ndarray(picture, format="rgb24")
+    try:
+        yield
+    finally:
+        video.coder_frame = own
 
 
 def main() -> None:
@@ -44,18 +59,21 @@ def main() -> None:
     arguments = parser.parse_args()
     cpu: dict[str, float] = defaultdict(float)
     identical = same_pictures = 0
+    stack = ExitStack()
+    workshop, warm = Workshop(), stack.enter_context(WarmRenderer())
+    stack.callback(workshop.close)
     simulated = filmed = 0.0
 
     def timed(name: str, start: float) -> None:
         cpu[name] += time.process_time() - start
 
-    with tempfile.TemporaryDirectory() as folder:
+    with stack, tempfile.TemporaryDirectory() as folder:
         plain = GenerateConfig(task=arguments.task, cameras=())
-        generate(Path(folder) / "warm.mcap", plain, 10_000)  # compiles what is compiled once
+        generate(Path(folder) / "warm.mcap", plain, 10_000, workshop)  # compiles what is compiled once
         for index in range(arguments.episodes):
             path = Path(folder) / f"{index}.mcap"
             start = time.process_time()
-            generate(path, plain, index)
+            generate(path, plain, index, workshop)
             timed("generate", start)
             start = time.process_time()
             report = check_subject(Subject(path=path, kind="recording"), CheckOptions(pictures=False))
@@ -71,20 +89,29 @@ def main() -> None:
             task=arguments.task, cameras=("front", "wrist"), width=arguments.size, height=arguments.size
         )
         if arguments.pictures:
-            generate(Path(folder) / "warm_pictures.mcap", config, 10_000)
+            warming = Path(folder) / "warm_pictures.mcap"
+            generate(warming, config, 10_000, workshop)
+            rerender(warming, Path(folder) / "warm_again.mcap", RerenderOptions(), renderers=warm)
         for index in range(arguments.pictures):
             path = Path(folder) / f"filmed_{index}.mcap"
+            before = Path(folder) / f"as_it_was_{index}.mcap"
+            with libswscale():
+                start = time.process_time()
+                generate(before, config, index, workshop)
+                timed("generate, as it was", start)
+                start = time.process_time()
+                rerender(before, Path(folder) / f"again_as_it_was_{index}.mcap", RerenderOptions())
+                timed("draw anew, as it was", start)
             start = time.process_time()
-            generate(path, config, index)
+            generate(path, config, index, workshop)
             timed("generate with pictures", start)
             start = time.process_time()
-            drawn = rerender(path, Path(folder) / f"again_{index}.mcap", RerenderOptions())
+            drawn = rerender(path, Path(folder) / f"again_{index}.mcap", RerenderOptions(), renderers=warm)
             timed("draw anew", start)
             same_pictures += not drawn.differing
             start = time.process_time()
-            rerender(
-                path, Path(folder) / f"small_{index}.mcap", RerenderOptions(cameras=("front",), width=96, height=96)
-            )
+            small = RerenderOptions(cameras=("front",), width=96, height=96)
+            rerender(path, Path(folder) / f"small_{index}.mcap", small, renderers=warm)
             timed("draw one camera, 96x96", start)
             for pictures in (False, True):
                 start = time.process_time()
@@ -99,7 +126,11 @@ def main() -> None:
         number, length = (arguments.pictures, filmed) if of_pictures else (count, simulated)
         print(f"{name:<24} {1e3 * seconds / number:8.1f} CPU ms an episode, {length / seconds:8.1f} times real time")
     if arguments.pictures:
-        print(f"generate / draw anew: {cpu['generate with pictures'] / cpu['draw anew']:.2f}")
+        was, now = cpu["generate, as it was"], cpu["generate with pictures"]
+        print(f"generate, as it was / now: {was / now:.2f}")
+        print(
+            f"generate / draw anew: as it was {was / cpu['draw anew, as it was']:.2f}, {now / cpu['draw anew']:.2f} now"
+        )
 
 
 if __name__ == "__main__":

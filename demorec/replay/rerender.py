@@ -388,20 +388,22 @@ def _compare(recording: Recording, out: Path, options: RerenderOptions) -> tuple
     """The packets of the cameras that were to stay as they were: equal pictures give equal packets."""
     if options.looks is not None:
         return (), {}
-    compared, differing = [], {}
+    differing: dict[str, int] = {}
     with Recording(out) as new:
         renderer = (recording.info.config.get("renderer"), recording.info.config.get("antialias", True))
         if renderer != (new.info.config.get("renderer"), new.info.config.get("antialias", True)):
             return (), {}
         before = {camera.name: camera for camera in recording.info.scene.cameras}
-        for camera in new.info.scene.cameras:
-            if before.get(camera.name) != camera or new.video_settings(camera.name) != recording.video_settings(
-                camera.name
-            ):
-                continue
-            compared.append(camera.name)
-            pairs = zip(recording.packets(camera.name), new.packets(camera.name), strict=True)
-            first = next((a.frame_index for a, b in pairs if a.data != b.data), None)
-            if first is not None:
-                differing[camera.name] = first
+        compared = [
+            camera.name
+            for camera in new.info.scene.cameras
+            if before.get(camera.name) == camera
+            and new.video_settings(camera.name) == recording.video_settings(camera.name)
+        ]
+        old_pictures, new_pictures = recording.coded_pictures(compared), new.coded_pictures(compared)
+    for camera in compared:
+        pairs = zip(old_pictures[camera].messages(), new_pictures[camera].messages(), strict=True)
+        first = next((frame for frame, (a, b) in enumerate(pairs) if a != b), None)
+        if first is not None:
+            differing[camera] = first
     return tuple(compared), differing

@@ -187,7 +187,7 @@ def shade_rows(
     for y in range(ids.shape[0]):
         x = left[y]
         x_end = right[y]
-        filled = 0
+        filled = np.int64(0)  # no literal, for which all that is inlined would be compiled once more
         while x < x_end:
             record = ids[y, x]
             xa = x
@@ -217,7 +217,7 @@ def shade_rows(
             n = x - xa
             if filled + n > CHUNK:
                 finish_chunk(y, filled, columns, scratch, places, heights, size, in_shadow, color, keep, still)
-                filled = 0
+                filled = np.int64(0)
             m = filled
             filled += n
             face = record_face[record]

@@ -82,6 +82,7 @@ def draw_instances(
     Returns:
         The next free record and vertex; a record of -1 when the room for clipped vertices or records ran out.
     """
+    with_ids = np.bool_(True)  # no literal, for which all that is inlined would be compiled once more
     guard = f4(GUARD)
     half_width = f4(width * 128.0)
     half_height = f4(height * 128.0)
@@ -126,7 +127,24 @@ def draw_instances(
                     vb = f8(vertices[b + index(IW)])
                     vc = f8(vertices[c + index(IW)])
                     if fill_triangle(
-                        x0, y0, va, x2, y2, vc, x1, y1, vb, area, width, height, values, ids, record, True, left, right
+                        x0,
+                        y0,
+                        va,
+                        x2,
+                        y2,
+                        vc,
+                        x1,
+                        y1,
+                        vb,
+                        area,
+                        width,
+                        height,
+                        values,
+                        ids,
+                        record,
+                        with_ids,
+                        left,
+                        right,
                     ):
                         record_corners[record, 0] = a
                         record_corners[record, 1] = c
@@ -195,7 +213,7 @@ def draw_instances(
                 vb = f8(vertices[v + IW])
                 vc = f8(vertices[w + IW])
                 if fill_triangle(
-                    x0, y0, va, x1, y1, vb, x2, y2, vc, area, width, height, values, ids, record, True, left, right
+                    x0, y0, va, x1, y1, vb, x2, y2, vc, area, width, height, values, ids, record, with_ids, left, right
                 ):
                     record_corners[record, 0] = u
                     record_corners[record, 1] = v
@@ -220,6 +238,8 @@ def draw_casters(
         bounds: (4,) x from, x to, y from, y to of what was drawn, widened (when `mark`).
         no_ids, no_extents: Empty int32 arrays.
     """
+    record = np.int64(0)  # no literals, see draw_instances
+    with_ids = np.bool_(False)
     for k in range(first, last):
         for f in range(face_start[k], face_end[k]):
             a = index(faces[f, 0])
@@ -258,5 +278,22 @@ def draw_casters(
                     for tile_x in range(max(0, x_first - 2) >> SHIFT, (min(size - 1, x_last + 1) >> SHIFT) + 1):
                         touched[tile_y, tile_x] = 1
             fill_triangle(
-                x0, y0, v0, x1, y1, v1, x2, y2, v2, area, size, size, heights, no_ids, 0, False, no_extents, no_extents
+                x0,
+                y0,
+                v0,
+                x1,
+                y1,
+                v1,
+                x2,
+                y2,
+                v2,
+                area,
+                size,
+                size,
+                heights,
+                no_ids,
+                record,
+                with_ids,
+                no_extents,
+                no_extents,
             )
