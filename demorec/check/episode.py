@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.check.base import NotMeasured
-from demorec.check.cells import Cells, Kind
-from demorec.check.drawn import NOT_DRAWABLE, Comparison, compare, draw_all, strays
+from demorec.check.cells import Kind
+from demorec.check.drawn import NOT_DRAWABLE, Comparison, DrawnPictures, compare, draw_all, strays
 from demorec.check.pictures_summary import PictureSummary, summarise
 from demorec.check.rows import link_matrices, matrices
 from demorec.errors import RecordingError
@@ -208,10 +208,13 @@ class RecordedEpisode:
         return self._pictures[camera.name, kind]
 
     @cached_property
-    def _drawn(self) -> dict[tuple[str, Kind], Cells] | NotMeasured:
-        """Every picture as the recorded numbers make it."""
+    def _drawn(self) -> DrawnPictures | NotMeasured:
+        """The pictures as the recorded numbers make them; each single one where some are coded without loss."""
+        kinds = {camera.name: self.kinds(camera.name) for camera in self.cameras}
+        is_lossy = all(of_camera == ("color",) for of_camera in kinds.values())
+        seen = [self.pictures(camera).cells for camera in self.cameras] if is_lossy else None
         try:
-            return draw_all(self.info, self.columns, {camera.name: self.kinds(camera.name) for camera in self.cameras})
+            return draw_all(self.info, self.columns, kinds, seen)
         except NOT_DRAWABLE as error:
             return NotMeasured(why=f"the recording cannot be drawn here: {error}")
 
@@ -222,7 +225,7 @@ class RecordedEpisode:
         seen = self.pictures(camera, kind).cells
         if not len(seen):
             return NotMeasured(why=f"camera {camera.name} has no picture that can be read")
-        return strays(seen, self._drawn[camera.name, kind])
+        return strays(seen, self._drawn.cells[camera.name, kind])
 
     def compared(self, camera: Camera, kind: Kind = "color") -> Comparison | NotMeasured:
         """A camera's pictures against what the recorded numbers make of them."""
@@ -235,7 +238,8 @@ class RecordedEpisode:
         if len(seen) < 3:
             return NotMeasured(why=f"camera {camera.name} has {len(seen)} pictures")
         if (camera.name, kind) not in self._comparisons:
-            self._comparisons[camera.name, kind] = compare(seen, self._drawn[camera.name, kind])
+            drawn = self._drawn
+            self._comparisons[camera.name, kind] = compare(seen, drawn.cells[camera.name, kind], drawn.frames)
         return self._comparisons[camera.name, kind]
 
 
