@@ -26,7 +26,7 @@ from pathlib import Path
 import numpy as np
 
 from demorec.check.fingers import Convex, depth_in
-from demorec.check.rows import inverse, link_matrices, matrices
+from demorec.check.rows import LinkMatrices, inverse, matrices
 from demorec.config import EpisodePlan, GenerateConfig
 from demorec.errors import SceneError
 from demorec.geometry import Array
@@ -135,7 +135,7 @@ def deepest_finger(episode: Episode, frames: Sequence[Frame]) -> tuple[float, st
     deepest = (0.0, "")
     for name in robot.gripper.finger_links:
         by_name = dict(zip(robot.joint_names, joints.T, strict=True))
-        finger = base @ link_matrices(urdf, name, by_name, len(frames))
+        finger = base @ LinkMatrices(urdf, by_name, len(frames))[name]
         parts = _parts(links[name], path.parent)
         for body in scene.movable:
             pose = _poses(frames, body)

@@ -79,7 +79,7 @@ def _expected(episode: RecordedEpisode, camera: Camera) -> Array:
     if camera.mount == "world":
         return np.broadcast_to(mounted, (episode.num_frames, 4, 4))
     try:
-        link = episode.base_from_link(camera.mount, episode.columns.joint_position)
+        link = episode.base_from_link(camera.mount)
     except RecordingError as error:
         if not isinstance(error.__cause__, KeyError):  # damage is no wrong camera
             raise

@@ -56,6 +56,10 @@ class CellGrid:
         size = (height, width)
         self._shapes: dict[Kind, tuple[int, ...]] = {"color": (*size, 3), "depth": size, "labels": size}
 
+    def shape(self, kind: Kind) -> tuple[int, int, int]:
+        """Of the cells of a picture: (h, w, channels)."""
+        return (len(self._rows) - 1, len(self._columns) - 1, CHANNELS[kind])
+
     def read(self, kind: Kind, picture: NDArray[Any]) -> PictureCells:
         """A picture (H, W, 3) uint8 of colours, (H, W) float32 metres or (H, W) int32 labels, as brightnesses.
 
@@ -69,7 +73,7 @@ class CellGrid:
                 f"A picture ({kind}) has the shape {picture.shape}, those of its camera {self._shapes[kind]}."
             )
         grid = self._rows, self._columns
-        sums = np.empty((len(self._rows) - 1, len(self._columns) - 1, CHANNELS[kind]))
+        sums = np.empty(self.shape(kind))
         dark = bright = 0
         if kind == "color":
             dark, bright = kernels.sum_colors(np.ascontiguousarray(picture), *grid, sums)

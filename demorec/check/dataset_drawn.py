@@ -50,7 +50,8 @@ def compare_beginning(
     try:
         world = RecordedWorld(info.robot, info.scene, joint_position=joints, object_poses=objects)
         grids = {name: (cells.shape[2], cells.shape[1]) for name, cells in seen.items()}
-        drawn = draw(world, count, dict.fromkeys(seen, ("color",)), grids)
+        beginning = {name: cells[:count] for name, cells in seen.items()}
+        drawn = draw(world, count, dict.fromkeys(seen, ("color",)), grids, beginning.values())
     except NOT_DRAWABLE as error:
         return NotMeasured(why=f"the scene cannot be drawn here: {error}")
-    return {name: compare(cells[:count], drawn[name, "color"]) for name, cells in seen.items()}
+    return {name: compare(cells, drawn.cells[name, "color"], drawn.frames) for name, cells in beginning.items()}

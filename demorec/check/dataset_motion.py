@@ -10,7 +10,7 @@ from demorec.check.alignment import servo_response
 from demorec.check.base import Measurement, check, worst
 from demorec.check.coverage import infos_by_task, largest_gap, twins
 from demorec.check.dataset import Dataset
-from demorec.check.rows import displacement, link_matrices, matrices
+from demorec.check.rows import LinkMatrices, displacement, matrices
 from demorec.check.run import motion_vector
 from demorec.errors import NotAllowedError
 from demorec.geometry import Array
@@ -123,7 +123,7 @@ def dataset_forward_kinematics(dataset: Dataset) -> Measurement | None:
             except NotAllowedError:  # a dataset does not hold the model of a robot of the user's own
                 return None
         joints = dict(zip(info.robot.arm_joints, rows[STATE].astype(np.float64).T, strict=False))
-        fk = link_matrices(urdfs[key], info.robot.tcp_link, joints, len(rows[STATE]))
+        fk = LinkMatrices(urdfs[key], joints, len(rows[STATE]))[info.robot.tcp_link]
         off = displacement(matrices(rows[EE_POSE].astype(np.float64)), fk)
         frame = int(np.argmax(off))
         found.append(Measurement(value=float(off[frame]), frame=frame, detail=f"episode {number}"))

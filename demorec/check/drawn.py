@@ -1,9 +1,12 @@
 """What a camera must have seen, drawn anew from the recorded numbers, beside what was recorded.
 
-The renderer that draws a recording needs no simulator: poses follow from the recorded joints and objects. Every picture
-is drawn small and compared with the recorded one in cells (means over small areas), in which the coder's error nearly
+The renderer that draws a recording needs no simulator: poses follow from the recorded joints and objects. Pictures are
+drawn small and compared with the recorded ones in cells (means over small areas), in which the coder's error nearly
 vanishes while a motion of a tenth of a cell still shows. Depth and labels are compared in the same way: depth as a
 brightness, labels as colours of a palette.
+
+Not every frame has to be drawn: where both the recorded picture and the recorded poses are what lies between those of
+the frames around, so is the drawn picture.
 """
 
 from __future__ import annotations
@@ -28,14 +31,32 @@ LONGER_SIDE = 112
 """Pixels that are drawn along the longer side, at most."""
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class DrawnPictures:
+    """What the cameras must have seen, T frames.
+
+    Attributes:
+        frames: (N,) frames that were drawn, in order, the first and the last among them; the pictures of the others are
+            means of the drawn ones before and after, weighted by time.
+        cells: (camera, kind) -> (T, h, w, channels).
+    """
+
+    frames: NDArray[np.int64]
+    cells: Mapping[tuple[str, Kind], Cells]
+
+
 def draw_all(
-    info: EpisodeInfo, columns: EpisodeColumns, kinds: Mapping[str, Iterable[Kind]]
-) -> dict[tuple[str, Kind], Cells]:
-    """(camera, kind) -> cells of every frame, as the recorded numbers make them.
+    info: EpisodeInfo,
+    columns: EpisodeColumns,
+    kinds: Mapping[str, Iterable[Kind]],
+    seen: Iterable[Cells] | None = None,
+) -> DrawnPictures:
+    """The pictures of an episode, as the recorded numbers make them.
 
     Args:
         info, columns: Of the recording.
         kinds: Camera name -> what is to be drawn of it.
+        seen: The recorded pictures, by which frames are chosen to be drawn; None: every frame is drawn.
 
     Raises:
         SceneError, RenderError: A model is not there, or cannot be drawn.
@@ -45,7 +66,7 @@ def draw_all(
     )
     # The recorded pictures' grid: the small ones' own may have a row more or less.
     counts = {camera.name: cell_counts(camera.width, camera.height) for camera in info.scene.cameras}
-    return draw(world, columns.num_frames, kinds, counts)
+    return draw(world, columns.num_frames, kinds, counts, seen)
 
 
 def draw(
@@ -53,8 +74,9 @@ def draw(
     num_frames: int,
     kinds: Mapping[str, Iterable[Kind]],
     counts: Mapping[str, tuple[int, int]],
-) -> dict[tuple[str, Kind], Cells]:
-    """(camera, kind) -> cells of the first frames of a world, in a grid of (columns, rows) for each camera.
+    seen: Iterable[Cells] | None = None,
+) -> DrawnPictures:
+    """The first frames of a world, in a grid of (columns, rows) for each camera; `seen` as of `draw_all`.
 
     Raises:
         SceneError, RenderError: It cannot be drawn.
@@ -62,18 +84,76 @@ def draw(
     cameras = tuple(_small(camera) for camera in world.scene.cameras if camera.name in kinds)
     wanted = {kind for of_camera in kinds.values() for kind in of_camera}
     grids = {camera.name: CellGrid(camera.width, camera.height, counts[camera.name]) for camera in cameras}
-    found: dict[tuple[str, Kind], list[Cells]] = {(name, kind): [] for name in grids for kind in kinds[name]}
+    poses = world.all_poses[:num_frames]
+    frames = np.flatnonzero(np.ones(num_frames)) if seen is None else frames_to_draw(seen, poses)
+    cells: dict[tuple[str, Kind], Cells] = {
+        (name, kind): np.empty((num_frames, *grid.shape(kind)), dtype=np.float32)
+        for name, grid in grids.items()
+        for kind in kinds[name]
+    }
     painter = Painter(_renderer(), cameras, depth="depth" in wanted, segmentation="labels" in wanted)
     painter.setup(world)
-    for frame in range(num_frames):
+    for frame in frames.tolist():
         world.frame = frame
         images = painter.images()
-        for name, kind in found:
+        for (name, kind), rows in cells.items():
             image = images[name]
             pictures = {"color": image.color, "depth": image.depth, "labels": image.segmentation}[kind]
             assert pictures is not None
-            found[name, kind].append(grids[name].read(kind, pictures).cells)
-    return {key: np.stack(cells) for key, cells in found.items()}
+            rows[frame] = grids[name].read(kind, pictures).cells
+    for rows in cells.values():
+        fill_between(rows, frames)
+    return DrawnPictures(frames=frames, cells=cells)
+
+
+_STRIDE = 3
+"""Every so many frames are drawn in any case; odd, so that both kinds of pictures of a GOP of 2 are among them."""
+_PICTURE_BETWEEN = 2.5
+"""Of 255, root mean square over the cells: a recorded picture that is farther from what lies between its neighbours is
+drawn. Less than half of what makes a picture odd or stale (`demorec.check.pictures`)."""
+_POSE_BETWEEN = 0.005
+"""Metres, or of a quaternion: the same for the poses."""
+
+
+def frames_to_draw(seen: Iterable[Cells], poses: Array) -> NDArray[np.int64]:
+    """(N,) frames whose drawn pictures tell those of the others, in order.
+
+    Args:
+        seen: Pictures of each camera, T frames, or fewer where the rest cannot be read.
+        poses: (T, n, 7) of everything that can be seen: position, quaternion.
+    """
+    from demorec.check import kernels
+
+    count = len(poses)
+    chosen = np.arange(count) % _STRIDE == 0
+    chosen[-1:] = True
+    before, after, share = _neighbours(np.flatnonzero(chosen), count)
+    weight = share[:, None, None]
+    chosen |= np.abs(poses - (1 - weight) * poses[before] - weight * poses[after]).max(axis=(1, 2)) > _POSE_BETWEEN
+    for cells in seen:
+        rows = np.ascontiguousarray(cells).reshape(len(cells), -1)
+        there = np.flatnonzero(after[: len(rows)] < len(rows))
+        chosen[len(there) : len(rows)] = True
+        off = np.zeros(len(there))
+        kernels.squares_between(rows, before, after, share, off)
+        chosen[there] |= off > _PICTURE_BETWEEN**2 * max(rows.shape[1], 1)
+    return np.flatnonzero(chosen)
+
+
+def _neighbours(frames: NDArray[np.int64], count: int) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
+    """(count,) the chosen frame before each frame, the one after, and how far it is on the way; itself where chosen."""
+    number = np.searchsorted(frames, np.arange(count))
+    after = frames[number]
+    before = np.where(after == np.arange(count), after, frames[np.maximum(number - 1, 0)])
+    return before, after, (np.arange(count) - before) / np.maximum(after - before, 1)
+
+
+def fill_between(cells: Cells, frames: NDArray[np.int64]) -> None:
+    """Fill the frames of (T, h, w, c) that are not among the drawn ones."""
+    before, after, share = _neighbours(frames, len(cells))
+    for frame in np.flatnonzero(share).tolist():
+        weight = np.float32(share[frame])
+        cells[frame] = (1 - weight) * cells[before[frame]] + weight * cells[after[frame]]
 
 
 @cache
@@ -118,14 +198,20 @@ _MIN_MOVING = 12
 """A lag is told from this many frames on in which the drawn cells change by so much (root mean square, of 255)."""
 
 
-def compare(seen: Cells, drawn: Cells) -> Comparison:
-    """Least squares over all frames: seen = drawn, but shifted, scaled and turned by one amount each."""
+def compare(seen: Cells, drawn: Cells, frames: NDArray[np.int64]) -> Comparison:
+    """Least squares over the drawn frames: seen = drawn, but shifted, scaled and turned by one amount each.
+
+    Args:
+        seen: (T, h, w, channels) as recorded.
+        drawn: The same of at least T frames, as of `DrawnPictures.cells`.
+        frames: Those that were drawn.
+    """
     from demorec.check import kernels
 
-    drawn = drawn[: len(seen)]
+    drawn, frames = drawn[: len(seen)], frames[frames < len(seen)]
     # Frames that are something else altogether must not decide how far the others are shifted.
-    size = _rms(seen - drawn)
-    usual = np.flatnonzero(size <= 3 * np.median(size) + 1e-6)
+    size = _rms(seen, drawn, frames)
+    usual = frames[size <= 3 * np.median(size) + 1e-6]
     gram, right = np.zeros((4, 4)), np.zeros(4)
     kernels.normal_equations(seen, drawn, usual, gram, right)
     # Enough that a direction in which nothing can be told gets nothing.
@@ -133,17 +219,16 @@ def compare(seen: Cells, drawn: Cells) -> Comparison:
     found = np.linalg.solve(gram, right)
     fitted = np.empty_like(drawn)
     kernels.add_bases(drawn, found, fitted)
-    step, observed = np.zeros_like(drawn), np.zeros_like(drawn)
-    np.subtract(drawn[1:], drawn[:-1], out=step[1:])
-    np.subtract(seen[1:], seen[:-1], out=observed[1:])
-    motion = _rms(step)
+    moved, shown = np.zeros(len(seen)), np.zeros(len(seen))
+    kernels.compare_steps(_flat(seen), _flat(drawn), moved, shown)
+    motion = np.sqrt(moved / max(drawn[0].size, 1))
     return Comparison(
         shift=found[:2] / drawn.shape[1],
         scale=float(found[2]),
-        lag=_lag(seen, fitted, motion > _MOVING),
-        unlike=_rms(seen - fitted),
+        lag=_lag(seen, fitted, frames[motion[frames] > _MOVING]),
+        unlike=_rms(seen, fitted, np.arange(len(seen))),
         motion=motion,
-        shown=_products(observed, step) / np.maximum(_products(step, step), 1e-6),
+        shown=shown / np.maximum(moved, 1e-6),
     )
 
 
@@ -165,23 +250,27 @@ def strays(seen: Cells, drawn: Cells) -> Array:
     return np.asarray(off.sum(axis=(1, 2)) / max(height * width, 1), dtype=np.float64)
 
 
-def _rms(cells: Cells) -> Array:
-    """(T,) root mean square over each frame's cells."""
-    return np.asarray(np.sqrt(_products(cells, cells) / max(cells[0].size, 1)), dtype=np.float64)
+def _rms(a: Cells, b: Cells, frames: NDArray[np.int64], late: int = 0) -> Array:
+    """Root mean square difference over the cells, of some frames of b from those `late` frames later in a."""
+    from demorec.check import kernels
+
+    squares = np.zeros(len(frames))
+    kernels.squares(_flat(a), _flat(b), frames, late, squares)
+    return np.asarray(np.sqrt(squares / max(b[0].size, 1)), dtype=np.float64)
 
 
-def _products(a: Cells, b: Cells) -> Array:
-    """(T,) sum of the products of each frame's cells."""
-    return np.asarray(np.einsum("ti,ti->t", a.reshape(len(a), -1), b.reshape(len(b), -1)), dtype=np.float64)
+def _flat(cells: Cells) -> Cells:
+    """(T, K) all numbers of each frame."""
+    return np.ascontiguousarray(cells).reshape(len(cells), -1)
 
 
-def _lag(seen: Cells, drawn: Cells, moving: NDArray[np.bool_]) -> float | None:
+def _lag(seen: Cells, drawn: Cells, moving: NDArray[np.int64]) -> float | None:
     """By how many frames `seen` runs behind `drawn`: whole lags, and a parabola through the best and its neighbours."""
-    rows = np.flatnonzero(moving[_MAX_LAG : len(seen) - _MAX_LAG]) + _MAX_LAG
+    rows = moving[(moving >= _MAX_LAG) & (moving < len(seen) - _MAX_LAG)]
     if len(rows) < _MIN_MOVING:
         return None
     lags = range(-_MAX_LAG, _MAX_LAG + 1)
-    errors = [float((_rms(seen[rows] - drawn[rows - lag]) ** 2).mean()) for lag in lags]
+    errors = [float((_rms(seen, drawn, rows, lag) ** 2).mean()) for lag in lags]
     best = int(np.argmin(errors))
     if best in (0, len(errors) - 1):
         return float(lags[best])

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from demorec.check.base import Found, Measurement, NotMeasured, check, worst
 from demorec.check.episode import RecordedEpisode
-from demorec.check.rows import link_matrices, longest_run
+from demorec.check.rows import longest_run
 from demorec.errors import SceneError
 from demorec.geometry import Array
 from demorec.scene.assets import asset_path
@@ -47,14 +47,11 @@ class _Dynamics:
 
     def __init__(self, episode: RecordedEpisode) -> None:
         self.episode = episode
-        self._positions = dict(zip(episode.info.robot.joint_names, episode.columns.joint_position.T, strict=True))
         self.loads = [*self._link_loads(), *self._carried_loads()]
 
     def frames_of(self, link: str) -> Array:
         """(T, 4, 4) world_from_link."""
-        episode = self.episode
-        poses = link_matrices(episode.urdf, link, self._positions, episode.num_frames)
-        return np.asarray(episode.world_from_base @ poses)
+        return np.asarray(self.episode.world_from_base @ self.episode.base_from_link(link))
 
     def _link_loads(self) -> list[_Load]:
         episode = self.episode

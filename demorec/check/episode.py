@@ -15,15 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.check.base import NotMeasured
-from demorec.check.cells import Cells, Kind
-from demorec.check.drawn import NOT_DRAWABLE, Comparison, compare, draw_all, strays
+from demorec.check.cells import Kind
+from demorec.check.drawn import NOT_DRAWABLE, Comparison, DrawnPictures, compare, draw_all, strays
 from demorec.check.pictures_summary import PictureSummary, summarise
-from demorec.check.rows import link_matrices, matrices
+from demorec.check.rows import LinkMatrices, matrices
 from demorec.errors import RecordingError
 from demorec.geometry import Array
-from demorec.recording import Recording
+from demorec.recording import Recording, channels
+from demorec.recording.chunks import Block
 from demorec.recording.container import Container
-from demorec.scene.episode import EpisodeColumns, EpisodeInfo, frame_time_ns
+from demorec.scene.episode import EpisodeColumns, EpisodeInfo, Event, frame_time_ns
 from demorec.scene.scene import Camera
 from demorec.scene.urdf import Urdf
 
@@ -37,6 +38,9 @@ _STAMP_FIRST = {
     "rcl_interfaces/msg/Log",
 }
 """Types whose first field is a time stamp, alone or in a header."""
+_STAMP = np.dtype([("seconds", "<i4"), ("nanoseconds", "<u4")])
+_STAMP_BYTES = 4 + _STAMP.itemsize
+"""A stamp with the four bytes of CDR's head before it."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -66,6 +70,7 @@ class RecordedEpisode:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._recording: Recording | None = None
+        self._container: Container | None = None
         self._pictures: dict[tuple[str, Kind], PictureSummary] = {}
         self._comparisons: dict[tuple[str, Kind], Comparison] = {}
 
@@ -81,6 +86,8 @@ class RecordedEpisode:
         """Close the file; harmless when called twice."""
         if self._recording is not None:
             self._recording.close()
+        if self._container is not None:
+            self._container.close()
 
     @property
     def recording(self) -> Recording:
@@ -114,35 +121,48 @@ class RecordedEpisode:
         """Every message of every topic, read once: every chunk's checksum is verified on the way."""
         with self.container() as container:
             schemas = {name: container.schemas[c.schema_id].name for name, c in container.channels.items()}
-            times: dict[str, list[int]] = {topic: [] for topic in schemas}
-            stamps: dict[str, list[int]] = {topic: [] for topic in schemas}
+            found = {topic: _scan(schemas[topic], block) for topic, block in self.blocks.items()}
+            pictures = [topic for topic in schemas if topic not in found]
+            times: dict[str, list[int]] = {topic: [] for topic in pictures}
+            stamps: dict[str, list[int]] = {topic: [] for topic in pictures}
             first: dict[str, bytes] = {}
-            stamped = {topic for topic, schema in schemas.items() if schema in _STAMP_FIRST}
-            for topic, time_ns, data in container.messages(list(schemas)):
+            for topic, time_ns, data in container.messages(pictures):
                 times[topic].append(time_ns)
-                if topic in stamped:
-                    stamps[topic].append(_stamp(data))
+                stamps[topic].append(_stamp(data))
                 first.setdefault(topic, data)
             for name in container.attachment_names:
                 container.attachment(name)
-        return {
-            topic: TopicScan(
-                schema=schema,
+        for topic in pictures:
+            found[topic] = TopicScan(
+                schema=schemas[topic],
                 time_ns=np.array(times[topic], dtype=np.int64),
-                stamp_ns=np.array(stamps[topic], dtype=np.int64) if topic in stamped else None,
+                stamp_ns=np.array(stamps[topic], dtype=np.int64) if schemas[topic] in _STAMP_FIRST else None,
                 first=first.get(topic, b""),
             )
-            for topic, schema in schemas.items()
-        }
+        return {topic: found[topic] for topic in schemas}
+
+    @cached_property
+    def blocks(self) -> dict[str, Block]:
+        """topic -> all its messages, but for pictures, which would be too large to be in memory together."""
+        with self.container() as container:
+            pictures = {
+                channels.camera_topic(camera.name, stream)
+                for camera in self.cameras
+                for stream in channels.PICTURE_STREAMS
+            }
+            return container.blocks([topic for topic in container.channels if topic not in pictures])
+
+    def block(self, topic: str) -> Block:
+        """All messages of a topic that is none of pictures; an empty one where there is no such topic."""
+        nothing = np.zeros(0, dtype=np.int64)
+        return self.blocks.get(topic, Block(content=b"", time_ns=nothing, starts=nothing, lengths=nothing))
 
     @contextmanager
     def container(self) -> Iterator[Container]:
         """The file's messages and metadata as they are."""
-        container = Container(self.path)
-        try:
-            yield container
-        finally:
-            container.close()
+        if self._container is None:
+            self._container = Container(self.path)
+        yield self._container
 
     @cached_property
     def index_counts(self) -> dict[str, int]:
@@ -159,13 +179,32 @@ class RecordedEpisode:
     @cached_property
     def urdf(self) -> Urdf:
         """The robot's joint tree, from the URDF that the recording itself contains (already scaled)."""
-        return Urdf.parse(self.recording.description())
+        return Urdf.parse(self.description)
 
-    def base_from_link(self, link: str, joint_position: Array) -> Array:
-        """(T, 4, 4) by forward kinematics of (T, n_arm) or (T, n_joints) positions; RecordingError: unknown link."""
+    @cached_property
+    def description(self) -> str:
+        """The recorded URDF of the robot."""
+        return self.recording.description()
+
+    @cached_property
+    def events(self) -> tuple[tuple[int, Event], ...]:
+        """(time_ns, event) in order of time, without changes of phase."""
+        return tuple(self.recording.events())
+
+    def kinematics(self, joint_position: Array) -> LinkMatrices:
+        """Forward kinematics of (T, n_arm) or (T, n_joints) positions."""
         by_name = dict(zip(self.info.robot.joint_names, joint_position.T, strict=False))
+        return LinkMatrices(self.urdf, by_name, len(joint_position))
+
+    @cached_property
+    def recorded_kinematics(self) -> LinkMatrices:
+        """Forward kinematics of the recorded joints."""
+        return self.kinematics(self.columns.joint_position)
+
+    def base_from_link(self, link: str, kinematics: LinkMatrices | None = None) -> Array:
+        """(T, 4, 4), by default of the recorded joints; RecordingError: unknown link."""
         try:
-            return link_matrices(self.urdf, link, by_name, len(joint_position))
+            return (kinematics or self.recorded_kinematics)[link]
         except KeyError as error:
             raise RecordingError(f"The recorded URDF has no link {link!r}: {self.path}") from error
 
@@ -177,7 +216,7 @@ class RecordedEpisode:
     @cached_property
     def world_from_tcp(self) -> Array:
         """(T, 4, 4) by forward kinematics of the recorded joints."""
-        fk = self.base_from_link(self.info.robot.tcp_link, self.columns.joint_position)
+        fk = self.base_from_link(self.info.robot.tcp_link)
         return np.asarray(self.world_from_base @ fk)
 
     def world_from_object(self, name: str) -> Array:
@@ -208,10 +247,13 @@ class RecordedEpisode:
         return self._pictures[camera.name, kind]
 
     @cached_property
-    def _drawn(self) -> dict[tuple[str, Kind], Cells] | NotMeasured:
-        """Every picture as the recorded numbers make it."""
+    def _drawn(self) -> DrawnPictures | NotMeasured:
+        """The pictures as the recorded numbers make them; each single one where some are coded without loss."""
+        kinds = {camera.name: self.kinds(camera.name) for camera in self.cameras}
+        is_lossy = all(of_camera == ("color",) for of_camera in kinds.values())
+        seen = [self.pictures(camera).cells for camera in self.cameras] if is_lossy else None
         try:
-            return draw_all(self.info, self.columns, {camera.name: self.kinds(camera.name) for camera in self.cameras})
+            return draw_all(self.info, self.columns, kinds, seen)
         except NOT_DRAWABLE as error:
             return NotMeasured(why=f"the recording cannot be drawn here: {error}")
 
@@ -222,7 +264,7 @@ class RecordedEpisode:
         seen = self.pictures(camera, kind).cells
         if not len(seen):
             return NotMeasured(why=f"camera {camera.name} has no picture that can be read")
-        return strays(seen, self._drawn[camera.name, kind])
+        return strays(seen, self._drawn.cells[camera.name, kind])
 
     def compared(self, camera: Camera, kind: Kind = "color") -> Comparison | NotMeasured:
         """A camera's pictures against what the recorded numbers make of them."""
@@ -235,8 +277,20 @@ class RecordedEpisode:
         if len(seen) < 3:
             return NotMeasured(why=f"camera {camera.name} has {len(seen)} pictures")
         if (camera.name, kind) not in self._comparisons:
-            self._comparisons[camera.name, kind] = compare(seen, self._drawn[camera.name, kind])
+            drawn = self._drawn
+            self._comparisons[camera.name, kind] = compare(seen, drawn.cells[camera.name, kind], drawn.frames)
         return self._comparisons[camera.name, kind]
+
+
+def _scan(schema: str, block: Block) -> TopicScan:
+    stamps = None
+    if schema in _STAMP_FIRST and len(block) and int(block.lengths.min()) >= _STAMP_BYTES:
+        told = np.ascontiguousarray(block.heads(_STAMP_BYTES)[:, 4:]).view(_STAMP).reshape(-1)
+        stamps = told["seconds"] * np.int64(1_000_000_000) + told["nanoseconds"]
+    elif schema in _STAMP_FIRST:
+        stamps = np.array([_stamp(data) for data in block.messages()], dtype=np.int64)
+    first = next(block.messages(), b"")
+    return TopicScan(schema=schema, time_ns=block.time_ns, stamp_ns=stamps, first=first)
 
 
 def _stamp(data: bytes) -> int:

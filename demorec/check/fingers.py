@@ -96,11 +96,11 @@ def finger_depth(episode: RecordedEpisode) -> Measurement | None:
     The fingers are those of the recorded description, within a tenth of a millimetre. Not measured where no finger
     comes within a millimetre of an object.
     """
-    robot, c = episode.info.robot, episode.columns
-    links = {link.name: link for link in read_links(episode.recording.description())}
+    robot = episode.info.robot
+    links = {link.name: link for link in read_links(episode.description)}
     found = []
     for name in robot.gripper.finger_links:
-        finger = episode.world_from_base @ episode.base_from_link(name, c.joint_position)
+        finger = episode.world_from_base @ episode.base_from_link(name)
         parts = [Convex.of_shape(shape).moved(shape.link_from_shape.matrix()) for shape in links[name].visuals]
         reach = max((float(np.linalg.norm(part.points, axis=1).max()) + part.radius for part in parts), default=0.0)
         for body in episode.info.scene.movable:

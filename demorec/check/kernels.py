@@ -127,3 +127,51 @@ def add_bases(drawn: NDArray[np.float32], amounts: NDArray[np.float64], fitted: 
                     right, down, larger, turned = _bases(drawn[t], i, j, c)
                     change = amounts[0] * right + amounts[1] * down + amounts[2] * larger + amounts[3] * turned
                     fitted[t, i, j, c] = drawn[t, i, j, c] + change
+
+
+@_njit  # type: ignore[untyped-decorator]
+def squares(
+    a: NDArray[np.float32], b: NDArray[np.float32], frames: NDArray[np.int64], late: int, sums: NDArray[np.float64]
+) -> None:
+    """Fill sums (N,): squared differences of b (T, K) at each frame from a (T, K) so many frames later."""
+    for i in range(len(frames)):
+        x, y = a[frames[i] + late], b[frames[i]]
+        total = 0.0
+        for k in range(len(y)):
+            difference = x[k] - y[k]
+            total += difference * difference
+        sums[i] = total
+
+
+@_njit  # type: ignore[untyped-decorator]
+def squares_between(
+    rows: NDArray[np.float32],
+    before: NDArray[np.int64],
+    after: NDArray[np.int64],
+    share: NDArray[np.float64],
+    sums: NDArray[np.float64],
+) -> None:
+    """Fill sums (N,): squared differences of each of rows (T, K) from the mean of two others, weighted by share."""
+    for t in range(len(sums)):
+        weight = np.float32(share[t])
+        x, a, b = rows[t], rows[before[t]], rows[after[t]]
+        total = 0.0
+        for k in range(len(x)):
+            difference = x[k] - (a[k] + weight * (b[k] - a[k]))
+            total += difference * difference
+        sums[t] = total
+
+
+@_njit  # type: ignore[untyped-decorator]
+def compare_steps(
+    seen: NDArray[np.float32], drawn: NDArray[np.float32], moved: NDArray[np.float64], shown: NDArray[np.float64]
+) -> None:
+    """Fill moved (T,) with the squared change of drawn (T, K) from frame to frame, shown (T,) with its product with
+    the change of seen (T, K); 0 at the first frame."""
+    for t in range(1, len(seen)):
+        size = product = 0.0
+        for k in range(seen.shape[1]):
+            step = drawn[t, k] - drawn[t - 1, k]
+            size += step * step
+            product += step * (seen[t, k] - seen[t - 1, k])
+        moved[t], shown[t] = size, product

@@ -27,7 +27,7 @@ def _speeds(episode: RecordedEpisode, name: str) -> Array:
 def _near_hand(episode: RecordedEpisode, body: Body) -> NDArray[np.bool_]:
     """(T,) whether hand or fingers may touch a body: its bounding sphere and a hand's breadth overlap."""
     radius = math.hypot(*body.shape.extents) / 2
-    hand = episode.base_from_link(episode.info.robot.hand_link, episode.columns.joint_position)
+    hand = episode.base_from_link(episode.info.robot.hand_link)
     hand = episode.world_from_base @ hand
     centre = episode.columns.object_poses[body.name][:, :3]
     near_tcp = np.linalg.norm(episode.world_from_tcp[:, :3, 3] - centre, axis=1) < radius + 0.06

@@ -189,13 +189,13 @@ def forward_kinematics(episode: RecordedEpisode) -> Measurement | None:
     """Observed, wanted and commanded TCP poses are those of their joints (0.1 m per rad of rotation added)."""
     c, link = episode.columns, episode.info.robot.tcp_link
     rows = (
-        ("observed", c.base_from_tcp, c.joint_position),
-        ("action", c.action_base_from_tcp, c.action_joint_target),
-        ("command", c.command_base_from_tcp, c.command_joint_target),
+        ("observed", c.base_from_tcp, episode.recorded_kinematics),
+        ("action", c.action_base_from_tcp, episode.kinematics(c.action_joint_target)),
+        ("command", c.command_base_from_tcp, episode.kinematics(c.command_joint_target)),
     )
     found = []
-    for name, poses, joints in rows:
-        off = displacement(matrices(poses), episode.base_from_link(link, joints))
+    for name, poses, kinematics in rows:
+        off = displacement(matrices(poses), episode.base_from_link(link, kinematics))
         if len(off):
             frame = int(np.argmax(off))
             found.append(Measurement(value=float(off[frame]), frame=frame, detail=name))
@@ -286,7 +286,7 @@ def wrench_holds_the_hand(episode: RecordedEpisode) -> Measurement | None:
     gravity = np.array(episode.info.scene.physics.gravity)
     if c.wrench is None or c.num_frames < 3 or not gravity.any():
         return None
-    hand = episode.world_from_base @ episode.base_from_link(episode.info.robot.hand_link, c.joint_position)
+    hand = episode.world_from_base @ episode.base_from_link(episode.info.robot.hand_link)
     force = (hand[:, :3, :3] @ c.wrench[:, :3, None])[1:-1, :, 0]
     steady = np.linalg.norm(np.diff(hand[:, :3, 3], 2, axis=0), axis=1) * fps**2 < 0.05 * np.linalg.norm(gravity)
     steady &= c.contact_force[1:-1] == 0

@@ -12,7 +12,7 @@ import numpy as np
 
 from demorec.check.base import Found, Measurement, NotMeasured, check, worst
 from demorec.check.episode import RecordedEpisode
-from demorec.check.rows import displacement, joint_matrices, matrices
+from demorec.check.rows import displacement, matrices
 from demorec.errors import SceneError
 from demorec.geometry import Array
 from demorec.recording import channels, messages, metadata
@@ -105,12 +105,11 @@ def moving_frames(episode: RecordedEpisode) -> Found:
     Distances in metres, with 0.1 m per rad of rotation.
     """
     robot, c = episode.info.robot, episode.columns
-    number = {name: index for index, name in enumerate(robot.joint_names)}
-    joints = [joint for joint in episode.urdf.joints if joint.kind != "fixed" and joint.name in number]
+    joints = [joint for joint in episode.urdf.joints if joint.kind != "fixed" and joint.name in robot.joint_names]
     names = [body.name for body in episode.info.scene.movable]
     layout = transforms_layout([*((j.parent, j.child) for j in joints), *((WORLD, name) for name in names)])
-    with episode.container() as container, damage_as_recording_error(episode.path):
-        block = container.blocks((channels.TF,))[channels.TF]
+    block = episode.block(channels.TF)
+    with damage_as_recording_error(episode.path):
         rows = layout.decode_rows(block.rows(len(layout.constant)))
     if len(rows) != c.num_frames:
         return Measurement(value=math.inf, detail=f"{len(rows)} messages for {c.num_frames} frames")
@@ -118,7 +117,7 @@ def moving_frames(episode: RecordedEpisode) -> Found:
     if any(stale):
         return Measurement(value=math.inf, frame=stale.index(True), detail="stamps inside are of another time")
     values = rows.reshape(len(rows), -1, 7)
-    expected = [joint_matrices(joint, c.joint_position[:, number[joint.name]]) for joint in joints]
+    expected = [episode.recorded_kinematics.parent_from_child(joint) for joint in joints]
     expected += [episode.world_from_object(name) for name in names]
     found: list[Measurement | None] = []
     for index, (name, poses) in enumerate(zip([*(j.child for j in joints), *names], expected, strict=True)):
@@ -161,13 +160,13 @@ def derived_values(episode: RecordedEpisode) -> Found:
 
 def _values(episode: RecordedEpisode, topics: tuple[str, ...]) -> dict[str, Array]:
     """topic -> (T, K) all values of its messages, those that become no column too."""
-    with episode.container() as container:
-        blocks = container.blocks(topics)
     rows = {}
     for stream in frame_streams(episode.info):
         if stream.topic in topics:
             with damage_as_recording_error(episode.path):
-                rows[stream.topic] = stream.layout.decode_rows(blocks[stream.topic].rows(len(stream.layout.constant)))
+                rows[stream.topic] = stream.layout.decode_rows(
+                    episode.block(stream.topic).rows(len(stream.layout.constant))
+                )
     return rows
 
 
@@ -182,14 +181,13 @@ def _values(episode: RecordedEpisode, topics: tuple[str, ...]) -> dict[str, Arra
 )
 def phase_events(episode: RecordedEpisode) -> Measurement:
     """Every change of /phase is in /events at the same time, and no other; every event reads and writes alike."""
-    changes, logged, wrong = [], [], 0
-    with episode.container() as container:
-        for topic, time_ns, data in container.messages((channels.PHASE, channels.EVENTS)):
-            with damage_as_recording_error(episode.path):
-                if topic == channels.PHASE:
-                    changes.append((time_ns, messages.read_string(data)))
-                    continue
-                event = messages.read_log(data)
+    phases, events = episode.block(channels.PHASE), episode.block(channels.EVENTS)
+    logged, wrong = [], 0
+    with damage_as_recording_error(episode.path):
+        told = map(messages.read_string, phases.messages())
+        changes = list(zip(phases.time_ns.tolist(), told, strict=True))
+        for time_ns, data in zip(events.time_ns.tolist(), events.messages(), strict=True):
+            event = messages.read_log(data)
             wrong += data != messages.log(time_ns, event)
             if event.name == channels.PHASE_EVENT:
                 logged.append((time_ns, event.message))

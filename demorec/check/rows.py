@@ -37,16 +37,33 @@ def inverse(transforms: Array) -> Array:
     return out
 
 
-def link_matrices(urdf: Urdf, link: str, joint_position: Mapping[str, Array], count: int) -> Array:
-    """(T, 4, 4) base_from_link, given joint name -> (T,) positions (rad, m); KeyError when there is no such link."""
-    total = np.broadcast_to(np.eye(4), (count, 4, 4)).copy()
-    for joint in urdf.path_to(link):
-        position = joint_position.get(joint.name)
+class LinkMatrices:
+    """Forward kinematics of some joint positions: each link's poses are computed once, when they are asked for.
+
+    Args:
+        urdf: The joint tree.
+        joint_position: Joint name -> (T,) positions, rad or m; joints left out are at 0.
+        count: T.
+    """
+
+    def __init__(self, urdf: Urdf, joint_position: Mapping[str, Array], count: int) -> None:
+        self._joint_position = joint_position
+        self._above = {joint.child: joint for joint in urdf.joints}
+        self._known = {urdf.root: np.broadcast_to(np.eye(4), (count, 4, 4))}
+
+    def __getitem__(self, link: str) -> Array:
+        """(T, 4, 4) base_from_link; KeyError when there is no such link."""
+        if link not in self._known:
+            joint = self._above[link]
+            self._known[link] = self[joint.parent] @ self.parent_from_child(joint)
+        return self._known[link]
+
+    def parent_from_child(self, joint: UrdfJoint) -> Array:
+        """(T, 4, 4), or (4, 4) where a joint does not move."""
+        position = self._joint_position.get(joint.name)
         if position is None or joint.kind == "fixed":
-            total = total @ joint.parent_from_joint.matrix()
-        else:
-            total = total @ joint_matrices(joint, position)
-    return total
+            return joint.parent_from_joint.matrix()
+        return joint_matrices(joint, position)
 
 
 def joint_matrices(joint: UrdfJoint, position: Array) -> Array:

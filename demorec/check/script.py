@@ -135,7 +135,7 @@ def story(episode: RecordedEpisode) -> Found:
     ]
     wrong = [text for _, text in strange]
     approaches = [stretch.first for stretch in stretches if stretch.phase in ("approach", "above_cube")]
-    grasps = [time_ns for time_ns, event in episode.recording.events() if event.name == "grasp"]
+    grasps = [time_ns for time_ns, event in episode.events if event.name == "grasp"]
     if len(grasps) != len(approaches):
         wrong.append(f"{len(grasps)} grasps announced, {len(approaches)} approached")
     else:
@@ -169,7 +169,7 @@ def deliberate_misses(episode: RecordedEpisode) -> Found:
     flags, behaviour = episode.columns.is_deliberate_miss, episode.info.behaviour
     told = [
         int(np.searchsorted(episode.frame_times, time_ns))
-        for time_ns, event in episode.recording.events()
+        for time_ns, event in episode.events
         if event.name == "miss" and event.message.endswith("on purpose")
     ]
     starts = np.flatnonzero(np.diff(np.concatenate([[False], flags])) & flags).tolist()

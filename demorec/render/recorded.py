@@ -35,6 +35,7 @@ class RecordedWorld:
     Attributes:
         scene: The scene.
         frame: Which state is shown, 0 .. T - 1.
+        all_poses: (T, n, 7) poses of all bodies and links at every frame, as `poses` gives them of one.
 
     Raises:
         SceneError: A model file is missing or broken.
@@ -62,7 +63,7 @@ class RecordedWorld:
             poses.append(_poses_of_movable(object_poses[body.name], model))
         self._visuals = tuple(bodies)
         count = len(joint_position)
-        self._poses = np.concatenate([np.broadcast_to(rows, (count, *rows.shape[1:])) for rows in poses], axis=1)
+        self.all_poses = np.concatenate([np.broadcast_to(rows, (count, *rows.shape[1:])) for rows in poses], axis=1)
 
     def visuals(self) -> tuple[VisualBody, ...]:
         """What can be seen: the fixed bodies, the robot, the movable bodies."""
@@ -74,7 +75,7 @@ class RecordedWorld:
 
     def poses(self) -> Array:
         """(n, 7) poses of all bodies and links at the present frame, as `Renderer.render` takes them."""
-        return np.asarray(self._poses[self.frame])
+        return np.asarray(self.all_poses[self.frame])
 
 
 def _poses_of_fixed(body: Body, model: BulletBody | None) -> Array:

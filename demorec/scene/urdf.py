@@ -6,6 +6,7 @@ import math
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import cast
 
@@ -36,6 +37,7 @@ def parse_xml(text: str) -> ET.Element:
         raise ValueError(f"the URDF is no XML ({error})") from error
 
 
+@lru_cache(maxsize=8)  # all recordings of a robot have the same
 def check_primitives(text: str) -> None:
     """ValueError unless a URDF can be used, and drawn without any other file: boxes, balls and cylinders alone."""
     Urdf.parse(text)
@@ -118,6 +120,7 @@ class Urdf:
         return cls.parse(path.read_text(), scale=scale)
 
     @classmethod
+    @lru_cache(maxsize=8)
     def parse(cls, text: str, *, scale: float = 1.0) -> Urdf:
         """The same from its text; ValueError also when that is no XML, or its joints are no tree."""
         robot = parse_xml(text)

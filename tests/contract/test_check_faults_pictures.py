@@ -5,7 +5,7 @@ The pictures of a good recording are decoded once and changed in memory.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import pytest
@@ -14,6 +14,10 @@ from support.check import checked, simulate
 from support.faults import Good, Rows
 
 from demorec.check.cells import Kind
+from demorec.check.drawn import Comparison, DrawnPictures, fill_between, frames_to_draw
+from demorec.check.episode import RecordedEpisode
+from demorec.geometry import Array
+from demorec.render.recorded import RecordedWorld
 from demorec.tables import CHECKS
 
 Fault = Callable[[Rows], Rows]
@@ -203,6 +207,59 @@ def test_a_fault(camera: str, kind: Kind, name: str, fault: Fault, check: str, g
     assert result.level == "fail", (result.value, result.detail)
 
 
+@pytest.fixture(scope="module")
+def poses(good: Good) -> Array:
+    """(T, n, 7) of everything that can be seen."""
+    info, columns = good.episode.info, good.episode.columns
+    joints, objects = columns.joint_position, columns.object_poses
+    return RecordedWorld(info.robot, info.scene, joint_position=joints, object_poses=objects).all_poses
+
+
+def drawn_in_part(good: Good, changed: Mapping[tuple[str, Kind], Rows], poses: Array) -> RecordedEpisode:
+    """The episode with other pictures, as if it had colour alone: only some of its frames are drawn."""
+    episode, whole = good.with_pictures(changed), good.episode._drawn
+    assert isinstance(whole, DrawnPictures)
+    frames = frames_to_draw([episode.pictures(camera).cells for camera in episode.cameras], poses)
+    cells = {key: rows.copy() for key, rows in whole.cells.items() if key[1] == "color"}
+    for rows in cells.values():
+        rows[np.setdiff1d(np.arange(len(rows)), frames)] = 0  # so that nothing but what is drawn counts
+        fill_between(rows, frames)
+    episode.__dict__["_drawn"] = DrawnPictures(frames=frames, cells=cells)
+    episode._comparisons.clear()
+    return episode
+
+
+def test_the_good_one_passes_drawn_in_part(good: Good, poses: Array) -> None:
+    episode = drawn_in_part(good, {}, poses)
+    assert isinstance(episode._drawn, DrawnPictures)
+    assert len(episode._drawn.frames) < 0.9 * episode.num_frames
+    for name in sorted({check for *_, check in COLOR} - {"picture_lag"}):  # it also asks for depth and labels
+        result = CHECKS.load(name).run(episode)
+        assert result.level == "pass", (name, result.value, result.detail)
+    for camera in episode.cameras:
+        part, whole = episode.compared(camera), good.episode.compared(camera)
+        assert isinstance(part, Comparison)
+        assert isinstance(whole, Comparison)
+        assert part.lag == pytest.approx(whole.lag, abs=0.03)
+        assert part.shift == pytest.approx(whole.shift, abs=0.001)
+
+
+@pytest.mark.parametrize(("name", "fault", "check"), COLOR, ids=[name for name, *_ in COLOR])
+@pytest.mark.parametrize("camera", ["front", pytest.param("wrist", marks=pytest.mark.slow)])
+def test_a_fault_of_one_drawn_in_part(
+    camera: str, name: str, fault: Fault, check: str, good: Good, poses: Array
+) -> None:
+    episode = drawn_in_part(good, {(camera, "color"): fault(good.pictures[camera, "color"])}, poses)
+    if check == "picture_lag":
+        compared = episode.compared(next(c for c in episode.cameras if c.name == camera))
+        assert isinstance(compared, Comparison)
+        assert compared.lag is not None
+        assert abs(compared.lag) > CHECKS.load(check).fail
+        return
+    result = CHECKS.load(check).run(episode)
+    assert result.level == "fail", (result.value, result.detail)
+
+
 def test_what_does_not_move_is_not_measured(good: Good) -> None:
     still = RecordedStill(good)
     result = CHECKS.load("picture_lag").run(still.episode)
@@ -217,7 +274,6 @@ class RecordedStill:
         first = {key: np.repeat(rows[:1], len(rows), axis=0) for key, rows in good.pictures.items()}
         self.episode = good.with_pictures(first)
         drawn = good.episode._drawn
-        assert isinstance(drawn, dict)
-        self.episode.__dict__["_drawn"] = {
-            key: np.repeat(cells[:1], len(cells), axis=0) for key, cells in drawn.items()
-        }
+        assert isinstance(drawn, DrawnPictures)
+        still = {key: np.repeat(cells[:1], len(cells), axis=0) for key, cells in drawn.cells.items()}
+        self.episode.__dict__["_drawn"] = DrawnPictures(frames=drawn.frames, cells=still)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from support.recording import write_episode
 
 from demorec.check.cells import DEPTH_RANGE, CellGrid, Cells, cell_counts
-from demorec.check.drawn import compare, draw_all
+from demorec.check.drawn import compare, draw_all, frames_to_draw
 from demorec.errors import RecordingError
 from demorec.geometry import Array
 from demorec.recording import Recording
@@ -69,7 +69,7 @@ def test_drawn_pictures_have_the_grid_of_the_recorded_ones(tmp_path: Path) -> No
     path = write_episode(tmp_path / "e.mcap", num_frames=2, cameras=("front",), width=500, height=224)
     with Recording(path) as recording:
         drawn = draw_all(recording.info, recording.columns(), {"front": ("color",)})
-    assert drawn["front", "color"].shape == (2, 13, 28, 3)
+    assert drawn.cells["front", "color"].shape == (2, 13, 28, 3)
 
 
 def waves(x: Array, y: Array, t: Array) -> Cells:
@@ -85,11 +85,46 @@ MIDDLE = 13.5
 def test_a_known_shift_and_size_are_measured() -> None:
     """The pictures are shifted by 0.1 cells to the right and 0.05 up, and things in them are 2 % larger."""
     seen = waves((X - 0.1 - MIDDLE) / 1.02 + MIDDLE, (Y + 0.05 - MIDDLE) / 1.02 + MIDDLE, T)
-    found = compare(seen, waves(X, Y, T))
+    found = compare(seen, waves(X, Y, T), np.arange(60))
     assert found.shift * 28 == pytest.approx([0.1, -0.05], abs=0.02)
     assert found.scale == pytest.approx(0.02, abs=0.004)
 
 
 def test_a_known_lag_is_measured() -> None:
-    found = compare(waves(X, Y, T - 2.3), waves(X, Y, T))
+    found = compare(waves(X, Y, T - 2.3), waves(X, Y, T), np.arange(60))
     assert found.lag == pytest.approx(2.3, abs=0.1)
+
+
+def test_frames_are_drawn_that_are_not_what_lies_between_their_neighbours() -> None:
+    """Every third frame and the last; a picture that jumps, and a pose that does, though no picture shows it."""
+    seen = np.full((14, 4, 4, 3), 100.0, dtype=np.float32) + np.arange(14, dtype=np.float32)[:, None, None, None]
+    poses = np.zeros((14, 2, 7))
+    poses[:, 1, 0] = 0.02 * np.arange(14)  # an even motion lies between
+    assert frames_to_draw([seen], poses).tolist() == [0, 3, 6, 9, 12, 13]
+    odd = seen.copy()
+    odd[7] += 3.0
+    assert frames_to_draw([seen, odd], poses).tolist() == [0, 3, 6, 7, 9, 12, 13]
+    poses[5, 1, 2] = 0.006
+    assert frames_to_draw([seen], poses).tolist() == [0, 3, 5, 6, 9, 12, 13]
+
+
+def test_frames_without_a_readable_neighbour_are_drawn() -> None:
+    """The camera's pictures end after frame 7: nothing tells 7 from both sides."""
+    poses = np.zeros((14, 1, 7))
+    assert frames_to_draw([np.zeros((8, 4, 4, 3), dtype=np.float32)], poses).tolist() == [0, 3, 6, 7, 9, 12, 13]
+
+
+def test_pictures_that_are_not_drawn_are_means_of_those_around(tmp_path: Path) -> None:
+    """Against the same episode drawn in every frame, whose joints move evenly."""
+    path = write_episode(tmp_path / "e.mcap", num_frames=5, cameras=("front",), width=64, height=64)
+    with Recording(path) as recording:
+        info, columns = recording.info, recording.columns()
+        whole = draw_all(info, columns, {"front": ("color",)}).cells["front", "color"]
+        still = np.zeros_like(whole)
+        drawn = draw_all(info, columns, {"front": ("color",)}, [still])
+    found = drawn.cells["front", "color"]
+    assert drawn.frames.tolist() != list(range(5))
+    for frame in drawn.frames.tolist():
+        np.testing.assert_array_equal(found[frame], whole[frame])
+    if 1 not in drawn.frames and 2 not in drawn.frames:
+        np.testing.assert_allclose(found[1], (2 * whole[0] + whole[3]) / 3, atol=1e-3)
