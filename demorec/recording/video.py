@@ -153,29 +153,13 @@ class _StreamEncoder:
         self._num_pictures = 0
 
     def encode(self, picture: Rgb) -> list[bytes]:
-        frame = coder_frame(picture)
+        frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
         frame.pts, frame.time_base = self._num_pictures, self._time_base
         self._num_pictures += 1
         return _bare(self._context.encode(frame))
 
     def finish(self) -> list[bytes]:
         return _bare(self._context.encode(None))
-
-
-def coder_frame(picture: Rgb) -> av.VideoFrame:
-    """A picture (H, W, 3) as the coders take it, to the bit as libswscale would make it of this one.
-
-    Pictures with odd or very short sides, which AV1 takes, are left to libswscale. ValueError for what is no picture.
-    """
-    height, width = picture.shape[:2]
-    if picture.shape[2:] != (3,) or picture.dtype != np.uint8 or height % 2 or width % 2 or min(height, width) < 8:
-        return av.VideoFrame.from_ndarray(picture, format="rgb24")
-    from demorec.recording.yuv import yuv420_from_rgb  # Numba takes a second to start
-
-    frame = av.VideoFrame(width, height, "yuv420p")
-    planes = [np.frombuffer(plane, dtype=np.uint8).reshape(-1, plane.line_size) for plane in frame.planes]
-    yuv420_from_rgb(np.ascontiguousarray(picture), *planes)
-    return frame
 
 
 def _bare(packets: Iterable[av.Packet]) -> list[bytes]:
