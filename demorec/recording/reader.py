@@ -136,11 +136,12 @@ class RecordingReader(EpisodeFile):
     def joint_samples(self) -> Iterator[JointSample]:
         """Every recorded joint state in order of time: the frames' own and those between them."""
         stream = next(row for row in frame_streams(self.info) if row.topic == channels.JOINT_STATES)
-        block = self._container.blocks((channels.JOINT_STATES,))[channels.JOINT_STATES]
-        with damage_as_recording_error(self.path):
-            rows = stream.layout.decode_rows(block.rows(len(stream.layout.constant)))
-        for time_ns, row in zip(block.time_ns.tolist(), rows.reshape(len(block), 3, rows.shape[1] // 3), strict=True):
-            yield JointSample(time_ns=time_ns, joint_position=row[0], joint_velocity=row[1], joint_effort=row[2])
+        for message in self._container.messages((channels.JOINT_STATES,)):
+            with damage_as_recording_error(self.path):
+                position, velocity, effort = stream.layout.decode([message.data]).reshape(3, -1)
+            yield JointSample(
+                time_ns=message.time_ns, joint_position=position, joint_velocity=velocity, joint_effort=effort
+            )
 
     def events(self) -> Iterator[tuple[int, Event]]:
         """(time_ns, event) in order of time; changes of phase are in `columns().phase`."""
