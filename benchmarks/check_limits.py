@@ -19,7 +19,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from demorec.check.limits import TABLE, Calibration, LimitTable, read_table
+from demorec.check.limits import TABLE, LimitCalibration, LimitTable, read_table
 from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.config import EpisodePlan, GenerateConfig, VideoConfig
 from demorec.errors import SceneError
@@ -124,7 +124,7 @@ def main(argv: list[str] | None = None) -> None:
 def write_table(largest: Mapping[str, float], *, seed: int, episodes: int) -> None:
     """The limits as they are now, with what was measured."""
     before = read_table()
-    calibration = Calibration(
+    calibration = LimitCalibration(
         seed=seed,
         date=datetime.datetime.now(datetime.UTC).date().isoformat(),
         episodes=episodes,

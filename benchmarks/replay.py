@@ -4,8 +4,8 @@
 
 CPU seconds of this process. Ratios are taken within one interleaved run: each episode is generated, checked,
 replayed and (the first few) drawn anew, one after the other. World and renderer are kept from one episode to the next,
-as the workers of `generate-dataset` and `demorec render` do; "as it was" has libswscale convert the pictures for the
-coder, and a new renderer for each recording that is drawn anew.
+as the workers of `generate-dataset` and `demorec render` do; "as it was" makes a new renderer for each recording that
+is drawn anew.
 """
 
 from __future__ import annotations
@@ -14,16 +14,13 @@ import argparse
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from pathlib import Path
-
-import av
 
 from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.config import EpisodePlan, GenerateConfig
 from demorec.loop import ScriptAgent, Session, Workshop, prepare
-from demorec.recording import EpisodeWriter, Recording, video
+from demorec.recording import EpisodeWriter, Recording
 from demorec.render.warm import WarmRenderer
 from demorec.replay import ReplayOptions, open_file, replay_all
 from demorec.replay.rerender import RerenderOptions, rerender
@@ -37,17 +34,6 @@ def generate(path: Path, config: GenerateConfig, index: int, workshop: Workshop)
         for frame in session.run(ScriptAgent(episode)):
             writer.write(frame)
         writer.finish(session.outcome)
-
-
-@contextmanager
-def libswscale() -> Iterator[None]:
-    """Pictures are given to the coders as they are, which have libswscale convert them."""
-    own = video.coder_frame
-    video.coder_frame = lambda picture: av.VideoFrame.from_ndarray(picture, format="rgb24")
-    try:
-        yield
-    finally:
-        video.coder_frame = own
 
 
 def main() -> None:
@@ -94,17 +80,12 @@ def main() -> None:
             rerender(warming, Path(folder) / "warm_again.mcap", RerenderOptions(), renderers=warm)
         for index in range(arguments.pictures):
             path = Path(folder) / f"filmed_{index}.mcap"
-            before = Path(folder) / f"as_it_was_{index}.mcap"
-            with libswscale():
-                start = time.process_time()
-                generate(before, config, index, workshop)
-                timed("generate, as it was", start)
-                start = time.process_time()
-                rerender(before, Path(folder) / f"again_as_it_was_{index}.mcap", RerenderOptions())
-                timed("draw anew, as it was", start)
             start = time.process_time()
             generate(path, config, index, workshop)
             timed("generate with pictures", start)
+            start = time.process_time()
+            rerender(path, Path(folder) / f"as_it_was_{index}.mcap", RerenderOptions())
+            timed("draw anew, as it was", start)
             start = time.process_time()
             drawn = rerender(path, Path(folder) / f"again_{index}.mcap", RerenderOptions(), renderers=warm)
             timed("draw anew", start)
@@ -126,11 +107,9 @@ def main() -> None:
         number, length = (arguments.pictures, filmed) if of_pictures else (count, simulated)
         print(f"{name:<24} {1e3 * seconds / number:8.1f} CPU ms an episode, {length / seconds:8.1f} times real time")
     if arguments.pictures:
-        was, now = cpu["generate, as it was"], cpu["generate with pictures"]
-        print(f"generate, as it was / now: {was / now:.2f}")
-        print(
-            f"generate / draw anew: as it was {was / cpu['draw anew, as it was']:.2f}, {now / cpu['draw anew']:.2f} now"
-        )
+        generation = cpu["generate with pictures"]
+        was, now = generation / cpu["draw anew, as it was"], generation / cpu["draw anew"]
+        print(f"generate / draw anew: as it was {was:.2f}, {now:.2f} now")
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from demorec.check.base import Measurement, check
-from demorec.check.episode import RecordedEpisode
+from demorec.check.episode import CheckedEpisode
 from demorec.geometry import Array
 from demorec.scene.scene import POSITION_GAIN
 
@@ -76,7 +76,7 @@ def lag_error(before: Array, after: Array, *, what: str) -> Measurement | None:
         "info.physics_hz",
     ),
 )
-def command_lag(episode: RecordedEpisode) -> Measurement | None:
+def command_lag(episode: CheckedEpisode) -> Measurement | None:
     """Command t is sent after observation t and reached, but for the servo's lag, at observation t + 1."""
     c, info = episode.columns, episode.info
     expected = servo_response(
@@ -96,7 +96,7 @@ def command_lag(episode: RecordedEpisode) -> Measurement | None:
         "/command",
     ),
 )
-def action_lag(episode: RecordedEpisode) -> Measurement | None:
+def action_lag(episode: CheckedEpisode) -> Measurement | None:
     """The action of a frame is the wish behind that frame's command.
 
     Exploration noise hides this from least squares, but a good part of every episode has none: what counts is the
@@ -127,7 +127,7 @@ def action_lag(episode: RecordedEpisode) -> Measurement | None:
         "/gripper",
     ),
 )
-def gripper_lag(episode: RecordedEpisode) -> Measurement | None:
+def gripper_lag(episode: CheckedEpisode) -> Measurement | None:
     """The opening starts to follow within a few frames of each command to close or open, and never before it."""
     c, fps = episode.columns, episode.info.fps
     jumps = np.flatnonzero(np.abs(np.diff(c.command_gripper)) > 0.01) + 1

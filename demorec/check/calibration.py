@@ -7,8 +7,8 @@ import math
 import numpy as np
 
 from demorec.check.base import COLOR_TOPICS, Found, Measurement, NotMeasured, check, worst
-from demorec.check.cells import Kind
-from demorec.check.episode import RecordedEpisode
+from demorec.check.cells import ImageKind
+from demorec.check.episode import CheckedEpisode
 from demorec.check.rows import displacement, matrices
 from demorec.errors import RecordingError
 from demorec.geometry import Array
@@ -34,7 +34,7 @@ UNRELATED = 16.0
         "info.scene.cameras.height",
     ),
 )
-def intrinsics(episode: RecordedEpisode) -> Found:
+def intrinsics(episode: CheckedEpisode) -> Found:
     """The calibration message agrees with the scene's camera and the pictures' size."""
     found = []
     for camera in episode.cameras:
@@ -63,7 +63,7 @@ def intrinsics(episode: RecordedEpisode) -> Found:
         "info.scene.robot.world_from_base",
     ),
 )
-def extrinsics(episode: RecordedEpisode) -> Found:
+def extrinsics(episode: CheckedEpisode) -> Found:
     """Recorded camera poses are those of the mount, by forward kinematics (0.1 m per rad of rotation)."""
     found = []
     for camera in episode.cameras:
@@ -74,7 +74,7 @@ def extrinsics(episode: RecordedEpisode) -> Found:
     return worst(*found)
 
 
-def _expected(episode: RecordedEpisode, camera: Camera) -> Array:
+def _expected(episode: CheckedEpisode, camera: Camera) -> Array:
     mounted = camera.mount_from_camera.matrix()[None]
     if camera.mount == "world":
         return np.broadcast_to(mounted, (episode.num_frames, 4, 4))
@@ -87,7 +87,7 @@ def _expected(episode: RecordedEpisode, camera: Camera) -> Array:
     return np.asarray(episode.world_from_base @ link @ mounted)
 
 
-def _allowance(episode: RecordedEpisode, camera: Camera) -> float:
+def _allowance(episode: CheckedEpisode, camera: Camera) -> float:
     """By how much pictures may be shifted, of their height, since the recorded calibration is off on purpose."""
     behaviour = episode.info.behaviour
     off = [behaviour.get(f"calibration_{camera.name}_{axis}", 0.0) for axis in "xyz"]
@@ -107,7 +107,7 @@ def _allowance(episode: RecordedEpisode, camera: Camera) -> float:
         "info.behaviour",
     ),
 )
-def projection(episode: RecordedEpisode) -> Found:
+def projection(episode: CheckedEpisode) -> Found:
     """Recorded poses, projected with K and extrinsics, fall where the picture has them.
 
     The pictures are drawn anew from joints, objects, K and mounts, and the shift that fits best is measured over all
@@ -142,7 +142,7 @@ def projection(episode: RecordedEpisode) -> Found:
         "info.scene.cameras.fov_y",
     ),
 )
-def projected_size(episode: RecordedEpisode) -> Found:
+def projected_size(episode: CheckedEpisode) -> Found:
     """Things are as large in the picture as their distance and K make them: catches a wrong focal length or scale."""
     found: list[Found] = []
     for camera in episode.cameras:
@@ -169,7 +169,7 @@ def projected_size(episode: RecordedEpisode) -> Found:
         "/object/{body}/pose",
     ),
 )
-def picture_lag(episode: RecordedEpisode) -> Found:
+def picture_lag(episode: CheckedEpisode) -> Found:
     """Picture t shows state t: robot and objects are where the numbers of the same frame put them.
 
     Colour, depth and labels of each camera against the pictures that are drawn of the frames before and after. Where
@@ -201,7 +201,7 @@ def picture_lag(episode: RecordedEpisode) -> Found:
         "info.scene.cameras.far",
     ),
 )
-def depth_matches_scene(episode: RecordedEpisode) -> Found:
+def depth_matches_scene(episode: CheckedEpisode) -> Found:
     """Depth is metres along the optical axis, in every frame: catches other units, distances along the ray, flips."""
     return _strays(episode, "depth")
 
@@ -217,12 +217,12 @@ def depth_matches_scene(episode: RecordedEpisode) -> Found:
         "info.scene.bodies.shape",
     ),
 )
-def segmentation_matches_scene(episode: RecordedEpisode) -> Found:
+def segmentation_matches_scene(episode: CheckedEpisode) -> Found:
     """Every pixel has the label of the body that geometry puts there, in every frame."""
     return _strays(episode, "labels")
 
 
-def _strays(episode: RecordedEpisode, kind: Kind) -> Found:
+def _strays(episode: CheckedEpisode, kind: ImageKind) -> Found:
     """The largest share of any picture of a kind."""
     found: list[Found] = []
     for camera in episode.cameras:

@@ -12,13 +12,13 @@ from demorec.errors import RecordingError
 
 Cells = NDArray[np.float32]
 """(T, h, w, channels), 0..255."""
-Kind = Literal["color", "depth", "labels"]
+ImageKind = Literal["color", "depth", "labels"]
 
 CELLS = 28
 """Cells along the longer side."""
 DEPTH_RANGE = 3.0
 """Metres that are brightness 255; what is farther is not told apart."""
-CHANNELS: dict[Kind, int] = {"color": 3, "depth": 1, "labels": 2}
+CHANNELS: dict[ImageKind, int] = {"color": 3, "depth": 1, "labels": 2}
 """Brightnesses that stand for a pixel: red, green and blue; how far it is; two for what it belongs to."""
 
 
@@ -54,13 +54,13 @@ class CellGrid:
         self._areas = np.outer(np.diff(self._rows), np.diff(self._columns))[:, :, None]
         self._num_pixels = width * height
         size = (height, width)
-        self._shapes: dict[Kind, tuple[int, ...]] = {"color": (*size, 3), "depth": size, "labels": size}
+        self._shapes: dict[ImageKind, tuple[int, ...]] = {"color": (*size, 3), "depth": size, "labels": size}
 
-    def shape(self, kind: Kind) -> tuple[int, int, int]:
+    def shape(self, kind: ImageKind) -> tuple[int, int, int]:
         """Of the cells of a picture: (h, w, channels)."""
         return (len(self._rows) - 1, len(self._columns) - 1, CHANNELS[kind])
 
-    def read(self, kind: Kind, picture: NDArray[Any]) -> PictureCells:
+    def read(self, kind: ImageKind, picture: NDArray[Any]) -> PictureCells:
         """A picture (H, W, 3) uint8 of colours, (H, W) float32 metres or (H, W) int32 labels, as brightnesses.
 
         Raises:

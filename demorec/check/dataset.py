@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from demorec.check.base import NotMeasured
 from demorec.check.dataset_drawn import compare_beginning
 from demorec.check.dataset_video import EpisodePictures, episode_pictures
-from demorec.check.drawn import Comparison
+from demorec.check.drawn import PictureComparison
 from demorec.errors import ConfigError, ExportError, in_words
 from demorec.lerobot.files import read_table
 from demorec.lerobot.language import COLUMNS, SpokenEpisode, spoken_episodes
@@ -89,7 +89,7 @@ class Dataset:
         return self._pictures[key]
 
     @cached_property
-    def compared(self) -> list[Mapping[str, Comparison] | NotMeasured]:
+    def compared(self) -> list[Mapping[str, PictureComparison] | NotMeasured]:
         """Camera -> how each episode begins in its pictures, against states and scene; only with a sidecar."""
         keys = {key.removeprefix(IMAGE_PREFIX): key for key in self.colour_keys}
         found = []

@@ -12,7 +12,7 @@ import numpy as np
 
 from demorec.check.base import NotMeasured
 from demorec.check.cells import Cells
-from demorec.check.drawn import NOT_DRAWABLE, Comparison, compare, draw
+from demorec.check.drawn import NOT_DRAWABLE, PictureComparison, compare, draw
 from demorec.geometry import Array
 from demorec.render.recorded import RecordedWorld
 from demorec.scene.episode import EpisodeInfo
@@ -26,7 +26,7 @@ MIN_FRAMES = 3
 
 def compare_beginning(
     info: EpisodeInfo, state: Array, fps: int, seen: Mapping[str, Cells]
-) -> Mapping[str, Comparison] | NotMeasured:
+) -> Mapping[str, PictureComparison] | NotMeasured:
     """Camera -> its pictures until the fingers first close against what states and scene make of them.
 
     Args:

@@ -20,7 +20,7 @@ from demorec.check.dataset import Dataset
 from demorec.language.kinds import STATES
 from demorec.language.questions import ANSWERS
 from demorec.language.referring import references
-from demorec.language.situation import COLORS, Situation, place_of, situation
+from demorec.language.situation import COLORS, Surroundings, place_of, situation
 from demorec.lerobot.boxes import BOXES_DIR, read_boxes
 from demorec.lerobot.language import COLUMNS, SpokenEpisode
 from demorec.scene.episode import CORRECTED_PHASE, MISTAKEN_PHASE, EpisodeInfo
@@ -166,7 +166,7 @@ def _wrong_phases(episode: SpokenEpisode, row: Row, fps: int) -> Iterator[str]:
             yield f"frame {first}: {entry['content'][:60]!r} {'hides' if is_miss else 'invents'} a deliberate miss"
 
 
-def _wrong_words(episode: SpokenEpisode, row: Row, info: EpisodeInfo, start: Situation) -> Iterator[str]:
+def _wrong_words(episode: SpokenEpisode, row: Row, info: EpisodeInfo, start: Surroundings) -> Iterator[str]:
     """Wordings mean the things of the task; subtasks name things of a goal, by kind and colour."""
     scene = info.scene
     objects = {goal.object for goal in scene.goals}
@@ -188,7 +188,7 @@ def _wrong_words(episode: SpokenEpisode, row: Row, info: EpisodeInfo, start: Sit
 
 
 def _wrong_interjections(
-    episode: SpokenEpisode, row: Row, info: EpisodeInfo, start: Situation, fps: int
+    episode: SpokenEpisode, row: Row, info: EpisodeInfo, start: Surroundings, fps: int
 ) -> Iterator[str]:
     """Interjections come where the expert listens, say what is meant and what was mistaken, and renew the plan."""
     said = {
@@ -220,12 +220,12 @@ def _wrong_interjections(
             yield f"the interjection at frame {frame} does not renew the plan"
 
 
-def _named(text: str, start: Situation) -> set[str]:
+def _named(text: str, start: Surroundings) -> set[str]:
     """Names of all things that a text refers to."""
     return {name for _, names in references(text, start) for name in names}
 
 
-def _colored(text: str, start: Situation) -> Iterator[tuple[str, str]]:
+def _colored(text: str, start: Surroundings) -> Iterator[tuple[str, str]]:
     """(colour, noun) of each phrase of a text that has both."""
     nouns = sorted({noun for thing in start.things for noun in thing.nouns}, key=len, reverse=True)
     pattern = re.compile(rf"\b({'|'.join(COLORS)}) ({'|'.join(map(re.escape, nouns))})\b")
@@ -251,7 +251,7 @@ class _Boxes:
         return self._found.get((camera, self._first[episode] + frame), {})
 
 
-def _wrong_answers(episode: SpokenEpisode, number: int, start: Situation, boxes: _Boxes) -> Iterator[str]:
+def _wrong_answers(episode: SpokenEpisode, number: int, start: Surroundings, boxes: _Boxes) -> Iterator[str]:
     for frame, rows in episode.events.items():
         for row in rows:
             answer, camera = _answer(row), str(row.get("camera"))
@@ -262,7 +262,7 @@ def _wrong_answers(episode: SpokenEpisode, number: int, start: Situation, boxes:
                 yield from (f"frame {frame}: {text}" for text in _against(answer, seen, start))
 
 
-def _against(answer: Row, seen: dict[str, list[float]], start: Situation) -> Iterator[str]:
+def _against(answer: Row, seen: dict[str, list[float]], start: Surroundings) -> Iterator[str]:
     """Faults of an answer, given what the picture shows."""
     if "count" in answer:
         count = sum(answer["label"] in start.thing(name).nouns for name in seen)
@@ -279,7 +279,7 @@ def _against(answer: Row, seen: dict[str, list[float]], start: Situation) -> Ite
             yield f"the point is not on {answer['label']}"
 
 
-def _may_be(phrase: str, name: str, start: Situation) -> bool:
+def _may_be(phrase: str, name: str, start: Surroundings) -> bool:
     """Whether kind and colour of a thing are those of a phrase, wherever it is by now."""
     thing = start.thing(name)
     colors = [word for word in phrase.split() if word in {other.color for other in start.things}]

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from demorec.check.base import Found, Measurement, NotMeasured, check
-from demorec.check.episode import RecordedEpisode
+from demorec.check.episode import CheckedEpisode
 from demorec.errors import ConfigError
 from demorec.plain import digest
 from demorec.scene.episode import POLICY_PHASE
@@ -40,7 +40,7 @@ COLOR_WORDS = frozenset(("red", "green", "blue", "yellow", "orange", "purple", "
         "cameras.segmentation",
     ),
 )
-def config_agrees(episode: RecordedEpisode) -> Found:
+def config_agrees(episode: CheckedEpisode) -> Found:
     """Task, robot, seed, rates, cameras, sizes and codec are those of the config, whose digest is recomputed."""
     info = episode.info
     if not info.config:
@@ -52,7 +52,7 @@ def config_agrees(episode: RecordedEpisode) -> Found:
     return Measurement(value=len(wrong), detail="; ".join(wrong[:3]))
 
 
-def _statements(episode: RecordedEpisode) -> Iterator[tuple[str, object, object]]:
+def _statements(episode: CheckedEpisode) -> Iterator[tuple[str, object, object]]:
     """What is said, how it is, and how the config has it."""
     info, config = episode.info, episode.info.config
     found: dict[str, Any] = {"task": info.task, "seed": info.root_seed, "fps": info.fps, "physics_hz": info.physics_hz}
@@ -83,7 +83,7 @@ def _statements(episode: RecordedEpisode) -> Iterator[tuple[str, object, object]
     warn=0,
     reads=("info.robot", "info.scene.robot.scale"),
 )
-def robot_as_known(episode: RecordedEpisode) -> Found:
+def robot_as_known(episode: CheckedEpisode) -> Found:
     """Limits, joints and links of one of demorec's own robots are those of its table, scaled as the scene says."""
     info = episode.info
     if info.robot.name not in ROBOTS.rows:
@@ -107,7 +107,7 @@ def robot_as_known(episode: RecordedEpisode) -> Found:
         "info.scene.goals.object",
     ),
 )
-def instruction_fits_scene(episode: RecordedEpisode) -> Found:
+def instruction_fits_scene(episode: CheckedEpisode) -> Found:
     """The instruction speaks of colours that are in the scene, and of those of the objects that have a goal."""
     scene = episode.info.scene
     words = [word for word in re.findall(r"[a-z]+", episode.info.instruction.lower()) if word in COLOR_WORDS]
@@ -135,7 +135,7 @@ def _goal_colors(scene: Scene) -> list[str]:
         "info.behaviour",
     ),
 )
-def noise_as_said(episode: RecordedEpisode) -> Found:
+def noise_as_said(episode: CheckedEpisode) -> Found:
     """Commands differ from labels by noise of the size that the behaviour names, and not at all where it names none."""
     c, behaviour = episode.columns, episode.info.behaviour
     if "action_noise" not in behaviour:

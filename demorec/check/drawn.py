@@ -18,7 +18,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.check.cells import CellGrid, Cells, Kind, cell_counts
+from demorec.check.cells import CellGrid, Cells, ImageKind, cell_counts
 from demorec.errors import RenderError, SceneError
 from demorec.geometry import Array
 from demorec.render import Renderer
@@ -42,13 +42,13 @@ class DrawnPictures:
     """
 
     frames: NDArray[np.int64]
-    cells: Mapping[tuple[str, Kind], Cells]
+    cells: Mapping[tuple[str, ImageKind], Cells]
 
 
 def draw_all(
     info: EpisodeInfo,
     columns: EpisodeColumns,
-    kinds: Mapping[str, Iterable[Kind]],
+    kinds: Mapping[str, Iterable[ImageKind]],
     seen: Iterable[Cells] | None = None,
 ) -> DrawnPictures:
     """The pictures of an episode, as the recorded numbers make them.
@@ -72,7 +72,7 @@ def draw_all(
 def draw(
     world: RecordedWorld,
     num_frames: int,
-    kinds: Mapping[str, Iterable[Kind]],
+    kinds: Mapping[str, Iterable[ImageKind]],
     counts: Mapping[str, tuple[int, int]],
     seen: Iterable[Cells] | None = None,
 ) -> DrawnPictures:
@@ -86,7 +86,7 @@ def draw(
     grids = {camera.name: CellGrid(camera.width, camera.height, counts[camera.name]) for camera in cameras}
     poses = world.all_poses[:num_frames]
     frames = np.flatnonzero(np.ones(num_frames)) if seen is None else frames_to_draw(seen, poses)
-    cells: dict[tuple[str, Kind], Cells] = {
+    cells: dict[tuple[str, ImageKind], Cells] = {
         (name, kind): np.empty((num_frames, *grid.shape(kind)), dtype=np.float32)
         for name, grid in grids.items()
         for kind in kinds[name]
@@ -170,7 +170,7 @@ def _small(camera: Camera) -> Camera:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Comparison:
+class PictureComparison:
     """Recorded pictures of a camera against the drawn ones, T frames.
 
     Attributes:
@@ -198,7 +198,7 @@ _MIN_MOVING = 12
 """A lag is told from this many frames on in which the drawn cells change by so much (root mean square, of 255)."""
 
 
-def compare(seen: Cells, drawn: Cells, frames: NDArray[np.int64]) -> Comparison:
+def compare(seen: Cells, drawn: Cells, frames: NDArray[np.int64]) -> PictureComparison:
     """Least squares over the drawn frames: seen = drawn, but shifted, scaled and turned by one amount each.
 
     Args:
@@ -222,7 +222,7 @@ def compare(seen: Cells, drawn: Cells, frames: NDArray[np.int64]) -> Comparison:
     moved, shown = np.zeros(len(seen)), np.zeros(len(seen))
     kernels.compare_steps(_flat(seen), _flat(drawn), moved, shown)
     motion = np.sqrt(moved / max(drawn[0].size, 1))
-    return Comparison(
+    return PictureComparison(
         shift=found[:2] / drawn.shape[1],
         scale=float(found[2]),
         lag=_lag(seen, fitted, frames[motion[frames] > _MOVING]),

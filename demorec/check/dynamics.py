@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.check.base import Found, Measurement, NotMeasured, check, worst
-from demorec.check.episode import RecordedEpisode
+from demorec.check.episode import CheckedEpisode
 from demorec.check.rows import longest_run
 from demorec.errors import SceneError
 from demorec.geometry import Array
@@ -45,7 +45,7 @@ class _Dynamics:
         SceneError: The robot's model is not to be had.
     """
 
-    def __init__(self, episode: RecordedEpisode) -> None:
+    def __init__(self, episode: CheckedEpisode) -> None:
         self.episode = episode
         self.loads = [*self._link_loads(), *self._carried_loads()]
 
@@ -132,7 +132,7 @@ def _inertials(urdf: str) -> dict[str, tuple[float, Array]]:
     measures="arm torques against inverse dynamics, median difference of the load",
     reads=("/joint_states", "info.scene.physics.gravity", "info.scene.bodies.mass", "/robot_description"),
 )
-def effort_bears_the_arm(episode: RecordedEpisode) -> Found:
+def effort_bears_the_arm(episode: CheckedEpisode) -> Found:
     """The motors of the joints that bear the arm give the torques that its weight and motion need.
 
     Catches torques of other joints, of another sign or unit, halved or frozen.
@@ -160,7 +160,7 @@ def effort_bears_the_arm(episode: RecordedEpisode) -> Found:
     measures="force on the hand against the weight and motion of what it bears, median difference of it",
     reads=("/wrench", "info.scene.physics.gravity", "info.scene.bodies.mass", "/robot_description"),
 )
-def wrench_bears_the_hand(episode: RecordedEpisode) -> Found:
+def wrench_bears_the_hand(episode: CheckedEpisode) -> Found:
     """The arm holds the hand, and what it carries, with the force that their masses need: catches other units."""
     wrench = episode.columns.wrench
     if wrench is None:
@@ -177,7 +177,7 @@ def wrench_bears_the_hand(episode: RecordedEpisode) -> Found:
     return Measurement(value=float(np.median(judged)), detail=f"{len(judged)} frames")
 
 
-def _dynamics(episode: RecordedEpisode) -> _Dynamics | NotMeasured:
+def _dynamics(episode: CheckedEpisode) -> _Dynamics | NotMeasured:
     if not any(episode.info.scene.physics.gravity):
         return NotMeasured(why="there is no gravity")
     try:
@@ -197,7 +197,7 @@ def _dynamics(episode: RecordedEpisode) -> _Dynamics | NotMeasured:
     fail=4,
     reads=("/joint_states", "/ee_pose", "/wrench"),
 )
-def stuck_sensors(episode: RecordedEpisode) -> Found:
+def stuck_sensors(episode: CheckedEpisode) -> Found:
     """What is measured changes, if ever so little, while the arm moves."""
     c, n = episode.columns, episode.num_arm
     moves = np.abs(np.diff(c.joint_position[:, :n], axis=0)).max(axis=1, initial=0.0) > 1e-5

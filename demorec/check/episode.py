@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.check.base import NotMeasured
-from demorec.check.cells import Kind
-from demorec.check.drawn import NOT_DRAWABLE, Comparison, DrawnPictures, compare, draw_all, strays
+from demorec.check.cells import ImageKind
+from demorec.check.drawn import NOT_DRAWABLE, DrawnPictures, PictureComparison, compare, draw_all, strays
 from demorec.check.pictures_summary import PictureSummary, summarise
 from demorec.check.rows import LinkMatrices, matrices
 from demorec.errors import RecordingError
@@ -60,7 +60,7 @@ class TopicScan:
     first: bytes
 
 
-class RecordedEpisode:
+class CheckedEpisode:
     """One recording; a context manager. Properties raise RecordingError where the file does not give them.
 
     Args:
@@ -71,8 +71,8 @@ class RecordedEpisode:
         self.path = path
         self._recording: Recording | None = None
         self._container: Container | None = None
-        self._pictures: dict[tuple[str, Kind], PictureSummary] = {}
-        self._comparisons: dict[tuple[str, Kind], Comparison] = {}
+        self._pictures: dict[tuple[str, ImageKind], PictureSummary] = {}
+        self._comparisons: dict[tuple[str, ImageKind], PictureComparison] = {}
 
     def __enter__(self) -> Self:
         return self
@@ -234,13 +234,13 @@ class RecordedEpisode:
         """(3, 3) K as the camera's own calibration message has it, which is what other programs read."""
         return self.recording.calibration(camera).intrinsics
 
-    def kinds(self, camera: str) -> tuple[Kind, ...]:
+    def kinds(self, camera: str) -> tuple[ImageKind, ...]:
         """Which pictures of a camera were recorded."""
-        depth: tuple[Kind, ...] = ("depth",) if self.recording.has_depth(camera) else ()
-        labels: tuple[Kind, ...] = ("labels",) if self.recording.has_segmentation(camera) else ()
+        depth: tuple[ImageKind, ...] = ("depth",) if self.recording.has_depth(camera) else ()
+        labels: tuple[ImageKind, ...] = ("labels",) if self.recording.has_segmentation(camera) else ()
         return ("color", *depth, *labels)
 
-    def pictures(self, camera: Camera, kind: Kind = "color") -> PictureSummary:
+    def pictures(self, camera: Camera, kind: ImageKind = "color") -> PictureSummary:
         """What the checks need of a camera's decoded pictures; decoded once."""
         if (camera.name, kind) not in self._pictures:
             self._pictures[camera.name, kind] = summarise(self.recording, camera, kind)
@@ -257,7 +257,7 @@ class RecordedEpisode:
         except NOT_DRAWABLE as error:
             return NotMeasured(why=f"the recording cannot be drawn here: {error}")
 
-    def strays(self, camera: Camera, kind: Kind) -> Array | NotMeasured:
+    def strays(self, camera: Camera, kind: ImageKind) -> Array | NotMeasured:
         """(T,) share of the cells of depth or labels that are not what the recorded numbers make of them."""
         if isinstance(self._drawn, NotMeasured):
             return self._drawn
@@ -266,7 +266,7 @@ class RecordedEpisode:
             return NotMeasured(why=f"camera {camera.name} has no picture that can be read")
         return strays(seen, self._drawn.cells[camera.name, kind])
 
-    def compared(self, camera: Camera, kind: Kind = "color") -> Comparison | NotMeasured:
+    def compared(self, camera: Camera, kind: ImageKind = "color") -> PictureComparison | NotMeasured:
         """A camera's pictures against what the recorded numbers make of them."""
         renderer = self.info.config.get("renderer", "raster")
         if kind == "color" and renderer != "raster":

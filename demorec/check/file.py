@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from demorec.check.base import Measurement, check
-from demorec.check.episode import RecordedEpisode
+from demorec.check.episode import CheckedEpisode
 from demorec.recording import channels, messages
 from demorec.recording.streams import frame_streams
 from demorec.scene.episode import FORMAT_VERSION
@@ -17,7 +17,7 @@ from demorec.scene.episode import FORMAT_VERSION
     warn=0,
     reads=("info.format_version",),
 )
-def opens(episode: RecordedEpisode) -> Measurement:
+def opens(episode: CheckedEpisode) -> Measurement:
     """The index and the metadata pass their checksums and are of a known format version."""
     version = episode.recording.info.format_version
     return Measurement(value=0, detail=f"format version {version} of {FORMAT_VERSION}")
@@ -29,7 +29,7 @@ def opens(episode: RecordedEpisode) -> Measurement:
     warn=0,
     reads=("metadata demorec.episode",),
 )
-def checksums(episode: RecordedEpisode) -> Measurement:
+def checksums(episode: CheckedEpisode) -> Measurement:
     """Every byte that holds a message or an attachment passes its checksum, and the index counts them right."""
     counts = {topic: len(scan.time_ns) for topic, scan in episode.scan.items()}
     wrong = [
@@ -50,7 +50,7 @@ def checksums(episode: RecordedEpisode) -> Measurement:
         "info.format_version",
     ),
 )
-def topics(episode: RecordedEpisode) -> Measurement:
+def topics(episode: CheckedEpisode) -> Measurement:
     """Every stream that the metadata promises is there, of its type, with one message for each frame."""
     expected: dict[str, tuple[str, int | None]] = {}
     for stream in frame_streams(episode.info):
@@ -77,7 +77,7 @@ def topics(episode: RecordedEpisode) -> Measurement:
     return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{len(expected)} topics")
 
 
-def _picture_streams(episode: RecordedEpisode, camera: str) -> Iterator[tuple[str, str]]:
+def _picture_streams(episode: CheckedEpisode, camera: str) -> Iterator[tuple[str, str]]:
     recording = episode.recording
     codec = recording.video_settings(camera).codec
     schema = messages.PROTOBUF_VIDEO if codec == "av1" else messages.COMPRESSED_IMAGE
@@ -100,7 +100,7 @@ def _picture_streams(episode: RecordedEpisode, camera: str) -> Iterator[tuple[st
         "/deliberate_miss",
     ),
 )
-def readable(episode: RecordedEpisode) -> Measurement:
+def readable(episode: CheckedEpisode) -> Measurement:
     """Every message has the layout that the metadata promises."""
     num_frames = episode.columns.num_frames
     num_events = len(episode.events)
@@ -114,7 +114,7 @@ def readable(episode: RecordedEpisode) -> Measurement:
     fail=1,
     reads=("metadata demorec.recovered",),
 )
-def complete(episode: RecordedEpisode) -> Measurement:
+def complete(episode: CheckedEpisode) -> Measurement:
     """The episode was recorded to its end."""
     cut = episode.recording.outcome is None
     return Measurement(value=int(cut), detail="recovered from a crash, no outcome" if cut else "")

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from demorec.check.base import Measurement, check, worst
-from demorec.check.episode import RecordedEpisode
+from demorec.check.episode import CheckedEpisode
 from demorec.geometry import Array
 from demorec.scene.scene import Shape
 from demorec.scene.urdf_shapes import UrdfShape, read_links
@@ -90,7 +90,7 @@ def _reach(body: Convex, world_from_body: Array, axes: Array) -> tuple[Array, Ar
     fail=0.002,
     reads=("/joint_states", "/robot_description", "/object/{body}/pose", "info.scene.bodies.shape.size"),
 )
-def finger_depth(episode: RecordedEpisode) -> Measurement | None:
+def finger_depth(episode: CheckedEpisode) -> Measurement | None:
     """Fingers press on the outside of what they hold (boxes, spheres, cylinders, capsules).
 
     The fingers are those of the recorded description, within a tenth of a millimetre. Not measured where no finger

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from demorec.check.base import Found, Measurement, NotMeasured, check
-from demorec.check.episode import RecordedEpisode
+from demorec.check.episode import CheckedEpisode
 from demorec.check.objects import SOLID
 from demorec.geometry import Array
 from demorec.scene.scene import Body
@@ -26,7 +26,7 @@ CARRIED_HEIGHT = 0.03
     fail=2e-3,
     reads=("/action", "/command"),
 )
-def gripper_label(episode: RecordedEpisode) -> Measurement | None:
+def gripper_label(episode: CheckedEpisode) -> Measurement | None:
     """Exploration noise is on the arm alone: the label asks for the opening that was sent."""
     c = episode.columns
     if not c.num_frames:
@@ -42,7 +42,7 @@ def gripper_label(episode: RecordedEpisode) -> Measurement | None:
     unit="m",
     reads=("/gripper", "/command", "/joint_states"),
 )
-def gripper_follows(episode: RecordedEpisode) -> Found:
+def gripper_follows(episode: CheckedEpisode) -> Found:
     """The fingers stand where they were told to, or further apart where something is between them.
 
     Catches openings and commands that are inverted, halved or frozen.
@@ -69,7 +69,7 @@ def gripper_follows(episode: RecordedEpisode) -> Found:
     measures="contact force on a carried object against that of the gripper's motors, off 1",
     reads=("/gripper", "info.robot.gripper.force", "/object/{body}/pose"),
 )
-def grip_force(episode: RecordedEpisode) -> Found:
+def grip_force(episode: CheckedEpisode) -> Found:
     """Two fingers that hold something press on it with the force of their motors, each of them.
 
     The median over the frames in which an object is carried: catches another unit, half the sum, a frozen value.
@@ -90,7 +90,7 @@ def grip_force(episode: RecordedEpisode) -> Found:
     )
 
 
-def _carried(episode: RecordedEpisode) -> Array:
+def _carried(episode: CheckedEpisode) -> Array:
     """(T,) whether a closed hand has some object in the air."""
     c = episode.columns
     closed = c.command_gripper < 0.5 * c.gripper_width
@@ -108,7 +108,7 @@ def _carried(episode: RecordedEpisode) -> Array:
     unit="N",
     reads=("/gripper", "/object/{body}/pose"),
 )
-def touches_nothing(episode: RecordedEpisode) -> Measurement | None:
+def touches_nothing(episode: CheckedEpisode) -> Measurement | None:
     """Fingers far above all supports and away from all objects touch nothing but each other."""
     c, scene = episode.columns, episode.info.scene
     tcp = episode.world_from_tcp[:, :3, 3]
@@ -138,7 +138,7 @@ def _top(body: Body) -> float:
     fail=1.05,
     reads=("/joint_states", "info.robot.torque_limit", "info.robot.gripper.force"),
 )
-def joint_effort(episode: RecordedEpisode) -> Measurement | None:
+def joint_effort(episode: CheckedEpisode) -> Measurement | None:
     """No motor gives more than it can; a gripper that presses gives all that it has."""
     c, n, robot = episode.columns, episode.num_arm, episode.info.robot
     limit = np.array([*robot.torque_limit, *[robot.gripper.force] * (len(robot.joint_names) - n)])

@@ -18,7 +18,7 @@ TABLE = Path(__file__).with_name("limits.toml")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Calibration:
+class LimitCalibration:
     """What the largest values were measured on.
 
     Attributes:
@@ -54,7 +54,7 @@ class Limit:
 class LimitTable:
     """The whole table: check -> its limits."""
 
-    calibration: Calibration
+    calibration: LimitCalibration
     checks: Mapping[str, Limit]
 
 

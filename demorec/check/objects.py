@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.check.base import Measurement, check, worst
-from demorec.check.episode import RecordedEpisode
+from demorec.check.episode import CheckedEpisode
 from demorec.check.rows import displacement, inverse, matrices
 from demorec.geometry import Array
 from demorec.scene.scene import Body, Shape
@@ -19,12 +19,12 @@ SOLID = ("box", "sphere", "cylinder", "capsule")
 """Shapes that fill what their size says; a mesh's or URDF's bounding box may be hollow."""
 
 
-def _speeds(episode: RecordedEpisode, name: str) -> Array:
+def _speeds(episode: CheckedEpisode, name: str) -> Array:
     """(T - 1, 3) m/s between frames."""
     return np.asarray(np.diff(episode.columns.object_poses[name][:, :3], axis=0) * episode.info.fps)
 
 
-def _near_hand(episode: RecordedEpisode, body: Body) -> NDArray[np.bool_]:
+def _near_hand(episode: CheckedEpisode, body: Body) -> NDArray[np.bool_]:
     """(T,) whether hand or fingers may touch a body: its bounding sphere and a hand's breadth overlap."""
     radius = math.hypot(*body.shape.extents) / 2
     hand = episode.base_from_link(episode.info.robot.hand_link)
@@ -35,7 +35,7 @@ def _near_hand(episode: RecordedEpisode, body: Body) -> NDArray[np.bool_]:
     return np.asarray(near_tcp | near_hand)
 
 
-def _touched(episode: RecordedEpisode) -> dict[str, NDArray[np.bool_]]:
+def _touched(episode: CheckedEpisode) -> dict[str, NDArray[np.bool_]]:
     """name -> (T - 1,) whether a movable body may have been pushed between frames t and t + 1.
 
     By the hand, or by another movable body that is near it and was itself pushed less than a moment ago.
@@ -81,7 +81,7 @@ def _held_for(flags: NDArray[np.bool_], count: int) -> NDArray[np.bool_]:
         "/joint_states",
     ),
 )
-def object_motion(episode: RecordedEpisode) -> Measurement | None:
+def object_motion(episode: CheckedEpisode) -> Measurement | None:
     """An object moves only when touched, or for a moment after it (falling, rolling, tipping)."""
     found = []
     for name, touched in _touched(episode).items():
@@ -99,7 +99,7 @@ def object_motion(episode: RecordedEpisode) -> Measurement | None:
     unit="m/s",
     reads=("/object/{body}/pose",),
 )
-def teleports(episode: RecordedEpisode) -> Measurement | None:
+def teleports(episode: CheckedEpisode) -> Measurement | None:
     """No object jumps."""
     c, fps = episode.columns, episode.info.fps
     if c.num_frames < 2:
@@ -128,7 +128,7 @@ def teleports(episode: RecordedEpisode) -> Measurement | None:
         "info.scene.robot.gripper_width",
     ),
 )
-def starts_as_scene_says(episode: RecordedEpisode) -> Measurement | None:
+def starts_as_scene_says(episode: CheckedEpisode) -> Measurement | None:
     """Objects and joints begin where the scene put them (0.1 m per rad of rotation; 0.1 m per rad of a joint).
 
     Physics settles for 0.1 s before the first frame, in which an object may fall, by 5.5 cm at most.
@@ -160,7 +160,7 @@ def starts_as_scene_says(episode: RecordedEpisode) -> Measurement | None:
         "info.scene.bodies.collides",
     ),
 )
-def penetration(episode: RecordedEpisode) -> Measurement | None:
+def penetration(episode: CheckedEpisode) -> Measurement | None:
     """Nothing solid is inside anything solid (boxes, spheres, cylinders, capsules)."""
     scene = episode.info.scene
     movable = [body for body in scene.movable if body.shape.kind in SOLID]
@@ -239,7 +239,7 @@ def _surface_points(shape: Shape) -> Array:
         "/gripper",
     ),
 )
-def carried_by_gripper(episode: RecordedEpisode) -> Measurement | None:
+def carried_by_gripper(episode: CheckedEpisode) -> Measurement | None:
     """While an object travels above where it rests, fingers press on it and stand as far apart as it is wide."""
     c, fps = episode.columns, episode.info.fps
     if c.num_frames < 3 or not episode.info.scene.movable:

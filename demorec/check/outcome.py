@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from demorec.check.base import Found, Measurement, check, worst
-from demorec.check.episode import RecordedEpisode
+from demorec.check.episode import CheckedEpisode
 from demorec.check.rows import matrices
 from demorec.scene.episode import SuccessCheck
 from demorec.tables import TASKS
@@ -31,7 +31,7 @@ AT_LEAST = ("on_support", "on_table", "gripper_width")
         "outcome.num_frames",
     ),
 )
-def outcome_consistent(episode: RecordedEpisode) -> Measurement | None:
+def outcome_consistent(episode: CheckedEpisode) -> Measurement | None:
     """Each condition passed as value and limit have it, success as the conditions; a failure has phase and reason."""
     outcome = episode.recording.outcome
     if outcome is None:
@@ -58,7 +58,7 @@ def outcome_consistent(episode: RecordedEpisode) -> Measurement | None:
     return Measurement(value=len(wrong), detail="; ".join(wrong) or f"{len(outcome.checks)} conditions")
 
 
-def _possible(episode: RecordedEpisode, condition: SuccessCheck) -> set[bool]:
+def _possible(episode: CheckedEpisode, condition: SuccessCheck) -> set[bool]:
     """What `passed` can be, given value and limit; a task of somebody else's may mean either side of the limit."""
     at_most, at_least = condition.value <= condition.limit, condition.value >= condition.limit
     if episode.info.task not in TASKS.rows:
@@ -78,7 +78,7 @@ def _possible(episode: RecordedEpisode, condition: SuccessCheck) -> set[bool]:
         "info.scene.goals.object",
     ),
 )
-def end_values(episode: RecordedEpisode) -> Found:
+def end_values(episode: CheckedEpisode) -> Found:
     """Height, tilt and opening that the outcome names are those of the last frame, in which all is at rest."""
     outcome, scene, c = episode.recording.outcome, episode.info.scene, episode.columns
     if outcome is None or not outcome.success or not c.num_frames:
@@ -114,7 +114,7 @@ def end_values(episode: RecordedEpisode) -> Found:
         "info.scene.goals.onto_from_goal",
     ),
 )
-def final_state(episode: RecordedEpisode) -> Measurement | None:
+def final_state(episode: CheckedEpisode) -> Measurement | None:
     """An object that is said to lie at its goal lies there in the last recorded frame."""
     outcome, scene, c = episode.recording.outcome, episode.info.scene, episode.columns
     if outcome is None or not outcome.success or not scene.goals or not c.num_frames:
@@ -147,7 +147,7 @@ def final_state(episode: RecordedEpisode) -> Measurement | None:
         "info.scene.goals.object",
     ),
 )
-def at_rest_in_the_end(episode: RecordedEpisode) -> Measurement | None:
+def at_rest_in_the_end(episode: CheckedEpisode) -> Measurement | None:
     """After a success the objects lie still: the recording does not stop in mid-motion."""
     outcome, c = episode.recording.outcome, episode.columns
     if outcome is None or not outcome.success or c.num_frames < 3:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from demorec.check.base import Measurement, check, worst
-from demorec.check.episode import RecordedEpisode
+from demorec.check.episode import CheckedEpisode
 from demorec.check.rows import displacement, matrices
 from demorec.geometry import Array
 
 
-def _worst_joint(episode: RecordedEpisode, table: Array, *, frame_offset: int = 0) -> Measurement | None:
+def _worst_joint(episode: CheckedEpisode, table: Array, *, frame_offset: int = 0) -> Measurement | None:
     """The largest entry of (T, n_arm), with its frame and joint."""
     if not table.size:
         return None
@@ -37,7 +37,7 @@ def _worst_joint(episode: RecordedEpisode, table: Array, *, frame_offset: int = 
         "/camera/{camera}/pose",
     ),
 )
-def finite_numbers(episode: RecordedEpisode) -> Measurement:
+def finite_numbers(episode: CheckedEpisode) -> Measurement:
     """Every recorded number is one."""
     c = episode.columns
     tables = {
@@ -73,7 +73,7 @@ def finite_numbers(episode: RecordedEpisode) -> Measurement:
         "info.robot.position_upper",
     ),
 )
-def joint_position(episode: RecordedEpisode) -> Measurement | None:
+def joint_position(episode: CheckedEpisode) -> Measurement | None:
     """Measured and commanded arm joints stay within the limits."""
     robot, c = episode.info.robot, episode.columns
     low, high = np.array(robot.position_lower), np.array(robot.position_upper)
@@ -95,7 +95,7 @@ def joint_position(episode: RecordedEpisode) -> Measurement | None:
         "info.robot.velocity_limit",
     ),
 )
-def joint_velocity(episode: RecordedEpisode) -> Measurement | None:
+def joint_velocity(episode: CheckedEpisode) -> Measurement | None:
     """Velocities, as recorded and as differences of measured and commanded positions."""
     n, fps, c = episode.num_arm, episode.info.fps, episode.columns
     limit = np.array(episode.info.robot.velocity_limit)
@@ -113,7 +113,7 @@ def joint_velocity(episode: RecordedEpisode) -> Measurement | None:
         "info.robot.acceleration_limit",
     ),
 )
-def action_acceleration(episode: RecordedEpisode) -> Measurement | None:
+def action_acceleration(episode: CheckedEpisode) -> Measurement | None:
     """The expert's joint targets (the labels) ask for no more than the motors give.
 
     A target that stops from one frame to the next is the harder the shorter a frame is; that of 1/30 s is the measure.
@@ -131,7 +131,7 @@ def action_acceleration(episode: RecordedEpisode) -> Measurement | None:
         "info.robot.acceleration_limit",
     ),
 )
-def joint_acceleration(episode: RecordedEpisode) -> Measurement | None:
+def joint_acceleration(episode: CheckedEpisode) -> Measurement | None:
     """Steps of the recorded velocities.
 
     Looser than the limits of a real arm: exploration noise on the commands asks for several times as much.
@@ -149,7 +149,7 @@ def joint_acceleration(episode: RecordedEpisode) -> Measurement | None:
         "info.fps",
     ),
 )
-def velocity_matches_position(episode: RecordedEpisode) -> Measurement | None:
+def velocity_matches_position(episode: CheckedEpisode) -> Measurement | None:
     """Differences of joint positions over the frame's time equal the mean of the velocities at both ends.
 
     Catches a wrong frame rate, degrees for radians, and velocities of other joints. The ratio is that of least
@@ -185,7 +185,7 @@ def velocity_matches_position(episode: RecordedEpisode) -> Measurement | None:
         "info.robot.tcp_link",
     ),
 )
-def forward_kinematics(episode: RecordedEpisode) -> Measurement | None:
+def forward_kinematics(episode: CheckedEpisode) -> Measurement | None:
     """Observed, wanted and commanded TCP poses are those of their joints (0.1 m per rad of rotation added)."""
     c, link = episode.columns, episode.info.robot.tcp_link
     rows = (
@@ -215,7 +215,7 @@ def forward_kinematics(episode: RecordedEpisode) -> Measurement | None:
         "/camera/{camera}/pose",
     ),
 )
-def unit_quaternions(episode: RecordedEpisode) -> Measurement | None:
+def unit_quaternions(episode: CheckedEpisode) -> Measurement | None:
     """Every rotation is one."""
     c = episode.columns
     poses = {"EE": c.base_from_tcp, "action EE": c.action_base_from_tcp, "command EE": c.command_base_from_tcp}
@@ -244,7 +244,7 @@ def unit_quaternions(episode: RecordedEpisode) -> Measurement | None:
         "info.robot.gripper.max_width",
     ),
 )
-def gripper_width(episode: RecordedEpisode) -> Measurement | None:
+def gripper_width(episode: CheckedEpisode) -> Measurement | None:
     """The opening is that of the finger joints and lies, as its target does, within 0 and the full opening.
 
     A millimetre of overshoot is allowed: the fingers have mass.
@@ -261,7 +261,7 @@ def gripper_width(episode: RecordedEpisode) -> Measurement | None:
     return worst(*found)
 
 
-def _widths(episode: RecordedEpisode) -> tuple[Array, Array, Array]:
+def _widths(episode: CheckedEpisode) -> tuple[Array, Array, Array]:
     c = episode.columns
     return c.gripper_width, c.action_gripper, c.command_gripper
 
@@ -276,7 +276,7 @@ def _widths(episode: RecordedEpisode) -> tuple[Array, Array, Array]:
         "info.scene.physics.gravity",
     ),
 )
-def wrench_holds_the_hand(episode: RecordedEpisode) -> Measurement | None:
+def wrench_holds_the_hand(episode: CheckedEpisode) -> Measurement | None:
     """Where the hand hardly accelerates and touches nothing, the arm's force on it is the answer to gravity.
 
     Catches axes of another frame, a turned sign, torques for forces. The median over those frames, rad; what is
@@ -306,7 +306,7 @@ def wrench_holds_the_hand(episode: RecordedEpisode) -> Measurement | None:
         "/command",
     ),
 )
-def command_tracking(episode: RecordedEpisode) -> Measurement | None:
+def command_tracking(episode: CheckedEpisode) -> Measurement | None:
     """The arm goes where it is sent, rad: catches commands of another episode, of another joint, or made up."""
     c = episode.columns
     off = np.abs(c.joint_position[1:, : episode.num_arm] - c.command_joint_target[:-1])
@@ -322,7 +322,7 @@ def command_tracking(episode: RecordedEpisode) -> Measurement | None:
         "/command",
     ),
 )
-def action_matches_command(episode: RecordedEpisode) -> Measurement | None:
+def action_matches_command(episode: CheckedEpisode) -> Measurement | None:
     """The label differs from what was executed by exploration noise at most, rad."""
     c = episode.columns
     return _worst_joint(episode, np.abs(c.action_joint_target - c.command_joint_target))
@@ -336,7 +336,7 @@ def action_matches_command(episode: RecordedEpisode) -> Measurement | None:
         "/joint_states",
     ),
 )
-def idle_frames(episode: RecordedEpisode) -> Measurement | None:
+def idle_frames(episode: CheckedEpisode) -> Measurement | None:
     """A policy that learns from idle frames learns to stand still."""
     c, n = episode.columns, episode.num_arm
     if c.num_frames < 2:

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.check.base import COLOR_TOPICS, Found, Measurement, NotMeasured, check, worst
-from demorec.check.drawn import Comparison
-from demorec.check.episode import RecordedEpisode
+from demorec.check.drawn import PictureComparison
+from demorec.check.episode import CheckedEpisode
 from demorec.check.rows import longest_run
 from demorec.geometry import Array
 from demorec.scene.scene import Camera
@@ -34,7 +34,7 @@ _PREDICTED_WEIGHT = 0.5
         "/camera/{camera}/segmentation",
     ),
 )
-def pictures_decode(episode: RecordedEpisode) -> Found:
+def pictures_decode(episode: CheckedEpisode) -> Found:
     """Every camera's video, depth and labels decode to their end, one picture a frame."""
     found = []
     for camera in episode.cameras:
@@ -56,7 +56,7 @@ def pictures_decode(episode: RecordedEpisode) -> Found:
     needs_pictures=True,
     reads=(*COLOR_TOPICS,),
 )
-def pictures_exposed(episode: RecordedEpisode) -> Found:
+def pictures_exposed(episode: CheckedEpisode) -> Found:
     """No picture is black or burnt out: 95 % of its pixels darker than 12 or brighter than 250 of 255."""
     found = []
     for camera in episode.cameras:
@@ -73,7 +73,7 @@ def pictures_exposed(episode: RecordedEpisode) -> Found:
     needs_pictures=True,
     reads=(*COLOR_TOPICS,),
 )
-def exposure(episode: RecordedEpisode) -> Found:
+def exposure(episode: CheckedEpisode) -> Found:
     """Most of every picture is neither under- nor overexposed."""
     found = []
     for camera in episode.cameras:
@@ -96,7 +96,7 @@ def exposure(episode: RecordedEpisode) -> Found:
         "info.scene.light",
     ),
 )
-def pictures_as_drawn(episode: RecordedEpisode) -> Found:
+def pictures_as_drawn(episode: CheckedEpisode) -> Found:
     """The pictures show robot, objects, colours and light as recorded: drawn anew and compared in every frame."""
     found: list[Found] = []
     for camera in episode.cameras:
@@ -118,7 +118,7 @@ def pictures_as_drawn(episode: RecordedEpisode) -> Found:
         "/object/{body}/pose",
     ),
 )
-def odd_pictures(episode: RecordedEpisode) -> Found:
+def odd_pictures(episode: CheckedEpisode) -> Found:
     """No single picture is another one, torn, blurred, shifted or off in colour."""
     found: list[Found] = []
     for camera in episode.cameras:
@@ -133,19 +133,19 @@ def odd_pictures(episode: RecordedEpisode) -> Found:
     return worst(*found)
 
 
-def _excess(compared: Comparison) -> Array:
+def _excess(compared: PictureComparison) -> Array:
     """(T,) by how much each picture is more unlike the drawn one than the usual picture."""
     return np.maximum(compared.unlike - np.median(compared.unlike), 0.0)
 
 
-def _is_exact(episode: RecordedEpisode, camera: Camera) -> NDArray[np.bool_]:
+def _is_exact(episode: CheckedEpisode, camera: Camera) -> NDArray[np.bool_]:
     """(T,) pictures whose coder leaves nothing to the next: all but the predicted ones of AV1."""
     if episode.recording.video_settings(camera.name).codec != "av1":
         return np.ones(episode.num_frames, dtype=np.bool_)
     return np.array([packet.is_keyframe for packet in episode.recording.packets(camera.name)], dtype=np.bool_)
 
 
-def _stale(compared: Comparison) -> NDArray[np.bool_]:
+def _stale(compared: PictureComparison) -> NDArray[np.bool_]:
     """(T,) pictures that show what was before, though something moves."""
     still = (compared.motion > MIN_MOTION) & (compared.shown < STALE_SHARE)
     return np.asarray(still & (_excess(compared) > STALE_EXCESS))
@@ -161,7 +161,7 @@ def _stale(compared: Comparison) -> NDArray[np.bool_]:
         "/object/{body}/pose",
     ),
 )
-def frozen(episode: RecordedEpisode) -> Found:
+def frozen(episode: CheckedEpisode) -> Found:
     """A camera does not stand still while something moves in its view."""
     return worst(*(_stale_frames(episode, camera, in_runs=True) for camera in episode.cameras))
 
@@ -176,12 +176,12 @@ def frozen(episode: RecordedEpisode) -> Found:
         "/object/{body}/pose",
     ),
 )
-def repeated_pictures(episode: RecordedEpisode) -> Found:
+def repeated_pictures(episode: CheckedEpisode) -> Found:
     """No picture was dropped and the one before shown in its place."""
     return worst(*(_stale_frames(episode, camera, in_runs=False) for camera in episode.cameras))
 
 
-def _stale_frames(episode: RecordedEpisode, camera: Camera, *, in_runs: bool) -> Found:
+def _stale_frames(episode: CheckedEpisode, camera: Camera, *, in_runs: bool) -> Found:
     """How many pictures of a camera are stale: the longest run of them, or all."""
     compared = episode.compared(camera)
     if isinstance(compared, NotMeasured):
@@ -203,7 +203,7 @@ def _stale_frames(episode: RecordedEpisode, camera: Camera, *, in_runs: bool) ->
     needs_pictures=True,
     reads=(*COLOR_TOPICS,),
 )
-def distinct_cameras(episode: RecordedEpisode) -> Found:
+def distinct_cameras(episode: CheckedEpisode) -> Found:
     """Two cameras in different places do not show the same pictures."""
     found = []
     for number, camera in enumerate(episode.cameras):
@@ -217,7 +217,7 @@ def distinct_cameras(episode: RecordedEpisode) -> Found:
     return worst(*found)
 
 
-def _same_place(episode: RecordedEpisode, camera: Camera, other: Camera) -> bool:
+def _same_place(episode: CheckedEpisode, camera: Camera, other: Camera) -> bool:
     poses = episode.columns.world_from_camera
     return bool(np.abs(poses[camera.name] - poses[other.name]).max(initial=0.0) < 1e-3)
 
@@ -241,7 +241,7 @@ def _dot(x: NDArray[np.float32], y: NDArray[np.float32]) -> float:
         "/camera/{camera}/histogram",
     ),
 )
-def pixel_statistics(episode: RecordedEpisode) -> Found:
+def pixel_statistics(episode: CheckedEpisode) -> Found:
     """The histograms, counted before coding, are those of the pictures: catches swapped channels and other pictures."""
     found = []
     for camera in episode.cameras:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.check.cells import CellGrid, Cells, Kind, PictureCells
+from demorec.check.cells import CellGrid, Cells, ImageKind, PictureCells
 from demorec.errors import RecordingError
 from demorec.geometry import Array
 from demorec.recording import Recording
@@ -39,9 +39,9 @@ class PictureSummary:
         return len(self.cells)
 
 
-def summarise(recording: Recording, camera: Camera, kind: Kind) -> PictureSummary:
+def summarise(recording: Recording, camera: Camera, kind: ImageKind) -> PictureSummary:
     """Decode all pictures of a camera once."""
-    read: dict[Kind, Callable[[str], Iterator[NDArray[Any]]]] = {
+    read: dict[ImageKind, Callable[[str], Iterator[NDArray[Any]]]] = {
         "color": recording.images,
         "depth": recording.depth,
         "labels": recording.segmentation,

@@ -26,7 +26,7 @@ from demorec.scene.episode import EpisodeInfo, Outcome
 from demorec.scene.scene import Body, Camera, RobotPlacement, Scene, Shape
 from demorec.tables import CHECKS, load_robot
 
-Kind = Literal["topic", "field", "column"]
+SourceKind = Literal["topic", "field", "column"]
 
 UNCHECKED: Mapping[str, str] = {
     "info.origin": "a text for people: of which recording a replay or a picture was made",
@@ -64,7 +64,7 @@ class Coverage:
     """
 
     name: str
-    kind: Kind
+    kind: SourceKind
     checks: tuple[str, ...]
     why_not: str = ""
 
@@ -85,7 +85,7 @@ def _covers(part: str, name: str) -> bool:
     return name == part or name.startswith(f"{part}.")
 
 
-def everything() -> Iterator[tuple[Kind, str]]:
+def everything() -> Iterator[tuple[SourceKind, str]]:
     """(kind, name) of all that recordings, runs and datasets hold."""
     for topic in topics():
         yield "topic", topic

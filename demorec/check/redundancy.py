@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 
 from demorec.check.base import Found, Measurement, NotMeasured, check, worst
-from demorec.check.episode import RecordedEpisode
+from demorec.check.episode import CheckedEpisode
 from demorec.check.rows import displacement, matrices
 from demorec.errors import SceneError
 from demorec.geometry import Array
@@ -43,7 +43,7 @@ from demorec.scene.scene import Camera
         "info.scene.bodies.rgba",
     ),
 )
-def latched_messages(episode: RecordedEpisode) -> Found:
+def latched_messages(episode: CheckedEpisode) -> Found:
     """Standing frames, descriptions, calibration (K, D, R, P, frame) and the labels' names follow from the metadata."""
     has_labels = any(episode.recording.has_segmentation(camera.name) for camera in episode.cameras)
     try:
@@ -66,7 +66,7 @@ def latched_messages(episode: RecordedEpisode) -> Found:
     warn=0,
     reads=("metadata demorec.episode", "metadata demorec.outcome"),
 )
-def metadata_agrees(episode: RecordedEpisode) -> Measurement:
+def metadata_agrees(episode: CheckedEpisode) -> Measurement:
     """What the metadata say in short, for people and other tools, is what they say at length."""
     info, outcome = episode.info, episode.recording.outcome
     with episode.container() as container:
@@ -99,7 +99,7 @@ def metadata_agrees(episode: RecordedEpisode) -> Measurement:
         "/robot_description",
     ),
 )
-def moving_frames(episode: RecordedEpisode) -> Found:
+def moving_frames(episode: CheckedEpisode) -> Found:
     """Every frame of /tf is where forward kinematics of the joints, or the object's pose, puts it.
 
     Distances in metres, with 0.1 m per rad of rotation.
@@ -140,7 +140,7 @@ def moving_frames(episode: RecordedEpisode) -> Found:
         "/joint_states",
     ),
 )
-def derived_values(episode: RecordedEpisode) -> Found:
+def derived_values(episode: CheckedEpisode) -> Found:
     """The velocity of the opening is the sum of the fingers'; nothing is commanded but positions (zeros elsewhere)."""
     n, c = episode.num_arm, episode.columns
     rows = _values(episode, (channels.GRIPPER, channels.ACTION, channels.COMMAND))
@@ -158,7 +158,7 @@ def derived_values(episode: RecordedEpisode) -> Found:
     return worst(*found)
 
 
-def _values(episode: RecordedEpisode, topics: tuple[str, ...]) -> dict[str, Array]:
+def _values(episode: CheckedEpisode, topics: tuple[str, ...]) -> dict[str, Array]:
     """topic -> (T, K) all values of its messages, those that become no column too."""
     rows = {}
     for stream in frame_streams(episode.info):
@@ -179,7 +179,7 @@ def _values(episode: RecordedEpisode, topics: tuple[str, ...]) -> dict[str, Arra
         "/phase",
     ),
 )
-def phase_events(episode: RecordedEpisode) -> Measurement:
+def phase_events(episode: CheckedEpisode) -> Measurement:
     """Every change of /phase is in /events at the same time, and no other; every event reads and writes alike."""
     phases, events = episode.block(channels.PHASE), episode.block(channels.EVENTS)
     logged, wrong = [], 0
@@ -212,13 +212,13 @@ def phase_events(episode: RecordedEpisode) -> Measurement:
         "cameras.video.codec",
     ),
 )
-def picture_messages(episode: RecordedEpisode) -> Measurement | None:
+def picture_messages(episode: CheckedEpisode) -> Measurement | None:
     """/video has the pictures of /h264 byte for byte; every message has its camera's frame, its format and its time."""
     found = [_picture_messages(episode, camera) for camera in episode.cameras]
     return worst(*found)
 
 
-def _picture_messages(episode: RecordedEpisode, camera: Camera) -> Measurement:
+def _picture_messages(episode: CheckedEpisode, camera: Camera) -> Measurement:
     name, frame_id = camera.name, camera_frame(camera.name)
     codec = episode.recording.video_settings(name).codec
     color = messages.PictureMessages(frame_id, codec)

@@ -10,7 +10,7 @@ from pathlib import Path
 from demorec.check.base import Check, Group, Level, Result, Scope
 from demorec.check.collected import NOT_APPLICABLE, CollectedSubject
 from demorec.check.dataset import Dataset
-from demorec.check.episode import RecordedEpisode
+from demorec.check.episode import CheckedEpisode
 from demorec.check.run import CheckedRun
 from demorec.errors import check_option, resource_error
 from demorec.processes import SPAWN
@@ -167,7 +167,7 @@ def check_subject(subject: Subject, options: CheckOptions) -> SubjectReport:
     if subject.kind == "recording" and is_collected(subject.path):
         found = _collected(subject.path, options)
     elif subject.kind == "recording":
-        with RecordedEpisode(subject.path) as episode:
+        with CheckedEpisode(subject.path) as episode:
             found = _run(checks, episode, ("opens", "readable"), lambda: episode.columns)
     elif subject.kind == "run" and is_collected_run(subject.path):
         found = [check.run(subject.path) for check in options.checks("collected_run")]

@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 
 from demorec.check.base import Found, Measurement, NotMeasured, check
-from demorec.check.episode import RecordedEpisode
+from demorec.check.episode import CheckedEpisode
 from demorec.scene.episode import CORRECTED_PHASE, INTERJECTION_EVENT, MISTAKEN_PHASE, POLICY_PHASE
 from demorec.tables import TASKS
 
@@ -55,7 +55,7 @@ NEXT = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class Stretch:
+class PhaseStretch:
     """Frames first to last (included) of one phase."""
 
     phase: str
@@ -63,17 +63,17 @@ class Stretch:
     last: int
 
 
-def _stretches(phases: tuple[str, ...]) -> list[Stretch]:
-    found: list[Stretch] = []
+def _stretches(phases: tuple[str, ...]) -> list[PhaseStretch]:
+    found: list[PhaseStretch] = []
     for frame, phase in enumerate(phases):
         if found and found[-1].phase == phase:
-            found[-1] = Stretch(phase=phase, first=found[-1].first, last=frame)
+            found[-1] = PhaseStretch(phase=phase, first=found[-1].first, last=frame)
         else:
-            found.append(Stretch(phase=phase, first=frame, last=frame))
+            found.append(PhaseStretch(phase=phase, first=frame, last=frame))
     return found
 
 
-def _is_scripted(episode: RecordedEpisode) -> NotMeasured | None:
+def _is_scripted(episode: CheckedEpisode) -> NotMeasured | None:
     """None where the phases are those of demorec's own skills."""
     if episode.info.task not in TASKS.rows:
         return NotMeasured(why=f"phases of the task {episode.info.task!r} may mean anything")
@@ -90,7 +90,7 @@ def _is_scripted(episode: RecordedEpisode) -> NotMeasured | None:
     warn=0,
     reads=("/phase", "/action", "/action/ee_pose"),
 )
-def phases_match_motion(episode: RecordedEpisode) -> Found:
+def phases_match_motion(episode: CheckedEpisode) -> Found:
     """The hand is told to be open or closed as the phase has it, from its first frame to its last; and up is up."""
     if (unknown := _is_scripted(episode)) is not None:
         return unknown
@@ -122,7 +122,7 @@ def phases_match_motion(episode: RecordedEpisode) -> Found:
         "info.scene.goals.object",
     ),
 )
-def story(episode: RecordedEpisode) -> Found:
+def story(episode: CheckedEpisode) -> Found:
     """Phases follow each other as the skills have them; each approach has its grasp, each retry its new approach."""
     if (unknown := _is_scripted(episode)) is not None:
         return unknown
@@ -162,7 +162,7 @@ def story(episode: RecordedEpisode) -> Found:
         "info.behaviour",
     ),
 )
-def deliberate_misses(episode: RecordedEpisode) -> Found:
+def deliberate_misses(episode: CheckedEpisode) -> Found:
     """Frames of a deliberate miss go from an approach to the event that tells it, where the behaviour has one."""
     if (unknown := _is_scripted(episode)) is not None:
         return unknown

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from demorec.check.base import Measurement, check, worst
-from demorec.check.episode import RecordedEpisode
+from demorec.check.episode import CheckedEpisode
 from demorec.recording import channels
 from demorec.recording.streams import frame_streams
 
 
-def _once_a_frame(episode: RecordedEpisode) -> list[str]:
+def _once_a_frame(episode: CheckedEpisode) -> list[str]:
     topics = [stream.topic for stream in frame_streams(episode.info)]
     return [topic for topic in topics if topic in episode.scan]
 
@@ -22,7 +22,7 @@ def _once_a_frame(episode: RecordedEpisode) -> list[str]:
     warn=0,
     reads=("info.fps",),
 )
-def frame_times(episode: RecordedEpisode) -> Measurement | None:
+def frame_times(episode: CheckedEpisode) -> Measurement | None:
     """Times rise in equal steps of 1 / fps from 0, the same on every stream of numbers."""
     expected = episode.frame_times
     found = []
@@ -48,7 +48,7 @@ def frame_times(episode: RecordedEpisode) -> Measurement | None:
         "info.physics_hz",
     ),
 )
-def joint_sample_times(episode: RecordedEpisode) -> Measurement | None:
+def joint_sample_times(episode: CheckedEpisode) -> Measurement | None:
     """Recorded at the physics rate, joint states rise in equal steps of 1 / physics_hz."""
     times = episode.scan[channels.JOINT_STATES].time_ns
     if len(times) == episode.num_frames:
@@ -78,7 +78,7 @@ def joint_sample_times(episode: RecordedEpisode) -> Measurement | None:
         "/camera/{camera}/segmentation",
     ),
 )
-def stamps(episode: RecordedEpisode) -> Measurement | None:
+def stamps(episode: CheckedEpisode) -> Measurement | None:
     """The stamp in each message's header, which ROS tools go by, is the time at which it was logged."""
     found = []
     for topic, scan in episode.scan.items():
@@ -102,7 +102,7 @@ def stamps(episode: RecordedEpisode) -> Measurement | None:
         "cameras.video.gop",
     ),
 )
-def video_frames(episode: RecordedEpisode) -> Measurement | None:
+def video_frames(episode: CheckedEpisode) -> Measurement | None:
     """Each camera has one coded picture a frame at the frame's time, and a keyframe at least every GOP."""
     found = []
     expected = episode.frame_times

@@ -12,7 +12,7 @@ from demorec.errors import ConfigError
 
 if TYPE_CHECKING:
     from demorec.evaluate.rollouts import Evaluation
-    from demorec.evaluate.statistics import Comparison
+    from demorec.evaluate.statistics import RateComparison
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,7 +103,7 @@ def _plain(evaluation: Evaluation) -> dict[str, Any]:
     return plain
 
 
-def _compared(comparison: Comparison, first: Path, second: Path) -> list[str]:
+def _compared(comparison: RateComparison, first: Path, second: Path) -> list[str]:
     low, high = (100 * bound for bound in comparison.interval)
     alone = f"{comparison.only_first} scenes by the first, {comparison.only_second} by the second"
     return [

@@ -21,7 +21,7 @@ from demorec.runs.run_file import DATASET, EPISODES, STARTING, UNFINISHED, Attem
 
 
 @dataclass(frozen=True, kw_only=True)
-class CheckSummary:
+class ClosingChecks:
     """What the checks at the end have found.
 
     Attributes:
@@ -40,7 +40,7 @@ class CheckSummary:
     made_again: int = 0
 
 
-def check_run(result: RunResult, *, deep_every: int = 0, progress: Callable[[int, int], None]) -> CheckSummary:
+def check_run(result: RunResult, *, deep_every: int = 0, progress: Callable[[int, int], None]) -> ClosingChecks:
     """Every check of run, recordings and dataset that needs no decoded pictures; of the episodes asked for.
 
     Args:
@@ -73,7 +73,7 @@ def check_run(result: RunResult, *, deep_every: int = 0, progress: Callable[[int
         if again.level == "fail":
             first = again.error or str(again.differences[0])
             failures.append(f"{again.path.name}: made again it is not the same: {first}")
-    return CheckSummary(
+    return ClosingChecks(
         subjects=len(subjects),
         warnings=warnings,
         failures=tuple(failures),
@@ -82,7 +82,7 @@ def check_run(result: RunResult, *, deep_every: int = 0, progress: Callable[[int
     )
 
 
-def print_result(result: RunResult, export: ExportRecord | None, checked: CheckSummary | None) -> None:
+def print_result(result: RunResult, export: ExportRecord | None, checked: ClosingChecks | None) -> None:
     """The closing table."""
     run, folder = result.run, result.folder
     attempts = run.attempts

@@ -43,7 +43,7 @@ class Reproduce:
         """Generate again, compare, report."""
         from demorec.cli.progress import RunProgress
         from demorec.generate.options import RunOptions
-        from demorec.generate.reproduce import Comparison, reproduce
+        from demorec.generate.reproduce import Reproduction, reproduce
 
         options = RunOptions(
             out=self.out, workers=self.workers, executor=self.executor, address=self.address, export=False
@@ -52,7 +52,7 @@ class Reproduce:
         refuse_inside([self.out])
         with RunProgress() as progress:
             found = reproduce(self.source, options, progress=progress, allowed=allowed_modules(self.allow))
-        if not isinstance(found, Comparison):
+        if not isinstance(found, Reproduction):
             tell(f"Interrupted; the same command goes on: {self.out}")
             return 130
         total = len(found.same) + len(found.different)

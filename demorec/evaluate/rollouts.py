@@ -38,7 +38,14 @@ from demorec.recording import EpisodeWriter
 from demorec.runs.find import EVALUATION_NAME
 from demorec.runs.run_file import EPISODES, FAILED, Attempt
 from demorec.safety.own_versions import version_differences
-from demorec.safety.replacing import Kind, check_replaceable, json_object, obstacle, replaced_parts, settle_parts
+from demorec.safety.replacing import (
+    ReplaceableKind,
+    check_replaceable,
+    json_object,
+    obstacle,
+    replaced_parts,
+    settle_parts,
+)
 from demorec.scene.episode import Outcome
 from demorec.scene.features import ENVIRONMENT_STATE, IMAGE_PREFIX, ActionKind
 from demorec.sim.world import World
@@ -326,7 +333,7 @@ def _is_evaluation(folder: Path) -> bool:
     return isinstance(found.get("settings"), dict) and isinstance(found.get("rollouts"), list)
 
 
-EVALUATION = Kind(
+EVALUATION = ReplaceableKind(
     name="an evaluation",
     is_folder=True,
     recognises=_is_evaluation,

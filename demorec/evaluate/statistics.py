@@ -43,7 +43,7 @@ class Rate:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Comparison:
+class RateComparison:
     """Two policies.
 
     Attributes:
@@ -64,7 +64,7 @@ class Comparison:
     p_value: float
 
 
-def compare(first: Mapping[int, bool], second: Mapping[int, bool]) -> Comparison:
+def compare(first: Mapping[int, bool], second: Mapping[int, bool]) -> RateComparison:
     """Compare two evaluations: scene (episode index) -> success."""
     a, b = (Rate(successes=sum(x.values()), trials=len(x)) for x in (first, second))
     (low_a, high_a), (low_b, high_b) = a.interval, b.interval
@@ -72,7 +72,7 @@ def compare(first: Mapping[int, bool], second: Mapping[int, bool]) -> Comparison
     shared = first.keys() & second.keys()
     only_first = sum(first[i] and not second[i] for i in shared)
     only_second = sum(second[i] and not first[i] for i in shared)
-    return Comparison(
+    return RateComparison(
         first=a,
         second=b,
         difference=difference,

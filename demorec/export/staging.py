@@ -19,7 +19,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from demorec.errors import ConfigError, ExportError
-from demorec.safety.replacing import Kind, check_replaceable
+from demorec.safety.replacing import ReplaceableKind, check_replaceable
 
 _RENAME_EXCHANGE = 2
 _AT_FDCWD = -100
@@ -31,7 +31,7 @@ NEW, OLD, CODED, _LOCK = "new", "old", "coded", "lock"
 
 
 @contextmanager
-def staged_folder(target: Path, kind: Kind, *, replace: bool, sources: Iterable[Path]) -> Iterator[Path]:
+def staged_folder(target: Path, kind: ReplaceableKind, *, replace: bool, sources: Iterable[Path]) -> Iterator[Path]:
     """Give an empty folder that becomes `target` when the block ends without an error.
 
     Args:

@@ -14,7 +14,7 @@ from demorec.lerobot.paths import CARD_PATH
 from demorec.lerobot.sidecar import CONFIGS_PATH
 from demorec.runs.run_file import DATASET as DATASET_FOLDER
 from demorec.runs.run_file import EPISODES, FAILED, RUN_NAME, UNFINISHED, RunFile
-from demorec.safety.replacing import RECORDING, Kind, files_below, json_object
+from demorec.safety.replacing import RECORDING, ReplaceableKind, files_below, json_object
 
 PARTS = (RUN_NAME, EPISODES, FAILED, UNFINISHED, DATASET_FOLDER)
 """All that a run writes; what else is in its folder is never touched."""
@@ -129,4 +129,4 @@ def _is_unfinished(name: str) -> bool:
     return any(pattern.fullmatch(name) for pattern in (_PART, _RECORDING_ASIDE, _REPORT))
 
 
-RUN = Kind(name="a run of generate-dataset", is_folder=True, recognises=_recognises, strangers=_strangers)
+RUN = ReplaceableKind(name="a run of generate-dataset", is_folder=True, recognises=_recognises, strangers=_strangers)

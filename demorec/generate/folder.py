@@ -29,7 +29,7 @@ from demorec.runs.run_file import (
     Attempt,
     DamagedRunFileError,
     RunFile,
-    Session,
+    RunSession,
     free_name,
     load_run_file,
     save_run_file,
@@ -84,7 +84,7 @@ class RunFolder:
         self._attempts = {(a.episode_index, a.attempt): a for a in run.known}
         self._made: list[Attempt] = []
         self._peak_worker_bytes = 0
-        self._session = Session(started=_now(), machine=machine())
+        self._session = RunSession(started=_now(), machine=machine())
         self._has_session = False
         self._started = time.monotonic()
         self._saved_at = -1e9

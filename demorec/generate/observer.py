@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from demorec.runs.run_file import Attempt, RunFile, Session
+from demorec.runs.run_file import Attempt, RunFile, RunSession
 
 
 class RunObserver(Protocol):
@@ -55,6 +55,6 @@ class RunResult:
 
     folder: Path
     run: RunFile
-    session: Session
+    session: RunSession
     made: tuple[Attempt, ...]
     interrupted: bool

@@ -58,7 +58,7 @@ class Original:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Comparison:
+class Reproduction:
     """How the copy compares.
 
     Attributes:
@@ -76,7 +76,7 @@ class Comparison:
 
 def reproduce(
     source: Path, options: RunOptions, *, progress: RunObserver, allowed: Sequence[str] = ()
-) -> Comparison | RunResult:
+) -> Reproduction | RunResult:
     """Make the source's run again in `options.out` and compare; the run's result alone when it was interrupted.
 
     Args:
@@ -118,7 +118,7 @@ def reproduce(
         export_lerobot([result.folder], target, replace(original.export, overwrite=there))
         made = _dataset_digests(target)
     same = tuple(key for key, value in original.digests.items() if made.get(key) == value)
-    return Comparison(
+    return Reproduction(
         result=result,
         same=same,
         different=tuple(key for key in original.digests if key not in same),

@@ -14,7 +14,7 @@ import h5py
 
 from demorec.errors import in_words
 from demorec.safety.files import HDF5_MAGIC, open_regular
-from demorec.safety.replacing import Kind
+from demorec.safety.replacing import ReplaceableKind
 
 ENV_ARGUMENTS = frozenset({"robot", "fps", "physics_hz", "cameras", "action", "privileged"})
 """What `env_args` says of every environment of ours, by which our files are known."""
@@ -90,8 +90,10 @@ def _observation_pattern(file: h5py.File) -> str:
     return "|".join(re.escape(str(name)) for name in described["env_kwargs"]["observations"])
 
 
-DATASET = Kind(name="a robomimic dataset (HDF5) by demorec", recognises=_is_our_dataset, strangers=_strangers)
-UNFINISHED = Kind(name="an HDF5 file", recognises=_begins_as_hdf5)
+DATASET = ReplaceableKind(
+    name="a robomimic dataset (HDF5) by demorec", recognises=_is_our_dataset, strangers=_strangers
+)
+UNFINISHED = ReplaceableKind(name="an HDF5 file", recognises=_begins_as_hdf5)
 """What a killed export leaves (`NewFile` sees to its first bytes)."""
 
 

@@ -98,7 +98,7 @@ class _Waiting:
     num_bytes: int = 0
 
 
-class EpisodeWriter:
+class ImportedEpisodeWriter:
     """Writes one episode; a context manager, which leaves nothing behind unless `finish` was called.
 
     Args:

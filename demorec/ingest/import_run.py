@@ -16,7 +16,7 @@ from demorec.ingest.bag import Bag, open_bag
 from demorec.ingest.channel import BagError
 from demorec.ingest.clock import NS
 from demorec.ingest.description import describe, origin_of, urdf_text
-from demorec.ingest.episode_writer import EpisodeWriter, PicturePlan, picture_plan
+from demorec.ingest.episode_writer import ImportedEpisodeWriter, PicturePlan, picture_plan
 from demorec.ingest.episodes import Window, task_text, windows
 from demorec.ingest.fields import FieldError
 from demorec.ingest.import_file import ImportFile, load_import_file, save_import_file
@@ -179,7 +179,7 @@ class _Import:
         if not waiting:
             return
         with ExitStack() as stack:
-            under_way: list[tuple[_Episode, EpisodeWriter]] = []
+            under_way: list[tuple[_Episode, ImportedEpisodeWriter]] = []
             for topic, number, values in self._pictures(waiting):
                 for episode in [episode for episode in waiting if _wants(episode, topic, number)]:
                     under_way.append((episode, stack.enter_context(self._writer(episode))))
@@ -196,12 +196,12 @@ class _Import:
             for episode, writer in under_way:
                 self._finish(episode, writer)
 
-    def _finish(self, episode: _Episode, writer: EpisodeWriter) -> None:
+    def _finish(self, episode: _Episode, writer: ImportedEpisodeWriter) -> None:
         writer.finish(success=episode.rows.window.success)
         self._folder.add(episode.path)
 
-    def _writer(self, episode: _Episode) -> EpisodeWriter:
-        return EpisodeWriter(episode.path, episode.info, episode.rows, episode.plans, video=self._video)
+    def _writer(self, episode: _Episode) -> ImportedEpisodeWriter:
+        return ImportedEpisodeWriter(episode.path, episode.info, episode.rows, episode.plans, video=self._video)
 
     def _pictures(self, episodes: Sequence[_Episode]) -> Iterator[tuple[str, int, dict[str, object]]]:
         """(topic, number, values) of the pictures that any episode takes."""

@@ -99,7 +99,7 @@ class Robot:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Task:
+class TaskText:
     """What the robot was asked to do; one of the three.
 
     Attributes:
@@ -174,7 +174,7 @@ class BagMapping:
     """
 
     robot: Robot
-    task: Task
+    task: TaskText
     clock: Clock
     episodes: Episodes = field(default_factory=Episodes)
     features: Mapping[str, tuple[Source, ...]]

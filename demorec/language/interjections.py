@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from demorec.language.referring import phrases_for
-from demorec.language.situation import Situation
+from demorec.language.situation import Surroundings
 from demorec.recording import Recording
 from demorec.scene.episode import INTERJECTION_EVENT, EpisodeColumns
 
@@ -61,7 +61,7 @@ def correction_of(recording: Recording, columns: EpisodeColumns) -> Correction |
     return None
 
 
-def interjection(correction: Correction, now: Situation, rng: np.random.Generator) -> tuple[str, str] | None:
+def interjection(correction: Correction, now: Surroundings, rng: np.random.Generator) -> tuple[str, str] | None:
     """What the user says and what is answered; None where no words mean the wanted thing alone."""
     wanted, mistaken = (phrases_for(name, now) for name in (correction.wanted, correction.mistaken))
     if not wanted:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Literal, get_args
 
-Kind = Literal["subtask", "plan", "memory", "motion", "task_aug", "vqa", "trace", "interjection"]
+LanguageKind = Literal["subtask", "plan", "memory", "motion", "task_aug", "vqa", "trace", "interjection"]
 """`task_aug` is another wording of the task, `vqa` a question about a picture, `trace` a way in a picture,
 `interjection` what somebody says in the midst of it."""
-KINDS: tuple[Kind, ...] = get_args(Kind)
-STATES: tuple[Kind, ...] = ("subtask", "plan", "memory", "motion", "task_aug")
+KINDS: tuple[LanguageKind, ...] = get_args(LanguageKind)
+STATES: tuple[LanguageKind, ...] = ("subtask", "plan", "memory", "motion", "task_aug")
 """Those that hold from a moment on; the others are about one moment."""

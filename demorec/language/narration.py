@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from demorec.geometry import Array
 from demorec.language.interjections import interjection
-from demorec.language.kinds import KINDS, Kind
+from demorec.language.kinds import KINDS, LanguageKind
 from demorec.language.questions import questions, traces
 from demorec.language.referring import phrase_for
-from demorec.language.situation import Situation, situation
+from demorec.language.situation import Surroundings, situation
 from demorec.language.subtasks import GoalWords, goal_words, memories, plan, subtask, tcp_motion
 from demorec.language.tries import Story, story_of
 from demorec.language.wordings import task_wordings
@@ -37,7 +37,7 @@ class Statement:
     """
 
     row: int
-    kind: Kind
+    kind: LanguageKind
     role: Literal["user", "assistant"]
     text: str
     camera: str | None = None
@@ -47,7 +47,7 @@ def narrate(
     recording: Recording,
     columns: EpisodeColumns,
     rows: NDArray[np.intp],
-    kinds: Collection[Kind],
+    kinds: Collection[LanguageKind],
     cameras: Sequence[str] = (),
 ) -> list[Statement]:
     """Everything of the wanted kinds, in the order of the rows; kinds of one row in the order of `KINDS`.
@@ -64,7 +64,7 @@ def narrate(
     """
     story = story_of(recording, columns)
     told = _Told(recording, columns, rows, story)
-    found: dict[Kind, Callable[[], Iterator[Statement]]] = {
+    found: dict[LanguageKind, Callable[[], Iterator[Statement]]] = {
         "subtask": told.subtasks,
         "plan": told.plans,
         "memory": told.memories,
@@ -90,7 +90,7 @@ class _Told:
             for attempt in story.tries
         }
 
-    def _situation(self, frame: int) -> Situation:
+    def _situation(self, frame: int) -> Surroundings:
         poses: dict[str, Array] = {name: values[frame] for name, values in self._columns.object_poses.items()}
         return situation(self._scene, poses)
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from demorec.geometry import Array
 from demorec.language.grounding import MIN_PIXELS, Seen, body_values, pixel_of, project, seen_things
 from demorec.language.referring import phrases_for
-from demorec.language.situation import Situation, Thing, situation
+from demorec.language.situation import NamedThing, Surroundings, situation
 from demorec.recording import Recording
 from demorec.scene.episode import EpisodeColumns
 from demorec.scene.scene import Camera, Scene
@@ -70,7 +70,7 @@ class _Moment:
     """Where all things are at one moment, and what they are called, whatever camera looks at them."""
 
     positions: dict[str, Array]
-    now: Situation
+    now: Surroundings
     _phrases: dict[str, list[str]] = field(default_factory=dict)
 
     def phrases(self, name: str) -> list[str]:
@@ -91,7 +91,7 @@ class _View:
     moment: _Moment
 
     @property
-    def now(self) -> Situation:
+    def now(self) -> Surroundings:
         """All things as they are."""
         return self.moment.now
 
@@ -246,7 +246,7 @@ def _relation(view: _View, name: str, other: str) -> str:
     return "left_of" if offset < 0 else "right_of"
 
 
-def rests_on(upper: Thing, lower: Thing) -> bool:
+def rests_on(upper: NamedThing, lower: NamedThing) -> bool:
     """Whether one thing's middle is above the other and no air is between them."""
     offset = upper.position - lower.position
     air = float(offset[2]) - upper.height / 2 - lower.height / 2

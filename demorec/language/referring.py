@@ -12,7 +12,7 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
 
-from demorec.language.situation import COLORS, Situation, Thing
+from demorec.language.situation import COLORS, NamedThing, Surroundings
 
 MIN_GAP = 0.04
 """By how much, metres, one thing must be farther to a side, or nearer, than the next one to be called so."""
@@ -23,7 +23,7 @@ _IN_FRONT = ("left", "right", "leftmost", "rightmost", "middle", "smaller", "lar
 _BEHIND = ("nearest to the robot", "farthest from the robot")
 
 
-def resolve(phrase: str, situation: Situation) -> frozenset[str]:
+def resolve(phrase: str, situation: Surroundings) -> frozenset[str]:
     """Names of the things that a phrase refers to: one for "the ...", all that fit for "every ...".
 
     Nothing when the phrase is none of this grammar, or when it could mean several things: ARTICLE [ORDER] [COLOUR]
@@ -33,13 +33,13 @@ def resolve(phrase: str, situation: Situation) -> frozenset[str]:
     return frozenset() if match is None else _resolved(match, situation)
 
 
-def references(text: str, situation: Situation) -> Iterator[tuple[str, frozenset[str]]]:
+def references(text: str, situation: Surroundings) -> Iterator[tuple[str, frozenset[str]]]:
     """Each phrase of a text that refers to something, and what it refers to; nothing where that is unclear."""
     for match in _grammar(situation).finditer(text.lower()):
         yield match[0], _resolved(match, situation)
 
 
-def phrases_for(name: str, situation: Situation) -> list[str]:
+def phrases_for(name: str, situation: Surroundings) -> list[str]:
     """Every phrase of the grammar that refers to this thing and nothing else; the plainest with a colour come first."""
     thing = situation.thing(name)
     found = []
@@ -56,7 +56,7 @@ def phrases_for(name: str, situation: Situation) -> list[str]:
     return found
 
 
-def phrase_for(name: str, situation: Situation) -> str:
+def phrase_for(name: str, situation: Surroundings) -> str:
     """The plainest phrase for a thing; "a red cube" where none tells it from the others."""
     found = phrases_for(name, situation)
     if found:
@@ -67,7 +67,7 @@ def phrase_for(name: str, situation: Situation) -> str:
 
 
 @lru_cache(maxsize=64)
-def _grammar(situation: Situation) -> re.Pattern[str]:
+def _grammar(situation: Surroundings) -> re.Pattern[str]:
     nouns = "|".join(sorted({re.escape(noun) for thing in situation.things for noun in thing.nouns}, key=len)[::-1])
     return re.compile(
         rf"\b(?P<article>the|every) (?:(?P<order>{'|'.join(_IN_FRONT)}) )?(?:(?P<color>{'|'.join(COLORS)}) )?"
@@ -75,7 +75,7 @@ def _grammar(situation: Situation) -> re.Pattern[str]:
     )
 
 
-def _resolved(match: re.Match[str], situation: Situation) -> frozenset[str]:
+def _resolved(match: re.Match[str], situation: Surroundings) -> frozenset[str]:
     fitting = [
         thing
         for thing in situation.things
@@ -89,7 +89,7 @@ def _resolved(match: re.Match[str], situation: Situation) -> frozenset[str]:
     return frozenset({fitting[0].name} if len(fitting) == 1 else ())
 
 
-def _first(things: Sequence[Thing], value: Callable[[Thing], float], margin: float) -> list[Thing]:
+def _first(things: Sequence[NamedThing], value: Callable[[NamedThing], float], margin: float) -> list[NamedThing]:
     """The one of the smallest value, or none when the next one is not larger by the margin; none of a single one."""
     ordered = sorted(things, key=value)
     if len(ordered) < 2 or value(ordered[1]) - value(ordered[0]) < margin:
@@ -97,48 +97,52 @@ def _first(things: Sequence[Thing], value: Callable[[Thing], float], margin: flo
     return ordered[:1]
 
 
-def _of_two(choose: Callable[[Sequence[Thing]], list[Thing]]) -> Callable[[Sequence[Thing]], list[Thing]]:
+def _of_two(
+    choose: Callable[[Sequence[NamedThing]], list[NamedThing]],
+) -> Callable[[Sequence[NamedThing]], list[NamedThing]]:
     return lambda things: choose(things) if len(things) == 2 else []
 
 
-def _of_more(choose: Callable[[Sequence[Thing]], list[Thing]]) -> Callable[[Sequence[Thing]], list[Thing]]:
+def _of_more(
+    choose: Callable[[Sequence[NamedThing]], list[NamedThing]],
+) -> Callable[[Sequence[NamedThing]], list[NamedThing]]:
     return lambda things: choose(things) if len(things) > 2 else []
 
 
-def _distance(thing: Thing) -> float:
+def _distance(thing: NamedThing) -> float:
     return math.hypot(float(thing.position[0]), float(thing.position[1]))
 
 
-def _leftmost(things: Sequence[Thing]) -> list[Thing]:
+def _leftmost(things: Sequence[NamedThing]) -> list[NamedThing]:
     return _first(things, lambda thing: -float(thing.position[1]), MIN_GAP)
 
 
-def _rightmost(things: Sequence[Thing]) -> list[Thing]:
+def _rightmost(things: Sequence[NamedThing]) -> list[NamedThing]:
     return _first(things, lambda thing: float(thing.position[1]), MIN_GAP)
 
 
-def _smallest(things: Sequence[Thing]) -> list[Thing]:
+def _smallest(things: Sequence[NamedThing]) -> list[NamedThing]:
     return _first(things, lambda thing: math.log(thing.size), math.log(MIN_SIZE_RATIO))
 
 
-def _largest(things: Sequence[Thing]) -> list[Thing]:
+def _largest(things: Sequence[NamedThing]) -> list[NamedThing]:
     return _first(things, lambda thing: -math.log(thing.size), math.log(MIN_SIZE_RATIO))
 
 
-def _nearest(things: Sequence[Thing]) -> list[Thing]:
+def _nearest(things: Sequence[NamedThing]) -> list[NamedThing]:
     return _first(things, _distance, MIN_GAP)
 
 
-def _farthest(things: Sequence[Thing]) -> list[Thing]:
+def _farthest(things: Sequence[NamedThing]) -> list[NamedThing]:
     return _first(things, lambda thing: -_distance(thing), MIN_GAP)
 
 
-def _middle(things: Sequence[Thing]) -> list[Thing]:
+def _middle(things: Sequence[NamedThing]) -> list[NamedThing]:
     """Of three in a row: the one between the others."""
     if len(things) != 3:
         return []
 
-    def detour(thing: Thing) -> float:
+    def detour(thing: NamedThing) -> float:
         """How much longer the way between the other two is by way of this one, metres."""
         a, b = (other.position[:2].tolist() for other in things if other is not thing)
         here = thing.position[:2].tolist()
@@ -148,7 +152,7 @@ def _middle(things: Sequence[Thing]) -> list[Thing]:
     return chosen if chosen and detour(chosen[0]) < MIN_GAP else []
 
 
-_ORDERS: dict[str, Callable[[Sequence[Thing]], list[Thing]]] = {
+_ORDERS: dict[str, Callable[[Sequence[NamedThing]], list[NamedThing]]] = {
     "left": _of_two(_leftmost),
     "right": _of_two(_rightmost),
     "leftmost": _of_more(_leftmost),

@@ -23,7 +23,7 @@ _AT_THE_PLACE = 0.01
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Thing:
+class NamedThing:
     """One body of the scene.
 
     Attributes:
@@ -51,12 +51,12 @@ class Thing:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Situation:
+class Surroundings:
     """All things at one moment, the floor and what else only carries the scene left out."""
 
-    things: tuple[Thing, ...]
+    things: tuple[NamedThing, ...]
 
-    def thing(self, name: str) -> Thing:
+    def thing(self, name: str) -> NamedThing:
         """The thing of that name; KeyError when there is none."""
         for thing in self.things:
             if thing.name == name:
@@ -64,7 +64,7 @@ class Situation:
         raise KeyError(name)
 
 
-def situation(scene: Scene, world_from_object: Mapping[str, Array] | None = None) -> Situation:
+def situation(scene: Scene, world_from_object: Mapping[str, Array] | None = None) -> Surroundings:
     """The things of a scene.
 
     Args:
@@ -79,7 +79,7 @@ def situation(scene: Scene, world_from_object: Mapping[str, Array] | None = None
             continue
         position = np.asarray(moved[body.name][:3]) if body.name in moved else body.world_from_body.position
         things.append(
-            Thing(
+            NamedThing(
                 name=body.name,
                 nouns=nouns_of(body),
                 color=body.color_name,
@@ -89,7 +89,7 @@ def situation(scene: Scene, world_from_object: Mapping[str, Array] | None = None
                 can_be_held=body.movable,
             )
         )
-    return Situation(things=tuple(things))
+    return Surroundings(things=tuple(things))
 
 
 def nouns_of(body: Body) -> tuple[str, ...]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from demorec.geometry import Array
 from demorec.language.referring import phrase_for
-from demorec.language.situation import Situation, nouns_of, place_of
+from demorec.language.situation import Surroundings, nouns_of, place_of
 from demorec.language.tries import Story, Stretch, Try
 from demorec.scene.episode import CORRECTED_PHASE, MISTAKEN_PHASE
 from demorec.scene.scene import Scene
@@ -63,7 +63,7 @@ class GoalWords:
     inside: str
 
 
-def goal_words(scene: Scene, goal_index: int | None, now: Situation) -> GoalWords:
+def goal_words(scene: Scene, goal_index: int | None, now: Surroundings) -> GoalWords:
     """Words that tell object and place of a goal from all other things as they are now."""
     if goal_index is None:
         return GoalWords(object="the object", place="its place", into="to", inside="at")

@@ -13,7 +13,7 @@ from itertools import product
 import numpy as np
 
 from demorec.language.referring import phrases_for, references, resolve
-from demorec.language.situation import Situation, place_of, situation
+from demorec.language.situation import Surroundings, place_of, situation
 from demorec.language.subtasks import joined, prepositions
 from demorec.scene.scene import Goal, Scene
 
@@ -93,7 +93,7 @@ def task_wordings(scene: Scene, instruction: str, rng: np.random.Generator, *, i
     return found
 
 
-def _is_proved(text: str, clauses: Sequence[_Clause], start: Situation) -> bool:
+def _is_proved(text: str, clauses: Sequence[_Clause], start: Surroundings) -> bool:
     """Whether each phrase of a wording refers to something definite, and all together to the things of the goals."""
     found = [names for _, names in references(text, start)]
     wanted = {name for clause in clauses for name in (clause.object, clause.place) if name}
@@ -101,7 +101,7 @@ def _is_proved(text: str, clauses: Sequence[_Clause], start: Situation) -> bool:
     return all(found) and wanted <= set().union(*found) <= allowed
 
 
-def _base_of(goal: Goal, start: Situation) -> str:
+def _base_of(goal: Goal, start: Surroundings) -> str:
     """Name of the movable thing that a goal's object stands on, or ""."""
     upper = start.thing(goal.object)
     for thing in start.things:
@@ -118,7 +118,7 @@ def _base_of(goal: Goal, start: Situation) -> str:
 
 
 def _one_by_one(
-    scene: Scene, clauses: Sequence[_Clause], start: Situation, is_dropped: bool, rng: np.random.Generator
+    scene: Scene, clauses: Sequence[_Clause], start: Surroundings, is_dropped: bool, rng: np.random.Generator
 ) -> Iterator[str]:
     """Sentences that name each goal."""
     per_goal = [list(_sentences(scene, clause, start, is_dropped)) for clause in clauses]
@@ -136,7 +136,7 @@ def _one_by_one(
         yield form.replace("{a}", text).replace("{b}", parts[-1])
 
 
-def _sentences(scene: Scene, clause: _Clause, start: Situation, is_dropped: bool) -> Iterator[str]:
+def _sentences(scene: Scene, clause: _Clause, start: Surroundings, is_dropped: bool) -> Iterator[str]:
     objects = phrases_for(clause.object, start)
     places = phrases_for(clause.place, start) if clause.place else []
     bases = phrases_for(clause.base, start)[:1] if clause.base else []

@@ -28,7 +28,7 @@ from demorec.lerobot.options import ExportOptions
 from demorec.lerobot.progress import STAGE_COLUMNS, EpisodeProgress, read_progress, write_progress
 from demorec.lerobot.readings import Reading, readings
 from demorec.lerobot.sidecar import SidecarStart, SidecarWriter
-from demorec.lerobot.verify import LEROBOT, MAX_EPISODES, Sample, Verifier, lerobot_is_installed
+from demorec.lerobot.verify import LEROBOT, MAX_EPISODES, VerifiedEpisode, Verifier, lerobot_is_installed
 from demorec.lerobot.writer import DatasetWriter, WriterStart
 from demorec.safety.replacing import shown
 
@@ -143,12 +143,12 @@ class _Export:
             digest=combined_digest(finished, [*self._before, *self._digests]),
         )
 
-    def samples(self) -> list[Sample]:
+    def samples(self) -> list[VerifiedEpisode]:
         """What shall be verified: the new episodes, or some of them, spread evenly, if there are very many."""
         first = self._existing.writer.num_episodes if self._existing else 0
         count = len(self._recordings)
         chosen = np.unique(np.linspace(0, count - 1, min(count, MAX_EPISODES)).round().astype(int)).tolist()
-        return [Sample(episode_index=first + index, recording=self._recordings[index]) for index in chosen]
+        return [VerifiedEpisode(episode_index=first + index, recording=self._recordings[index]) for index in chosen]
 
     def _dataset_info(self, first: Reading) -> DatasetInfo:
         if self._existing is not None:

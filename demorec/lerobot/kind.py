@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 from demorec.lerobot.paths import INFO_PATH, SIDECAR_DIR
-from demorec.safety.replacing import Kind, files_below, json_object
+from demorec.safety.replacing import ReplaceableKind, files_below, json_object
 
 _NUMBERED = r"(file-\d+|episode_\d+)"
 _PARTS = re.compile(
@@ -41,7 +41,7 @@ def _strangers(folder: Path) -> list[str]:
     return [name for name in files_below(folder) if not is_dataset_file(name) or (folder / name).is_dir()]
 
 
-DATASET = Kind(
+DATASET = ReplaceableKind(
     name="a LeRobot dataset",
     is_folder=True,
     recognises=_is_dataset,
@@ -54,5 +54,5 @@ def _unlinkable(folder: Path) -> list[str]:
     return [name for name in files_below(folder) if not (folder / name).is_file()]
 
 
-GROWING_DATASET = Kind(name=DATASET.name, is_folder=True, recognises=_is_dataset, strangers=_unlinkable)
+GROWING_DATASET = ReplaceableKind(name=DATASET.name, is_folder=True, recognises=_is_dataset, strangers=_unlinkable)
 """One that is appended to: all its files are taken over, whoever's they are; links to folders and devices cannot be."""

@@ -9,7 +9,7 @@ from typing import Literal
 from demorec.config import VideoConfig
 from demorec.errors import ConfigError, OptionError
 from demorec.export.options import CommonOptions
-from demorec.language.kinds import KINDS, Kind
+from demorec.language.kinds import KINDS, LanguageKind
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +60,7 @@ class ExportOptions(CommonOptions):
         return VideoConfig(codec=self.transcode_codec, crf=self.transcode_crf)
 
     @property
-    def spoken(self) -> tuple[Kind, ...]:
+    def spoken(self) -> tuple[LanguageKind, ...]:
         """The kinds of language to be written."""
         named = self.language
         return () if named is None else tuple(kind for kind in KINDS if not named or kind in named)

@@ -57,7 +57,7 @@ def lerobot_is_installed() -> bool:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sample:
+class VerifiedEpisode:
     """An episode of the dataset and the recording that it comes from."""
 
     episode_index: int
@@ -89,7 +89,7 @@ class Verifier:
         self._process.join()
         self._cache.cleanup()
 
-    def verify(self, root: Path, samples: Sequence[Sample], options: ExportOptions) -> int:
+    def verify(self, root: Path, samples: Sequence[VerifiedEpisode], options: ExportOptions) -> int:
         """Compare; return how many frames were compared.
 
         Raises:
@@ -132,7 +132,7 @@ def _serve(pipe: Connection[Any, Any], cache: str) -> None:
         pipe.send(answer)
 
 
-def _verify(root: Path, samples: tuple[Sample, ...], options: ExportOptions) -> int:
+def _verify(root: Path, samples: tuple[VerifiedEpisode, ...], options: ExportOptions) -> int:
     from lerobot.datasets import LeRobotDataset
 
     try:
@@ -148,7 +148,9 @@ def _verify(root: Path, samples: tuple[Sample, ...], options: ExportOptions) -> 
     return frames
 
 
-def _compare_episode(dataset: Any, sample: Sample, recording: AnyRecording, options: ExportOptions, number: int) -> int:
+def _compare_episode(
+    dataset: Any, sample: VerifiedEpisode, recording: AnyRecording, options: ExportOptions, number: int
+) -> int:
     expected = prepare_episode(recording, options, code_depth=False).data
     first = int(dataset.meta.episodes[sample.episode_index]["dataset_from_index"])
     # The last frame, where offsets add up, and one more that differs from episode to episode.

@@ -59,7 +59,7 @@ def show(recordings: Sequence[Path]) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Report:
+class ViewerReport:
     """What a view of the viewer complains about."""
 
     view: str
@@ -214,10 +214,10 @@ class HeadlessViewer:
                 return self._picture(view.view_id)
         raise KeyError(name)
 
-    def reports(self) -> list[Report]:
+    def reports(self) -> list[ViewerReport]:
         """Every warning and error of a view."""
         return [
-            Report(view=view.name, severity=report.severity, message=report.summary)
+            ViewerReport(view=view.name, severity=report.severity, message=report.summary)
             for view in self.client.get_state().views
             for report in view.reports
         ]

@@ -19,14 +19,14 @@ from demorec.report.episodes import MOST_SHOWN
 from demorec.report.exported import missing_in, read_episodes, read_story
 from demorec.report.filmstrip import strip_budget
 from demorec.report.recorded import Components, ReadEpisode, merge, read_recording
-from demorec.runs.find import EPISODE_FOLDERS, Found, Kind, expect, expect_recordings
+from demorec.runs.find import EPISODE_FOLDERS, Found, PathKind, expect, expect_recordings
 from demorec.runs.run_file import RUN_NAME, Attempt, DamagedRunFileError, RunFile, load_run_file
 from demorec.scene.episode import EpisodeInfo
 from demorec.scene.features import IMAGE_PREFIX
 
 _SHOWN = 3
 """Of several values of one fact."""
-_KINDS: Mapping[Kind, str] = {
+_KINDS: Mapping[PathKind, str] = {
     "recording": "recording",
     "run": "run",
     "evaluation": "evaluation of a policy",

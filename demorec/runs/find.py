@@ -17,7 +17,7 @@ from demorec.lerobot.paths import INFO_PATH
 from demorec.runs.run_file import EPISODES, FAILED, RUN_NAME
 from demorec.safety.files import HDF5_MAGIC, MCAP_MAGIC, RERUN_MAGICS, irregular_kind, open_regular
 
-Kind = Literal[
+PathKind = Literal[
     "recording",
     "unfinished",
     "rrd",
@@ -32,12 +32,12 @@ Kind = Literal[
 ]
 """What a path can be. "recordings" is a folder of recordings without a run.json."""
 
-EPISODE_FOLDERS: tuple[Kind, ...] = ("run", "recordings", "evaluation")
+EPISODE_FOLDERS: tuple[PathKind, ...] = ("run", "recordings", "evaluation")
 """What holds recordings, in itself or in episodes/ and failed/."""
 
 EVALUATION_NAME = "evaluation.json"
 
-_NAMES: dict[Kind, str] = {
+_NAMES: dict[PathKind, str] = {
     "recording": "a recording (.mcap)",
     "unfinished": "an unfinished recording (.part)",
     "rrd": "a Rerun file (.rrd)",
@@ -48,7 +48,7 @@ _NAMES: dict[Kind, str] = {
     "dataset": "a LeRobot dataset",
     "recordings": "a folder of recordings",
 }
-_ADVICE: dict[Kind, str] = {
+_ADVICE: dict[PathKind, str] = {
     "unfinished": "; demorec recover keeps what is whole in it",
     "rrd": "; demorec view shows it by a name that ends in .rrd",
     "hdf5": "; name the run that it was made from",
@@ -57,15 +57,15 @@ _ADVICE: dict[Kind, str] = {
     "evaluation": "; name one of its recordings",
     "recordings": "; name one of them",
 }
-_MAGICS: tuple[tuple[bytes, Kind], ...] = (
+_MAGICS: tuple[tuple[bytes, PathKind], ...] = (
     (MCAP_MAGIC, "recording"),
     *((magic, "rrd") for magic in RERUN_MAGICS),
     (HDF5_MAGIC, "hdf5"),
     (b"#ROSBAG", "rosbag"),
     (b"SQLite format 3", "rosbag"),
 )
-_SUFFIXES: dict[str, Kind] = {".mcap": "recording", ".part": "unfinished", ".rrd": "rrd", ".hdf5": "hdf5"}
-_MARKS: tuple[tuple[str, Kind], ...] = (
+_SUFFIXES: dict[str, PathKind] = {".mcap": "recording", ".part": "unfinished", ".rrd": "rrd", ".hdf5": "hdf5"}
+_MARKS: tuple[tuple[str, PathKind], ...] = (
     (RUN_NAME, "run"),
     (INFO_PATH, "dataset"),
     (EVALUATION_NAME, "evaluation"),
@@ -90,7 +90,7 @@ class Found:
     """
 
     path: Path
-    kind: Kind
+    kind: PathKind
     reason: str = ""
     recordings: tuple[Path, ...] = ()
     failed: tuple[Path, ...] = ()
@@ -119,7 +119,7 @@ def find(path: Path) -> Found:
         return Found(path=path, kind="unreadable", reason=f"This cannot be read ({error.strerror})")
 
 
-def expect(path: Path, *kinds: Kind) -> Found:
+def expect(path: Path, *kinds: PathKind) -> Found:
     """What a path is, if it is of one of these kinds and, as a folder of episodes, has a recording.
 
     Raises:

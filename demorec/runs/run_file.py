@@ -72,7 +72,7 @@ class Attempt:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Session:
+class RunSession:
     """One start of the command that worked on this run. Wall-clock times in UTC, ISO 8601."""
 
     started: str
@@ -117,7 +117,7 @@ class RunFile:
     num_episodes: int
     attempts: tuple[Attempt, ...] = ()
     beyond: tuple[Attempt, ...] = ()
-    sessions: tuple[Session, ...] = ()
+    sessions: tuple[RunSession, ...] = ()
     export: ExportRecord | None = None
 
     @property

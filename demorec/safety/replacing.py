@@ -30,7 +30,7 @@ _MARK_TEXT = "What --overwrite replaces. demorec removes this folder when the ne
 
 
 @dataclass(frozen=True, kw_only=True)
-class Kind:
+class ReplaceableKind:
     """A kind of file or folder that a command makes, and may therefore replace.
 
     Attributes:
@@ -57,16 +57,16 @@ def _begins_with(*magics: bytes) -> Callable[[Path], bool]:
     return recognises
 
 
-RECORDING = Kind(name="a recording (MCAP)", recognises=_begins_with(MCAP_MAGIC))
-RERUN_FILE = Kind(name="a Rerun file (.rrd)", recognises=_begins_with(*RERUN_MAGICS))
-PICTURE = Kind(name="a picture (PNG)", recognises=_begins_with(b"\x89PNG\r\n\x1a\n"))
+RECORDING = ReplaceableKind(name="a recording (MCAP)", recognises=_begins_with(MCAP_MAGIC))
+RERUN_FILE = ReplaceableKind(name="a Rerun file (.rrd)", recognises=_begins_with(*RERUN_MAGICS))
+PICTURE = ReplaceableKind(name="a picture (PNG)", recognises=_begins_with(b"\x89PNG\r\n\x1a\n"))
 REPORT_MARK = "<!doctype html>\n<!-- A report by demorec. -->\n"
-REPORT = Kind(name="a report (HTML)", recognises=_begins_with(REPORT_MARK.encode()))
+REPORT = ReplaceableKind(name="a report (HTML)", recognises=_begins_with(REPORT_MARK.encode()))
 
 
 def check_replaceable(
     target: Path,
-    kind: Kind,
+    kind: ReplaceableKind,
     *,
     overwrite: bool,
     sources: Iterable[Path] = (),
@@ -95,7 +95,7 @@ def check_replaceable(
         raise ConfigError(f"This is never replaced, since {reason}: choose another name: {target}")
 
 
-def obstacle(target: Path, kind: Kind, sources: Iterable[Path] = ()) -> str:
+def obstacle(target: Path, kind: ReplaceableKind, sources: Iterable[Path] = ()) -> str:
     """Why `target` must not be replaced, as `check_replaceable` tells it; "" when it may be, or nothing is there."""
     try:
         return _obstacle(target, kind, sources) if os.path.lexists(target) else ""
@@ -103,7 +103,7 @@ def obstacle(target: Path, kind: Kind, sources: Iterable[Path] = ()) -> str:
         return f"it cannot be read ({error.strerror})"
 
 
-def _obstacle(target: Path, kind: Kind, sources: Iterable[Path]) -> str:
+def _obstacle(target: Path, kind: ReplaceableKind, sources: Iterable[Path]) -> str:
     if not target.exists():
         return "it is a link to something that is not there"
     reason = use_as_source(target.resolve(), sources)
@@ -246,7 +246,7 @@ def _put_back(folder: Path, names: Sequence[str]) -> None:
     aside.rmdir()
 
 
-def lock_part(part: Path, kind: Kind) -> int:
+def lock_part(part: Path, kind: ReplaceableKind) -> int:
     """Open an unfinished file for writing, locked until the descriptor is closed or the process dies.
 
     What a dead process left there stays as it is; the caller decides about it.
@@ -277,7 +277,7 @@ def lock_part(part: Path, kind: Kind) -> int:
 
 
 @contextmanager
-def written_whole(target: Path, kind: Kind) -> Iterator[Path]:
+def written_whole(target: Path, kind: ReplaceableKind) -> Iterator[Path]:
     """Give the name of a file beside `target`, which takes its place in one step when the block ends without an error.
 
     A leftover of a killed process is written over; an error removes the unfinished file.

@@ -213,19 +213,19 @@ def test_a_full_disk_leaves_nothing_half_written(
 def test_interrupting_leaves_nothing_half_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from demorec.ingest.episode_writer import EpisodeWriter
+    from demorec.ingest.episode_writer import ImportedEpisodeWriter
 
     bag = bags.write_mcap(bags.in_order(bags.so101(0.5)), tmp_path / "bag.mcap")
     mapping = bag_mappings.write_mapping(bag_mappings.SO101, tmp_path / "robot.toml")
-    add, calls = EpisodeWriter.add, iter(range(100))
+    add, calls = ImportedEpisodeWriter.add, iter(range(100))
 
-    def interrupted(self: EpisodeWriter, topic: str, number: int, values: dict[str, object]) -> None:
+    def interrupted(self: ImportedEpisodeWriter, topic: str, number: int, values: dict[str, object]) -> None:
         if next(calls) == 9:
             raise KeyboardInterrupt
         add(self, topic, number, values)
 
     with monkeypatch.context() as patched:
-        patched.setattr(EpisodeWriter, "add", interrupted)
+        patched.setattr(ImportedEpisodeWriter, "add", interrupted)
         assert _run("import", bag, "--mapping", mapping, "--out", tmp_path / "run") == 130
     assert "interrupted" in capsys.readouterr().err
     assert not list((tmp_path / "run/episodes").iterdir())

@@ -14,7 +14,7 @@ from support.recording import write_episode
 from demorec.cli import main
 from demorec.errors import ConfigError
 from demorec.lerobot.paths import INFO_PATH
-from demorec.runs.find import Kind, expect, find
+from demorec.runs.find import PathKind, expect, find
 
 
 def make_fifo(path: Path) -> None:
@@ -154,7 +154,7 @@ def a_recording(name: str) -> Callable[[Path], Path]:
         (write("other/x.txt"), "nothing"),
     ],
 )
-def test_what_there_is_gets_its_name(tmp_path: Path, make: Callable[[Path], Path], kind: Kind) -> None:
+def test_what_there_is_gets_its_name(tmp_path: Path, make: Callable[[Path], Path], kind: PathKind) -> None:
     assert find(make(tmp_path)).kind == kind
 
 

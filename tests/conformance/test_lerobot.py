@@ -19,7 +19,7 @@ from support.recording import make_episode
 import demorec.lerobot.writer
 from demorec.lerobot import ExportOptions, dataset_digest, export_lerobot, verify
 from demorec.lerobot.depth import code_values, quantised
-from demorec.lerobot.verify import Sample
+from demorec.lerobot.verify import VerifiedEpisode
 from demorec.recording import Recording
 
 LENGTHS = (20, 15, 17, 9, 31, 12)
@@ -189,7 +189,7 @@ def test_depth_without_its_colour_is_verified(tmp_path: Path) -> None:
     )
     export_lerobot([run], tmp_path / "d", options)
     episodes = sorted((run / "episodes").iterdir())
-    samples = tuple(Sample(episode_index=index, recording=path) for index, path in enumerate(episodes))
+    samples = tuple(VerifiedEpisode(episode_index=index, recording=path) for index, path in enumerate(episodes))
     assert verify._verify(tmp_path / "d", samples, options) == 4  # in this process, which has loaded LeRobot already
     assert open_dataset(tmp_path / "d").meta.camera_keys == ["observation.images.front_depth"]
 

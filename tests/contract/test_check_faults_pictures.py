@@ -13,9 +13,9 @@ from PIL import Image, ImageFilter
 from support.check import checked, simulate
 from support.faults import Good, Rows
 
-from demorec.check.cells import Kind
-from demorec.check.drawn import Comparison, DrawnPictures, fill_between, frames_to_draw
-from demorec.check.episode import RecordedEpisode
+from demorec.check.cells import ImageKind
+from demorec.check.drawn import DrawnPictures, PictureComparison, fill_between, frames_to_draw
+from demorec.check.episode import CheckedEpisode
 from demorec.geometry import Array
 from demorec.render.recorded import RecordedWorld
 from demorec.tables import CHECKS
@@ -182,7 +182,7 @@ LABELS: list[tuple[str, Fault, str]] = [
     ("upside down", lambda rows: rows[:, ::-1], "segmentation_matches_scene"),
 ]
 
-CASES: list[tuple[Kind, str, Fault, str]] = [
+CASES: list[tuple[ImageKind, str, Fault, str]] = [
     *(("color", *row) for row in COLOR),
     *(("depth", *row) for row in DEPTH),
     *(("labels", *row) for row in LABELS),
@@ -199,7 +199,7 @@ def test_the_good_one_passes(good: Good) -> None:
 
 @pytest.mark.parametrize(("kind", "name", "fault", "check"), CASES, ids=[f"{kind}: {name}" for kind, name, *_ in CASES])
 @pytest.mark.parametrize("camera", ["front", pytest.param("wrist", marks=pytest.mark.slow)])
-def test_a_fault(camera: str, kind: Kind, name: str, fault: Fault, check: str, good: Good) -> None:
+def test_a_fault(camera: str, kind: ImageKind, name: str, fault: Fault, check: str, good: Good) -> None:
     rows = good.pictures[camera, kind]
     changed = fault(rows)
     assert not np.array_equal(changed, rows)
@@ -215,7 +215,7 @@ def poses(good: Good) -> Array:
     return RecordedWorld(info.robot, info.scene, joint_position=joints, object_poses=objects).all_poses
 
 
-def drawn_in_part(good: Good, changed: Mapping[tuple[str, Kind], Rows], poses: Array) -> RecordedEpisode:
+def drawn_in_part(good: Good, changed: Mapping[tuple[str, ImageKind], Rows], poses: Array) -> CheckedEpisode:
     """The episode with other pictures, as if it had colour alone: only some of its frames are drawn."""
     episode, whole = good.with_pictures(changed), good.episode._drawn
     assert isinstance(whole, DrawnPictures)
@@ -238,8 +238,8 @@ def test_the_good_one_passes_drawn_in_part(good: Good, poses: Array) -> None:
         assert result.level == "pass", (name, result.value, result.detail)
     for camera in episode.cameras:
         part, whole = episode.compared(camera), good.episode.compared(camera)
-        assert isinstance(part, Comparison)
-        assert isinstance(whole, Comparison)
+        assert isinstance(part, PictureComparison)
+        assert isinstance(whole, PictureComparison)
         assert part.lag == pytest.approx(whole.lag, abs=0.03)
         assert part.shift == pytest.approx(whole.shift, abs=0.001)
 
@@ -252,7 +252,7 @@ def test_a_fault_of_one_drawn_in_part(
     episode = drawn_in_part(good, {(camera, "color"): fault(good.pictures[camera, "color"])}, poses)
     if check == "picture_lag":
         compared = episode.compared(next(c for c in episode.cameras if c.name == camera))
-        assert isinstance(compared, Comparison)
+        assert isinstance(compared, PictureComparison)
         assert compared.lag is not None
         assert abs(compared.lag) > CHECKS.load(check).fail
         return

@@ -111,12 +111,12 @@ def test_one_bad_recording_leaves_the_reports_of_the_others(
 
 
 def test_what_nobody_foresaw_is_a_finding(good: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from demorec.check.episode import RecordedEpisode
+    from demorec.check.episode import CheckedEpisode
 
-    def broken(self: RecordedEpisode) -> None:
+    def broken(self: CheckedEpisode) -> None:
         raise IndexError("list index out of range")
 
-    monkeypatch.setattr(RecordedEpisode, "world_from_tcp", property(broken))
+    monkeypatch.setattr(CheckedEpisode, "world_from_tcp", property(broken))
     report = checked(good / "episodes" / "episode_000000.mcap")
     failed = {result.check: result.detail for result in report.results if result.level == "fail"}
     assert len(failed) == 1, "one cause is one finding"

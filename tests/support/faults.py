@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.check.base import Result
-from demorec.check.cells import CellGrid, Kind
-from demorec.check.drawn import Comparison
-from demorec.check.episode import RecordedEpisode
+from demorec.check.cells import CellGrid, ImageKind
+from demorec.check.drawn import PictureComparison
+from demorec.check.episode import CheckedEpisode
 from demorec.check.pictures_summary import PictureSummary
 from demorec.scene.episode import EpisodeColumns, EpisodeInfo, Outcome
 from demorec.scene.scene import Camera
@@ -31,13 +31,13 @@ class Good:
         pictures: (camera, kind) -> (T, H, W[, 3]).
     """
 
-    episode: RecordedEpisode
-    pictures: Mapping[tuple[str, Kind], Rows] = field(default_factory=dict)
+    episode: CheckedEpisode
+    pictures: Mapping[tuple[str, ImageKind], Rows] = field(default_factory=dict)
 
     @classmethod
     def open(cls, path: Path) -> Good:
         """Read and decode everything."""
-        episode = RecordedEpisode(path)
+        episode = CheckedEpisode(path)
         recording, pictures = episode.recording, {}
         for camera in episode.cameras:
             for kind in episode.kinds(camera.name):
@@ -51,16 +51,16 @@ class Good:
     def _cameras(self) -> dict[str, Camera]:
         return {camera.name: camera for camera in self.episode.cameras}
 
-    def with_pictures(self, changed: Mapping[tuple[str, Kind], Rows]) -> RecordedEpisode:
+    def with_pictures(self, changed: Mapping[tuple[str, ImageKind], Rows]) -> CheckedEpisode:
         """The episode with other pictures; what is drawn of it stays."""
-        spoilt = RecordedEpisode(self.episode.path)
+        spoilt = CheckedEpisode(self.episode.path)
         spoilt._recording = self.episode.recording
         spoilt.__dict__["columns"] = self.episode.columns
         spoilt.__dict__["_drawn"] = self.episode._drawn
         for key in self.pictures.keys() - changed.keys():
             spoilt._pictures[key] = self.episode.pictures(self._cameras[key[0]], key[1])
             compared = self.episode.compared(self._cameras[key[0]], key[1])
-            assert isinstance(compared, Comparison)
+            assert isinstance(compared, PictureComparison)
             spoilt._comparisons[key] = compared
         for (name, kind), pictures in changed.items():
             grid = CellGrid(pictures.shape[2], pictures.shape[1])
@@ -102,7 +102,7 @@ class Changed:
 
 def judged(path: Path, check: str, fault: Callable[[Changed], Changed]) -> Result:
     """What a check says of a recording with a fault in its numbers or in what is said about it."""
-    with RecordedEpisode(path) as episode:
+    with CheckedEpisode(path) as episode:
         recording = episode.recording
         assert recording.outcome is not None
         before = Changed(columns=recording.columns(), info=recording.info, outcome=recording.outcome)

@@ -16,7 +16,7 @@ from demorec.cli.generate_report import check_run
 from demorec.config import GenerateConfig
 from demorec.generate.observer import RunResult
 from demorec.runs.recordings import inspect_recording
-from demorec.runs.run_file import RunFile, Session, save_run_file
+from demorec.runs.run_file import RunFile, RunSession, save_run_file
 
 FAILED = "failed/episode_000000.attempt_0.mcap"
 
@@ -99,7 +99,7 @@ def test_the_closing_table_counts_them_apart(run: Path) -> None:
     """What decides the exit code of generate-dataset."""
     attempt = replace(inspect_recording(run / FAILED).attempt, file=FAILED)
     known = RunFile(config=GenerateConfig(), versions={}, num_episodes=1, attempts=(attempt,))
-    result = RunResult(folder=run, run=known, session=Session(started=""), made=(), interrupted=False)
+    result = RunResult(folder=run, run=known, session=RunSession(started=""), made=(), interrupted=False)
     found = check_run(result, progress=lambda done, total: None)
     assert found.failed_attempts == 1
     assert not any(failure.startswith(Path(FAILED).name) for failure in found.failures)

@@ -14,12 +14,12 @@ from demorec.cli.generate_report import next_commands
 from demorec.config import GenerateConfig
 from demorec.generate.contents import set_aside
 from demorec.generate.observer import RunResult
-from demorec.runs.run_file import ExportRecord, RunFile, Session
+from demorec.runs.run_file import ExportRecord, RunFile, RunSession
 
 
 def result_of(folder: Path, *, cameras: tuple[str, ...] = ("front",)) -> RunResult:
     run = RunFile(config=GenerateConfig(cameras=cameras), versions={}, num_episodes=1)
-    return RunResult(folder=folder, run=run, session=Session(started=""), made=(), interrupted=False)
+    return RunResult(folder=folder, run=run, session=RunSession(started=""), made=(), interrupted=False)
 
 
 EXPORT = ExportRecord(run_digest="12", repo_id="me/cubes")

@@ -15,7 +15,7 @@ from demorec.errors import ExportError
 from demorec.geometry import Pose
 from demorec.language.narration import narrate
 from demorec.language.referring import phrase_for, phrases_for, references, resolve
-from demorec.language.situation import Situation, situation
+from demorec.language.situation import Surroundings, situation
 from demorec.lerobot import files
 from demorec.lerobot.language import EpisodeLanguage, LanguageRow, language_arrays
 from demorec.recording import EpisodeWriter, Recording
@@ -157,7 +157,7 @@ def test_phases_of_a_foreign_script_are_told_as_they_are(tmp_path: Path) -> None
 def test_things_are_where_the_poses_say(tmp_path: Path) -> None:
     things = scene(("red", 0.4, 0.2, 0.05), ("red", 0.5, -0.2, 0.03))
     poses = {"red_cube_0": np.array([0.4, -0.4, 0.0, 0, 0, 0, 1.0])}
-    now: Situation = situation(things, poses)
+    now: Surroundings = situation(things, poses)
     assert resolve("the right red cube", now) == {"red_cube_0"}
 
 

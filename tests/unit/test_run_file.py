@@ -20,7 +20,7 @@ from demorec.runs.run_file import (
     DamagedRunFileError,
     ExportRecord,
     RunFile,
-    Session,
+    RunSession,
     load_run_file,
     recording_name,
     save_run_file,
@@ -48,7 +48,7 @@ def a_run() -> RunFile:
         config=GenerateConfig(seed=3, cameras=("wrist",)),
         versions={"numpy": "2"},
         num_episodes=8,
-        sessions=(Session(started="2026-01-01T00:00:00+00:00", machine={"host": "somewhere"}),),
+        sessions=(RunSession(started="2026-01-01T00:00:00+00:00", machine={"host": "somewhere"}),),
         export=ExportRecord(run_digest="12", repo_id="me/cubes"),
     ).with_attempts(attempts)
 

@@ -52,7 +52,7 @@ class Difference:
         return text if self.largest is None or len(self.frames) < 2 else f"{text}; at most {self.largest:.3g} apart"
 
 
-def in_words(value: Value | None) -> str:
+def difference_in_words(value: Value | None) -> str:
     """A value as a person reads it; None is what is missing."""
     if value is None:
         return "nothing"
@@ -70,7 +70,7 @@ class Differences:
     def add(self, stream: str, field: str, frame: int | None, recorded: Value | None, again: Value | None) -> None:
         """Two values that differ."""
         frames, first, first_again, largest = self._found.setdefault(
-            (stream, field), ([], in_words(recorded), in_words(again), None)
+            (stream, field), ([], difference_in_words(recorded), difference_in_words(again), None)
         )
         if frame is not None and (not frames or frames[-1] != frame):
             frames.append(frame)
