@@ -43,7 +43,7 @@ class Improve:
     num_scenes: int = 50
     """Held-out scenes on which each policy is tried."""
     seed: int = 1
-    """Of the trainings; the scenes of round k have the root seed SEED + k, which should not be the demonstrations'."""
+    """Of the trainings; the scenes of round k have the root seed of the demonstrations plus SEED + k."""
     action: str = "joint_increment"
     """joint, joint_increment, ee or ee_delta."""
     privileged: bool = False

@@ -54,7 +54,7 @@ class Plan:
         num_rounds: Rounds of corrections.
         num_episodes: Scenes in which the policy of a round is corrected.
         num_scenes: Held-out scenes on which each policy is tried.
-        seed: Of the trainings; the scenes of round k have the root seed `seed` + k.
+        seed: Of the trainings; the scenes of round k have the root seed of the demonstrations' plus `seed` + k.
         action, privileged, features: As of the export.
         takeover: When the expert takes over.
     """
@@ -189,7 +189,7 @@ class Improvement:
 
     def _correct(self, number: int) -> None:
         """The policy of the round before acts and is corrected, in scenes that no round had."""
-        config = replace(self._config, seed=self._plan.seed + number)
+        config = replace(self._config, seed=self._config.seed + self._plan.seed + number)
         self._act(
             self.policy(number - 1), config, self._corrections(number), self._plan.num_episodes, self._plan.takeover
         )

@@ -30,6 +30,7 @@ ROWS: dict[str, tuple[int, str]] = {
     "export hdf5 RUN --out NEW.hdf5": (0, "1 episode, 24 frames"),
     "evaluate --policy RUN": (2, "No policy"),
     "correct --policy RUN": (2, "No policy"),
+    "improve RUN --config-path MAPPING --out NEW": (2, COLLECTED),
     "reproduce RUN --out NEW": (2, COLLECTED),
     "reproduce DATASET --out NEW": (2, COLLECTED),
     "import BAG --mapping MAPPING --out RUN": (0, "1 of 1 bags had been imported before."),

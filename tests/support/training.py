@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from demorec.recording.scheduling import ordinary_scheduling
+
 CAMERA, DEPTH = "observation.images.top", "observation.images.top_depth"
 SIZE = 64
 """Of the pictures: the least that LeRobot's AV1 encoder takes."""
@@ -26,6 +28,11 @@ def write_by_lerobot(
         depth: Whether there is a depth camera, too.
         arguments: Of `LeRobotDataset.create`.
     """
+    with ordinary_scheduling():  # module fixtures run outside of that of every test
+        return _write(root, lengths, stored_as=stored_as, depth=depth, **arguments)
+
+
+def _write(root: Path, lengths: Sequence[int], *, stored_as: str, depth: bool, **arguments: Any) -> Path:
     from lerobot.datasets import LeRobotDataset
 
     axes = ["height", "width", "channels"]
