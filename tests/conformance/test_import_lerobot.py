@@ -31,7 +31,7 @@ VECTORS = ("observation.state", "observation.single", "action")
 NAME = CAMERA.removeprefix("observation.images.")
 
 
-@pytest.fixture(scope="module", params=["video", "image", "long_gops"])
+@pytest.fixture(scope="module", params=[pytest.param("video", marks=pytest.mark.slow), "image", "long_gops"])
 def imported(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path, Path]:
     """How pictures are kept, a dataset by LeRobot, and the run that was made of it."""
     from lerobot.configs import RGBEncoderConfig

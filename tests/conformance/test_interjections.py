@@ -78,6 +78,7 @@ def test_the_recording_passes_every_check(run: Path) -> None:
     assert [result.check for result in report.results if result.level not in ("pass", "skip")] == []
 
 
+@pytest.mark.slow
 def test_lerobots_own_validator_finds_nothing(dataset: Path, tmp_path: Path) -> None:
     from lerobot.annotations.steerable_pipeline.reader import iter_episodes
     from lerobot.annotations.steerable_pipeline.staging import EpisodeStaging

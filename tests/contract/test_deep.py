@@ -206,7 +206,7 @@ def leaves(value: Any, path: str) -> Iterator[tuple[str, Any, Any]]:
             yield where, value, key
 
 
-@pytest.mark.parametrize("record", [EPISODE, OUTCOME])
+@pytest.mark.parametrize("record", [pytest.param(EPISODE, marks=pytest.mark.slow), OUTCOME])
 def test_every_field_of_the_metadata(record: str, filmed: Path) -> None:
     """One value each, in turn: it is named, and nothing else is."""
     again = Contents.of(filmed)
