@@ -119,7 +119,8 @@ class Render:
         return 1 if differing else 0
 
     def _options(self) -> RerenderOptions:
-        from demorec.replay.rerender import RerenderOptions, read_cameras
+        from demorec.replay.free_camera import read_cameras
+        from demorec.replay.rerender import RerenderOptions
         from demorec.tables import RENDERERS
 
         if self.renderer is not None:

@@ -13,20 +13,18 @@ What is there is used again, so that the same command goes on where the last one
 from __future__ import annotations
 
 import json
-import os
 import resource
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from demorec.config import GenerateConfig, deciding_versions
 from demorec.errors import ConfigError, DemorecError, in_words
 from demorec.evaluate.correction import read_takeover
 from demorec.evaluate.moments import TakeOver
-from demorec.evaluate.policy import find_checkpoint, policy_summary
+from demorec.evaluate.policy import TRAIN_CONFIG_NAME, find_checkpoint, policy_summary
 from demorec.evaluate.rollouts import Evaluation, evaluate, load_evaluation, settings_for
 from demorec.evaluate.statistics import Rate
 from demorec.generate.plan import plain_differences
@@ -36,11 +34,10 @@ from demorec.plain import to_plain
 from demorec.processes import start_program
 from demorec.runs.lock import LOCK_NAME, run_lock
 from demorec.runs.run_file import free_name, load_run_file
+from demorec.safety.files import replace_text
 from demorec.scene.features import ActionKind
 
 SETTINGS_NAME, TRAINED_NAME, LOG_NAME = "improve.json", "training.json", "training.log"
-_CONFIG_NAME = "train_config.json"
-"""In which lerobot-train keeps its settings, in each checkpoint."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -146,7 +143,7 @@ class Improvement:
                 raise ConfigError(
                     f"The folder holds something else ({strangers[0]}), choose another --out: {self._out}"
                 )
-            _write_json(path, found)
+            replace_text(path, json.dumps(found, indent=1))
             return
         try:
             before = json.loads(path.read_text())
@@ -236,7 +233,7 @@ class Improvement:
             if found.get("policy_digest") != digest:
                 raise DemorecError(f"The policy is not the one that was trained here (its digest differs): {train}")
             return float(found["cpu_seconds"])
-        checkpoint = train / "checkpoints" / "last" / "pretrained_model" / _CONFIG_NAME
+        checkpoint = train / "checkpoints" / "last" / "pretrained_model" / TRAIN_CONFIG_NAME
         if checkpoint.exists():
             words = [f"--config_path={checkpoint}", "--resume=true"]
         else:
@@ -255,7 +252,7 @@ class Improvement:
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
         seconds = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
         _, digest = policy_summary(find_checkpoint(train))
-        _write_json(done, {"policy_digest": digest, "cpu_seconds": round(seconds, 1)})
+        replace_text(done, json.dumps({"policy_digest": digest, "cpu_seconds": round(seconds, 1)}, indent=1))
         return seconds
 
 
@@ -277,12 +274,3 @@ def _run_training(words: Sequence[str], log: Path) -> None:
     if code:
         lines = log.read_text(errors="replace").strip().splitlines() or ["nothing was said"]
         raise DemorecError(f"The training failed ({lines[-1].strip()}), all that it said is in {log}")
-
-
-def _write_json(path: Path, plain: dict[str, Any]) -> None:
-    part = path.with_name(f"{path.name}.part")
-    with part.open("w") as file:
-        json.dump(plain, file, indent=1)
-        file.flush()
-        os.fsync(file.fileno())
-    part.replace(path)

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import functools
 import json
-import os
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field, replace
@@ -37,6 +36,7 @@ from demorec.plain import from_plain, to_plain
 from demorec.recording import EpisodeWriter
 from demorec.runs.find import EVALUATION_NAME
 from demorec.runs.run_file import EPISODES, FAILED, Attempt
+from demorec.safety.files import replace_text
 from demorec.safety.own_versions import version_differences
 from demorec.safety.replacing import (
     ReplaceableKind,
@@ -371,9 +371,4 @@ def _factors(config: GenerateConfig, episode_index: int, attempt: int) -> dict[s
 
 
 def _save(evaluation: Evaluation, folder: Path) -> None:
-    part = folder / f"{EVALUATION_NAME}.part"
-    with part.open("w") as file:
-        json.dump(to_plain(evaluation), file, indent=1, allow_nan=False)
-        file.flush()
-        os.fsync(file.fileno())
-    part.replace(folder / EVALUATION_NAME)
+    replace_text(folder / EVALUATION_NAME, json.dumps(to_plain(evaluation), indent=1, allow_nan=False))

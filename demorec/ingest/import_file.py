@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +11,7 @@ from demorec.ingest.mapping import BagMapping
 from demorec.ingest.report import BagReport
 from demorec.plain import from_json, to_json
 from demorec.runs.run_file import IMPORT_NAME
-from demorec.safety.files import read_text_limited
+from demorec.safety.files import read_text_limited, replace_text
 
 FORMAT = 1
 _MAX_BYTES = 256 << 20
@@ -56,14 +55,8 @@ def load_import_file(folder: Path) -> ImportFile | None:
 def save_import_file(content: ImportFile, folder: Path) -> None:
     """Replace import.json in one step; BagError when it cannot be written."""
     path = folder / IMPORT_NAME
-    part = folder / f"{IMPORT_NAME}.part"
     try:
-        part.unlink(missing_ok=True)
-        with part.open("x") as file:
-            file.write(to_json(content, indent=2) + "\n")
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
+        replace_text(path, to_json(content, indent=2) + "\n")
     except OSError as error:
         raise resource_error(error, path) or BagError(
             f"import.json cannot be written ({error.strerror}): {path}"

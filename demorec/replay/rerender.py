@@ -6,18 +6,15 @@ looks the pictures come out again as they were before coding, so the coded packe
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from demorec.config import EpisodePlan, GenerateConfig, VideoConfig, read_toml
-from demorec.errors import ConfigError, DemorecError, NotAllowedError, RecordingError, in_words
-from demorec.geometry import Pose, look_at
+from demorec.config import EpisodePlan, GenerateConfig, VideoConfig
+from demorec.errors import ConfigError, DemorecError, NotAllowedError, RecordingError
+from demorec.geometry import Pose
 from demorec.loop import prepare
 from demorec.plain import digest, from_plain, to_json
 from demorec.recording import EpisodeWriter, Recording
@@ -27,6 +24,7 @@ from demorec.render import Renderer
 from demorec.render.painter import Painter
 from demorec.render.recorded import RecordedWorld
 from demorec.render.warm import WarmRenderer
+from demorec.replay.free_camera import FreeCamera
 from demorec.safety.files import make_folder
 from demorec.safety.user_modules import split_name
 from demorec.scene.assets import allow_models
@@ -36,75 +34,6 @@ from demorec.scene.variation import Ranges, resolve
 from demorec.seeding import generator
 from demorec.tables import CAMERAS, RENDERERS, camera_name
 from demorec.tasks.vary import vary_looks
-
-
-@dataclass(frozen=True, kw_only=True)
-class FreeCamera:
-    """A camera described in a TOML table of its own; angles in degrees, lengths in metres.
-
-    Attributes:
-        position: In the mount's frame.
-        look_at: Point that it looks at, in the mount's frame; this or `quat_xyzw`.
-        up: Direction that is up in the picture.
-        quat_xyzw: Rotation mount_from_camera, OpenCV axes, in place of `look_at`.
-        fov_y_degrees: Vertical field of view.
-        mount: "world", or a link of the robot.
-        width, height: Pixels; default: as the other cameras.
-    """
-
-    position: tuple[float, float, float]
-    look_at: tuple[float, float, float] | None = None
-    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
-    quat_xyzw: tuple[float, float, float, float] | None = None
-    fov_y_degrees: float = 45.0
-    mount: str = "world"
-    width: int | None = None
-    height: int | None = None
-
-    def camera(self, name: str, *, width: int, height: int) -> Camera:
-        """The camera; ConfigError for an impossible description."""
-        if (self.look_at is None) == (self.quat_xyzw is None):
-            raise ConfigError(f"The camera {name!r} needs either look_at or quat_xyzw, not both and not neither.")
-        if not 1.0 <= self.fov_y_degrees <= 170.0:
-            raise ConfigError(f"fov_y_degrees of the camera {name!r} is {self.fov_y_degrees}, allowed are 1 to 170.")
-        try:
-            if self.quat_xyzw is None:
-                assert self.look_at is not None
-                pose = look_at(self.position, self.look_at, self.up)
-            else:
-                length = math.sqrt(sum(v * v for v in self.quat_xyzw))
-                if abs(length - 1.0) > 1e-3:
-                    raise ValueError(f"quat_xyzw has length {length:.4f}, must have 1")
-                pose = Pose(position=np.array(self.position), quat_xyzw=np.array(self.quat_xyzw) / length)
-        except ValueError as error:
-            raise ConfigError(f"The camera {name!r} cannot stand like this ({error}).") from error
-        return Camera(
-            name=name,
-            width=self.width or width,
-            height=self.height or height,
-            fov_y=math.radians(self.fov_y_degrees),
-            mount=self.mount,
-            mount_from_camera=pose,
-        )
-
-
-def read_cameras(path: Path) -> dict[str, FreeCamera]:
-    """Cameras of a TOML file, one table each; ConfigError names every bad key."""
-    cameras = {}
-    for name, table in read_toml(path).items():
-        try:
-            cameras[name] = from_plain(_tuples(table), FreeCamera)
-        except (ValueError, TypeError, AttributeError) as error:
-            raise ConfigError(f"The camera {name!r} of the file cannot be used ({in_words(error)}): {path}") from error
-    if not cameras:
-        raise ConfigError(f"The file describes no camera; write a table, e.g. [side] with position and look_at: {path}")
-    return cameras
-
-
-def _tuples(table: Any) -> Any:
-    if not isinstance(table, dict):
-        raise TypeError("a camera is a table of its own, e.g. [side]")
-    return {key: [float(v) for v in value] if isinstance(value, list) else value for key, value in table.items()}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -388,22 +317,20 @@ def _compare(recording: Recording, out: Path, options: RerenderOptions) -> tuple
     """The packets of the cameras that were to stay as they were: equal pictures give equal packets."""
     if options.looks is not None:
         return (), {}
-    differing: dict[str, int] = {}
+    compared, differing = [], {}
     with Recording(out) as new:
         renderer = (recording.info.config.get("renderer"), recording.info.config.get("antialias", True))
         if renderer != (new.info.config.get("renderer"), new.info.config.get("antialias", True)):
             return (), {}
         before = {camera.name: camera for camera in recording.info.scene.cameras}
-        compared = [
-            camera.name
-            for camera in new.info.scene.cameras
-            if before.get(camera.name) == camera
-            and new.video_settings(camera.name) == recording.video_settings(camera.name)
-        ]
-        old_pictures, new_pictures = recording.coded_pictures(compared), new.coded_pictures(compared)
-    for camera in compared:
-        pairs = zip(old_pictures[camera].messages(), new_pictures[camera].messages(), strict=True)
-        first = next((frame for frame, (a, b) in enumerate(pairs) if a != b), None)
-        if first is not None:
-            differing[camera] = first
+        for camera in new.info.scene.cameras:
+            if before.get(camera.name) != camera or new.video_settings(camera.name) != recording.video_settings(
+                camera.name
+            ):
+                continue
+            compared.append(camera.name)
+            pairs = zip(recording.packets(camera.name), new.packets(camera.name), strict=True)
+            first = next((a.frame_index for a, b in pairs if a.data != b.data), None)
+            if first is not None:
+                differing[camera.name] = first
     return tuple(compared), differing

@@ -17,7 +17,7 @@ from typing import Any
 from demorec.config import GenerateConfig
 from demorec.errors import ConfigError, DemorecError, in_words, resource_error
 from demorec.plain import digest, from_plain, to_plain
-from demorec.safety.files import open_regular, read_json_limited
+from demorec.safety.files import open_regular, read_json_limited, replace_text
 
 RUN_NAME = "run.json"
 RUN_FORMAT = 1
@@ -188,13 +188,7 @@ def replace_run_file(folder: Path, head: Mapping[str, Any], lines: Iterable[Mapp
     text = json.dumps(head, indent=2, allow_nan=False)[:-2]
     text += ',\n  "episodes": [\n' + ",\n".join("    " + json.dumps(line, allow_nan=False) for line in lines)
     text += "\n  ]\n}\n"
-    part = folder / f"{RUN_NAME}.part"
-    part.unlink(missing_ok=True)  # of a crash; whatever else has that name must not be written through
-    with part.open("x") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    part.replace(folder / RUN_NAME)
+    replace_text(folder / RUN_NAME, text)
     sync_folder(folder)
 
 

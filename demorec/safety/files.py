@@ -88,6 +88,23 @@ def make_folder(path: Path) -> None:
         ) from error
 
 
+def replace_text(path: Path, text: str) -> None:
+    """Write a file anew, in one step: what is there stays until all of the text is on the disk.
+
+    It is written beside its place first, to a new file: what else has that name is never written through.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    part = path.with_name(f"{path.name}.part")
+    part.unlink(missing_ok=True)
+    with part.open("x") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+    part.replace(path)
+
+
 def irregular_kind(mode: int) -> str:
     """What something that is no regular file is, by its `st_mode`: "a FIFO"."""
     return _KINDS.get(stat.S_IFMT(mode), "something else")

@@ -38,15 +38,13 @@ class FastDataset(LeRobotDataset):  # type: ignore[misc]
     def __init__(
         self, *args: Any, frame_cache_bytes: int = DEFAULT_CACHE_BYTES, expert_only: bool = False, **kwargs: Any
     ) -> None:
-        super().__init__(*args, **kwargs)
-        self._frame_cache_bytes = frame_cache_bytes
+        self._frame_cache_bytes = frame_cache_bytes  # before the reader is made
         self._expert_only = expert_only
+        super().__init__(*args, **kwargs)
         if expert_only and INTERVENTION not in self.meta.features:
             raise ConfigError(
                 f"The dataset does not tell which frames are the expert's: export it with --intervention: {self.root}"
             )
-        if expert_only and self.reader is not None:
-            self.reader._expert_only = True
 
     def __getitems__(self, indices: Sequence[int]) -> list[Item]:
         """The items of a batch, in the given order: what `DataLoader` calls; errors as of an item."""

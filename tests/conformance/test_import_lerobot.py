@@ -114,10 +114,10 @@ def _opened(data: bytes) -> Any:
     return Image.open(io.BytesIO(data)).convert("RGB")
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("imported", ["video"], indirect=True)
 def test_the_packets_are_those_of_the_video(imported: tuple[str, Path, Path]) -> None:
-    kind, dataset, run = imported
-    if kind != "video":
-        pytest.skip("pictures are coded once")
+    _, dataset, run = imported
     packets = []
     for file in sorted((dataset / "videos" / CAMERA).rglob("*.mp4")):
         with av.open(str(file)) as container:
@@ -207,11 +207,12 @@ FAULTS: dict[str, tuple[Callable[[Path], object], str]] = {
 }
 
 
-@pytest.mark.parametrize("fault", FAULTS)
+CASES = [(kind, fault) for kind in ("image", "long_gops") for fault in FAULTS if (kind, fault) != ("image", "video")]
+
+
+@pytest.mark.parametrize(("imported", "fault"), CASES, indirect=["imported"])
 def test_what_cannot_be_imported_is_one_sentence(fault: str, imported: tuple[str, Path, Path], tmp_path: Path) -> None:
-    kind, dataset, _ = imported
-    if kind == "image" and fault == "video":
-        pytest.skip("there is no video")
+    _, dataset, _ = imported
     shutil.copytree(dataset, tmp_path / "d")
     change, words = FAULTS[fault]
     change(tmp_path / "d")

@@ -15,7 +15,8 @@ from support.commands import exit_code
 from demorec.errors import ConfigError
 from demorec.recording import Recording
 from demorec.render.warm import WarmRenderer
-from demorec.replay.rerender import RerenderOptions, read_cameras, rerender
+from demorec.replay.free_camera import read_cameras
+from demorec.replay.rerender import RerenderOptions, rerender
 
 SIDE = """
 [side]
