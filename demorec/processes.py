@@ -17,6 +17,8 @@ from typing import Any
 
 _PATIENCE_S = 3.0
 """How long a program may take to end when it is asked to."""
+_LATER_S = 0.02
+"""When an interrupt is said again that came where nothing can be raised."""
 _hiding = threading.Lock()
 _starting = threading.Lock()
 
@@ -29,6 +31,7 @@ class _Process(SpawnProcess):
 
     def run(self) -> None:
         threading.Thread(target=_end_with_parent, daemon=True).start()
+        sys.unraisablehook = _interrupt_again
         try:
             super().run()
         except KeyboardInterrupt:  # Ctrl-C reaches the whole process group; the parent is the one who tells
@@ -106,6 +109,16 @@ def _stand_between(command: Sequence[str]) -> int:
 
     threading.Thread(target=watch, daemon=True).start()
     return abs(program.wait())
+
+
+def _interrupt_again(told: sys.UnraisableHookArgs) -> None:
+    """Where Ctrl-C falls into a destructor or a callback, Python prints it and goes on: say it again after that."""
+    if issubclass(told.exc_type, KeyboardInterrupt):
+        again = threading.Timer(_LATER_S, os.kill, (os.getpid(), signal.SIGINT))
+        again.daemon = True
+        again.start()
+    else:
+        sys.__unraisablehook__(told)
 
 
 def _end_with_parent() -> None:

@@ -102,7 +102,8 @@ def test_every_item_is_equal(kind: str, roots: dict[str, Path]) -> None:
     assert_same_item(fast[-1], slow[-1])
 
 
-@pytest.mark.parametrize("kind", quick("lerobot_images"))
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
 def test_every_window_is_equal(kind: str, roots: dict[str, Path]) -> None:
     _, plain = pair(roots[kind])
     fast, slow = pair(roots[kind], delta_timestamps=windows(plain), return_uint8=False, depth_output_unit="m")

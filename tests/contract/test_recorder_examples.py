@@ -13,6 +13,7 @@ import pytest
 from demorec.recording import CollectedRecording
 from demorec.runs.collected import load_collected_run
 
+pytestmark = pytest.mark.slow  # loops in real time, and three programs that load PyBullet and gymnasium
 EXAMPLES = Path(__file__).parents[2] / "examples" / "recorder"
 
 

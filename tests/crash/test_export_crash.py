@@ -100,6 +100,7 @@ def test_a_full_disk_where_processes_leave_pictures(context: Any, run: Path, tmp
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_hdf5_killed_at_any_moment(context: Any, run: Path, tmp_path: Path) -> None:
     place = tmp_path / "place"
     out = place / "d.hdf5"

@@ -82,6 +82,7 @@ def test_what_needs_lerobot_names_it(run: Path, tmp_path: Path, monkeypatch: pyt
     assert not isinstance(error.value, ExportError)
 
 
+@pytest.mark.slow
 def test_no_module_but_the_plug_ins_needs_them() -> None:
     """In a fresh process, every module of the package, so every command, imports without them."""
     code = f"""

@@ -52,6 +52,44 @@ def test_python_itself_would_run_the_script_again(tmp_path: Path) -> None:
     assert "bootstrapping phase" in done.stderr
 
 
+IN_A_CALLBACK = """
+import os, signal, time, weakref
+
+class Thing:
+    pass
+
+def interrupted(_):
+    os.kill(os.getpid(), signal.SIGINT)
+    for _ in range(1000):
+        pass
+
+def work():
+    thing = Thing()
+    kept = weakref.ref(thing, interrupted)
+    del thing
+    for _ in range(6000):
+        time.sleep(0.01)
+    print("it goes on")
+"""
+STARTS_IT = """
+from work import work
+from demorec.processes import SPAWN
+
+process = SPAWN.Process(target=work)
+process.start()
+process.join()
+print(process.exitcode)
+"""
+
+
+def test_ctrl_c_in_a_callback_is_heard_and_not_printed(tmp_path: Path) -> None:
+    (tmp_path / "work.py").write_text(IN_A_CALLBACK)
+    (tmp_path / "script.py").write_text(STARTS_IT)
+    hears = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); import script"
+    done = subprocess.run([sys.executable, "-c", hears], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (done.stdout.split(), done.stderr) == (["130"], "")
+
+
 PARENT = """
 import time
 from concurrent.futures import ProcessPoolExecutor
