@@ -13,8 +13,9 @@ from demorec.config import EpisodePlan, GenerateConfig
 from demorec.errors import ConfigError, GenerationError
 from demorec.generate.executor import MAKE_EPISODE, Made, Raised
 from demorec.generate.local import LocalExecutor
-from demorec.generate.options import RunOptions, available_cores
+from demorec.generate.options import RunOptions
 from demorec.lerobot import ExportOptions, export_lerobot
+from demorec.processes import available_cores
 from demorec.runs.run_file import EPISODES, FAILED, STARTING, UNFINISHED
 
 _MEASURED = 2

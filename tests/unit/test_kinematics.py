@@ -170,7 +170,7 @@ def test_a_chain_with_other_joints_is_refused() -> None:
     spec = ROBOTS.load("panda")
     with pytest.raises(ValueError, match="panda_joint7"):
         ArmKinematics.from_urdf(
-            asset_path(spec.urdf),
+            Urdf.load(asset_path(spec.urdf)),
             arm_joints=spec.arm_joints[:6],
             tcp_link=spec.tcp_link,
             lower=spec.position_lower[:6],

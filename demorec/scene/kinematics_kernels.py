@@ -1,0 +1,271 @@
+"""The loops of an arm's kinematics, compiled by Numba.
+
+Without fast-math and without BLAS, every sum in a fixed order, so that the same targets come out on every CPU (an
+OpenBLAS kernel is chosen by CPU type and changes the last bits). Loops stand where NumPy would take whole arrays: they
+compile several times as fast. The methods are the textbook ones: product of homogeneous transforms, geometric Jacobian,
+damped least squares with a projected null-space pull (Siciliano et al., Robotics, sections 2.8, 3.1, 3.7).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from demorec.precompiled import Bundle
+
+BUNDLE = Bundle("kinematics", [Path(__file__)])
+
+
+def _njit(function: Callable[..., Any]) -> Any:
+    return BUNDLE.njit(function, error_model="numpy")
+
+
+@_njit
+def _multiply(a, b):  # type: ignore[no-untyped-def]
+    """Product of two (3, 3) matrices, each sum in index order."""
+    out = np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]
+    return out
+
+
+@_njit
+def _apply(a, v):  # type: ignore[no-untyped-def]
+    """(3, 3) matrix times (3,) vector."""
+    out = np.empty(3)
+    for i in range(3):
+        out[i] = a[i, 0] * v[0] + a[i, 1] * v[1] + a[i, 2] * v[2]
+    return out
+
+
+@_njit
+def _scaled(v, factor):  # type: ignore[no-untyped-def]
+    """A vector times a number."""
+    out = np.empty(len(v))
+    for i in range(len(v)):
+        out[i] = v[i] * factor
+    return out
+
+
+@_njit
+def _blend(a, b, share):  # type: ignore[no-untyped-def]
+    """The vector that lies at a share of the way from one to another."""
+    out = np.empty(len(a))
+    for i in range(len(a)):
+        out[i] = a[i] + share * (b[i] - a[i])
+    return out
+
+
+@_njit
+def _axis_rotation(axis, angle):  # type: ignore[no-untyped-def]
+    """Rodrigues' formula for a unit axis."""
+    c, s = math.cos(angle), math.sin(angle)
+    x, y, z = axis[0], axis[1], axis[2]
+    t = 1.0 - c
+    out = np.empty((3, 3))
+    out[0, 0], out[0, 1], out[0, 2] = t * x * x + c, t * x * y - s * z, t * x * z + s * y
+    out[1, 0], out[1, 1], out[1, 2] = t * x * y + s * z, t * y * y + c, t * y * z - s * x
+    out[2, 0], out[2, 1], out[2, 2] = t * x * z - s * y, t * y * z + s * x, t * z * z + c
+    return out
+
+
+@_njit
+def _rotation_vector(wanted, found):  # type: ignore[no-untyped-def]
+    """Rotation vector (3,) in the base frame that turns `found` into `wanted`."""
+    error = np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            error[i, j] = wanted[i, 0] * found[j, 0] + wanted[i, 1] * found[j, 1] + wanted[i, 2] * found[j, 2]
+    v = np.empty(3)
+    v[0], v[1], v[2] = error[2, 1] - error[1, 2], error[0, 2] - error[2, 0], error[1, 0] - error[0, 1]
+    sine = 0.5 * math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+    cosine = 0.5 * (error[0, 0] + error[1, 1] + error[2, 2] - 1.0)
+    if sine > 1e-9:
+        return _scaled(v, math.atan2(sine, cosine) / (2.0 * sine))
+    if cosine > 0.0:
+        return _scaled(v, 0.5)
+    # Half a turn: the axis is the largest column of (E + I) / 2.
+    largest = 0
+    for i in range(3):
+        if error[i, i] > error[largest, largest]:
+            largest = i
+    out = np.empty(3)
+    for i in range(3):
+        out[i] = 0.5 * (error[i, largest] + (1.0 if i == largest else 0.0))
+    return _scaled(out, math.pi / math.sqrt(out[0] * out[0] + out[1] * out[1] + out[2] * out[2]))
+
+
+@_njit
+def forward(q, origins, rotations, axes, tool, tool_rotation):  # type: ignore[no-untyped-def]
+    """TCP position (3,), rotation (3, 3) and geometric Jacobian (6, n)."""
+    n = len(q)
+    position = np.zeros(3)
+    rotation = np.eye(3)
+    joint_position = np.empty((n, 3))
+    joint_axis = np.empty((n, 3))
+    for i in range(n):
+        step = _apply(rotation, origins[i])
+        rotation = _multiply(_multiply(rotation, rotations[i]), _axis_rotation(axes[i], q[i]))
+        axis = _apply(rotation, axes[i])
+        for k in range(3):
+            position[k] += step[k]
+            joint_position[i, k] = position[k]
+            joint_axis[i, k] = axis[k]
+    step = _apply(rotation, tool)
+    for k in range(3):
+        position[k] += step[k]
+    rotation = _multiply(rotation, tool_rotation)
+    jacobian = np.empty((6, n))
+    for i in range(n):
+        x, y, z = joint_axis[i, 0], joint_axis[i, 1], joint_axis[i, 2]
+        dx, dy, dz = (
+            position[0] - joint_position[i, 0],
+            position[1] - joint_position[i, 1],
+            position[2] - joint_position[i, 2],
+        )
+        jacobian[0, i], jacobian[1, i], jacobian[2, i] = y * dz - z * dy, z * dx - x * dz, x * dy - y * dx
+        jacobian[3, i], jacobian[4, i], jacobian[5, i] = x, y, z
+    return position, rotation, jacobian
+
+
+@_njit
+def _damped_solve(jacobian, damping, rhs):  # type: ignore[no-untyped-def]
+    """(J J^T + damping^2 I)^-1 rhs for each column of rhs (6, m), by Cholesky's method."""
+    n, m = jacobian.shape[1], rhs.shape[1]
+    lower = np.zeros((6, 6))
+    for i in range(6):
+        for j in range(i + 1):
+            total = damping * damping if i == j else 0.0
+            for k in range(n):
+                total += jacobian[i, k] * jacobian[j, k]
+            for k in range(j):
+                total -= lower[i, k] * lower[j, k]
+            lower[i, j] = math.sqrt(total) if i == j else total / lower[j, j]
+    out = rhs.copy()
+    for column in range(m):
+        for i in range(6):
+            for k in range(i):
+                out[i, column] -= lower[i, k] * out[k, column]
+            out[i, column] /= lower[i, i]
+        for i in range(5, -1, -1):
+            for k in range(i + 1, 6):
+                out[i, column] -= lower[k, i] * out[k, column]
+            out[i, column] /= lower[i, i]
+    return out
+
+
+@_njit
+def inverse(  # type: ignore[no-untyped-def]
+    wanted_position,
+    wanted_rotation,
+    start,
+    rest,
+    null_gain,
+    max_iterations,
+    position_tolerance,
+    rotation_tolerance,
+    origins,
+    rotations,
+    axes,
+    tool,
+    tool_rotation,
+    low,
+    high,
+):
+    """Damped least squares: dq = J# e + (I - J# J) gain (rest - q), clipped to 0.35 rad a step and to the limits."""
+    n = len(start)
+    q = start.copy()
+    error = np.empty((6, 1))
+    for iteration in range(max_iterations + 1):
+        position, rotation, jacobian = forward(q, origins, rotations, axes, tool, tool_rotation)
+        turn = _rotation_vector(wanted_rotation, rotation)
+        worst_position = 0.0
+        worst_rotation = 0.0
+        for i in range(3):
+            error[i, 0] = wanted_position[i] - position[i]
+            error[3 + i, 0] = turn[i]
+            worst_position = max(worst_position, abs(error[i, 0]))
+            worst_rotation = max(worst_rotation, abs(error[3 + i, 0]))
+        # A pull needs at least one step, or a start that already reaches the pose would never be improved.
+        may_stop = iteration > 0 or null_gain == 0.0
+        if may_stop and worst_position < position_tolerance and worst_rotation < rotation_tolerance:
+            return q, True
+        if iteration == max_iterations:
+            break
+        for i in range(6):
+            pull = 0.0
+            for k in range(n):
+                pull += jacobian[i, k] * null_gain * (rest[k] - q[k])
+            error[i, 0] -= pull
+        solved = _damped_solve(jacobian, 1e-3, error)
+        step = np.empty(n)
+        largest = 0.0
+        for k in range(n):
+            step[k] = null_gain * (rest[k] - q[k])
+            for i in range(6):
+                step[k] += jacobian[i, k] * solved[i, 0]
+            largest = max(largest, abs(step[k]))
+        factor = 0.35 / largest if largest > 0.35 else 1.0
+        for k in range(n):
+            q[k] = min(max(q[k] + factor * step[k], low[k] + 0.01), high[k] - 0.01)
+    return q, False
+
+
+@_njit
+def straight_path(  # type: ignore[no-untyped-def]
+    start,
+    goal,
+    start_position,
+    start_rotation,
+    goal_position,
+    goal_rotation,
+    fractions,
+    origins,
+    rotations,
+    axes,
+    tool,
+    tool_rotation,
+    low,
+    high,
+):
+    """(N, n) joint positions on a straight line of the tool, turning evenly; whether all were reached."""
+    turn = _rotation_vector(goal_rotation, start_rotation)
+    angle = math.sqrt(turn[0] * turn[0] + turn[1] * turn[1] + turn[2] * turn[2])
+    axis = np.array([0.0, 0.0, 1.0])
+    if angle > 1e-12:
+        for k in range(3):
+            axis[k] = turn[k] / angle
+    out = np.empty((len(fractions), len(start)))
+    all_reached = True
+    max_iterations = np.int64(40)  # no literal, for which Numba would compile `_inverse` once more
+    for t in range(len(fractions)):
+        u = fractions[t]
+        position = _blend(start_position, goal_position, u)
+        rotation = _multiply(_axis_rotation(axis, u * angle), start_rotation)
+        seed = _blend(start, goal, u)
+        q, reached = inverse(
+            position,
+            rotation,
+            seed,
+            seed,
+            0.0,
+            max_iterations,
+            1e-4,
+            1e-3,
+            origins,
+            rotations,
+            axes,
+            tool,
+            tool_rotation,
+            low,
+            high,
+        )
+        all_reached = all_reached and reached
+        for k in range(len(q)):
+            out[t, k] = q[k]
+    return out, all_reached
