@@ -1,11 +1,15 @@
 """Calibrates the limits of `demorec check`: the largest value that each check finds in good recordings.
 
-    python benchmarks/check_limits.py                      # every setting once
+    python benchmarks/check_limits.py                      # every task, robot and variation once
+    python benchmarks/check_limits.py --rounds 5 --anew    # five times, in other sizes, rates and codecs each time
     python benchmarks/check_limits.py --part 2/5           # every fifth setting, from the second on
+    python benchmarks/check_limits.py --clean --rounds 2   # how many of other good episodes are told of, no more
 
 Settings run over all tasks, robots and variations, and with each through sizes, frame rates, codecs and qualities,
-depth and segmentation. Successful episodes only. What is found is merged into demorec/check/limits.toml (the larger
-value stays; `--anew` forgets what is there), whose limits this program leaves alone: it lists those that are too near.
+depth and segmentation. Successful episodes only; warnings and failures that they get are listed. What is found is
+merged into demorec/check/limits.toml (the larger value stays; `--anew` forgets what is there), whose limits this
+program leaves alone: it lists those that are too near. `--clean` measures the checks instead: default coding and rate,
+128 and 224 pixels, episodes of another seed; it writes nothing.
 """
 
 from __future__ import annotations
@@ -14,11 +18,12 @@ import argparse
 import datetime
 import itertools
 import tempfile
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
+from demorec.check.base import Result
 from demorec.check.limits import TABLE, LimitCalibration, LimitTable, read_table
 from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.config import EpisodePlan, GenerateConfig, VideoConfig
@@ -41,9 +46,10 @@ VIDEOS = (
 VARIATIONS = ("none", "mild", "full")
 
 
-def settings(seed: int) -> Iterator[GenerateConfig]:
-    """Every task, robot and variation; the lists above turn beside them at rates of their own."""
-    for number, (variation, robot, task) in enumerate(itertools.product(VARIATIONS, ROBOTS.names(), TASKS.names())):
+def settings(seed: int, turn: int) -> Iterator[GenerateConfig]:
+    """Every task, robot and variation; the lists above turn beside them at rates of their own, from `turn` on."""
+    every = itertools.product(VARIATIONS, ROBOTS.names(), TASKS.names())
+    for number, (variation, robot, task) in enumerate(every, start=turn):
         width, height = SIZES[number % len(SIZES)]
         extra = number % 4 == 3
         yield GenerateConfig(
@@ -57,6 +63,19 @@ def settings(seed: int) -> Iterator[GenerateConfig]:
             video=VIDEOS[number % len(VIDEOS)],
             depth=extra,
             segmentation=extra,
+        )
+
+
+def clean_settings(seed: int) -> Iterator[GenerateConfig]:
+    """Every task, robot and variation in two sizes, all else as `generate-dataset` has it."""
+    for variation, robot, task, size in itertools.product(VARIATIONS, ROBOTS.names(), TASKS.names(), (128, 224)):
+        yield GenerateConfig(
+            task=task,
+            robot=robot,
+            variation=variation,  # type: ignore[arg-type]
+            seed=seed,
+            width=size,
+            height=size,
         )
 
 
@@ -101,24 +120,43 @@ def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--seed", type=int, default=2026)
     parser.add_argument("--part", default="1/1", help="K/N: every N-th setting from the K-th on")
-    parser.add_argument("--episodes", type=int, default=1, help="of each setting")
-    parser.add_argument("--first", type=int, default=0, help="index of the first episode")
+    parser.add_argument("--rounds", type=int, default=1, help="over all tasks, robots and variations")
+    parser.add_argument("--first", type=int, default=0, help="the first round, which is the index of its episodes")
     parser.add_argument("--anew", action="store_true", help="forget the values in the table")
+    parser.add_argument("--clean", action="store_true", help="count episodes that are told of; write nothing")
     options = parser.parse_args(argv)
     first, step = (int(word) for word in options.part.split("/"))
+    if options.clean:
+        count_clean(itertools.islice(clean_settings(options.seed + 1), first - 1, None, step), options)
+        return
     before = read_table()
     largest = {name: 0.0 if options.anew else limit.largest for name, limit in before.checks.items()}
     count = 0 if options.anew else before.calibration.episodes
     with tempfile.TemporaryDirectory() as folder:
-        for config in itertools.islice(settings(options.seed), first - 1, None, step):
-            for index in range(options.first, options.first + options.episodes):
+        for index in range(options.first, options.first + options.rounds):
+            for config in itertools.islice(settings(options.seed, index), first - 1, None, step):
                 count += measure(config, index, Path(folder) / "episode.mcap", largest)
-            # After each setting, so that one can stop at any time.
-            write_table(largest, seed=options.seed, episodes=count)
+                # After each episode, so that one can stop at any time.
+                write_table(largest, seed=options.seed, episodes=count)
     print(f"{count} episodes in all; limits that are too near:")
     for name, limit in read_table().checks.items():
         if largest.get(name, 0.0) * before.calibration.margin > limit.warn:
             print(f"  {name}: warns above {limit.warn:g}, the largest value is {largest.get(name, 0.0):g}")
+
+
+def count_clean(found: Iterator[GenerateConfig], options: argparse.Namespace) -> None:
+    """Check good episodes, tell how many of them got a warning or failed."""
+    levels: Counter[str] = Counter()
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "episode.mcap"
+        for number, config in enumerate(found, start=1):
+            for index in range(options.first, options.first + options.rounds):
+                if record(config, index, path):
+                    said = {result.level for result in results(config, index, path)}
+                    levels["fail" if "fail" in said else "warn" if "warn" in said else "pass"] += 1
+            if number % 10 == 0:
+                print(f"{number} settings: {dict(levels)}")
+    print(f"{levels.total()} good episodes: {levels['warn']} with warnings, {levels['fail']} failed")
 
 
 def write_table(largest: Mapping[str, float], *, seed: int, episodes: int) -> None:
@@ -128,7 +166,7 @@ def write_table(largest: Mapping[str, float], *, seed: int, episodes: int) -> No
         seed=seed,
         date=datetime.datetime.now(datetime.UTC).date().isoformat(),
         episodes=episodes,
-        settings="an episode each of settings across tasks, robots, variations, sizes, rates, codecs; not yet all",
+        settings="rounds over all tasks, robots and variations; sizes, rates, codecs and qualities turn beside them",
         margin=before.calibration.margin,
     )
     checks = {
@@ -142,14 +180,21 @@ def measure(config: GenerateConfig, index: int, path: Path, largest: dict[str, f
     """Check one good episode, keep the largest values; how many episodes that were (a failed one is none)."""
     if not record(config, index, path):
         return 0
-    said: Mapping[str, Any] = {"task": config.task, "robot": config.robot, "variation": config.variation}
-    for result in check_subject(Subject(path=path, kind="recording"), CheckOptions()).results:
-        if result.level in ("warn", "fail"):
-            size = f"{config.width}x{config.height} {config.fps} fps {config.video.codec} crf {config.video.crf}"
-            print(*said.values(), size, index, result.level, result.check, result.value, result.frame, result.detail)
+    for result in results(config, index, path):
         if result.check in largest and result.value is not None:
             largest[result.check] = max(largest[result.check], result.value)
     return 1
+
+
+def results(config: GenerateConfig, index: int, path: Path) -> tuple[Result, ...]:
+    """Of all checks of an episode; those that it does not pass are told."""
+    said = config.task, config.robot, config.variation, f"{config.width}x{config.height}", f"{config.fps} fps"
+    found = check_subject(Subject(path=path, kind="recording"), CheckOptions()).results
+    for result in found:
+        if result.level in ("warn", "fail"):
+            coded = f"{config.video.codec} crf {config.video.crf}"
+            print(*said, coded, index, result.level, result.check, result.value, result.frame, result.detail)
+    return found
 
 
 if __name__ == "__main__":

@@ -23,6 +23,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 
 CHOICES: dict[str, dict[str, Any]] = {
     "plain": {},
+    "subtask": {"language": ("subtask",)},
     "states": {"language": ("subtask", "plan", "memory", "motion", "task_aug")},
     "language": {"language": ()},
     "progress": {"progress": True},
@@ -59,7 +60,7 @@ def items(run: Path, work: Path, rounds: int, *, pictures: bool) -> None:
 
     features = () if pictures else ("observation.state", "action")
     datasets = {}
-    for name in ("plain", "states"):
+    for name in ("plain", "subtask", "states"):
         out = work / f"items-{name}-{pictures}"
         export_lerobot([run], out, ExportOptions(verify=False, features=features, **CHOICES[name]))
         datasets[name] = LeRobotDataset("local/x", root=out, video_backend="pyav")
@@ -71,9 +72,10 @@ def items(run: Path, work: Path, rounds: int, *, pictures: bool) -> None:
             for index in range(count):
                 dataset[index * len(dataset) // count]
             seconds[name].append((time.process_time() - start) / count)
-    ratio = statistics.median(a / b for a, b in zip(seconds["states"], seconds["plain"], strict=True))
-    costs = ", ".join(f"{name} {1e3 * statistics.median(found):.2f} ms" for name, found in seconds.items())
-    print(f"an item {'with' if pictures else 'without'} pictures: {costs}, ratio {ratio:.2f}")
+    print(f"an item {'with' if pictures else 'without'} pictures: CPU ms, ratio to plain")
+    for name, found in seconds.items():
+        ratio = statistics.median(a / b for a, b in zip(found, seconds["plain"], strict=True))
+        print(f"  {name:9} {1e3 * statistics.median(found):7.3f} {ratio:6.2f}")
 
 
 def main() -> None:

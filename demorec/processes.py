@@ -12,6 +12,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from multiprocessing import connection, resource_tracker
 from multiprocessing.context import SpawnContext, SpawnProcess
+from pathlib import Path
 from types import FrameType
 from typing import Any
 
@@ -21,6 +22,18 @@ _LATER_S = 0.02
 """When an interrupt is said again that came where nothing can be raised."""
 _hiding = threading.Lock()
 _starting = threading.Lock()
+
+
+def available_cores() -> int:
+    """Cores that this process may use: its affinity mask, and the quota of its control group where there is one."""
+    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
+    try:
+        quota, period = Path("/sys/fs/cgroup/cpu.max").read_text().split()
+        if quota != "max":
+            count = min(count, max(1, round(int(quota) / int(period))))
+    except (OSError, ValueError):
+        pass  # no control groups of version 2: the affinity mask is all there is
+    return count
 
 
 class _Process(SpawnProcess):

@@ -182,6 +182,7 @@ CHECKS: Registry[Check] = Registry(
         "dataset_forward_kinematics": "demorec.check.dataset_motion:dataset_forward_kinematics",
         "dataset_action_lag": "demorec.check.dataset_motion:dataset_action_lag",
         "dataset_sidecar": "demorec.check.dataset_files:dataset_sidecar",
+        "dataset_robots": "demorec.check.dataset_robots:dataset_robots",
         "dataset_facts": "demorec.check.dataset_facts:dataset_facts",
         "dataset_progress": "demorec.check.dataset_facts:dataset_progress",
         "dataset_language": "demorec.check.dataset_language:dataset_language",

@@ -15,8 +15,6 @@ from demorec.geometry import Array
 from demorec.recording import channels
 from demorec.scene.scene import Camera
 
-NEAREST = 0.3
-"""Metres: nearer to a camera there is little that a shifted camera would see shifted."""
 UNRELATED = 16.0
 """Root mean square difference of all pictures from the drawn ones, of 255, from which on they show something else."""
 
@@ -88,10 +86,8 @@ def _expected(episode: CheckedEpisode, camera: Camera) -> Array:
 
 
 def _allowance(episode: CheckedEpisode, camera: Camera) -> float:
-    """By how much pictures may be shifted, of their height, since the recorded calibration is off on purpose."""
-    behaviour = episode.info.behaviour
-    off = [behaviour.get(f"calibration_{camera.name}_{axis}", 0.0) for axis in "xyz"]
-    angle = behaviour.get(f"calibration_{camera.name}_angle", 0.0) + math.hypot(*off) / NEAREST
+    """By how much pictures may be shifted, of their height, since the recorded calibration is turned on purpose."""
+    angle = episode.info.behaviour.get(f"calibration_{camera.name}_angle", 0.0)
     return angle / (2 * math.tan(camera.fov_y / 2))
 
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from demorec.check.base import Found, Measurement, NotMeasured, check, worst
 from demorec.recording import CollectedRecording
+from demorec.recording.collected.streams import SUBTASK
 from demorec.recording.collected.transforms import JointPositions
 from demorec.recording.container import Container
 from demorec.recording.video import decode
@@ -55,6 +56,14 @@ class CollectedSubject:
             found[camera] = [float(image[::4, ::4].std()) for image in images]
         return found
 
+    @cached_property
+    def measured(self) -> dict[str, list[float]]:
+        """Depth camera -> in each of its pictures, the share of pixels that measured a distance."""
+        return {
+            camera: [float(np.mean(np.isfinite(values) & (values > 0))) for values in self.recording.distances(camera)]
+            for camera in self.recording.depth_cameras
+        }
+
 
 @check(
     scope="collected",
@@ -89,13 +98,14 @@ def collected_checksums(subject: CollectedSubject) -> Measurement:
 @check(
     scope="collected",
     group="file",
-    measures="streams that do not decode into numbers",
+    measures="streams that do not decode into numbers, or into words",
     warn=0,
-    reads=("/frames", "/{feature}"),
+    reads=("/frames", "/{feature}", SUBTASK),
 )
 def collected_readable(subject: CollectedSubject) -> Measurement:
     """Every message has the layout that the metadata promises, at its frame's time."""
-    return Measurement(value=0, detail=f"{subject.columns.num_frames} frames")
+    said = f", {len(subject.recording.subtasks)} subtasks" if subject.recording.subtasks else ""
+    return Measurement(value=0, detail=f"{subject.columns.num_frames} frames{said}")
 
 
 @check(
@@ -276,18 +286,21 @@ def collected_stuck(subject: CollectedSubject) -> Found:
 @check(
     scope="collected",
     group="pictures",
-    measures="cameras whose pictures do not decode, are of another size, or show one colour in more than half of them",
+    measures="cameras whose pictures do not decode, are of another size, or show one colour, or no distance, in more "
+    "than half of them",
     warn=0,
     needs_pictures=True,
-    reads=("/camera/{camera}/h264",),
+    reads=("/camera/{camera}/h264", "/camera/{camera}/depth"),
 )
 def collected_pictures(subject: CollectedSubject) -> Found:
     """Every picture decodes and shows something."""
-    if not subject.recording.cameras:
+    if not subject.recording.info.cameras:
         return None
+    measured = subject.measured.items()
     blank = [
         camera for camera, levels in subject.contrast.items() if levels and float(np.median(levels)) < _BLANK_LEVELS
     ]
+    blank += [camera for camera, shares in measured if shares and float(np.median(shares)) == 0]
     return Measurement(value=len(blank), detail=", ".join(f"camera {camera} shows nothing" for camera in blank))
 
 

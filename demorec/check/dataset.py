@@ -15,11 +15,12 @@ from demorec.check.dataset_drawn import compare_beginning
 from demorec.check.dataset_video import EpisodePictures, episode_pictures
 from demorec.check.drawn import PictureComparison
 from demorec.errors import ConfigError, ExportError, in_words
-from demorec.lerobot.files import read_table
+from demorec.lerobot.files import open_table, read_table
 from demorec.lerobot.language import COLUMNS, SpokenEpisode, spoken_episodes
 from demorec.lerobot.layout import AUTOMATIC_FEATURES, DatasetInfo
 from demorec.lerobot.paths import SIDECAR_DIR
 from demorec.lerobot.reader import EpisodePlace, RowReader, episode_places, read_tasks
+from demorec.lerobot.robots import DatasetRobot, read_robot
 from demorec.lerobot.sidecar import EPISODE_SCHEMA
 from demorec.scene.episode import EpisodeInfo
 from demorec.scene.features import ACTION, IMAGE_PREFIX, STATE, ActionKind, action_names
@@ -110,6 +111,23 @@ class Dataset:
         for path in sorted((self.path / SIDECAR_DIR / "episodes").glob("*/*.parquet")):
             rows += read_table(path, names, schema=EPISODE_SCHEMA).to_pylist()
         return rows
+
+    @cached_property
+    def robot_digests(self) -> list[str | None]:
+        """By what name each row of `sidecar` calls its arm; None where that is not known, as in older datasets."""
+        found: list[str | None] = []
+        for path in sorted((self.path / SIDECAR_DIR / "episodes").glob("*/*.parquet")):
+            table = open_table(path)
+            if "robot_digest" in table.schema_arrow.names:
+                found += read_table(path, ["robot_digest"], schema=EPISODE_SCHEMA).column(0).to_pylist()
+            else:
+                found += [None] * table.metadata.num_rows
+        return found
+
+    @cached_property
+    def robots(self) -> dict[str, DatasetRobot]:
+        """Name -> arm, of all that the episodes call by name."""
+        return {name: read_robot(self.path, name) for name in sorted(filter(None, set(self.robot_digests)))}
 
     @cached_property
     def spoken(self) -> list[SpokenEpisode]:

@@ -12,7 +12,8 @@ import numpy as np
 
 from demorec.check.base import NotMeasured
 from demorec.check.cells import Cells
-from demorec.check.drawn import NOT_DRAWABLE, PictureComparison, compare, draw
+from demorec.check.drawn import NOT_DRAWABLE, PictureComparison, compare, draw, frames_to_draw
+from demorec.check.episode_drawn import drawable_scene
 from demorec.geometry import Array
 from demorec.render.recorded import RecordedWorld
 from demorec.scene.episode import EpisodeInfo
@@ -48,10 +49,12 @@ def compare_beginning(
     joints = np.concatenate([state[:count, :num_arm], info.robot.gripper.joint_position(opening[:count])], axis=1)
     objects = {body.name: np.tile(body.world_from_body.vector(), (count, 1)) for body in info.scene.movable}
     try:
-        world = RecordedWorld(info.robot, info.scene, joint_position=joints, object_poses=objects)
+        scene = drawable_scene(info)
+        world = RecordedWorld(info.robot, scene, joint_position=joints, object_poses=objects)
         grids = {name: (cells.shape[2], cells.shape[1]) for name, cells in seen.items()}
         beginning = {name: cells[:count] for name, cells in seen.items()}
-        drawn = draw(world, count, dict.fromkeys(seen, ("color",)), grids, beginning.values())
+        frames = frames_to_draw(beginning.values(), world.all_poses[:count])
+        drawn = draw(world, scene.cameras, frames, dict.fromkeys(seen, ("color",)), grids)
     except NOT_DRAWABLE as error:
         return NotMeasured(why=f"the scene cannot be drawn here: {error}")
     return {name: compare(cells, drawn.cells[name, "color"], drawn.frames) for name, cells in beginning.items()}

@@ -108,22 +108,24 @@ def dataset_velocity(dataset: Dataset) -> Measurement | None:
     reads=(
         "observation.state",
         "observation.ee_pose",
+        "demorec/",
     ),
 )
 def dataset_forward_kinematics(dataset: Dataset) -> Measurement | None:
     """observation.ee_pose is that of observation.state (float32; 0.1 m per rad of rotation)."""
     if EE_POSE not in dataset.info.features:
         return None
-    found, urdfs = [], {}
+    found = []
     for number, (rows, info) in enumerate(dataset.described()):
-        key = (info.robot.urdf, info.scene.robot.scale)
-        if key not in urdfs:
+        if (name := dataset.robot_digests[number]) is not None:
+            urdf = dataset.robots[name].model
+        else:
             try:
-                urdfs[key] = Urdf.load(asset_path(info.robot.urdf), scale=info.scene.robot.scale)
-            except NotAllowedError:  # a dataset does not hold the model of a robot of the user's own
+                urdf = Urdf.load(asset_path(info.robot.urdf), scale=info.scene.robot.scale)
+            except NotAllowedError:  # older datasets do not hold the model of a robot of the user's own
                 return None
         joints = dict(zip(info.robot.arm_joints, rows[STATE].astype(np.float64).T, strict=False))
-        fk = LinkMatrices(urdfs[key], joints, len(rows[STATE]))[info.robot.tcp_link]
+        fk = LinkMatrices(urdf, joints, len(rows[STATE]))[info.robot.tcp_link]
         off = displacement(matrices(rows[EE_POSE].astype(np.float64)), fk)
         frame = int(np.argmax(off))
         found.append(Measurement(value=float(off[frame]), frame=frame, detail=f"episode {number}"))

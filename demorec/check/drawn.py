@@ -18,13 +18,12 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.check.cells import CellGrid, Cells, ImageKind, cell_counts
+from demorec.check.cells import CellGrid, Cells, ImageKind
 from demorec.errors import RenderError, SceneError
 from demorec.geometry import Array
 from demorec.render import Renderer
 from demorec.render.painter import Painter
 from demorec.render.recorded import RecordedWorld
-from demorec.scene.episode import EpisodeColumns, EpisodeInfo
 from demorec.scene.scene import Camera
 
 LONGER_SIDE = 112
@@ -45,53 +44,34 @@ class DrawnPictures:
     cells: Mapping[tuple[str, ImageKind], Cells]
 
 
-def draw_all(
-    info: EpisodeInfo,
-    columns: EpisodeColumns,
-    kinds: Mapping[str, Iterable[ImageKind]],
-    seen: Iterable[Cells] | None = None,
-) -> DrawnPictures:
-    """The pictures of an episode, as the recorded numbers make them.
-
-    Args:
-        info, columns: Of the recording.
-        kinds: Camera name -> what is to be drawn of it.
-        seen: The recorded pictures, by which frames are chosen to be drawn; None: every frame is drawn.
-
-    Raises:
-        SceneError, RenderError: A model is not there, or cannot be drawn.
-    """
-    world = RecordedWorld(
-        info.robot, info.scene, joint_position=columns.joint_position, object_poses=columns.object_poses
-    )
-    # The recorded pictures' grid: the small ones' own may have a row more or less.
-    counts = {camera.name: cell_counts(camera.width, camera.height) for camera in info.scene.cameras}
-    return draw(world, columns.num_frames, kinds, counts, seen)
-
-
 def draw(
     world: RecordedWorld,
-    num_frames: int,
+    cameras: Iterable[Camera],
+    frames: NDArray[np.int64],
     kinds: Mapping[str, Iterable[ImageKind]],
     counts: Mapping[str, tuple[int, int]],
-    seen: Iterable[Cells] | None = None,
 ) -> DrawnPictures:
-    """The first frames of a world, in a grid of (columns, rows) for each camera; `seen` as of `draw_all`.
+    """The frames of a world, up to the last of those that are drawn.
+
+    Args:
+        world: What is drawn.
+        cameras: Where from, in full size; those that are not among `kinds` are left out.
+        frames: Those that are drawn, in order, from 0 on; the others are filled in between.
+        kinds: Camera name -> what is to be drawn of it.
+        counts: Camera name -> (columns, rows) of its grid.
 
     Raises:
         SceneError, RenderError: It cannot be drawn.
     """
-    cameras = tuple(_small(camera) for camera in world.scene.cameras if camera.name in kinds)
+    small = tuple(_small(camera) for camera in cameras if camera.name in kinds)
     wanted = {kind for of_camera in kinds.values() for kind in of_camera}
-    grids = {camera.name: CellGrid(camera.width, camera.height, counts[camera.name]) for camera in cameras}
-    poses = world.all_poses[:num_frames]
-    frames = np.flatnonzero(np.ones(num_frames)) if seen is None else frames_to_draw(seen, poses)
+    grids = {camera.name: CellGrid(camera.width, camera.height, counts[camera.name]) for camera in small}
     cells: dict[tuple[str, ImageKind], Cells] = {
-        (name, kind): np.empty((num_frames, *grid.shape(kind)), dtype=np.float32)
+        (name, kind): np.empty((frames[-1] + 1, *grid.shape(kind)), dtype=np.float32)
         for name, grid in grids.items()
         for kind in kinds[name]
     }
-    painter = Painter(_renderer(), cameras, depth="depth" in wanted, segmentation="labels" in wanted)
+    painter = Painter(_renderer(), small, depth="depth" in wanted, segmentation="labels" in wanted)
     painter.setup(world)
     for frame in frames.tolist():
         world.frame = frame
@@ -122,22 +102,36 @@ def frames_to_draw(seen: Iterable[Cells], poses: Array) -> NDArray[np.int64]:
         seen: Pictures of each camera, T frames, or fewer where the rest cannot be read.
         poses: (T, n, 7) of everything that can be seen: position, quaternion.
     """
+    rows = [np.ascontiguousarray(cells).reshape(len(cells), -1) for cells in seen]
+    chosen = np.arange(len(poses)) % _STRIDE == 0
+    chosen[-1:] = True
+    while True:
+        # With other neighbours, frames may be told less well than before.
+        more = chosen | _not_between(rows, poses, *_neighbours(np.flatnonzero(chosen), len(poses)))
+        if np.array_equal(more, chosen):
+            return np.flatnonzero(chosen)
+        chosen = more
+
+
+def _not_between(
+    seen: Iterable[NDArray[np.float32]],
+    poses: Array,
+    before: NDArray[np.int64],
+    after: NDArray[np.int64],
+    share: Array,
+) -> NDArray[np.bool_]:
+    """(T,) frames whose pictures or poses are not what lies between those of the frames before and after."""
     from demorec.check import kernels
 
-    count = len(poses)
-    chosen = np.arange(count) % _STRIDE == 0
-    chosen[-1:] = True
-    before, after, share = _neighbours(np.flatnonzero(chosen), count)
     weight = share[:, None, None]
-    chosen |= np.abs(poses - (1 - weight) * poses[before] - weight * poses[after]).max(axis=(1, 2)) > _POSE_BETWEEN
-    for cells in seen:
-        rows = np.ascontiguousarray(cells).reshape(len(cells), -1)
+    off = np.abs(poses - (1 - weight) * poses[before] - weight * poses[after]).max(axis=(1, 2)) > _POSE_BETWEEN
+    for rows in seen:
         there = np.flatnonzero(after[: len(rows)] < len(rows))
-        chosen[len(there) : len(rows)] = True
-        off = np.zeros(len(there))
-        kernels.squares_between(rows, before, after, share, off)
-        chosen[there] |= off > _PICTURE_BETWEEN**2 * max(rows.shape[1], 1)
-    return np.flatnonzero(chosen)
+        off[len(there) : len(rows)] = True
+        sums = np.zeros(len(there))
+        kernels.squares_between(rows, before, after, share, sums)
+        off[there] |= sums > _PICTURE_BETWEEN**2 * max(rows.shape[1], 1)
+    return np.asarray(off)
 
 
 def _neighbours(frames: NDArray[np.int64], count: int) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
@@ -192,10 +186,26 @@ class PictureComparison:
 
 _STRAY = 4.0
 """Of 255: a depth or label that is off by more is another."""
+_TURNED_STRAY = 16.0
+"""The same where a camera's turn was found in its pictures: what is left of it moves edges by a twentieth of a cell."""
 _MAX_LAG = 3
 _MOVING = 1.0
 _MIN_MOVING = 12
 """A lag is told from this many frames on in which the drawn cells change by so much (root mean square, of 255)."""
+
+
+def fit(seen: Cells, drawn: Cells, frames: NDArray[np.int64]) -> Array:
+    """(4,) by how much the recorded pictures are to the right, below (cells), larger (share) and turned (rad)."""
+    from demorec.check import kernels
+
+    # Frames that are something else altogether must not decide how far the others are shifted.
+    size = _rms(seen, drawn, frames)
+    usual = frames[size <= 3 * np.median(size) + 1e-6]
+    gram, right = np.zeros((4, 4)), np.zeros(4)
+    kernels.normal_equations(seen, drawn, usual, gram, right)
+    # Enough that a direction in which nothing can be told gets nothing.
+    gram += np.eye(4) * max(1e-3 * float(np.trace(gram)) / 4, 1e-9)
+    return np.asarray(np.linalg.solve(gram, right))
 
 
 def compare(seen: Cells, drawn: Cells, frames: NDArray[np.int64]) -> PictureComparison:
@@ -209,14 +219,7 @@ def compare(seen: Cells, drawn: Cells, frames: NDArray[np.int64]) -> PictureComp
     from demorec.check import kernels
 
     drawn, frames = drawn[: len(seen)], frames[frames < len(seen)]
-    # Frames that are something else altogether must not decide how far the others are shifted.
-    size = _rms(seen, drawn, frames)
-    usual = frames[size <= 3 * np.median(size) + 1e-6]
-    gram, right = np.zeros((4, 4)), np.zeros(4)
-    kernels.normal_equations(seen, drawn, usual, gram, right)
-    # Enough that a direction in which nothing can be told gets nothing.
-    gram += np.eye(4) * max(1e-3 * float(np.trace(gram)) / 4, 1e-9)
-    found = np.linalg.solve(gram, right)
+    found = fit(seen, drawn, frames)
     fitted = np.empty_like(drawn)
     kernels.add_bases(drawn, found, fitted)
     moved, shown = np.zeros(len(seen)), np.zeros(len(seen))
@@ -232,7 +235,7 @@ def compare(seen: Cells, drawn: Cells, frames: NDArray[np.int64]) -> PictureComp
     )
 
 
-def strays(seen: Cells, drawn: Cells) -> Array:
+def strays(seen: Cells, drawn: Cells, *, is_turned: bool = False) -> Array:
     """(T,) share of the cells whose value lies outside those of the drawn cell and its eight neighbours.
 
     For depth and labels, which are coded without loss: edges may lie elsewhere by a cell, nothing else may differ.
@@ -246,7 +249,7 @@ def strays(seen: Cells, drawn: Cells) -> Array:
         np.minimum(low, cells, out=low)
         np.maximum(high, cells, out=high)
     inner = seen[:, 1 : 1 + height, 1 : 1 + width]
-    off = np.maximum(low - inner, inner - high).max(axis=3) > _STRAY
+    off = np.maximum(low - inner, inner - high).max(axis=3) > (_TURNED_STRAY if is_turned else _STRAY)
     return np.asarray(off.sum(axis=(1, 2)) / max(height * width, 1), dtype=np.float64)
 
 
@@ -280,4 +283,4 @@ def _lag(seen: Cells, drawn: Cells, moving: NDArray[np.int64]) -> float | None:
 
 
 NOT_DRAWABLE = (SceneError, RenderError)
-"""Errors of `draw_all` that say nothing about the recording: a model is not installed, or may not be read."""
+"""Errors of `draw` that say nothing about the recording: a model is not installed, or may not be read."""

@@ -137,7 +137,7 @@ def effort_bears_the_arm(episode: CheckedEpisode) -> Found:
 
     Catches torques of other joints, of another sign or unit, halved or frozen.
     """
-    dynamics = _dynamics(episode)
+    dynamics = episode.shared(_dynamics)
     if isinstance(dynamics, NotMeasured):
         return dynamics
     judged, found = dynamics.is_judged, []
@@ -165,7 +165,7 @@ def wrench_bears_the_hand(episode: CheckedEpisode) -> Found:
     wrench = episode.columns.wrench
     if wrench is None:
         return None
-    dynamics = _dynamics(episode)
+    dynamics = episode.shared(_dynamics)
     if isinstance(dynamics, NotMeasured):
         return dynamics
     link = episode.info.robot.hand_link

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Self, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from demorec.check.base import NotMeasured
 from demorec.check.cells import ImageKind
-from demorec.check.drawn import NOT_DRAWABLE, DrawnPictures, PictureComparison, compare, draw_all, strays
+from demorec.check.drawn import NOT_DRAWABLE, PictureComparison, compare, strays
+from demorec.check.episode_drawn import DrawnEpisode, draw_episode
 from demorec.check.pictures_summary import PictureSummary, summarise
 from demorec.check.rows import LinkMatrices, matrices
 from demorec.errors import RecordingError
@@ -73,6 +74,7 @@ class CheckedEpisode:
         self._container: Container | None = None
         self._pictures: dict[tuple[str, ImageKind], PictureSummary] = {}
         self._comparisons: dict[tuple[str, ImageKind], PictureComparison] = {}
+        self._shared: dict[Callable[[CheckedEpisode], object], object] = {}
 
     def __enter__(self) -> Self:
         return self
@@ -88,6 +90,12 @@ class CheckedEpisode:
             self._recording.close()
         if self._container is not None:
             self._container.close()
+
+    def shared[T](self, compute: Callable[[CheckedEpisode], T]) -> T:
+        """What a function makes of the episode, computed once for all checks that ask for it."""
+        if compute not in self._shared:
+            self._shared[compute] = compute(self)
+        return cast(T, self._shared[compute])
 
     @property
     def recording(self) -> Recording:
@@ -247,13 +255,13 @@ class CheckedEpisode:
         return self._pictures[camera.name, kind]
 
     @cached_property
-    def _drawn(self) -> DrawnPictures | NotMeasured:
+    def _drawn(self) -> DrawnEpisode | NotMeasured:
         """The pictures as the recorded numbers make them; each single one where some are coded without loss."""
         kinds = {camera.name: self.kinds(camera.name) for camera in self.cameras}
-        is_lossy = all(of_camera == ("color",) for of_camera in kinds.values())
-        seen = [self.pictures(camera).cells for camera in self.cameras] if is_lossy else None
+        is_exact = any(of_camera != ("color",) for of_camera in kinds.values())
         try:
-            return draw_all(self.info, self.columns, kinds, seen)
+            colors = {camera.name: self.pictures(camera).cells for camera in self.cameras}
+            return draw_episode(self.info, self.columns, kinds, colors, draw_each=is_exact)
         except NOT_DRAWABLE as error:
             return NotMeasured(why=f"the recording cannot be drawn here: {error}")
 
@@ -264,7 +272,8 @@ class CheckedEpisode:
         seen = self.pictures(camera, kind).cells
         if not len(seen):
             return NotMeasured(why=f"camera {camera.name} has no picture that can be read")
-        return strays(seen, self._drawn.cells[camera.name, kind])
+        is_turned = camera.name in self._drawn.shift
+        return strays(seen, self._drawn.pictures.cells[camera.name, kind], is_turned=is_turned)
 
     def compared(self, camera: Camera, kind: ImageKind = "color") -> PictureComparison | NotMeasured:
         """A camera's pictures against what the recorded numbers make of them."""
@@ -277,8 +286,10 @@ class CheckedEpisode:
         if len(seen) < 3:
             return NotMeasured(why=f"camera {camera.name} has {len(seen)} pictures")
         if (camera.name, kind) not in self._comparisons:
-            drawn = self._drawn
-            self._comparisons[camera.name, kind] = compare(seen, drawn.cells[camera.name, kind], drawn.frames)
+            drawn = self._drawn.pictures
+            compared = compare(seen, drawn.cells[camera.name, kind], drawn.frames)
+            shift = compared.shift + self._drawn.shift.get(camera.name, 0.0)
+            self._comparisons[camera.name, kind] = replace(compared, shift=shift)
         return self._comparisons[camera.name, kind]
 
 

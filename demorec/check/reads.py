@@ -17,6 +17,7 @@ from demorec.lerobot.language import COLUMNS
 from demorec.lerobot.layout import AUTOMATIC_FEATURES
 from demorec.lerobot.progress import PROGRESS_PATH
 from demorec.recording import channels
+from demorec.recording.collected.streams import SUBTASK
 from demorec.recording.metadata import COLLECTED, EPISODE, OUTCOME, RECOVERED, CameraStreams
 from demorec.recording.streams import frame_streams
 from demorec.recording.transforms import FrameTree
@@ -96,7 +97,7 @@ def everything() -> Iterator[tuple[SourceKind, str]]:
             yield "field", field
     yield "field", f"metadata {COLLECTED}"
     yield "field", IMPORT_NAME
-    for topic in ("/frames", "/{feature}"):
+    for topic in ("/frames", "/{feature}", SUBTASK):
         yield "topic", topic
     for column in columns():
         yield "column", column

@@ -78,7 +78,7 @@ class Check:
         if self.coverage_picture is not None:
             self._check_picture(self.coverage_picture)
         from demorec.check.report import CheckOptions, check_subjects, find_subjects, useful_workers
-        from demorec.generate.options import available_cores
+        from demorec.processes import available_cores
 
         allowed = allowed_modules(self.allow)
         subjects = find_subjects(self.paths)
@@ -107,14 +107,14 @@ class Check:
         failed = [report for report in reports if report.is_bad(strict=self.strict)]
         diverged = [replayed for replayed in replays if not _as_recorded(replayed)]
         different = [report for report in remade if report.level == "fail" or (self.strict and report.level == "warn")]
-        if self.json:
-            from demorec.cli.deep import plain_deep
+        from demorec.cli.deep import deep_summary, plain_deep
 
+        if self.json:
             plain = [_plain(report) for report in reports] + [_plain_replay(r) for r in replays]
             say_json(plain + [plain_deep(report) for report in remade])
         else:
             summary = _summary(reports, len(failed), len(replays), len(diverged))
-            say(summary + (f" {len(remade)} made again, {len(different)} not as recorded." if remade else ""))
+            say(summary + deep_summary(remade, different))
         return 1 if failed or diverged or different else 0
 
     def _remade(self, subjects: Sequence[Subject], options: CheckOptions) -> Iterator[DeepReport]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -34,6 +35,19 @@ def _verdict(report: DeepReport) -> str:
         return f"the same to the bit in all {report.num_frames} frames{aside}"
     frames = {frame for difference in report.differences for frame in difference.frames}
     return f"{len(report.differences)} fields differ, in {len(frames)} of {report.num_frames} frames"
+
+
+def deep_summary(remade: Sequence[DeepReport], different: Sequence[DeepReport]) -> str:
+    """The end of the last line: how many were made again, how many of them differ, how many cannot be; "" for none.
+
+    Args:
+        remade: All that were tried.
+        different: Those among them that count as failed; what cannot be made again is one of them.
+    """
+    impossible = sum(bool(report.error) for report in remade)
+    made, differ = len(remade) - impossible, sum(not report.error for report in different)
+    text = f" {made} made again, {differ} not as recorded." if made else ""
+    return text + (f" {impossible} could not be made again." if impossible else "")
 
 
 def plain_deep(report: DeepReport) -> dict[str, Any]:

@@ -79,6 +79,10 @@ def _told(report: ExportReport) -> list[str]:
         lines.append(f"{counted(report.skipped_unknown, 'recording')} of unknown outcome left out ({_TAKEN}).")
     if report.left_out:
         lines.append(f"Left out, since the dataset does not have them: {', '.join(report.left_out)}.")
+    if report.depth_left_out:
+        lines.append(f"Distances are left out unless --depth asks for them: camera {', '.join(report.depth_left_out)}.")
+    if report.silent:
+        lines.append(f"Nobody said a subtask, so nothing is written of it, in {', '.join(report.silent)}.")
     lines += [f"Pictures coded anew: camera {what}." for what in report.transcoded]
     if report.verified_frames:
         lines.append(f"Verified: {report.verified_frames} frames read through LeRobot equal the recordings.")

@@ -16,7 +16,8 @@ from demorec.cli.progress import duration
 from demorec.generate.contents import set_aside
 from demorec.generate.estimate import Estimate
 from demorec.generate.observer import RunResult
-from demorec.generate.options import RunOptions, available_cores
+from demorec.generate.options import RunOptions
+from demorec.processes import available_cores
 from demorec.runs.run_file import DATASET, EPISODES, STARTING, UNFINISHED, Attempt, ExportRecord, RunFile
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
@@ -12,13 +12,17 @@ from demorec.cli.output import counted, say, tell
 from demorec.config import VideoConfig
 from demorec.errors import ConfigError
 
-_LEROBOT = Path("lerobot")
-"""As the first word: what follows is a dataset."""
+if TYPE_CHECKING:
+    from demorec.ingest.dataset_import import DatasetImport
+    from demorec.ingest.hdf5_import import Hdf5Import
+
+_LEROBOT, _HDF5 = Path("lerobot"), Path("hdf5")
+"""As the first word: what follows is a dataset, or HDF5 files."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Import:
-    """Make a run of another robot's bags (MCAP, .db3, rosbag2 folders; without ROS) or of a LeRobot dataset.
+    """Make a run of another robot's bags (MCAP, .db3, rosbag2 folders; without ROS), HDF5 files or LeRobot dataset.
 
     A mapping (TOML) says which topics become which features; --suggest writes one from what is in a bag. Every row
     holds messages that are in the bag and says how old they are; what is missing or too old is an error, or drops the
@@ -27,20 +31,26 @@ class Import:
     A LeRobot dataset (v3.0, whoever wrote it) needs no mapping: its features keep their names, its numbers every bit,
     and its video packets stay as they are where each episode begins with a keyframe.
 
+    HDF5 files in robomimic's or ALOHA's layout take a mapping as well: which datasets become which features. Their
+    numbers keep every bit, JPEG files stay as they are.
+
     Examples:
       demorec import --suggest monday.mcap > robot.toml
       demorec import monday.mcap tuesday/ --mapping robot.toml --out runs/robot
       demorec import lerobot datasets/cups --out runs/cups
+      demorec import hdf5 demo.hdf5 --suggest > demo.toml
+      demorec import hdf5 demo.hdf5 --mapping demo.toml --out runs/demo
     """
 
     bags: Positional[tuple[Path, ...]]
-    """Bags; each is an episode, or several, as the mapping says. Or the word lerobot and a dataset."""
+    """Bags; each is an episode, or several, as the mapping says. Or the word lerobot and a dataset, or the word hdf5
+    and HDF5 files."""
     mapping: Path | None = None
-    """What of the bags becomes what; an import needs it."""
+    """What of the bags or HDF5 files becomes what; their import needs it."""
     out: Path | None = None
     """The run to make or to continue; an import needs it."""
     suggest: bool = False
-    """Write a mapping for the first bag to standard output instead of importing."""
+    """Write a mapping for the first bag or HDF5 file to standard output instead of importing."""
     video: Annotated[VideoConfig, arg(name="")] = field(default_factory=VideoConfig)
     """How pictures are coded that come as pixels."""
 
@@ -50,6 +60,8 @@ class Import:
             raise ConfigError("No bag is given: name one, e.g. demorec import --suggest monday.mcap.")
         if self.bags[0] == _LEROBOT:
             return self._import_dataset()
+        if self.bags[0] == _HDF5:
+            return self._import_hdf5()
         if self.suggest:
             from demorec.ingest.suggest import suggested_mapping
 
@@ -92,7 +104,38 @@ class Import:
         result = import_lerobot(self.bags[1], self.out, video=self.video)
         say(*(f"camera {name}: {told}" for name, told in result.cameras.items()))
         say(*(f"{name} is left out: {reason}." for name, reason in result.left_out.items()))
-        if there := result.num_episodes - result.num_new:
-            tell(f"{there} of {counted(result.num_episodes, 'episode')} had been imported before.")
-        say(f"{counted(result.num_episodes, 'episode')}, {result.num_frames} frames: {self.out}")
+        _say_made(result, self.out)
         return 0
+
+    def _import_hdf5(self) -> int:
+        files = self.bags[1:]
+        if not files:
+            raise ConfigError(
+                "Name HDF5 files after the word hdf5: demorec import hdf5 demo.hdf5 --mapping demo.toml --out "
+                "runs/demo. A bag of that name is given with its folder."
+            )
+        if self.suggest:
+            from demorec.ingest.hdf5_suggest import suggested_hdf5_mapping
+
+            say(*suggested_hdf5_mapping(files[0]))
+            return 0
+        if self.mapping is None or self.out is None:
+            raise ConfigError(
+                f"An import needs --mapping and --out: demorec import hdf5 {files[0]} --suggest > demo.toml writes a "
+                "mapping."
+            )
+        from demorec.ingest.hdf5_import import import_hdf5
+
+        self.video.validate()
+        result = import_hdf5(files, self.mapping, self.out, video=self.video)
+        say(*(f"camera {name}: {told}" for name, told in result.cameras.items()))
+        if result.left_out:
+            say(f"The mapping does not name, and so the run does not have: {', '.join(result.left_out)}.")
+        _say_made(result, self.out)
+        return 0
+
+
+def _say_made(result: DatasetImport | Hdf5Import, out: Path) -> None:
+    if there := result.num_episodes - result.num_new:
+        tell(f"{there} of {counted(result.num_episodes, 'episode')} had been imported before.")
+    say(f"{counted(result.num_episodes, 'episode')}, {result.num_frames} frames: {out}")

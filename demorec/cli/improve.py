@@ -69,8 +69,8 @@ class Improve:
         self.takeover.validate()
         refuse_inside([self.out])
         from demorec.evaluate.improvement import Improvement, Plan
-        from demorec.generate.options import available_cores
         from demorec.loop.actions import check_action_kind
+        from demorec.processes import available_cores
 
         plan = Plan(
             demonstrations=self.demonstrations,

@@ -8,15 +8,16 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from demorec.cli.output import say
-from demorec.runs.find import expect
+from demorec.runs.find import EVALUATION_NAME, expect
+from demorec.runs.run_file import EPISODES, FAILED, RUN_NAME
 
 
 @dataclass(frozen=True, kw_only=True)
 class Recover:
     """Turn what a crash left of a recording into an indexed one.
 
-    Everything whole is kept: all frames up to the last second before the crash. The damaged file stays as it is.
-    Exits with 1 when there is nothing to keep.
+    Everything whole is kept: all frames up to the last second before the crash. The damaged file stays as it is; of a
+    recording that is whole, no second one is made unless --out names it. Exits with 1 when there is nothing to keep.
 
     Examples:
       demorec recover recordings/cubes/unfinished/node-1-0/episode_000003.mcap.part
@@ -26,15 +27,19 @@ class Recover:
     file: Positional[Path]
     """An unfinished recording (NAME.mcap.part), or a finished one that was damaged."""
     out: Path | None = None
-    """The recording to be made (auto: NAME.mcap beside NAME.mcap.part, NAME.recovered.mcap beside NAME.mcap)."""
+    """The recording to be made (auto: NAME.mcap beside NAME.mcap.part; NAME.recovered.mcap beside NAME.mcap, or in
+    RUN/recovered where that is an episode of a run or an evaluation)."""
     overwrite: bool = False
     """Replace the recording that is to be made, if it is there."""
 
     def run(self) -> int:
         """Recover and say how much was kept."""
-        from demorec.recording import recover
+        from demorec.recording import is_whole, recover
 
-        expect(self.file, "recording", "unfinished")
+        found = expect(self.file, "recording", "unfinished")
+        if found.kind == "recording" and self.out is None and is_whole(self.file):
+            say(f"Nothing to recover, the recording is whole: {self.file}")
+            return 0
         result = recover(self.file, self.out or _default_target(self.file), overwrite=self.overwrite)
         if result.is_complete:
             say(f"Complete: all {result.num_frames} frames and the outcome are there: {result.path}")
@@ -46,4 +51,9 @@ class Recover:
 def _default_target(file: Path) -> Path:
     if file.suffix == ".part":
         return file.with_suffix("")
-    return file.with_name(f"{file.stem}.recovered{file.suffix or '.mcap'}")
+    name = f"{file.stem}.recovered{file.suffix or '.mcap'}"
+    folder = file.absolute().parent
+    marks = (RUN_NAME, EVALUATION_NAME)
+    if folder.name in (EPISODES, FAILED) and any((folder.parent / mark).is_file() for mark in marks):
+        return folder.parent / "recovered" / name  # beside it, it would count as one more episode
+    return file.with_name(name)

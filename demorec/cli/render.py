@@ -17,7 +17,7 @@ from demorec.cli.paths import refuse_sources
 from demorec.cli.progress import ProgressBar
 from demorec.config import VideoConfig
 from demorec.errors import ConfigError, check_option
-from demorec.processes import SPAWN
+from demorec.processes import SPAWN, available_cores
 from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings
 from demorec.safety.user_modules import modules_of
 
@@ -91,7 +91,6 @@ class Render:
             raise ConfigError("No path is given: name a recording or a run, e.g. demorec render recordings --out new.")
         options = self._options()
         jobs = _jobs(self.paths, self.out)
-        from demorec.generate.options import available_cores
 
         if self.workers is not None:
             check_option("workers", self.workers, 1, 1024)

@@ -67,8 +67,8 @@ class RolloutFlags:
             check_option("workers", self.workers, 1, 1024)
         refuse_inside([out])
         from demorec.evaluate.rollouts import evaluate, settings_for
-        from demorec.generate.options import available_cores
         from demorec.loop.actions import check_action_kind
+        from demorec.processes import available_cores
 
         settings = settings_for(
             policy,

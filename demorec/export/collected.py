@@ -26,7 +26,7 @@ class CollectedData:
     Attributes:
         recorded: All of its numbers.
         features: Feature -> (T, D) float32; (T,) bool for DONE.
-        pictures: Camera -> (T,) numbers of the pictures that the frames show.
+        pictures: Camera, depth cameras included -> (T,) numbers of the pictures that the frames show.
     """
 
     recorded: CollectedColumns
@@ -39,6 +39,11 @@ def wanted_cameras(recording: CollectedRecording, options: CommonOptions) -> lis
     return [name for name in recording.cameras if options.takes(IMAGE_PREFIX + name)]
 
 
+def wanted_depth(recording: CollectedRecording, options: CommonOptions) -> list[str]:
+    """The depth cameras that the dataset shall have: none unless depth is asked for."""
+    return [name for name in recording.depth_cameras if options.depth and options.takes(IMAGE_PREFIX + name)]
+
+
 def check_options(recording: CollectedRecording, options: CommonOptions) -> None:
     """Raise ConfigError for options that a collected episode cannot serve."""
     info = recording.info
@@ -47,7 +52,15 @@ def check_options(recording: CollectedRecording, options: CommonOptions) -> None
             f"action is {options.action!r}, but the actions of collected episodes are exported as they came: "
             f"{recording.path}"
         )
-    for name in ("privileged", "depth", "language", "progress", "boxes"):  # the last three of LeRobot datasets alone
+    if options.depth and not recording.depth_cameras:
+        raise ConfigError(f"depth is asked for, but no camera of the recording measures distances: {recording.path}")
+    unknown = [kind for kind in getattr(options, "language", None) or () if kind != "subtask"]
+    if unknown:
+        raise ConfigError(
+            f"language names {unknown[0]!r}, but of collected episodes nothing is known but the subtasks that somebody "
+            f"said: {recording.path}"
+        )
+    for name in ("privileged", "progress", "boxes"):  # the last two of LeRobot datasets alone
         if getattr(options, name, None) not in (None, False):
             raise ConfigError(f"{name} is asked for, which collected episodes do not have: {recording.path}")
     if options.fps not in (None, info.fps):
@@ -56,7 +69,8 @@ def check_options(recording: CollectedRecording, options: CommonOptions) -> None
             f"it depends on what its actions mean: {recording.path}"
         )
     offered = [*(feature.name for feature in info.features), DONE]
-    check_feature_names(options, [*offered, *(IMAGE_PREFIX + name for name in recording.cameras)])
+    cameras = [*recording.cameras, *(recording.depth_cameras if options.depth else ())]
+    check_feature_names(options, [*offered, *(IMAGE_PREFIX + name for name in cameras)])
 
 
 def collected_data(recording: CollectedRecording, options: CommonOptions) -> CollectedData:
@@ -87,7 +101,8 @@ def collected_data(recording: CollectedRecording, options: CommonOptions) -> Col
         recorded=columns,
         features=features,
         pictures={
-            camera: shown_pictures(recording, columns, camera, options) for camera in wanted_cameras(recording, options)
+            camera: shown_pictures(recording, columns, camera, options)
+            for camera in (*wanted_cameras(recording, options), *wanted_depth(recording, options))
         },
     )
 
@@ -126,9 +141,22 @@ def shown_images(recording: CollectedRecording, camera: str, numbers: NDArray[np
     Raises:
         ExportError: They do.
     """
+    return _shown(recording, camera, numbers, recording.images(camera))
+
+
+def shown_depth(
+    recording: CollectedRecording, camera: str, numbers: NDArray[np.int64]
+) -> Iterator[NDArray[np.float32]]:
+    """The distances (H, W), metres, that frames show; as `shown_images`."""
+    return _shown(recording, camera, numbers, recording.depth(camera))
+
+
+def _shown[P](
+    recording: CollectedRecording, camera: str, numbers: NDArray[np.int64], pictures: Iterator[P]
+) -> Iterator[P]:
     if (np.diff(numbers) < 0).any():
         raise ExportError(f"The pictures of the camera {camera} are not in the order of the frames: {recording.path}")
-    images = enumerate(recording.images(camera))
+    images = enumerate(pictures)
     number, picture = next(images)
     for wanted in numbers.tolist():
         while number < wanted:

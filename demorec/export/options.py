@@ -64,6 +64,8 @@ class ExportReport:
         skipped_unknown: Episodes that were left out since their recordings end before the outcome.
         transcoded: Cameras whose pictures had to be coded anew, with the reason.
         left_out: Features that the dataset appended to does not have.
+        depth_left_out: Depth cameras of collected episodes that were not asked for.
+        silent: Recordings of collected episodes whose language was asked for, but of which nobody said a subtask.
         verified_frames: Frames that were compared through LeRobot; 0 when not asked for, or without LeRobot.
         not_verified: Why LeRobot did not verify what was asked for, as a sentence, or "".
         digest: Of the content, as `dataset_digest`.
@@ -79,6 +81,8 @@ class ExportReport:
     skipped_unknown: int = 0
     transcoded: tuple[str, ...] = ()
     left_out: tuple[str, ...] = ()
+    depth_left_out: tuple[str, ...] = ()
+    silent: tuple[str, ...] = ()
     verified_frames: int = 0
     not_verified: str = ""
     digest: str = ""

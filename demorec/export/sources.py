@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from demorec.errors import ConfigError
@@ -85,15 +85,25 @@ def _attempt_order(source: ExportSource) -> tuple[str, bool, str]:
 
 @dataclass(frozen=True, kw_only=True)
 class Profile:
-    """What all recordings of a dataset must have in common, as (what, value) in words."""
+    """What all recordings of a dataset must have in common, as (what, value) in words.
+
+    Attributes:
+        traits: That.
+        depth_left_out: Depth cameras of collected episodes that were not asked for.
+        is_silent: Whether it is a collected episode of which nobody said a subtask.
+    """
 
     traits: tuple[tuple[str, str], ...]
+    depth_left_out: tuple[str, ...] = field(default=(), compare=False)
+    is_silent: bool = field(default=False, compare=False)
 
     @classmethod
     def of(cls, recording: AnyRecording, options: CommonOptions) -> Profile:
         """That of a recording, as far as it matters for these options."""
         if isinstance(recording, CollectedRecording):
-            return cls(traits=_collected_traits(recording, options))
+            unwanted = () if options.depth else recording.depth_cameras
+            common = _collected_traits(recording, options)
+            return cls(traits=common, depth_left_out=unwanted, is_silent=not recording.subtasks)
         info = recording.info
         # A scaled arm (the tutorial's) has the same joints and limits; its lengths stay with each episode's sidecar.
         robot = info.robot.scaled(0.0)
@@ -132,7 +142,8 @@ def _collected_traits(recording: CollectedRecording, options: CommonOptions) -> 
     info = recording.info
     wanted = [feature for feature in info.features if options.takes(feature.name)]
     features = [(f"feature {feature.name}", ", ".join(feature.names)) for feature in wanted]
-    cameras = [name for name in recording.cameras if options.takes(IMAGE_PREFIX + name)]
+    offered = (*recording.cameras, *(recording.depth_cameras if options.depth else ()))
+    cameras = [name for name in offered if options.takes(IMAGE_PREFIX + name)]
     names = ("features", " ".join(feature.name for feature in wanted))
     return (
         ("kind of episode", "collected"),
@@ -154,10 +165,16 @@ class Intake:
     Attributes:
         skipped_failures: Failed attempts that were left out so far.
         skipped_unknown: Recordings that were left out since they end before their outcome.
+        depth_left_out: Depth cameras that were not asked for.
+        silent: Names of recordings of collected episodes of which nobody said a subtask.
+        num_taken: Recordings that go in.
     """
 
     def __init__(self, found: Sequence[ExportSource], options: CommonOptions) -> None:
         self.skipped_failures = self.skipped_unknown = 0
+        self.depth_left_out: tuple[str, ...] = ()
+        self.silent: list[str] = []
+        self.num_taken = 0
         self._found = found
         self._options = options
         self._first: tuple[Profile, Path] | None = None
@@ -170,8 +187,12 @@ class Intake:
         """
         if self._first is None:
             self._first = profile, path
+            self.depth_left_out = profile.depth_left_out
         elif profile != self._first[0]:
             _refuse_differences(*self._first, (source.path for source in self._found), self._options)
+        self.num_taken += 1
+        if profile.is_silent:
+            self.silent.append(path.name)
 
     def leave_out(self, outcome: Outcome | CollectedOutcome | None) -> None:
         """Note a failed attempt, or one of unknown outcome, that only counts for the success rate."""

@@ -17,9 +17,10 @@ from demorec.errors import ConfigError, DemorecError, GenerationError, resource_
 from demorec.generate.contents import PARTS, RUN, check_dataset_place
 from demorec.generate.executor import peak_memory
 from demorec.generate.observer import RunObserver, RunResult
-from demorec.generate.options import RunOptions, available_cores
+from demorec.generate.options import RunOptions
 from demorec.generate.plan import differences
 from demorec.generate.survey import Inspector, recordings_of, survey
+from demorec.processes import available_cores
 from demorec.runs.lock import LOCK_NAME, run_lock
 from demorec.runs.run_file import (
     EPISODES,

@@ -18,7 +18,7 @@ from typing import Any
 from demorec.config import EpisodePlan
 from demorec.errors import ConfigError, GenerationError, MissingDependencyError, in_words
 from demorec.generate.executor import SINGLE_THREADED, Lost, Report, attempt_episode
-from demorec.generate.options import available_cores
+from demorec.processes import available_cores
 from demorec.runs.run_file import RUN_NAME
 
 try:

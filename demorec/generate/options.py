@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -75,15 +74,3 @@ def default_out(task: str) -> Path:
 def default_repo_id(task: str) -> str:
     """local/TASK."""
     return f"local/{task.rpartition(':')[2]}"
-
-
-def available_cores() -> int:
-    """Cores that this process may use: its affinity mask, and the quota of its control group where there is one."""
-    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
-    try:
-        quota, period = Path("/sys/fs/cgroup/cpu.max").read_text().split()
-        if quota != "max":
-            count = min(count, max(1, round(int(quota) / int(period))))
-    except (OSError, ValueError):
-        pass  # no control groups of version 2: the affinity mask is all there is
-    return count

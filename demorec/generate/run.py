@@ -19,9 +19,10 @@ from demorec.generate.folder import RunFolder, open_run
 from demorec.generate.interrupts import catch_interrupts
 from demorec.generate.local import LocalExecutor
 from demorec.generate.observer import NoProgress, RunObserver, RunResult
-from demorec.generate.options import RunOptions, available_cores
+from demorec.generate.options import RunOptions
 from demorec.generate.plan import Schedule
 from demorec.generate.survey import Inspector
+from demorec.processes import available_cores
 from demorec.render.warm_up import warm_up_renderer
 from demorec.runs.recordings import inspect_recording
 from demorec.runs.run_file import UNFINISHED, RunFile

@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 
 from demorec.errors import ConfigError
-from demorec.export.collected import collected_data, shown_images, wanted_cameras
+from demorec.export.collected import collected_data, shown_depth, shown_images, wanted_cameras, wanted_depth
 from demorec.export.columns import DONE
 from demorec.hdf5.file import COLLECTED_ARGUMENTS, COLLECTED_ENVIRONMENT
 from demorec.hdf5.options import Hdf5Options
@@ -52,6 +52,12 @@ def write_collected(demo: h5py.Group, recording: CollectedRecording, options: Hd
             add_vectors(observations, names[name], values, elements[name])
     for camera, numbers in data.pictures.items():
         settings = recording.video_settings(camera)
+        if camera in recording.depth_cameras:
+            shape = (count, settings.height, settings.width, 1)
+            stored = add_pictures(observations, names[camera], shape, np.float32, options.compression)
+            for index, metres in enumerate(shown_depth(recording, camera, numbers)):
+                stored[index] = metres[..., np.newaxis]
+            continue
         shape = (count, settings.height, settings.width, 3)
         stored = add_pictures(observations, names[camera + _IMAGE], shape, np.uint8, options.compression)
         for index, picture in enumerate(shown_images(recording, camera, numbers)):
@@ -79,11 +85,12 @@ def _observation_names(recording: CollectedRecording, options: Hdf5Options) -> d
     if ACTION not in features:
         raise ConfigError(f"robomimic's layout needs actions, and the episode has none: {recording.path}")
     names = {name: name.removeprefix(_PREFIX) for name in features if name != ACTION}
-    names |= {camera + _IMAGE: camera + _IMAGE for camera in wanted_cameras(recording, options)}
-    given = list(names.values())
+    cameras = {camera + _IMAGE: camera + _IMAGE for camera in wanted_cameras(recording, options)}
+    depths = {camera: camera for camera in wanted_depth(recording, options)}
+    given = [*names.values(), *cameras.values(), *depths.values()]
     if twice := sorted({name for name in given if given.count(name) > 1}):
         raise ConfigError(
             f"Two streams of the episode would be called {', '.join(twice)} in the file, leave one of them out "
             f"(--features): {recording.path}"
         )
-    return names
+    return names | cameras | depths

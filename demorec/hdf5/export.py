@@ -83,4 +83,5 @@ def _write(
         new_frames=writer.num_frames,
         skipped_failures=intake.skipped_failures,
         skipped_unknown=intake.skipped_unknown,
+        depth_left_out=intake.depth_left_out,
     )

@@ -11,30 +11,26 @@ from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from demorec.config import VideoConfig
 from demorec.errors import ConfigError
 from demorec.ingest.channel import BagError
 from demorec.ingest.dataset_pictures import DatasetCamera, ImageCamera, VideoCamera
+from demorec.ingest.frames_writer import Picture, write_frames
 from demorec.lerobot.layout import AUTOMATIC_FEATURES, DatasetInfo, Feature
 from demorec.lerobot.paths import INFO_PATH
 from demorec.lerobot.reader import EpisodePlace, RowReader, episode_places, read_tasks
-from demorec.recording import CollectedWriter
 from demorec.runs.collected import open_collected_run
 from demorec.runs.find import expect
 from demorec.runs.run_file import sha256_of
 from demorec.scene.collected import (
     CollectedCamera,
     CollectedFeature,
-    CollectedFrame,
     CollectedInfo,
-    CollectedOutcome,
     Origin,
-    Sample,
     SourceFile,
+    Vector,
 )
-from demorec.scene.episode import frame_time_ns
 from demorec.scene.features import IMAGE_PREFIX
 
 _SUCCESS = "next.success"
@@ -84,7 +80,14 @@ def import_lerobot(root: Path, out: Path, *, video: VideoConfig | None = None) -
             if not folder.has(info):
                 target = folder.path_of(place.episode_index)
                 folder.check_fits(info)
-                _write(target, info, rows, dataset.pictures(place), video or VideoConfig())
+                write_frames(
+                    target,
+                    info,
+                    rows.frames(),
+                    dataset.pictures(place),
+                    success=rows.success,
+                    video=video or VideoConfig(),
+                )
                 folder.add(target)
                 num_new += 1
     return DatasetImport(
@@ -101,8 +104,13 @@ class _Rows:
     """The numbers of an episode of T frames: feature -> (T, D), and how it ended."""
 
     num_frames: int
-    features: Mapping[str, NDArray[np.float32] | NDArray[np.float64]]
+    features: Mapping[str, Vector]
     success: bool | None
+
+    def frames(self) -> Iterator[dict[str, Vector]]:
+        """Feature -> (D,) of each frame."""
+        for number in range(self.num_frames):
+            yield {name: values[number] for name, values in self.features.items()}
 
 
 @dataclass(kw_only=True, eq=False)
@@ -192,7 +200,7 @@ class _Dataset:
         features = {feature.name: columns[feature.name] for feature in self.features}
         return info, _Rows(num_frames=place.length, features=features, success=success)
 
-    def pictures(self, place: EpisodePlace) -> dict[str, Iterator[bytes | NDArray[np.uint8]]]:
+    def pictures(self, place: EpisodePlace) -> dict[str, Iterator[Picture]]:
         """Camera -> its pictures in an episode, one a frame."""
         return {name: camera.pictures(place) for name, camera in self.cameras.items()}
 
@@ -247,24 +255,3 @@ def _camera(root: Path, info: DatasetInfo, name: str, places: list[EpisodePlace]
     camera = ImageCamera(root=root, info=info, key=name)
     camera.measure(places[0])
     return camera
-
-
-def _write(
-    path: Path,
-    info: CollectedInfo,
-    rows: _Rows,
-    pictures: Mapping[str, Iterator[bytes | NDArray[np.uint8]]],
-    video: VideoConfig,
-) -> None:
-    """Record an episode: whole, or not at all."""
-    writer = CollectedWriter(path, info, video=video)
-    try:
-        for number in range(rows.num_frames):
-            time_ns = frame_time_ns(number, info.fps)
-            shown = {name: writer.picture(name, time_ns, next(images)) for name, images in pictures.items()}
-            samples = {name: Sample(stamp_ns=time_ns, vector=values[number]) for name, values in rows.features.items()}
-            writer.write(CollectedFrame(time_ns=time_ns, samples=samples, pictures=shown))
-        writer.finish(CollectedOutcome(success=rows.success, num_frames=rows.num_frames))
-    except BaseException:
-        writer.discard()
-        raise

@@ -24,6 +24,7 @@ from PIL import Image
 from demorec.config import MAX_PIXELS
 from demorec.errors import in_words
 from demorec.ingest.channel import BagError
+from demorec.ingest.frames_writer import Picture
 from demorec.lerobot.files import check_video, open_table
 from demorec.lerobot.layout import VIDEO_PATH, DatasetInfo
 from demorec.lerobot.reader import EpisodePlace
@@ -33,7 +34,6 @@ _CODECS: dict[str, Literal["h264", "h265", "av1"]] = {"h264": "h264", "hevc": "h
 _TO_START_CODES = {"h264": "h264_mp4toannexb", "h265": "hevc_mp4toannexb"}
 _TEMPORAL_DELIMITER = b"\x12\x00"
 """In front of every temporal unit of AV1 (its specification, section 7.5); mp4 files leave it out."""
-Picture = bytes | NDArray[np.uint8]
 
 
 class DatasetCamera(ABC):

@@ -13,7 +13,8 @@ from demorec.errors import ConfigError
 from demorec.ingest.bag import Bag
 from demorec.ingest.channel import BagError
 from demorec.ingest.episode_writer import PicturePlan
-from demorec.ingest.mapping import STATE, BagMapping
+from demorec.ingest.mapping import BagMapping
+from demorec.ingest.mapping_file import STATE, recorded_unit
 from demorec.ingest.rows import EpisodeRows, FeatureRows, Timelines
 from demorec.ingest.streams import BagStreams
 from demorec.safety.files import read_text_limited
@@ -21,14 +22,13 @@ from demorec.scene.collected import CollectedCamera, CollectedFeature, Collected
 from demorec.scene.urdf import Urdf
 
 _MAX_URDF_BYTES = 4 << 20
-_UNITS = {"degree": "deg"}
 
 
-def urdf_text(mapping: BagMapping, mapping_path: Path) -> str:
-    """The URDF that the mapping names a file for; "" when it names none. ConfigError when it cannot be read."""
-    if not mapping.robot.urdf:
+def urdf_text(name: str, mapping_path: Path) -> str:
+    """The URDF that a mapping names a file for; "" when it names none. ConfigError when it cannot be read."""
+    if not name:
         return ""
-    path = mapping_path.parent / mapping.robot.urdf
+    path = mapping_path.parent / name
     try:
         return read_text_limited(path, _MAX_URDF_BYTES)
     except (OSError, UnicodeDecodeError) as error:
@@ -84,7 +84,7 @@ def _urdf_of(bag: Bag, streams: BagStreams, topic: str) -> str:
 
 
 def _feature(name: str, feature: FeatureRows, lines: Timelines, joints: frozenset[str]) -> CollectedFeature:
-    units = tuple(_UNITS.get(unit, unit) for unit in feature.units)
+    units = tuple(map(recorded_unit, feature.units))
     sources = lines.mapping.features[name]
     told = []
     for index, source in enumerate(sources):

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, Self, cast
+from typing import Any, Self, cast
 
 import numpy as np
 
@@ -22,9 +22,8 @@ from demorec.ingest.ros_types import Values
 from demorec.ingest.rows import CameraRows, EpisodeRows
 from demorec.ingest.streams import Stream
 from demorec.recording import CollectedWriter
-from demorec.scene.collected import CollectedFrame, CollectedInfo, CollectedOutcome, Sample
+from demorec.scene.collected import DEPTH_UNITS, CollectedFrame, CollectedInfo, CollectedOutcome, Kept, Sample
 
-Kept = Literal["", "h264", "h265", "av1", "jpeg"]
 _MAX_WAITING = 1 << 29
 """Bytes of pictures that wait for earlier ones, which come later in the bag."""
 
@@ -36,7 +35,8 @@ class PicturePlan:
     Attributes:
         topic: Of them.
         head: Of the first.
-        kept: The codec whose packets stay as they are; "" for pixels, which are coded once.
+        kept: The codec whose packets stay as they are, or the encoding of distances; "" for pixels, which are coded
+            once.
         numbers: (P,) which of the topic's messages are taken, in the order of their times.
         stamps_ns: (P,) their times.
         positions: (R,) which of the taken ones each row shows.
@@ -78,11 +78,18 @@ def picture_plan(rows: CameraRows, stream: Stream, line: Timeline) -> PicturePla
     return PicturePlan(
         topic=stream.topic,
         head=head,
-        kept=cast(Kept, head.format) if head.format in KEPT_FORMATS else "",
+        kept=_kept(head),
         numbers=stream.numbers[line.order[taken]],
         stamps_ns=line.times_ns[taken],
         positions=np.searchsorted(taken, place),
     )
+
+
+def _kept(head: PictureHead) -> Kept:
+    """What stays as it is of pictures like this one."""
+    if head.encoding in DEPTH_UNITS:
+        return cast(Kept, head.encoding)
+    return cast(Kept, head.format) if head.format in KEPT_FORMATS else ""
 
 
 def _times_of(stream: Stream, line: Timeline, rows: CameraRows) -> Int:
@@ -106,6 +113,7 @@ class ImportedEpisodeWriter:
         info: What is known of the episode.
         rows: Its rows.
         plans: Camera -> its pictures.
+        subtasks: Row -> what is begun there, in words.
         video: How pixels are coded.
     """
 
@@ -116,9 +124,10 @@ class ImportedEpisodeWriter:
         rows: EpisodeRows,
         plans: Mapping[str, PicturePlan],
         *,
+        subtasks: Mapping[int, str],
         video: VideoConfig,
     ) -> None:
-        self._rows = rows
+        self._rows, self._subtasks = rows, subtasks
         self._waiting = {
             name: _Waiting(plan=plan, places={int(number): k for k, number in enumerate(plan.numbers)})
             for name, plan in plans.items()
@@ -152,7 +161,8 @@ class ImportedEpisodeWriter:
         self._write_rows()
 
     def _take(self, name: str, waiting: _Waiting, place: int, values: Values) -> None:
-        data: Any = picture_bytes(values) if waiting.plan.kept else decode_picture(values)
+        is_coded = waiting.plan.kept and waiting.plan.kept not in DEPTH_UNITS
+        data: Any = picture_bytes(values) if is_coded else decode_picture(values)
         size = len(data) if isinstance(data, bytes) else data.nbytes
         waiting.pictures[place] = (data, size)
         waiting.num_bytes += size
@@ -177,7 +187,8 @@ class ImportedEpisodeWriter:
                 for name, feature in self._rows.features.items()
             }
             pictures = {name: int(waiting.plan.positions[row]) for name, waiting in self._waiting.items()}
-            self._writer.write(CollectedFrame(time_ns=time_ns, samples=samples, pictures=pictures))
+            subtask = self._subtasks.get(row, "")
+            self._writer.write(CollectedFrame(time_ns=time_ns, samples=samples, pictures=pictures, subtask=subtask))
             self._next_row += 1
 
     def finish(self, *, success: bool | None) -> None:

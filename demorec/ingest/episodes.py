@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 
 import numpy as np
 
 from demorec.ingest.bag import Bag
 from demorec.ingest.channel import BagError
-from demorec.ingest.clock import NS, Timeline
-from demorec.ingest.mapping import BagMapping
+from demorec.ingest.clock import NS, Int, Timeline
+from demorec.ingest.fields import FieldError
+from demorec.ingest.mapping import BagMapping, Episodes
+from demorec.ingest.service_calls import ServiceCall
 from demorec.ingest.streams import BagStreams, Text
-
-_NUMBER = re.compile(r"([_\-. ]*\d+)+$")
+from demorec.ingest.words import task_in_name
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,13 +50,40 @@ def windows(bag: Bag, streams: BagStreams, timelines: list[Timeline], mapping: B
         return found
     if episodes.cut == "gap":
         return _between_gaps(timelines, episodes.gap_s)
-    found = _between_markers(streams.texts[episodes.topic], mapping)
+    is_service = episodes.cut == "service"
+    found = _between_markers(_calls(bag, streams, episodes) if is_service else streams.texts[episodes.topic], mapping)
+    if not found and episodes.start_topic:
+        raise BagError(
+            f"No call of {episodes.start_topic} is followed by one of {episodes.stop_topic}, so there is no episode: "
+            f"{bag.path}"
+        )
+    if not found and is_service:
+        raise BagError(
+            f"No call of {episodes.topic} with true (or {episodes.start!r}) in {episodes.field!r} is followed by one "
+            f"with false (or {episodes.stop!r}), so there is no episode: {bag.path}"
+        )
     if not found:
         raise BagError(
             f"No marker of {episodes.topic} says {episodes.start!r} and then {episodes.stop!r}, so there is no "
             f"episode: {bag.path}"
         )
     return found
+
+
+def _calls(bag: Bag, streams: BagStreams, episodes: Episodes) -> list[Text]:
+    """The calls of services as markers."""
+    try:
+        if episodes.topic:
+            calls = streams.calls[episodes.topic]
+            return [_marker(call, call.value(episodes.field)) for call in calls]
+        begins = [_marker(call, episodes.start) for call in streams.calls[episodes.start_topic]]
+        return [*begins, *(_marker(call, episodes.stop) for call in streams.calls[episodes.stop_topic])]
+    except FieldError as error:
+        raise BagError(f"The calls of {episodes.topic} cannot be used, since {error}: {bag.path}") from error
+
+
+def _marker(call: ServiceCall, value: object) -> Text:
+    return Text(time_ns=call.time_ns, log_ns=call.time_ns, value=value)
 
 
 def _between_gaps(timelines: list[Timeline], gap_s: float) -> list[Window]:
@@ -93,7 +120,7 @@ def task_text(bag: Bag, streams: BagStreams, window: Window, mapping: BagMapping
     if task.text:
         return task.text.strip()
     if task.file_name:
-        text = _NUMBER.sub("", bag.name).replace("_", " ").replace("-", " ").strip()
+        text = task_in_name(bag.name)
         if not text:
             raise BagError(f"The bag's name says no task, which the mapping takes from it: {bag.path}")
         return text
@@ -104,3 +131,28 @@ def task_text(bag: Bag, streams: BagStreams, window: Window, mapping: BagMapping
     if not isinstance(value, str) or not value.strip():
         raise BagError(f"The task of {task.topic} is no text: {bag.path}")
     return value.strip()
+
+
+def subtask_rows(bag: Bag, streams: BagStreams, window: Window, times_ns: Int, mapping: BagMapping) -> dict[int, str]:
+    """Row -> what is begun there: the texts of the mapping's topic that were said within the episode.
+
+    Of several before a row the last one holds from it on; a text that is said again, and an empty one, begins nothing.
+
+    Raises:
+        BagError: What was said is no text.
+    """
+    words = mapping.episodes
+    is_marker = words.cut == "marker" and words.topic == mapping.subtasks.topic
+    markers = {words.start, words.stop, words.success, words.failure} if is_marker else set()
+    found: dict[int, str] = {}
+    for text in sorted(streams.texts.get(mapping.subtasks.topic, ()), key=lambda text: text.time_ns):
+        if not window.begin_ns <= text.time_ns <= times_ns[-1]:
+            continue
+        if not isinstance(text.value, str):
+            raise BagError(f"The subtask of {mapping.subtasks.topic} is no text: {bag.path}")
+        if text.value in markers:
+            continue
+        if said := " ".join(text.value.split()):
+            found[int(np.searchsorted(times_ns, text.time_ns))] = said
+    before = ["", *found.values()]
+    return {row: said for (row, said), last in zip(found.items(), before, strict=False) if said != last}

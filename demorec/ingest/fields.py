@@ -13,12 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.ingest.mapping import Source, conversion_factor
+from demorec.ingest.mapping import Source
+from demorec.ingest.mapping_file import MAX_ELEMENTS, Part, conversion_factor
 from demorec.ingest.ros_types import Values
 from demorec.registry import nearest_match
 
-MAX_ELEMENTS = 4096
-"""Of a source: more is a picture or a point cloud, not a vector."""
 _STEP = re.compile(r"(?P<name>[^.\[\]]+)|\[(?P<key>[^=\]]+)=(?P<value>[^\]]*)\]|\[(?P<index>\d+)\]")
 _STAMP_PATHS = (
     ("header", "stamp"),
@@ -305,13 +304,13 @@ def _joined(parts: Sequence[Any]) -> NDArray[np.floating[Any]]:
     return np.concatenate([array.astype(np.float32 if single else np.float64) for array in arrays])
 
 
-def converted(source: Source, vectors: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
-    """(N, D) in the unit of the feature; the very same array where that is the bag's."""
-    factor = conversion_factor(source.unit, source.to)
+def converted(part: Part, vectors: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
+    """(N, D) in the unit of the feature; the very same array where that is the source's."""
+    factor = conversion_factor(part.unit, part.to)
     if factor is None:
         return vectors
     if math.isnan(factor):
-        low, high = np.array(source.limits, dtype=np.float64).T
+        low, high = np.array(part.limits, dtype=np.float64).T
         scaled: NDArray[np.float64] = low + (vectors.astype(np.float64) + 100.0) / 200.0 * (high - low)
         return scaled
     return vectors.astype(np.float64) * factor

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.ingest.clock import NS, Int, Timeline
-from demorec.ingest.mapping import ACTION, STATE, BagMapping
+from demorec.ingest.mapping import BagMapping
+from demorec.ingest.mapping_file import ACTION, STATE
 from demorec.ingest.streams import NO_STAMP, BagStreams, Stream
 
 _JITTER = 0.25

@@ -17,7 +17,7 @@ from demorec.ingest.channel import BagError
 from demorec.ingest.clock import NS
 from demorec.ingest.description import describe, origin_of, urdf_text
 from demorec.ingest.episode_writer import ImportedEpisodeWriter, PicturePlan, picture_plan
-from demorec.ingest.episodes import Window, task_text, windows
+from demorec.ingest.episodes import Window, subtask_rows, task_text, windows
 from demorec.ingest.fields import FieldError
 from demorec.ingest.import_file import ImportFile, load_import_file, save_import_file
 from demorec.ingest.mapping import BagMapping, read_mapping
@@ -64,7 +64,7 @@ def import_bags(
         RecordingError: The disk is full or gone.
     """
     mapping = read_mapping(mapping_path)
-    urdf = urdf_text(mapping, mapping_path)
+    urdf = urdf_text(mapping.robot.urdf, mapping_path)
     bags = [open_bag(path) for path in paths]
     known = load_import_file(out) or ImportFile(mapping=mapping, mapping_digest=mapping.digest)
     if known.mapping_digest != mapping.digest:
@@ -91,6 +91,7 @@ class _Episode:
     info: CollectedInfo
     rows: EpisodeRows
     plans: dict[str, PicturePlan]
+    subtasks: dict[int, str]
     path: Path
 
 
@@ -159,7 +160,8 @@ class _Import:
             instruction=task_text(self._bag, streams, rows.window, self._mapping),
             origin=origin_of(self._files, self._mapping),
         )
-        return _Episode(info=info, rows=rows, plans=plans, path=self._folder.path_of(index))
+        subtasks = subtask_rows(self._bag, streams, rows.window, rows.times_ns, self._mapping)
+        return _Episode(info=info, rows=rows, plans=plans, subtasks=subtasks, path=self._folder.path_of(index))
 
     def _check_alike(self, episodes: Sequence[_Episode]) -> None:
         """ConfigError unless the episodes are of the kind that the run holds, and of one kind."""
@@ -201,7 +203,9 @@ class _Import:
         self._folder.add(episode.path)
 
     def _writer(self, episode: _Episode) -> ImportedEpisodeWriter:
-        return ImportedEpisodeWriter(episode.path, episode.info, episode.rows, episode.plans, video=self._video)
+        return ImportedEpisodeWriter(
+            episode.path, episode.info, episode.rows, episode.plans, subtasks=episode.subtasks, video=self._video
+        )
 
     def _pictures(self, episodes: Sequence[_Episode]) -> Iterator[tuple[str, int, dict[str, object]]]:
         """(topic, number, values) of the pictures that any episode takes."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterable, Iterator
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import av
 import numpy as np
@@ -13,6 +13,7 @@ from PIL import Image
 
 from demorec.config import MAX_PIXELS
 from demorec.errors import in_words
+from demorec.ingest.compressed_depth import compressed_depth_head, decode_compressed_depth
 from demorec.ingest.fields import FieldError, picture_bytes
 from demorec.ingest.raw_pictures import RAW_ENCODINGS, check_raw, raw_picture
 from demorec.ingest.ros_types import Values
@@ -32,8 +33,8 @@ class PictureHead(NamedTuple):
     """What is known of a picture before it is decoded.
 
     Attributes:
-        format: raw, jpeg, png or a codec of `VIDEO_FORMATS`.
-        encoding: Of raw pixels: "rgb8", "bayer_rggb8", "16UC1"; else "".
+        format: raw, jpeg, png, compressedDepth or a codec of `VIDEO_FORMATS`.
+        encoding: Of raw pixels and of distances: "rgb8", "bayer_rggb8", "16UC1"; else "".
         width, height: Pixels; 0 in video between keyframes.
         is_keyframe: Whether it can be decoded without those before it: in video a keyframe with its parameter sets.
     """
@@ -58,7 +59,7 @@ def picture_head(values: Values) -> PictureHead:
     data = picture_bytes(values)
     name = str(values["format"]).lower()
     if "compresseddepth" in name:
-        raise FieldError("it holds depth, which an episode has no place for")
+        return _checked(PictureHead("compressedDepth", *compressed_depth_head(str(values["format"]), data), True))
     if data.startswith((_JPEG, _PNG)):
         return _checked(_file_head("jpeg" if data.startswith(_JPEG) else "png", data))
     codec = _ALIASES.get(name, name)
@@ -89,10 +90,12 @@ def _file_head(kind: str, data: bytes) -> PictureHead:
     return PictureHead(kind, "", width, height, True)
 
 
-def decode_picture(values: Values) -> NDArray[np.uint8]:
-    """(H, W, 3) RGB of a picture that is no video; FieldError when it cannot be decoded."""
+def decode_picture(values: Values) -> NDArray[Any]:
+    """(H, W, 3) RGB of a picture that is no video, or its distances (H, W); FieldError when it cannot be decoded."""
     if "encoding" in values:
         return raw_picture(values)
+    if "compresseddepth" in str(values["format"]).lower():
+        return decode_compressed_depth(picture_bytes(values))
     try:
         with Image.open(io.BytesIO(picture_bytes(values)), formats=("JPEG", "PNG")) as image:
             if image.mode not in ("RGB", "RGBA", "L", "P", "1"):

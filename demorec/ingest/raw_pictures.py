@@ -1,10 +1,12 @@
-"""Pixels as cameras send them, to RGB: the encodings of sensor_msgs/Image and foxglove.RawImage.
+"""Pixels as cameras send them, to RGB or distances: the encodings of sensor_msgs/Image and foxglove.RawImage.
 
 Reordering of bytes changes no value. Bayer patterns and YUV are computed, in the plainest way that others agree on:
 bilinear interpolation, ITU-R BT.601 with limited range.
 """
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,13 +29,23 @@ _BAYER = {"bayer_rggb8": (0, 0), "bayer_grbg8": (0, 1), "bayer_gbrg8": (1, 0), "
 """Encoding -> row and column of the first red pixel."""
 _YUV = {"uyvy": (1, 0, 2), "yuv422": (1, 0, 2), "yuyv": (0, 1, 3), "yuv422_yuy2": (0, 1, 3)}
 """Encoding -> where the first luma, U and V of a pair of pixels are, of its four bytes."""
-RAW_ENCODINGS = (*_CHANNELS, *_BAYER, *_YUV)
+_DEPTH = {"16UC1": "u2", "32FC1": "f4"}
+"""Encoding of distances -> type of one."""
+RAW_ENCODINGS = (*_CHANNELS, *_BAYER, *_YUV, *_DEPTH)
 
 
-def raw_picture(values: Values) -> Rgb:
-    """(H, W, 3) of a message; FieldError when its bytes are not those of its size and encoding."""
+def raw_picture(values: Values) -> NDArray[Any]:
+    """(H, W, 3) uint8 of a message, or (H, W) distances as they are: uint16 (16UC1) or float32 (32FC1).
+
+    Raises:
+        FieldError: Its bytes are not those of its size and encoding.
+    """
     encoding, height = str(values["encoding"]), int(values["height"])
     rows = _rows(values)
+    if encoding in _DEPTH:
+        kind = np.dtype(_DEPTH[encoding]).newbyteorder(">" if values.get("is_bigendian") else "<")
+        stored = np.ascontiguousarray(rows).view(kind)
+        return stored.astype(stored.dtype.newbyteorder("="))
     if encoding in _CHANNELS:
         channels, order = _CHANNELS[encoding]
         return np.ascontiguousarray(rows.reshape(height, -1, channels)[:, :, list(order)])
@@ -55,6 +67,8 @@ def _bytes_of_row(encoding: str, width: int) -> int:
         return width * _CHANNELS[encoding][0]
     if encoding in _BAYER:
         return width
+    if encoding in _DEPTH:
+        return width * np.dtype(_DEPTH[encoding]).itemsize
     if encoding in _YUV and width % 2 == 0:
         return 2 * width
     raise FieldError(f"its encoding {encoding[:40]!r} is not read; {', '.join(RAW_ENCODINGS)} are")

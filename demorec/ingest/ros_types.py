@@ -34,7 +34,8 @@ _TIME: _Fields = [
     ("nanosec", (Nodetype.BASE, ("uint32", 0))),
 ]
 _BUILT_IN = {"builtin_interfaces/msg/Time": _TIME, "builtin_interfaces/msg/Duration": _TIME}
-_IDL_SEPARATOR = "=" * 80 + "\n"
+_SEPARATOR = "=" * 80 + "\n"
+"""Between the definitions of types that are in one text."""
 
 
 def ros_decoder(type_name: str, schema_encoding: str, schema: bytes, *, is_cdr: bool) -> Callable[[bytes], Values]:
@@ -83,14 +84,14 @@ def _full_name(name: str) -> str:
 @lru_cache(maxsize=512)
 def _types(name: str, schema_encoding: str, schema: bytes) -> Mapping[str, _Fields]:
     try:
-        if schema_encoding in ("ros2msg", "ros1msg"):
+        if "/srv/" in name:
+            parsed = _service_event(name, schema.decode())
+        elif schema_encoding in ("ros2msg", "ros1msg"):
             parsed = get_types_from_msg(schema.decode(), name)
         elif schema_encoding == "ros2idl":
             parsed = {}
             text = schema.decode()
-            parts = (
-                [part.split("\n", 1)[1] for part in text.split(_IDL_SEPARATOR)[1:]] if _IDL_SEPARATOR in text else []
-            )
+            parts = [part.split("\n", 1)[1] for part in text.split(_SEPARATOR)[1:]] if _SEPARATOR in text else []
             for part in parts or [text]:
                 parsed |= get_types_from_idl(part)
         elif not schema_encoding:
@@ -107,6 +108,32 @@ def _types(name: str, schema_encoding: str, schema: bytes) -> Mapping[str, _Fiel
     if name not in types:
         raise ValueError("it comes without a definition, and is no type of ROS itself")
     return types
+
+
+def _service_event(name: str, text: str) -> dict[str, Any]:
+    """The types of a service's events: rosbag2 writes the definition of the service, from which they follow.
+
+    It has a line of "=", "SRV: " and the name in front, and requests and responses apart by "---".
+    """
+    package, _, event = name.split("/", 2)
+    service = event.removesuffix("_Event")
+    if not text.strip():
+        raise ValueError(f"it comes without the definition of the service {package}/srv/{service}")
+    first, *others = [part for part in text.split(_SEPARATOR) if part.strip()]
+    head, _, body = first.partition("\n")
+    if event == service or head.strip() != f"SRV: {package}/srv/{service}":
+        raise ValueError(f"its definition is not that of the service {package}/srv/{service}")
+    request, _, response = f"\n{body}".partition("\n---")
+    types: dict[str, Any] = {}
+    for part, fields in (("Request", request), ("Response", response)):
+        types |= get_types_from_msg(_SEPARATOR.join([f"{fields}\n", *others]), f"{package}/msg/{service}_{part}")
+    event_type = "service_msgs/ServiceEventInfo info\n" + "".join(
+        f"{package}/{service}_{part}[<=1] {part.lower()}\n" for part in ("Request", "Response")
+    )
+    ((_, definition),) = get_types_from_msg(event_type, f"{package}/msg/{event}").items()
+    known = get_typestore(Stores.ROS2_JAZZY).fielddefs
+    info = "service_msgs/msg/ServiceEventInfo"
+    return {**types, info: known[info], name: definition}
 
 
 class _Builder:

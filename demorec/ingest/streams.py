@@ -15,10 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from demorec.errors import in_words
 from demorec.ingest.bag import Bag
 from demorec.ingest.channel import BagChannel, BagError, BagMessage
 from demorec.ingest.decoding import Decoder, UnknownEncodingError, decoder_of
 from demorec.ingest.fields import (
+    FieldError,
     OtherPublisherError,
     SourceLayout,
     SourceReader,
@@ -33,6 +35,7 @@ from demorec.ingest.fields import (
 from demorec.ingest.mapping import BagMapping, CameraSource, Source
 from demorec.ingest.picture_messages import PictureHead, picture_head
 from demorec.ingest.ros_types import Values
+from demorec.ingest.service_calls import CallReader, ServiceCall
 from demorec.registry import nearest_match
 
 NO_STAMP = -(2**63)
@@ -103,6 +106,7 @@ class BagStreams:
         cameras: Name of a camera -> its stream.
         infos: Name of a camera -> its first calibration message.
         texts: Topic -> its texts.
+        calls: Topic of a service's events -> its calls.
         problems: Why parts of the bag could not be read.
         first_ns, last_ns: When the first and last message of the bag was recorded.
     """
@@ -111,6 +115,7 @@ class BagStreams:
     cameras: dict[str, Stream]
     infos: dict[str, Values]
     texts: dict[str, list[Text]]
+    calls: dict[str, list[ServiceCall]]
     problems: list[str]
     first_ns: int
     last_ns: int
@@ -253,10 +258,13 @@ class _Reading:
         for stream in (*self._sources.values(), *self._cameras.values()):
             self._streams.setdefault(stream.topic, []).append(stream)
         self._fields = {mapping.task.topic: mapping.task.field, mapping.robot.urdf_topic: "data"}
+        self._fields[mapping.subtasks.topic] = mapping.subtasks.field
         if mapping.episodes.cut == "marker":
             self._fields[mapping.episodes.topic] = mapping.episodes.field
         self._fields.pop("", None)
         self._texts: dict[str, list[Text]] = {topic: [] for topic in self._fields}
+        by_header = mapping.clock.stamp == "header"
+        self._calls = {topic: CallReader(by_header=by_header) for topic in mapping.episodes.services}
         self._infos: dict[str, Values] = {}
         self._info_topics = {camera.info_topic: name for name, camera in mapping.cameras.items() if camera.info_topic}
         self._wanted = mapping.topics
@@ -284,12 +292,19 @@ class _Reading:
         except (ValueError, RecursionError, OverflowError, TypeError) as error:
             for stream in streams:
                 stream.malformed(str(error))
+            if topic in self._texts or topic in self._calls:
+                self._refused[topic] = in_words(error)
             return
         checksum = zlib.crc32(message.data)
         for stream in streams:
             stream.add(number, message, values, checksum)
         if topic in self._texts:
             self._add_text(topic, message, values)
+        if topic in self._calls:
+            try:
+                self._calls[topic].add(values, message.log_ns)
+            except FieldError as error:
+                self._refused[topic] = str(error)
         if topic in self._info_topics:
             self._infos.setdefault(self._info_topics[topic], values)
 
@@ -353,6 +368,7 @@ class _Reading:
             cameras={name: stream.finished() for name, stream in self._cameras.items()},
             infos=self._infos,
             texts=self._texts,
+            calls={topic: reader.calls() for topic, reader in self._calls.items()},
             problems=problems,
             first_ns=self._first_ns,
             last_ns=self._last_ns,

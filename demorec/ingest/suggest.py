@@ -24,6 +24,8 @@ from demorec.ingest.mapping import Source
 from demorec.ingest.picture_messages import VIDEO_FORMATS, PictureHead, picture_head
 from demorec.ingest.ros_types import Values
 from demorec.ingest.streams import BagDecoder
+from demorec.ingest.words import quoted, unique_name
+from demorec.scene.collected import DEPTH_UNITS
 
 _KEPT = 64
 """Messages of a topic that are looked into."""
@@ -35,6 +37,7 @@ _TASK = re.compile(r"task|instruction|prompt")
 _POSE_TYPES = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/PoseStamped", "foxglove.PoseInFrame")
 _VECTOR_FIELDS = ("position", "positions", "joints.position", "points[0].positions", "data")
 _STOP_WORDS = {"camera", "cam", "color", "image", "raw", "rect", "compressed", "rgb", "cameras", "images", "video"}
+_DEPTH_WORDS = {"depth", "aligned", "to", "compresseddepth", "registered"}
 _CAMERA_WORD = re.compile(r"[^a-z0-9]+")
 
 
@@ -95,13 +98,14 @@ def suggested_mapping(path: Path) -> list[str]:
     lines = [f"# A mapping for {path.name}, suggested from what is in it; docs/import.md explains every key.", "#"]
     lines += [f"# {problem}" for problem in problems[:5]]
     lines += list(_listed(topics))
-    lines += ["", "[robot]", f"name = {_quoted(_robot_name(bag))}", *_robot_model(topics)]
+    lines += ["", "[robot]", f"name = {quoted(_robot_name(bag))}", *_robot_model(topics)]
     lines += ["", "[task]", *_task(topics, bag)]
     lines += ["", "[clock]", *_clock(topics, cameras, vectors)]
+    lines += list(_services(topics))
     lines += list(_features(vectors))
     lines += list(_poses(topics))
     for camera, topic in cameras.items():
-        lines += ["", f"[cameras.{camera}]", f"topic = {_quoted(topic)}", *_info_topic(topic, topics)]
+        lines += ["", f"[cameras.{camera}]", f"topic = {quoted(topic)}", *_info_topic(topic, topics)]
     return lines
 
 
@@ -209,19 +213,21 @@ def _cameras(topics: Mapping[str, _Topic]) -> Iterator[tuple[str, str]]:
     for name in sorted(pictures):
         if any(other != name and other.startswith(f"{name}/") for other in pictures):
             continue  # image_raw beside image_raw/compressed: the same pictures
-        words = [word for word in _CAMERA_WORD.split(name.lower()) if word and word not in _STOP_WORDS]
-        camera = "_".join(dict.fromkeys(words[-2:])) or "camera"
+        head = heads[name]
+        is_depth = head is not None and head.encoding in DEPTH_UNITS
+        ignored = _STOP_WORDS | _DEPTH_WORDS if is_depth else _STOP_WORDS
+        words = [word for word in _CAMERA_WORD.split(name.lower()) if word and word not in ignored]
+        camera = "_".join([*dict.fromkeys(words[-2:])] or ["camera"]) + ("_depth" if is_depth else "")
         camera = camera if camera[0].isalpha() else f"camera_{camera}"
-        while camera in taken:
-            camera += "_2"
+        camera = unique_name(camera, taken)
         taken.add(camera)
         yield camera, name
 
 
 def _info_topic(topic: str, topics: Mapping[str, _Topic]) -> list[str]:
-    base = topic.removesuffix("/compressed").rpartition("/")[0]
+    base = topic.removesuffix("/compressed").removesuffix("/compressedDepth").rpartition("/")[0]
     name = f"{base}/camera_info"
-    return [f"info_topic = {_quoted(name)}"] if name in topics else []
+    return [f"info_topic = {quoted(name)}"] if name in topics else []
 
 
 def _robot_name(bag: Bag) -> str:
@@ -230,14 +236,14 @@ def _robot_name(bag: Bag) -> str:
 
 def _robot_model(topics: Mapping[str, _Topic]) -> list[str]:
     found = next((name for name in sorted(topics) if name.endswith("robot_description")), "")
-    return [f"urdf_topic = {_quoted(found)}"] if found else ['# urdf = "robot.urdf"']
+    return [f"urdf_topic = {quoted(found)}"] if found else ['# urdf = "robot.urdf"']
 
 
 def _task(topics: Mapping[str, _Topic], bag: Bag) -> list[str]:
     told = [name for name, topic in sorted(topics.items()) if _TASK.search(name.lower()) and _is_text(topic)]
     if told:
-        return [f"topic = {_quoted(told[0])}"]
-    return [f"text = {_quoted(bag.name.replace('_', ' '))}  # what the robot was asked to do", "# file_name = true"]
+        return [f"topic = {quoted(told[0])}"]
+    return [f"text = {quoted(bag.name.replace('_', ' '))}  # what the robot was asked to do", "# file_name = true"]
 
 
 def _is_text(topic: _Topic) -> bool:
@@ -251,12 +257,19 @@ def _clock(topics: Mapping[str, _Topic], cameras: Mapping[str, str], vectors: Se
     slowest = min(rates, key=lambda name: rates[name], default="")
     if slowest:
         head = _head(topics[cameras[slowest]].values[0])
-        chosen = f"rows = {_quoted(cameras[slowest])}  # a row for each of its pictures"
+        chosen = f"rows = {quoted(cameras[slowest])}  # a row for each of its pictures"
         lines.append(chosen if head is not None and head.format in VIDEO_FORMATS else f"# {chosen}")
     mapped = [*cameras.values(), *(vector.topic for vector in vectors if vector.role)]
     if any(not topics[name].has_stamp for name in mapped):
         lines.append('stamp = "log"  # not all headers have a time')
     return [*lines, 'when_old = "error"  # or "drop_episode"']
+
+
+def _services(topics: Mapping[str, _Topic]) -> Iterator[str]:
+    """Services whose calls may begin and end episodes."""
+    for name in (name for name in sorted(topics) if name.endswith("/_service_event")):
+        yield from ("", "# [episodes]", '# cut = "service"  # calls of it cut the bag, by a boolean in their requests')
+        yield f"# topic = {quoted(name)}"
 
 
 def _features(vectors: Sequence[_Vector]) -> Iterator[str]:
@@ -297,11 +310,11 @@ def _prefix(vector: _Vector, chosen: Sequence[_Vector]) -> str:
 
 def _source(feature: str, vector: _Vector, *, prefix: str) -> Iterator[str]:
     key = feature if "." not in feature else f'"{feature}"'
-    yield from ("", f"[[features.{key}]]", f"topic = {_quoted(vector.topic)}", f"field = {_quoted(vector.field)}")
+    yield from ("", f"[[features.{key}]]", f"topic = {quoted(vector.topic)}", f"field = {quoted(vector.field)}")
     if vector.has_names:
-        yield f"joints = [{', '.join(_quoted(name) for name in vector.layout.names)}]"
+        yield f"joints = [{', '.join(quoted(name) for name in vector.layout.names)}]"
     if prefix:
-        yield f"prefix = {_quoted(prefix)}"
+        yield f"prefix = {quoted(prefix)}"
 
 
 def _poses(topics: Mapping[str, _Topic]) -> Iterator[str]:
@@ -309,10 +322,5 @@ def _poses(topics: Mapping[str, _Topic]) -> Iterator[str]:
     is_sure = len(found) == 1 and topics[found[0]].rate_hz > 0
     for name in found:
         mark = "" if is_sure else "# "
-        yield from ("", f'{mark}[[features."observation.ee_pose"]]', f"{mark}topic = {_quoted(name)}")
+        yield from ("", f'{mark}[[features."observation.ee_pose"]]', f"{mark}topic = {quoted(name)}")
         yield f'{mark}field = "pose"'
-
-
-def _quoted(text: str) -> str:
-    """A TOML string."""
-    return json.dumps(text, ensure_ascii=False)

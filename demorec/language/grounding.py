@@ -66,12 +66,18 @@ def seen_things(labels: NDArray[np.int32], values: dict[str, int]) -> dict[str, 
         values: Name of a body -> its number in the segmentation.
     """
     # Bodies that are spoken of have no links, so that their numbers are the labels themselves.
-    by_column = labels.T.ravel()
     known = {value: name for name, value in values.items()}
-    pixels = np.flatnonzero((by_column >= min(known, default=0)) & (by_column <= max(known, default=-1)))
-    shown = by_column[pixels]
-    found = {known[value]: pixels[shown == value] for value in np.flatnonzero(np.bincount(shown)) if value in known}
-    return {name: Seen(name=name, pixels=found[name], height=len(labels)) for name in values if name in found}
+    flat, (height, width) = labels.ravel(), labels.shape
+    pixels = np.flatnonzero((flat >= min(known, default=0)) & (flat <= max(known, default=-1)))
+    shown = flat[pixels]
+    rows, columns = np.divmod(pixels, width)
+    by_column = columns * height + rows  # few pixels are put in order, not all of the picture
+    found = {
+        known[value]: np.sort(by_column[shown == value])
+        for value in np.flatnonzero(np.bincount(shown))
+        if value in known
+    }
+    return {name: Seen(name=name, pixels=found[name], height=height) for name in values if name in found}
 
 
 def body_values(recording: Recording) -> dict[str, int]:

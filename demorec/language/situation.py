@@ -73,22 +73,21 @@ def situation(scene: Scene, world_from_object: Mapping[str, Array] | None = None
     """
     base_from_world = scene.robot.world_from_base.inverse()
     moved = world_from_object or {}
-    things = []
-    for body in scene.bodies:
-        if body.role == "fixture":
-            continue
-        position = np.asarray(moved[body.name][:3]) if body.name in moved else body.world_from_body.position
-        things.append(
-            NamedThing(
-                name=body.name,
-                nouns=nouns_of(body),
-                color=body.color_name,
-                size=max(body.shape.extents),
-                position=base_from_world.apply(position),
-                height=body.shape.extents[2],
-                can_be_held=body.movable,
-            )
+    bodies = [body for body in scene.bodies if body.role != "fixture"]
+    places = [moved[body.name][:3] if body.name in moved else body.world_from_body.position for body in bodies]
+    positions = base_from_world.apply(np.array(places).reshape(-1, 3))
+    things = [
+        NamedThing(
+            name=body.name,
+            nouns=nouns_of(body),
+            color=body.color_name,
+            size=max(body.shape.extents),
+            position=position,
+            height=body.shape.extents[2],
+            can_be_held=body.movable,
         )
+        for body, position in zip(bodies, positions, strict=True)
+    ]
     return Surroundings(things=tuple(things))
 
 

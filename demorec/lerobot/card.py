@@ -17,13 +17,15 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
+from demorec.lerobot.attempts import ATTEMPT_SCHEMA
 from demorec.lerobot.commands import making_commands
 from demorec.lerobot.files import read_table
+from demorec.lerobot.language import EVENTS, PERSISTENT
 from demorec.lerobot.layout import AUTOMATIC_FEATURES, DatasetInfo, Feature
 from demorec.lerobot.options import ExportOptions
 from demorec.lerobot.paths import CARD_PATH, SIDECAR_DIR
 from demorec.lerobot.reader import read_tasks
-from demorec.lerobot.sidecar import ATTEMPT_SCHEMA
+from demorec.lerobot.robots import ROBOTS_DIR
 from demorec.lerobot.thumbnails import THUMBNAILS_PATH, write_thumbnails
 from demorec.lerobot.writer import write_text
 from demorec.scene.features import ACTION, EE_POSE, ENVIRONMENT_STATE, IMAGE_PREFIX, STATE, VELOCITY, ActionKind
@@ -64,6 +66,9 @@ _MEANING = {
     "next.success": "true at the last frame of a success",
     "intervention": "true where the expert acts in an episode that a policy began; its other frames are the policy's",
     "timestamp": "seconds since the episode's start",
+    PERSISTENT: "what is said of the episode, each entry from its `timestamp` on until the next one of its style; all "
+    "of it in every row",
+    EVENTS: "what is said at this row alone: questions about its pictures with their answers, and the like",
 }
 _ACTION_MEANING: Mapping[ActionKind, str] = {
     "joint": "absolute joint targets (rad), gripper opening (m)",
@@ -142,6 +147,7 @@ def _card(root: Path, info: DatasetInfo, about: CardFacts, has_sheet: bool) -> I
         yield from _success_section(_read_attempts(root))
         yield from ("## What stands beside", "")
         yield f"`{SIDECAR_DIR}/episodes/` says where each episode comes from, how it ended and what its cameras were."
+        yield from _robot_section(root)
         yield ""
         return
     yield (
@@ -158,8 +164,21 @@ def _card(root: Path, info: DatasetInfo, about: CardFacts, has_sheet: bool) -> I
         "camera intrinsics and extrinsics, poses, the complete scene of every episode), `camera_poses/` (of moving "
         "cameras, per frame, world_from_camera, OpenCV axes), `attempts/` (failed ones too), `configs.json`."
     )
+    yield from _robot_section(root)
     yield ""
     yield from _origin_section(root, about)
+
+
+def _robot_section(root: Path) -> Iterable[str]:
+    """What draws the arm, of a dataset that holds it."""
+    urdfs = sorted((root / ROBOTS_DIR).glob("*.urdf"))
+    if urdfs:
+        names = ", ".join(f"`{path.relative_to(root).as_posix()}`" for path in urdfs)
+        yield ""
+        yield (
+            f"The robot as a URDF: {names}. The JSON file beside it says which element of which feature moves which of "
+            "its joints (`joints`), and, of a simulated robot, its TCP link, limits and gripper (`spec`)."
+        )
 
 
 def _meaning(key: str, item: Feature, about: CardFacts) -> str:

@@ -8,9 +8,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.config import VideoConfig
-from demorec.export.collected import check_options, collected_data, shown_images, shown_pictures, wanted_cameras
+from demorec.export.collected import (
+    check_options,
+    collected_data,
+    shown_depth,
+    shown_images,
+    shown_pictures,
+    wanted_cameras,
+    wanted_depth,
+)
 from demorec.export.columns import DONE
-from demorec.lerobot.layout import AUTOMATIC_FEATURES, Feature
+from demorec.language.narration import Statement
+from demorec.lerobot.depth import depth_info, depth_video
+from demorec.lerobot.language import COLUMNS, EpisodeLanguage, episode_language
+from demorec.lerobot.layout import AUTOMATIC_FEATURES, LANGUAGE_FEATURE, Feature
 from demorec.lerobot.mp4 import CodedVideo
 from demorec.lerobot.options import ExportOptions
 from demorec.lerobot.stats import PixelHistogram, colour_levels
@@ -42,7 +53,15 @@ def collected_features(recording: CollectedRecording, options: ExportOptions) ->
         features[IMAGE_PREFIX + camera] = Feature(
             dtype="video", shape=shape, names=("height", "width", "channels"), info=info
         )
-    return {**features, DONE: Feature(dtype="bool", shape=(1,)), **AUTOMATIC_FEATURES}
+    for camera in wanted_depth(recording, options):
+        settings = recording.video_settings(camera)
+        described = depth_info(width=settings.width, height=settings.height, fps=settings.fps)
+        shape = (settings.height, settings.width, 1)
+        features[IMAGE_PREFIX + camera] = Feature(
+            dtype="video", shape=shape, names=("height", "width", "channels"), info=described
+        )
+    told = {} if options.language is None else dict.fromkeys(COLUMNS, LANGUAGE_FEATURE)
+    return {**features, DONE: Feature(dtype="bool", shape=(1,)), **AUTOMATIC_FEATURES, **told}
 
 
 def reasons_to_transcode(recording: CollectedRecording, options: ExportOptions) -> dict[str, str]:
@@ -73,8 +92,12 @@ def _dataset_settings(recording: CollectedRecording, camera: str, video: VideoCo
     return make_encoder(video=video, width=settings.width, height=settings.height, fps=recording.info.fps).settings
 
 
-def prepare_collected(recording: CollectedRecording, options: ExportOptions) -> tuple[EpisodeData, dict[str, Any]]:
+def prepare_collected(
+    recording: CollectedRecording, options: ExportOptions, *, code_depth: bool
+) -> tuple[EpisodeData, dict[str, Any]]:
     """Read a recording into memory, as the dataset wants it, and as its row in the sidecar says it.
+
+    Depth videos, which must be coded, are made only with `code_depth`.
 
     Raises:
         ExportError: It has no frames, or frames without pictures.
@@ -86,6 +109,11 @@ def prepare_collected(recording: CollectedRecording, options: ExportOptions) -> 
     videos, pixels = {}, {}
     for camera, numbers in data.pictures.items():
         key = IMAGE_PREFIX + camera
+        if camera in recording.depth_cameras:
+            if code_depth:
+                pictures = shown_depth(recording, camera, numbers)
+                videos[key], pixels[key] = depth_video(pictures, fps=recording.info.fps)
+            continue
         videos[key] = (
             _transcoded(recording, camera, options.transcode, numbers)
             if reasons[camera]
@@ -101,8 +129,17 @@ def prepare_collected(recording: CollectedRecording, options: ExportOptions) -> 
         videos=videos,
         video_info={key: wanted[key].info or {} for key in videos},
         pixels=pixels,
+        language=_language(recording, options),
     )
     return episode, _sidecar_row(recording)
+
+
+def _language(recording: CollectedRecording, options: ExportOptions) -> EpisodeLanguage:
+    """The subtasks that somebody said, at the rows where they begin; nothing else is known."""
+    if options.language is None:
+        return EpisodeLanguage()
+    said = [Statement(row=frame, kind="subtask", role="assistant", text=text) for frame, text in recording.subtasks]
+    return episode_language(said, fps=recording.info.fps)
 
 
 def _kept(recording: CollectedRecording, camera: str, numbers: NDArray[np.int64]) -> CodedVideo:

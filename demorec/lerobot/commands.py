@@ -59,7 +59,7 @@ def flags(values: Any, defaults: Any) -> Iterator[str]:
         elif isinstance(value, bool):
             yield f"--{name}" if value else f"--no-{name}"
         elif isinstance(value, tuple):
-            words = value or ("none",)  # --cameras none
-            yield f"--{name} {' '.join(shlex.quote(str(word)) for word in words)}"
+            words = value or (("none",) if default else ())  # --cameras none, but a bare --language names no kinds
+            yield " ".join([f"--{name}", *(shlex.quote(str(word)) for word in words)])
         else:
             yield f"--{name} {'auto' if value is None else shlex.quote(str(value))}"

@@ -118,6 +118,7 @@ class _Export:
                     data = reading.prepared.data
                     boxes.add(writer.num_episodes - 1, reading.prepared.boxes, data.num_frames)
             self._refuse_duplicates()
+            self._refuse_silence()
             finished = writer.finish()
             boxes.finish()
             configs = sidecar.finish(self._about_this_export())
@@ -140,6 +141,8 @@ class _Export:
             skipped_unknown=self._intake.skipped_unknown,
             transcoded=tuple(self._transcoded),
             left_out=self._left_out,
+            depth_left_out=self._intake.depth_left_out,
+            silent=() if self._options.language is None else tuple(self._intake.silent),
             digest=combined_digest(finished, [*self._before, *self._digests]),
         )
 
@@ -209,6 +212,18 @@ class _Export:
             raise ConfigError(
                 f"The dataset has {len(twice)} of these episodes already: {shown(twice)}. Leave them out with "
                 "--episodes, or give --allow-duplicates to have them twice."
+            )
+
+    def _refuse_silence(self) -> None:
+        """Raise ConfigError when language is asked for and nobody said a word in any episode of a new dataset."""
+        if (
+            self._existing is None
+            and self._options.language is not None
+            and len(self._intake.silent) == self._intake.num_taken
+        ):
+            raise ConfigError(
+                "Language is asked for, but the episodes were collected and nobody said a subtask in any of them (in "
+                "the mapping of an import, [subtasks] names the topic of it): leave --language out."
             )
 
     def _about_this_export(self) -> dict[str, Any]:

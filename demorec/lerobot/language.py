@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -41,6 +41,7 @@ _STATE = pa.struct([*_EVENT_FIELDS[:3], pa.field("timestamp", pa.float32()), *_E
 TYPES: dict[str, pa.DataType] = {PERSISTENT: pa.list_(_STATE), EVENTS: pa.list_(_EVENT)}
 """Column -> its type, as the package datasets reads LeRobot's own."""
 REPEATING = tuple(f"{name}.list.element.{item}" for name in COLUMNS for item in ("role", "content", "style", "camera"))
+REPEATING += (f"{PERSISTENT}.list.element.timestamp",)
 """Parquet's names of the parts whose values come again and again."""
 
 
@@ -91,14 +92,20 @@ def episode_language(statements: Sequence[Statement], *, fps: int) -> EpisodeLan
     persistent: list[LanguageRow] = []
     events: dict[int, list[LanguageRow]] = {}
     for statement in statements:
-        said = LanguageRow(role=statement.role, content=statement.text, style=statement.kind)
-        if statement.kind in STATES:
-            persistent.append(replace(said, timestamp=float(np.float32(statement.row / fps))))
+        is_state = statement.kind in STATES
+        is_answer = statement.kind == "interjection" and statement.role == "assistant"  # a call of a tool, in LeRobot
+        said = LanguageRow(
+            role=statement.role,
+            content=None if is_answer else statement.text,
+            style=None if is_answer else statement.kind,
+            timestamp=float(np.float32(statement.row / fps)) if is_state else None,
+            camera=None if statement.camera is None else IMAGE_PREFIX + statement.camera,
+            spoken=statement.text if is_answer else "",
+        )
+        if is_state:
+            persistent.append(said)
         else:
-            camera = None if statement.camera is None else IMAGE_PREFIX + statement.camera
-            if statement.kind == "interjection" and statement.role == "assistant":  # LeRobot's form of an answer
-                said = replace(said, content=None, style=None, spoken=statement.text)
-            events.setdefault(statement.row, []).append(replace(said, camera=camera))
+            events.setdefault(statement.row, []).append(said)
     return EpisodeLanguage(persistent=tuple(persistent), events={row: tuple(told) for row, told in events.items()})
 
 

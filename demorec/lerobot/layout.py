@@ -115,6 +115,8 @@ AUTOMATIC_FEATURES: dict[str, Feature] = {
     "task_index": Feature(dtype="int64", shape=(1,)),
 }
 """Come last in every dataset, filled in by the writer."""
+LANGUAGE_FEATURE = Feature(dtype="language", shape=(1,))
+"""Of each of LeRobot's language columns."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -26,10 +26,10 @@ from demorec.lerobot.collected import collected_features, prepare_collected, rea
 from demorec.lerobot.depth import depth_info, depth_video
 from demorec.lerobot.facts import episode_facts
 from demorec.lerobot.language import COLUMNS, EpisodeLanguage, episode_language
-from demorec.lerobot.layout import AUTOMATIC_FEATURES, Feature
+from demorec.lerobot.layout import AUTOMATIC_FEATURES, LANGUAGE_FEATURE, Feature
 from demorec.lerobot.options import ExportOptions
 from demorec.lerobot.progress import EpisodeProgress
-from demorec.lerobot.sidecar import AttemptRecord, EpisodeRecord
+from demorec.lerobot.sidecar import EpisodeRecord
 from demorec.lerobot.stats import PixelHistogram, colour_levels
 from demorec.lerobot.transcode import coded_videos, dataset_settings, reason_to_transcode, video_info
 from demorec.lerobot.writer import EpisodeData
@@ -41,8 +41,6 @@ _SCALARS = {
     DONE: Feature(dtype="bool", shape=(1,)),
     SUCCESS: Feature(dtype="bool", shape=(1,)),
 }
-
-_LANGUAGE = Feature(dtype="language", shape=(1,))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -86,7 +84,7 @@ def dataset_features(recording: AnyRecording, options: ExportOptions) -> dict[st
     features[ACTION] = Feature(dtype="float32", shape=(len(names),), names=names)
     if options.intervention:
         features[INTERVENTION] = Feature(dtype="bool", shape=(1,))
-    told = {} if options.language is None else dict.fromkeys(COLUMNS, _LANGUAGE)
+    told = {} if options.language is None else dict.fromkeys(COLUMNS, LANGUAGE_FEATURE)
     return {**_chosen({**features, **_SCALARS, **AUTOMATIC_FEATURES}, options), **told}
 
 
@@ -121,8 +119,8 @@ def prepare_episode(recording: AnyRecording, options: ExportOptions, *, code_dep
         RecordingError: It is damaged.
     """
     if isinstance(recording, CollectedRecording):
-        episode, row = prepare_collected(recording, options)
-        return PreparedEpisode(data=episode, record=EpisodeRecord.of_collected(row, AttemptRecord.of(recording)))
+        episode, row = prepare_collected(recording, options, code_depth=code_depth)
+        return PreparedEpisode(data=episode, record=EpisodeRecord.of_collected(row, recording))
     stride = frame_stride(recording.info.fps, options.fps)
     wanted = dataset_features(recording, options)
     columns = feature_columns(recording, options)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
@@ -12,11 +11,11 @@ from pathlib import Path
 from demorec.export.columns import frame_stride
 from demorec.export.options import ProgressCallback
 from demorec.export.sources import ExportSource, Profile, goes_in, is_among_episodes
+from demorec.lerobot.attempts import AttemptRecord
 from demorec.lerobot.layout import Feature
 from demorec.lerobot.options import ExportOptions
 from demorec.lerobot.prepare import PreparedEpisode, dataset_features, prepare_episode, transcoded_cameras
-from demorec.lerobot.sidecar import AttemptRecord
-from demorec.processes import SPAWN
+from demorec.processes import SPAWN, available_cores
 from demorec.recording import CollectedRecording, open_recording
 from demorec.scene.collected import CollectedOutcome
 from demorec.scene.episode import Outcome
@@ -97,10 +96,9 @@ def readings(
 
 
 def _workers_that_pay(sources: Sequence[ExportSource], options: ExportOptions) -> int:
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     transcodes = options.depth or options.fps is not None
     size = sum(source.path.stat().st_size for source in sources) * (20 if transcodes else 1)
-    return min(cores, 8) if size >= _BYTES_THAT_PAY else 1
+    return min(available_cores(), 8) if size >= _BYTES_THAT_PAY else 1
 
 
 def _read_aside(source: ExportSource, options: ExportOptions, folder: Path) -> Reading | None:

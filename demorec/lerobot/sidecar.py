@@ -6,6 +6,7 @@
   robot as JSON, from which `demorec` can build the world again.
 - `camera_poses/`: one row per frame, for cameras that move.
 - `attempts/`: one row per attempt that was seen, failed ones included, for success rates.
+- `robots/`: what draws and moves the arms, in a form that needs nothing of ours (`demorec.lerobot.robots`).
 - `configs.json`: config digest -> resolved configuration; `export.json`: how the dataset was made.
 """
 
@@ -23,13 +24,15 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from demorec.geometry import Array
+from demorec.lerobot.attempts import ATTEMPT_SCHEMA, AttemptRecord, outcome_of
 from demorec.lerobot.layout import SIDECAR_ATTEMPTS_PATH, SIDECAR_CAMERAS_PATH, SIDECAR_EPISODES_PATH, FilePosition
 from demorec.lerobot.parquet import RollingParquet, vector_array
 from demorec.lerobot.paths import SIDECAR_DIR
+from demorec.lerobot.robots import DatasetRobot, robot_of, robot_of_collected, write_robot
 from demorec.lerobot.writer import WrittenEpisode, write_text
 from demorec.plain import to_json, to_plain
-from demorec.recording import AnyRecording, CollectedRecording, Recording
-from demorec.scene.episode import EpisodeColumns, Outcome
+from demorec.recording import CollectedRecording, Recording
+from demorec.scene.episode import EpisodeColumns
 from demorec.scene.scene import Scene
 
 CONFIGS_PATH = f"{SIDECAR_DIR}/configs.json"
@@ -88,90 +91,9 @@ EPISODE_SCHEMA = pa.schema(
         ("goals", pa.list_(_GOAL)),
         ("cameras", pa.list_(_CAMERA)),
         ("episode_info", pa.string()),
+        ("robot_digest", pa.string()),
     ]
 )
-
-ATTEMPT_SCHEMA = pa.schema(
-    [
-        ("source", pa.string()),
-        ("run_episode_index", pa.int64()),
-        ("attempt", pa.int64()),
-        ("success", pa.bool_()),
-        ("failure_phase", pa.string()),
-        ("failure_reason", pa.string()),
-        ("object", pa.string()),
-        ("object_x", pa.float64()),
-        ("object_y", pa.float64()),
-        ("goal_x", pa.float64()),
-        ("goal_y", pa.float64()),
-        ("in_dataset", pa.bool_()),
-    ]
-)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class AttemptRecord:
-    """One attempt, as far as success rates need it; positions in the world frame, metres, at the start.
-
-    `success` is None where nobody said: of a collected episode.
-    """
-
-    source: str
-    run_episode_index: int
-    attempt: int
-    success: bool | None
-    failure_phase: str
-    failure_reason: str
-    object: str
-    object_x: float | None
-    object_y: float | None
-    goal_x: float | None
-    goal_y: float | None
-
-    @classmethod
-    def of(cls, recording: AnyRecording) -> AttemptRecord:
-        """From the recording's metadata alone."""
-        if isinstance(recording, CollectedRecording):
-            return cls._of_collected(recording)
-        info, outcome = recording.info, _outcome(recording)
-        name, object_position, goal_position = "", (None, None), (None, None)
-        if info.scene.goals:
-            goal = info.scene.goals[0]
-            name = goal.object
-            x, y, _ = info.scene.body(goal.object).world_from_body.position.tolist()
-            object_position = (x, y)
-            x, y, _ = info.scene.world_from_goal(goal).position.tolist()
-            goal_position = (x, y)
-        return cls(
-            source=recording.path.name,
-            run_episode_index=info.episode_index,
-            attempt=info.attempt,
-            success=outcome.success,
-            failure_phase=outcome.failure_phase,
-            failure_reason=outcome.failure_reason,
-            object=name,
-            object_x=object_position[0],
-            object_y=object_position[1],
-            goal_x=goal_position[0],
-            goal_y=goal_position[1],
-        )
-
-    @classmethod
-    def _of_collected(cls, recording: CollectedRecording) -> AttemptRecord:
-        outcome = recording.outcome
-        return cls(
-            source=recording.path.name,
-            run_episode_index=recording.info.episode_index,
-            attempt=0,
-            success=None if outcome is None else outcome.success,
-            failure_phase="",
-            failure_reason="cut off by a crash" if outcome is None else outcome.reason,
-            object="",
-            object_x=None,
-            object_y=None,
-            goal_x=None,
-            goal_y=None,
-        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -183,6 +105,7 @@ class EpisodeRecord:
         attempt: Of the attempts' table.
         moving_cameras: Camera -> (T, 7) world_from_camera of every frame in the dataset.
         config_digest, config: Of its run.
+        robot: What draws and moves its arm; None where that is not known.
     """
 
     row: Mapping[str, Any]
@@ -190,16 +113,24 @@ class EpisodeRecord:
     moving_cameras: Mapping[str, Array]
     config_digest: str
     config: Mapping[str, Any]
+    robot: DatasetRobot | None
 
     @classmethod
-    def of_collected(cls, row: Mapping[str, Any], attempt: AttemptRecord) -> EpisodeRecord:
+    def of_collected(cls, row: Mapping[str, Any], recording: CollectedRecording) -> EpisodeRecord:
         """Of a collected episode, of which there is no config and no pose."""
-        return cls(row=row, attempt=attempt, moving_cameras={}, config_digest="", config={})
+        return cls(
+            row=row,
+            attempt=AttemptRecord.of(recording),
+            moving_cameras={},
+            config_digest="",
+            config={},
+            robot=robot_of_collected(recording),
+        )
 
     @classmethod
     def of(cls, recording: Recording, columns: EpisodeColumns, rows: NDArray[np.intp]) -> EpisodeRecord:
         """Of a recording of which the frames `rows` are exported; frame numbers are those of the dataset."""
-        info, outcome = recording.info, _outcome(recording)
+        info, outcome = recording.info, outcome_of(recording)
         row = {
             "source": recording.path.name,
             "run_episode_index": info.episode_index,
@@ -232,6 +163,7 @@ class EpisodeRecord:
             moving_cameras=moving,
             config_digest=info.config_digest,
             config=info.config,
+            robot=robot_of(recording),
         )
 
 
@@ -276,13 +208,6 @@ def _things(scene: Scene, columns: EpisodeColumns) -> dict[str, list[dict[str, A
             for camera in scene.cameras
         ],
     }
-
-
-def _outcome(recording: Recording) -> Outcome:
-    """That of the recording; one that a crash cut off counts as failed."""
-    return recording.outcome or Outcome(
-        success=False, checks=(), failure_reason="interrupted", num_frames=recording.num_frames
-    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -334,7 +259,11 @@ class SidecarWriter:
     def add(self, written: WrittenEpisode, record: EpisodeRecord) -> None:
         """What belongs to an episode of the dataset."""
         episode_index = written.episode_index
-        self._episode_rows.append({"episode_index": episode_index, "content_digest": written.digest, **record.row})
+        robot = record.robot
+        added = {"episode_index": episode_index, "content_digest": written.digest}
+        self._episode_rows.append({**added, **record.row, "robot_digest": None if robot is None else robot.digest})
+        if robot is not None:
+            write_robot(self._root, robot)
         if record.config_digest or record.config:
             self._configs.setdefault(record.config_digest, record.config)
         self.add_attempt(record.attempt, in_dataset=True)

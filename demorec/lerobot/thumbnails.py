@@ -17,7 +17,7 @@ from demorec.scene.features import IMAGE_PREFIX
 
 THUMBNAILS_PATH = f"{SIDECAR_DIR}/thumbnails.jpg"
 
-_EPISODES, _MOMENTS, _SIDE, _LABEL = 4, 5, 160, 18
+_EPISODES, _MOMENTS, _SIDE, _LABEL, _GAP = 4, 5, 160, 18, 2
 
 
 def write_thumbnails(root: Path, info: DatasetInfo) -> bool:
@@ -30,7 +30,7 @@ def write_thumbnails(root: Path, info: DatasetInfo) -> bool:
     height, width, _ = info.features[key].shape
     scale = _SIDE / max(height, width)
     size = max(1, round(width * scale)), max(1, round(height * scale))
-    sheet = Image.new("RGB", (size[0] * _MOMENTS, (size[1] + _LABEL) * len(places)), "white")
+    sheet = Image.new("RGB", ((size[0] + _GAP) * _MOMENTS - _GAP, (size[1] + _LABEL) * len(places)), "white")
     draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(size=12)
     for row, place in enumerate(places):
         top = row * (size[1] + _LABEL)
@@ -38,12 +38,12 @@ def write_thumbnails(root: Path, info: DatasetInfo) -> bool:
         draw.text((4, top + 1), printable(label), fill="black", font=font)
         moments = np.linspace(0, place.length - 1, _MOMENTS).round().astype(int).tolist()
         for column, picture in enumerate(pictures_at(root, info, key, place, moments)):
-            corner = column * size[0], top + _LABEL
+            corner = column * (size[0] + _GAP), top + _LABEL
             sheet.paste(Image.fromarray(picture).resize(size, reducing_gap=1.0), corner)
             time = f"{moments[column] / info.fps:.1f} s"
-            draw.text(
-                (corner[0] + 4, corner[1] + 2), time, fill="white", font=font, stroke_width=2, stroke_fill="black"
-            )
+            left, above, right, below = draw.textbbox((corner[0] + 4, corner[1] + 1), time, font=font)
+            draw.rectangle((left - 3, above - 2, right + 2, below + 2), fill="black")
+            draw.text((corner[0] + 4, corner[1] + 1), time, fill="white", font=font)
     path = root / THUMBNAILS_PATH
     path.parent.mkdir(parents=True, exist_ok=True)
     path.unlink(missing_ok=True)

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from demorec.errors import DemorecError, ExportError, in_words, resource_error
 from demorec.export.collected import shown_pictures
@@ -171,7 +172,8 @@ def _compare_episode(
             wrong.append("task")
         if float(item["timestamp"]) != float(np.float32(moment / dataset.meta.fps)):
             wrong.append("timestamp")
-        for camera in recording.cameras:
+        depth = recording.depth_cameras if isinstance(recording, CollectedRecording) else ()
+        for camera in (*recording.cameras, *depth):
             wrong += _wrong_pictures(item, recording, camera, moment, options)
         if wrong:
             raise ExportError(
@@ -196,10 +198,20 @@ def _is_wrong_collected(
 ) -> bool:
     """Whether a picture differs from the one that the frame shows."""
     shown = shown_pictures(recording, recording.columns(), camera, options)
+    if camera in recording.depth_cameras:
+        recorded = next(islice(recording.depth(camera), int(shown[moment]), None))
+        return _is_wrong_depth(tensor, recorded)
     expected = recording.picture(camera, int(shown[moment]))
     limit = _TRANSCODED_TOLERANCE if reasons_to_transcode(recording, options)[camera] else 0.0
     found = tensor.numpy().transpose(1, 2, 0).astype(np.float64)
     return bool(np.abs(found - expected).mean() > limit)
+
+
+def _is_wrong_depth(tensor: Any, recorded: NDArray[np.float32]) -> bool:
+    """Whether distances, which LeRobot gives in mm, are not the recorded ones (H, W), m, as far as its codes tell."""
+    found = tensor.numpy()
+    found = found.reshape(found.shape[-2:]) / 1000
+    return bool(np.abs(found - code_values()[quantised(recorded)]).max() > _DEPTH_TOLERANCE)
 
 
 def _wrong_pictures(item: Any, recording: AnyRecording, camera: str, moment: int, options: ExportOptions) -> list[str]:
@@ -215,9 +227,7 @@ def _wrong_pictures(item: Any, recording: AnyRecording, camera: str, moment: int
         if np.abs(found - recording.image(camera, moment * stride)).mean() > limit:
             wrong.append(key)
     if key + DEPTH_SUFFIX in item:
-        found = item[key + DEPTH_SUFFIX].numpy()
-        found = found.reshape(found.shape[-2:]) / 1000  # LeRobot gives millimetres
         recorded = next(islice(recording.depth(camera), moment * stride, None))
-        if np.abs(found - code_values()[quantised(recorded)]).max() > _DEPTH_TOLERANCE:
+        if _is_wrong_depth(item[key + DEPTH_SUFFIX], recorded):
             wrong.append(key + DEPTH_SUFFIX)
     return wrong

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from itertools import batched
 
 import numpy as np
@@ -16,6 +16,7 @@ from demorec.playback.times import indexes
 from demorec.scene.scene import Camera
 
 _CODECS = {"h264": rr.VideoCodec.H264, "h265": rr.VideoCodec.H265, "av1": rr.VideoCodec.AV1}
+Distances = NDArray[np.uint16] | NDArray[np.float32]
 _PICTURES_AT_ONCE = 64
 _FRUSTUM_METRES = {"world": 0.22}
 _FRUSTUM_ON_ROBOT = 0.04
@@ -28,7 +29,7 @@ def log_cameras(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpis
         if camera.name in episode.videos:
             send_video(recording, paths.camera(camera.name), episode.time_ns, episode.videos[camera.name])
         if camera.name in episode.depth:
-            _send_depth(recording, paths.depth(camera.name), episode, episode.depth[camera.name])
+            send_depth(recording, paths.depth(camera.name), episode.time_ns, _frame_depth(episode, camera.name))
         if camera.name in episode.segmentation:
             _send_segmentation(recording, paths.segmentation(camera.name), episode, episode.segmentation[camera.name])
     if episode.segmentation:
@@ -70,26 +71,33 @@ def send_video(recording: rr.RecordingStream, entity: str, frame_times: NDArray[
         recording.send_columns(entity, indexes(batch.time_ns, frame_times), columns)
 
 
-def _send_depth(
+def _frame_depth(episode: PlayedEpisode, camera: str) -> Iterator[tuple[int, Distances]]:
+    for time_ns, metres in zip(episode.time_ns.tolist(), episode.depth[camera](), strict=False):
+        yield time_ns, np.rint(metres * 1000).astype(np.uint16)
+
+
+def send_depth(
     recording: rr.RecordingStream,
     entity: str,
-    episode: PlayedEpisode,
-    read: Callable[[], Iterator[NDArray[np.float32]]],
+    frame_times: NDArray[np.int64],
+    pictures: Iterable[tuple[int, Distances]],
 ) -> None:
-    for frames in batched(enumerate(read()), _PICTURES_AT_ONCE):
-        pictures = [np.rint(metres * 1000).astype(np.uint16) for _, metres in frames]
-        height, width = pictures[0].shape
+    """Distances (H, W), uint16 millimetres or float32 metres, each at its time."""
+    for batch in batched(pictures, _PICTURES_AT_ONCE):
+        height, width = batch[0][1].shape
+        is_metres = batch[0][1].dtype == np.float32
         columns = rr.DepthImage.columns(
-            buffer=[picture.tobytes() for picture in pictures],
-            format=[_format(width, height)] * len(pictures),
-            meter=[1000.0] * len(pictures),
+            buffer=[picture.tobytes() for _, picture in batch],
+            format=[_format(width, height, is_float=is_metres)] * len(batch),
+            meter=[1.0 if is_metres else 1000.0] * len(batch),
         )
-        times = episode.time_ns[[index for index, _ in frames]]
-        recording.send_columns(entity, indexes(times, episode.time_ns), columns)
+        times = np.array([time_ns for time_ns, _ in batch])
+        recording.send_columns(entity, indexes(times, frame_times), columns)
 
 
-def _format(width: int, height: int) -> rr.components.ImageFormat:
-    return rr.components.ImageFormat(width=width, height=height, channel_datatype=rr.ChannelDatatype.U16)
+def _format(width: int, height: int, *, is_float: bool = False) -> rr.components.ImageFormat:
+    kind = rr.ChannelDatatype.F32 if is_float else rr.ChannelDatatype.U16
+    return rr.components.ImageFormat(width=width, height=height, channel_datatype=kind)
 
 
 def _compact(episode: PlayedEpisode) -> dict[int, int]:

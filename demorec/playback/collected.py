@@ -5,9 +5,9 @@ from __future__ import annotations
 import hashlib
 import logging
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from itertools import batched
 from pathlib import Path
@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 
 from demorec.errors import DemorecError, as_reason
 from demorec.geometry import Pose
-from demorec.playback.cameras import send_video
+from demorec.playback.cameras import Distances, send_depth, send_video
 from demorec.playback.episode import Curves, Video, VideoBatch
-from demorec.playback.meshes import SurfaceMesh, urdf_meshes
+from demorec.playback.meshes import SurfaceMesh, skeleton_meshes, urdf_meshes
 from demorec.playback.paths import Paths
 from demorec.playback.robot import log_model
 from demorec.playback.style import series_colors
@@ -45,6 +45,7 @@ class PlayedCollected:
         joint_position: Joint of the URDF -> (T,) rad or m.
         curves: Feature -> its elements over time.
         videos: Camera -> coded pictures, each at the time of the first frame that holds it.
+        depth: Depth camera -> reads (time, distances as they came) of each of its pictures.
     """
 
     name: str
@@ -57,6 +58,7 @@ class PlayedCollected:
     joint_position: Mapping[str, NDArray[np.float64]]
     curves: Mapping[str, Curves]
     videos: Mapping[str, Video]
+    depth: Mapping[str, Callable[[], Iterator[tuple[int, Distances]]]] = field(default_factory=dict)
 
     @property
     def num_frames(self) -> int:
@@ -106,6 +108,11 @@ def open_collected(path: Path, *, group: str) -> Iterator[PlayedCollected]:
                 for camera in recording.cameras
                 if len(columns.picture_stamps[camera])
             },
+            depth={
+                camera: partial(_distances, recording, camera, _shown_at(columns, camera, time_ns))
+                for camera in recording.depth_cameras
+                if len(columns.picture_stamps[camera])
+            },
         )
 
 
@@ -128,6 +135,12 @@ def _batches(recording: CollectedRecording, camera: str, shown_at: NDArray[np.in
             samples=[packet.data for packet in packets],
             is_keyframe=np.array([packet.is_keyframe for packet in packets]),
         )
+
+
+def _distances(
+    recording: CollectedRecording, camera: str, shown_at: NDArray[np.int64]
+) -> Iterator[tuple[int, Distances]]:
+    return zip(shown_at.tolist(), recording.distances(camera), strict=True)
 
 
 def new_collected_recording(episode: PlayedCollected) -> rr.RecordingStream:
@@ -167,10 +180,12 @@ def log_collected(recording: rr.RecordingStream, episode: PlayedCollected) -> No
     recording.log(paths.world, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     if info.urdf:
         urdf = Urdf.parse(info.urdf)
-        meshes = _meshes(info.urdf)
+        meshes = _meshes(info.urdf, urdf)
         log_model(recording, paths, urdf, meshes, episode.joint_position, base=Pose(), time_ns=episode.time_ns)
     for camera, video in episode.videos.items():
         send_video(recording, paths.camera(camera), episode.time_ns, video)
+    for camera, pictures in episode.depth.items():
+        send_depth(recording, paths.depth(camera), episode.time_ns, pictures())
     for name, curves in episode.curves.items():
         entity = paths.curves(name)
         colors = series_colors(len(curves.names))
@@ -180,13 +195,13 @@ def log_collected(recording: rr.RecordingStream, episode: PlayedCollected) -> No
     recording.log(paths.summary, rr.TextDocument(_summary(episode), media_type="text/markdown"), static=True)
 
 
-def _meshes(urdf: str) -> Mapping[str, SurfaceMesh]:
-    """Link -> what it looks like; nothing where the URDF names files that are not here."""
+def _meshes(text: str, urdf: Urdf) -> Mapping[str, SurfaceMesh]:
+    """Link -> what it looks like; rods between the joints where the URDF names files that are not here."""
     try:
-        return urdf_meshes(urdf, None)
+        return urdf_meshes(text, None)
     except (DemorecError, OSError, ValueError) as error:
-        log.warning("The robot is not drawn, since %s.", as_reason(error))
-        return {}
+        log.warning("The robot is drawn as rods between its joints, since %s.", as_reason(error))
+        return skeleton_meshes(urdf)
 
 
 def _summary(episode: PlayedCollected) -> str:
@@ -212,6 +227,7 @@ def collected_layout(episode: PlayedCollected, *, is_alone: bool = False) -> rrb
     top += [
         rrb.Spatial2DView(origin=paths.camera(camera), contents=["$origin"], name=camera) for camera in episode.videos
     ]
+    top += [rrb.Spatial2DView(origin=paths.depth(camera), name=camera) for camera in episode.depth]
     plots = [
         rrb.TimeSeriesView(
             origin="/",

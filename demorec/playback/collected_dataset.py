@@ -13,9 +13,11 @@ from numpy.typing import NDArray
 from demorec.geometry import Array
 from demorec.lerobot.layout import AUTOMATIC_FEATURES, DatasetInfo
 from demorec.lerobot.reader import read_tasks
+from demorec.lerobot.robots import DatasetRobot
 from demorec.plain import from_json
 from demorec.playback.collected import PlayedCollected
 from demorec.playback.episode import Curves, Video
+from demorec.recording.collected.transforms import JointPositions
 from demorec.scene.collected import CollectedCamera, CollectedFeature, CollectedInfo, CollectedOutcome, Origin
 
 _TASK, _DONE = "task_index", "next.done"
@@ -28,8 +30,9 @@ def collected_of_dataset(
     data: Mapping[str, Array],
     time_ns: NDArray[np.int64],
     videos: Mapping[str, Video],
+    robot: DatasetRobot | None,
 ) -> PlayedCollected:
-    """An episode as its dataset knows it: at the dataset's rate, and without the robot's model, which it does not keep.
+    """An episode as its dataset knows it, at the dataset's rate.
 
     Args:
         root: The dataset's folder.
@@ -38,6 +41,7 @@ def collected_of_dataset(
         data: Feature -> (T, D) of the episode's rows.
         time_ns: (T,) of the rows.
         videos: Camera -> coded pictures.
+        robot: The arm, if it is known.
 
     Raises:
         RecordingError, ExportError, ValueError, KeyError, TypeError: Its tables hold something odd.
@@ -49,6 +53,15 @@ def collected_of_dataset(
         if name not in AUTOMATIC_FEATURES and name != _DONE
     }
     tasks = read_tasks(root)
+    joints, units = ({}, {}) if robot is None else (robot.record.joints, robot.record.units)
+    features = tuple(
+        CollectedFeature(
+            name=name, dtype="float32", names=parts, joints=joints.get(name, ()), units=units.get(name, ())
+        )
+        for name, parts in names.items()
+    )
+    positions = JointPositions(features)
+    values = positions.of(data).T if positions.joints else ()
     return PlayedCollected(
         name=f"episode_{number:06d}",
         group=root.resolve().name,
@@ -59,7 +72,8 @@ def collected_of_dataset(
             instruction=tasks[int(data[_TASK][0, 0])] if num_frames else "",
             robot=described.robot_type or "",
             fps=int(described.fps),
-            features=tuple(CollectedFeature(name=name, dtype="float32", names=parts) for name, parts in names.items()),
+            urdf="" if robot is None else robot.urdf,
+            features=features,
             cameras=tuple(
                 CollectedCamera(name=camera["name"], width=camera["width"], height=camera["height"])
                 for camera in row["cameras"]
@@ -69,7 +83,7 @@ def collected_of_dataset(
         ),
         outcome=CollectedOutcome(success=row["success"], num_frames=num_frames, reason=row["failure_reason"]),
         time_ns=time_ns,
-        joint_position={},
+        joint_position=dict(zip(positions.joints, values, strict=True)),
         curves={name: Curves(time_ns=time_ns, values=data[name], names=parts) for name, parts in names.items()},
         videos=videos,
     )

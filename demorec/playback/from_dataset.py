@@ -20,6 +20,7 @@ from demorec.lerobot.files import check_video, read_json, read_table
 from demorec.lerobot.language import COLUMNS, spoken_episodes
 from demorec.lerobot.layout import DatasetInfo, Feature
 from demorec.lerobot.paths import SIDECAR_DIR
+from demorec.lerobot.robots import DatasetRobot, read_robot
 from demorec.playback.collected import PlayedCollected
 from demorec.playback.collected_dataset import collected_of_dataset
 from demorec.playback.episode import Box, Curves, PlayedEpisode, Video, VideoBatch
@@ -28,6 +29,7 @@ from demorec.scene.assets import asset_path
 from demorec.scene.episode import EpisodeInfo, Outcome, SuccessCheck, frame_time_ns
 from demorec.scene.features import ENVIRONMENT_STATE, IMAGE_PREFIX
 from demorec.scene.kinematics import ArmKinematics
+from demorec.scene.urdf import Urdf, check_primitives
 from demorec.scene.validity import read_episode_info
 
 _PICTURES_AT_ONCE = 256
@@ -66,7 +68,7 @@ def _read_episode(root: Path, episode_index: int) -> PlayedEpisode | PlayedColle
         data = _data(root, episode_index, columns)
         time_ns = _times(len(data["index"]), described)
         videos = _videos(root, episode_index, time_ns, described.features)
-        return collected_of_dataset(root, row, described, data, time_ns, videos)
+        return collected_of_dataset(root, row, described, data, time_ns, videos, _robot(root, row))
     export = dict(read_json(root / SIDECAR_DIR / "export.json"))
     info = read_episode_info(row["episode_info"])
     missing = {"observation.state", "action"} - described.features.keys()
@@ -79,7 +81,9 @@ def _read_episode(root: Path, episode_index: int) -> PlayedEpisode | PlayedColle
     time_ns = _times(num_frames, described)
     num_arm = len(info.robot.arm_joints)
     state = data["observation.state"]
-    base_from_tcp = data["observation.ee_pose"] if "observation.ee_pose" in data else _tcp_poses(info, state)
+    if (robot := _robot(root, row)) is not None:
+        check_primitives(robot.urdf)
+    base_from_tcp = data["observation.ee_pose"] if "observation.ee_pose" in data else _tcp_poses(info, state, robot)
     fingers = info.robot.gripper.joint_position(state[:, num_arm])
     ends = {item["name"]: _pose_row(item["world_from_object_end"]) for item in row["objects"]}
     return PlayedEpisode(
@@ -89,7 +93,7 @@ def _read_episode(root: Path, episode_index: int) -> PlayedEpisode | PlayedColle
         source=str(row["source"]),
         info=info,
         outcome=_outcome(row, num_frames),
-        robot_description=None,
+        robot_description=None if robot is None else robot.urdf,
         time_ns=time_ns,
         joint_position=np.concatenate([state[:, :num_arm], fingers], axis=1),
         base_from_tcp=base_from_tcp,
@@ -125,6 +129,12 @@ def _episode_row(root: Path, episode_index: int) -> dict[str, Any]:
     raise RecordingError(f"The dataset has no episode {episode_index}: {root}")
 
 
+def _robot(root: Path, row: dict[str, Any]) -> DatasetRobot | None:
+    """The arm of an episode; None in a dataset that does not keep it."""
+    name = row.get("robot_digest")
+    return None if name is None else read_robot(root, str(name))
+
+
 def _data(root: Path, episode_index: int, columns: list[str]) -> dict[str, Array]:
     rows = _rows(root, "data", columns, episode_index)
     result = {}
@@ -137,16 +147,16 @@ def _data(root: Path, episode_index: int, columns: list[str]) -> dict[str, Array
     return result
 
 
-def _tcp_poses(info: EpisodeInfo, state: Array) -> Array:
+def _tcp_poses(info: EpisodeInfo, state: Array, robot: DatasetRobot | None) -> Array:
     """(T, 7) from the joints, of a dataset that leaves observation.ee_pose out."""
-    robot = info.robot
+    spec = info.robot
+    urdf = Urdf.load(asset_path(spec.urdf), scale=info.scene.robot.scale) if robot is None else robot.model
     arm = ArmKinematics.from_urdf(
-        asset_path(robot.urdf),
-        arm_joints=robot.arm_joints,
-        tcp_link=robot.tcp_link,
-        lower=robot.position_lower,
-        upper=robot.position_upper,
-        scale=info.scene.robot.scale,
+        urdf,
+        arm_joints=spec.arm_joints,
+        tcp_link=spec.tcp_link,
+        lower=spec.position_lower,
+        upper=spec.position_upper,
     )
     return np.array([arm.forward(row).vector() for row in state[:, : arm.num_joints]])
 

@@ -172,13 +172,15 @@ def _curve_views(roots: list[Paths], episode: PlayedEpisode) -> rrb.Container:
         shown = [name for name in names if name in episode.curves]
         if not shown:
             return None
+        num_series = len(roots) * sum(len(episode.curves[name].names) for name in shown)
         return rrb.TimeSeriesView(
             origin="/",
             contents=[paths.curves(name) for paths in roots for name in shown],
             name=title,
             axis_x=rrb.TimeAxis(link=rrb.components.LinkAxis.LinkToGlobal),
             plot_legend=rrb.PlotLegend(
-                rrb.Corner2D.RightTop if len(episode.curves[shown[0]].names) > 3 else rrb.Corner2D.LeftBottom
+                rrb.Corner2D.RightTop if len(episode.curves[shown[0]].names) > 3 else rrb.Corner2D.LeftBottom,
+                visible=num_series > 1,  # the title names a single one, and a legend would hide part of it
             ),
         )
 

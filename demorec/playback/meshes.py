@@ -23,12 +23,15 @@ from demorec.errors import DemorecError, RecordingError, in_words
 from demorec.geometry import Pose
 from demorec.scene.assets import mesh_path
 from demorec.scene.scene import Rgba
+from demorec.scene.urdf import Urdf
 from demorec.scene.urdf_shapes import UrdfShape, read_links
 
 MAX_TRIANGLES = 2500
 """Of one mesh file."""
 _CREASE = np.radians(35.0)
 """Edges sharper than this stay sharp when a surface is shaded."""
+_ROD_RADIUS, _SHORTEST_ROD = 0.015, 1e-3
+"""Metres."""
 _CACHE_VERSION = b"2"
 
 
@@ -93,6 +96,17 @@ def urdf_meshes(text: str, folder: Path | None, scale: float = 1.0) -> dict[str,
     return links
 
 
+def skeleton_meshes(urdf: Urdf) -> dict[str, SurfaceMesh]:
+    """Link -> rods from its origin to those of the joints that hang on it, of an arm whose looks are not known."""
+    links: dict[str, list[SurfaceMesh]] = {}
+    for joint in urdf.joints:
+        end = joint.parent_from_joint.position
+        if np.abs(end).max() > _SHORTEST_ROD:
+            rod = trimesh.creation.cylinder(radius=_ROD_RADIUS, segment=[np.zeros(3), end], sections=16)
+            links.setdefault(joint.parent, []).append(of_trimesh(rod))
+    return {link: joined(rods) for link, rods in links.items()}
+
+
 def _shape_mesh(shape: UrdfShape, folder: Path | None) -> SurfaceMesh | None:
     scale: NDArray[np.float64] = np.ones(3)
     match shape.kind:
@@ -120,7 +134,7 @@ def _mesh_path(folder: Path | None, name: str) -> Path:
             return mesh_path(folder, name)
         except DemorecError as error:
             raise RecordingError(str(error)) from error
-    raise RecordingError(f"The robot's mesh {name!r} is not beside its URDF: {folder}")
+    raise RecordingError(f"The robot's mesh {name!r} is named by its URDF, but is not kept with it")
 
 
 @functools.lru_cache(maxsize=64)

@@ -15,7 +15,7 @@ from demorec.recording.collected.writer import CollectedWriter
 from demorec.recording.opening import AnyRecording, open_recording
 from demorec.recording.pixels import PixelStatistics
 from demorec.recording.recording import Recording
-from demorec.recording.recover import Recovered, recover
+from demorec.recording.recover import Recovered, is_whole, recover
 from demorec.recording.video import VideoPacket, VideoSettings
 from demorec.recording.writer import EpisodeWriter, WriteStats
 
@@ -30,6 +30,7 @@ __all__ = [
     "VideoPacket",
     "VideoSettings",
     "WriteStats",
+    "is_whole",
     "open_recording",
     "recover",
 ]

@@ -241,6 +241,10 @@ class CdrReader:
             raise ValueError("a string without its closing NUL")
         return raw[:-1].decode()
 
+    def octets(self, count: int) -> bytes:
+        """Byte after byte."""
+        return self._take(count)
+
     def integers(self) -> NDArray[np.int64]:
         """A sequence of int64."""
         count = self.u32()

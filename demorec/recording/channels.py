@@ -69,9 +69,16 @@ def latched_messages(info: EpisodeInfo, frames: FrameTree, *, has_labels: bool) 
 PHASE_EVENT = "phase"
 """Name of the events that the writer adds at each change of phase, so that a log shows them too."""
 
-_VIDEO_STREAMS = {"h264": "h264", "h265": "h265", "av1": "video", "jpeg": "image/compressed"}
+_VIDEO_STREAMS = {
+    "h264": "h264",
+    "h265": "h265",
+    "av1": "video",
+    "jpeg": "image/compressed",
+    "16UC1": "depth",
+    "32FC1": "depth",
+}
 PICTURE_STREAMS = (
-    *(stream for codec, stream in _VIDEO_STREAMS.items() if codec != "h265"),
+    *(stream for codec, stream in _VIDEO_STREAMS.items() if codec in ("h264", "av1", "jpeg")),
     "depth",
     "segmentation",
     "histogram",
@@ -80,5 +87,5 @@ PICTURE_STREAMS = (
 
 
 def video_topic(camera: str, codec: str) -> str:
-    """Where the coded colour pictures of a camera are read from."""
+    """Where the coded pictures of a camera, in colour or of distances, are read from."""
     return camera_topic(camera, _VIDEO_STREAMS[codec])

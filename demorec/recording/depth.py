@@ -21,12 +21,16 @@ _HEAD = struct.Struct("<iffii")
 
 def encode_depth(metres: NDArray[np.float32]) -> bytes:
     """Depth (H, W) in metres, 0 (or not finite) where nothing was hit; farther than 65.535 m counts as nothing."""
-    from demorec.recording import kernels
-
     with np.errstate(invalid="ignore"):
         known = (metres > 0) & (metres <= MAX_METRES)
-    millimetres = np.where(known, np.rint(np.where(known, metres, 0) * 1000), 0).astype(np.uint16)
-    height, width = metres.shape
+    return encode_millimetres(np.where(known, np.rint(np.where(known, metres, 0) * 1000), 0).astype(np.uint16))
+
+
+def encode_millimetres(millimetres: NDArray[np.uint16]) -> bytes:
+    """Depth (H, W) in whole millimetres, 0 where nothing was measured."""
+    from demorec.recording import kernels
+
+    height, width = millimetres.shape
     flat = millimetres.reshape(-1)
     words = np.zeros(len(flat) * 2 + 4, dtype=np.uint32)  # at most 7 groups a pixel and 6 + 6 a pair of runs
     count = kernels.rvl_encode(flat, words)
@@ -35,6 +39,11 @@ def encode_depth(metres: NDArray[np.float32]) -> bytes:
 
 def decode_depth(data: bytes, size: tuple[int, int]) -> NDArray[np.float32]:
     """Inverse of `encode_depth`, to half a millimetre; ValueError for no RVL picture of that (height, width)."""
+    return np.asarray(decode_millimetres(data, size) / np.float32(1000), dtype=np.float32)
+
+
+def decode_millimetres(data: bytes, size: tuple[int, int]) -> NDArray[np.uint16]:
+    """Inverse of `encode_millimetres`; ValueError for no RVL picture of that (height, width)."""
     from demorec.recording import kernels
 
     if len(data) < _HEAD.size or (len(data) - _HEAD.size) % 4:
@@ -46,4 +55,4 @@ def decode_depth(data: bytes, size: tuple[int, int]) -> NDArray[np.float32]:
     flat = np.zeros(width * height, dtype=np.uint16)
     if not kernels.rvl_decode(words, flat):
         raise ValueError("a depth picture whose runs do not fit its size")
-    return np.asarray(flat.reshape(height, width) / np.float32(1000), dtype=np.float32)
+    return flat.reshape(height, width)

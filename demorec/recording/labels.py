@@ -6,8 +6,10 @@ Uncompressed pictures of one channel Rerun takes for depth, and stands them in t
 from __future__ import annotations
 
 import io
+import struct
 from collections.abc import Iterator
 
+import av
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
@@ -20,6 +22,10 @@ from demorec.scene.urdf import Urdf
 BACKGROUND = -1
 FORMAT = "mono16; png compressed "
 """In the words of ROS's compressed_image_transport, blank included."""
+_PNG_HEAD = struct.Struct(">16sIIBB")
+_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR"
+_GREY_16 = (16, 0)
+"""Bits of a channel, and the colour type of one that is grey."""
 _LINK_SHIFT = 24
 _BODY_MASK = (1 << _LINK_SHIFT) - 1
 
@@ -41,7 +47,12 @@ def to_labels(segmentation: NDArray[np.int32]) -> NDArray[np.uint16]:
 def from_labels(labels: NDArray[np.uint16]) -> NDArray[np.int32]:
     """Inverse of `to_labels`."""
     values = labels.astype(np.int32)
-    return ((values >> 8) - 1) + ((values & 255) << _LINK_SHIFT)  # the background, 0, becomes -1 by itself
+    links = values & 255
+    links <<= _LINK_SHIFT
+    values >>= 8
+    values -= 1  # the background, 0, becomes -1 by itself
+    values += links  # all in place: memory for each step would cost more than the step
+    return values
 
 
 def encode_labels(segmentation: NDArray[np.int32]) -> bytes:
@@ -52,13 +63,28 @@ def encode_labels(segmentation: NDArray[np.int32]) -> bytes:
 
 
 def decode_labels(data: bytes, size: tuple[int, int]) -> NDArray[np.int32]:
-    """Inverse of `encode_labels`; ValueError or OSError when the bytes are no such file of that (height, width)."""
-    with Image.open(io.BytesIO(data), formats=("PNG",)) as image:
-        if image.mode != "I;16":
-            raise ValueError(f"a segmentation picture of the kind {image.mode!r}")
-        if (image.height, image.width) != size:  # before anything is unpacked
-            raise ValueError(f"a segmentation picture of {image.width}x{image.height} pixels")
-        return from_labels(np.asarray(image, dtype=np.uint16))
+    """Inverse of `encode_labels`; ValueError when the bytes are no such file of that (height, width).
+
+    FFmpeg unpacks a picture in a third of the time that Pillow takes.
+    """
+    if len(data) < _PNG_HEAD.size:
+        raise ValueError("a segmentation picture that is cut off")
+    signature, width, height, depth, color = _PNG_HEAD.unpack_from(data)
+    if signature != _PNG_SIGNATURE or (depth, color) != _GREY_16:
+        raise ValueError("a segmentation picture that is no PNG file of 16-bit numbers")
+    if (height, width) != size:  # before anything is unpacked
+        raise ValueError(f"a segmentation picture of {width}x{height} pixels")
+    decoder = av.CodecContext.create("png", "r")
+    decoder.thread_count = 1
+    decoder.options = {"err_detect": "crccheck+explode"}
+    try:
+        frames = decoder.decode(av.Packet(data))
+    except av.FFmpegError as error:
+        raise ValueError("a segmentation picture that is damaged") from error
+    if len(frames) != 1 or frames[0].format.name != "gray16be" or (frames[0].height, frames[0].width) != size:
+        raise ValueError("a segmentation picture that is damaged")
+    lines = np.frombuffer(frames[0].planes[0], dtype=">u2").reshape(height, -1)  # FFmpeg may pad lines
+    return from_labels(lines[:, :width].astype(np.uint16))
 
 
 def segment_names(info: EpisodeInfo) -> Iterator[tuple[int, str]]:

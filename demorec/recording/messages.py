@@ -22,6 +22,7 @@ BOOL = "std_msgs/msg/Bool"
 LOG = "rcl_interfaces/msg/Log"
 FLOAT64_ARRAY = "std_msgs/msg/Float64MultiArray"
 INT64_ARRAY = "std_msgs/msg/Int64MultiArray"
+IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 PROTOBUF_VIDEO = "foxglove.CompressedVideo"
 COMPRESSED_VIDEO = "foxglove_msgs/msg/CompressedVideo"
@@ -119,6 +120,32 @@ class PictureMessages:
 
 
 _U32 = struct.Struct("<I")
+
+
+def image(time_ns: int, frame_id: str, encoding: str, size: tuple[int, int], data: bytes) -> bytes:
+    """sensor_msgs/Image of (height, width) pixels in little endian."""
+    message = CdrWriter()
+    message.header(frame_id, time_ns)
+    message.u32(size[0])
+    message.u32(size[1])
+    message.text(encoding)
+    message.u8(0)  # is_bigendian
+    message.u32(len(data) // size[0])
+    message.u32(len(data))
+    return message.finish() + data
+
+
+def read_image(data: bytes) -> bytes:
+    """The pixels of an `image`; ValueError when it is cut off."""
+    message = CdrReader(data)
+    message.header()
+    for _ in range(2):
+        message.u32()
+    message.text()
+    message.u8()
+    message.u32()
+    count = message.u32()
+    return message.octets(count)
 
 
 def read_compressed_image(data: bytes) -> bytes:

@@ -17,10 +17,12 @@ from demorec.recording.collected.metadata import read_collected_metadata, read_c
 from demorec.recording.collected.reader import CollectedRecording
 from demorec.recording.collected.streams import FRAMES, feature_streams
 from demorec.recording.container import SalvagedMessage, SalvagedMetadata, salvage
+from demorec.recording.opening import open_recording
 from demorec.recording.part_file import PartFile
 from demorec.recording.recording import Recording
 from demorec.recording.ros2 import DEFINITIONS
 from demorec.recording.streams import frame_streams
+from demorec.safety.files import make_folder
 from demorec.scene.collected import Origin
 from demorec.scene.episode import frame_time_ns
 
@@ -59,6 +61,7 @@ def recover(source: Path, target: Path, *, overwrite: bool = False) -> Recovered
         raise RecordingError(f"{without_path(error, source)}: {source}") from error
     if survey.num_frames == 0:
         raise RecordingError(f"Nothing can be recovered, the file holds no whole frame ({survey.reason}): {source}")
+    make_folder(target.parent)
     num_messages = 0
     seen: Counter[str] = Counter()
     # The usual place for an unfinished file is where the source may lie.
@@ -95,6 +98,15 @@ def recover(source: Path, target: Path, *, overwrite: bool = False) -> Recovered
         is_complete=survey.outcome is not None,
         reason="" if survey.outcome is not None else survey.reason,
     )
+
+
+def is_whole(source: Path) -> bool:
+    """Whether a recording opens, ended in order, and can be read to its end."""
+    try:
+        with open_recording(source) as recording:
+            return recording.outcome is not None and bool(recording.digest())
+    except RecordingError:
+        return False
 
 
 def can_be_made_again(part: Path, *, origin: str | Origin) -> bool:

@@ -66,6 +66,12 @@ DEFINITIONS: dict[str, str] = {
         _TIME,
         _ROI,
     ),
+    "sensor_msgs/msg/Image": _definition(
+        "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\nuint32 step\n"
+        "uint8[] data\n",
+        _HEADER,
+        _TIME,
+    ),
     "sensor_msgs/msg/CompressedImage": _definition(
         "std_msgs/Header header\nstring format\nuint8[] data\n", _HEADER, _TIME
     ),

@@ -41,7 +41,7 @@ class VideoSettings:
     """How the pictures of one camera were coded: what a dataset's metadata and an mp4 file need to know.
 
     Attributes:
-        codec: Of the bit stream.
+        codec: Of the bit stream; of depth the encoding of its distances.
         encoder: FFmpeg's name of the encoder, "" for jpeg and for packets that came coded.
         width, height: Pixels.
         fps: Pictures per second.
@@ -53,7 +53,7 @@ class VideoSettings:
         jpeg_quality: 1..100; None unless the codec is jpeg.
     """
 
-    codec: Literal["h264", "h265", "av1", "jpeg"]
+    codec: Literal["h264", "h265", "av1", "jpeg", "16UC1", "32FC1"]
     encoder: str
     width: int
     height: int

@@ -13,7 +13,7 @@ from demorec.recording import EpisodeWriter
 from demorec.render.warm import WarmRenderer
 from demorec.replay.demonstration import Demonstration, ReplayOptions
 from demorec.replay.drive import ReplayReport, replay
-from demorec.replay.rerender import recorded_view, view_painter
+from demorec.replay.rerender import recorded_view, view_behaviour, view_painter
 from demorec.safety.files import make_folder
 from demorec.scene.assets import allow_models
 from demorec.sim.world import World
@@ -84,7 +84,8 @@ def record_replay(
     config = d.info.config
     view = recorded_view(d.info, options.allowed)
     make_folder(out)
-    info = replace(d.info, fps=d.fps, origin=f"replay of {d.digest[:16]}")
+    behaviour = view_behaviour(d.info, view)
+    info = replace(d.info, fps=d.fps, behaviour=behaviour, origin=f"replay of {d.digest[:16]}")
     video = from_plain(config.get("video", {}), VideoConfig)
     painter = None
     if info.scene.cameras:

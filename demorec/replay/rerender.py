@@ -171,6 +171,16 @@ def new_view(info: EpisodeInfo, options: RerenderOptions) -> SceneView:
     return SceneView(scene=scene, true_cameras=tuple(true_cameras), true_from_recorded=kept)
 
 
+def view_behaviour(info: EpisodeInfo, view: SceneView) -> dict[str, float]:
+    """What was drawn for an episode, without the calibration errors of cameras that have none in the view."""
+    off = {f"calibration_{name}" for name in view.true_from_recorded}
+    return {
+        name: value
+        for name, value in info.behaviour.items()
+        if not name.startswith("calibration_") or name.rpartition("_")[0] in off
+    }
+
+
 def _default_size(info: EpisodeInfo, options: RerenderOptions) -> tuple[int, int]:
     first = info.scene.cameras[0] if info.scene.cameras else None
     width = options.width or (first.width if first else int(info.config.get("width", 224)))
@@ -256,6 +266,7 @@ def rerender(
         new_info = replace(
             info,
             scene=view.scene,
+            behaviour=view_behaviour(info, view),
             config=config,
             config_digest=digest(config),
             origin=f"render of {recording.digest()[:16]}",

@@ -11,11 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.errors import ConfigError, ExportError, in_words, without_path
+from demorec.lerobot.attempts import ATTEMPT_SCHEMA
 from demorec.lerobot.files import read_json, read_table
 from demorec.lerobot.layout import DatasetInfo
 from demorec.lerobot.paths import SIDECAR_DIR
 from demorec.lerobot.reader import EpisodePlace, RowReader, episode_places
-from demorec.lerobot.sidecar import ATTEMPT_SCHEMA, CONFIGS_PATH, EPISODE_SCHEMA
+from demorec.lerobot.sidecar import CONFIGS_PATH, EPISODE_SCHEMA
 from demorec.lerobot.stills import pictures_at
 from demorec.report.content import Filmstrip, PhaseSpan, ReportedEpisode
 from demorec.report.filmstrip import filmstrip

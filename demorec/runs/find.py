@@ -51,7 +51,7 @@ _NAMES: dict[PathKind, str] = {
 _ADVICE: dict[PathKind, str] = {
     "unfinished": "; demorec recover keeps what is whole in it",
     "rrd": "; demorec view shows it by a name that ends in .rrd",
-    "hdf5": "; name the run that it was made from",
+    "hdf5": "; name the run that it was made from, or make one of it (demorec import hdf5)",
     "dataset": "; name the run that it was made from",
     "run": "; name one of its recordings",
     "evaluation": "; name one of its recordings",

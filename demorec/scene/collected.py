@@ -24,6 +24,9 @@ COLLECTED_VERSION = 1
 NO_PICTURE = -1
 """Stands for the number of a picture where a frame has none."""
 
+Kept = Literal["", "h264", "h265", "av1", "jpeg", "16UC1", "32FC1"]
+DEPTH_UNITS: Mapping[str, float] = {"16UC1": 1000.0, "32FC1": 1.0}
+"""Encoding of distances -> how many of its units a metre has."""
 Vector = NDArray[np.float32] | NDArray[np.float64]
 
 
@@ -57,7 +60,8 @@ class CollectedCamera:
         name: Unique; also its topic.
         width, height: Pixels.
         kept: The codec of its pictures where they come coded and stay as they are; "" where they come as pixels, which
-            the recorder codes.
+            the recorder codes. Of a depth camera ROS's name for its distances, whose every bit stays: "16UC1" (whole
+            millimetres, 0 where nothing was measured) or "32FC1" (metres, 0 or not finite where nothing was).
         intrinsics: K row by row, 9 numbers in pixels; None when unknown.
         distortion: Of the plumb bob model (k1, k2, p1, p2, k3); empty for none.
         mount: The link of the URDF that carries it; "" when unknown.
@@ -68,12 +72,17 @@ class CollectedCamera:
     name: str
     width: int
     height: int
-    kept: Literal["", "h264", "h265", "av1", "jpeg"] = ""
+    kept: Kept = ""
     intrinsics: tuple[float, ...] | None = None
     distortion: tuple[float, ...] = ()
     mount: str = ""
     mount_from_camera: Pose | None = None
     source: str = ""
+
+    @property
+    def is_depth(self) -> bool:
+        """Whether its pictures are distances."""
+        return self.kept in DEPTH_UNITS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,11 +162,14 @@ class CollectedFrame:
         samples: Feature -> what it holds; every feature.
         pictures: Camera -> number of the picture that it holds, counted from 0 in each camera. One picture may be held
             by several frames, or by none; a camera that is left out has no picture at this frame.
+        subtask: What the robot begins to do with this frame, in the words of whoever said it; "" where nothing new was
+            said.
     """
 
     time_ns: int
     samples: Mapping[str, Sample]
     pictures: Mapping[str, int] = field(default_factory=dict)
+    subtask: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)

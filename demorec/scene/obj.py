@@ -68,7 +68,10 @@ def read_obj(path: Path) -> ObjFile:
     material = ""
 
     def parse(corner: str) -> tuple[int, int, int]:
-        parts = (corner + "//").split("/")[:3]
+        parts = corner.split("/")
+        if "-" not in corner and len(parts) == 3 and "" not in parts:
+            return int(parts[0]), int(parts[1]), int(parts[2])
+        parts = [*parts, "", ""][:3]
         # Negative numbers count back from the latest; 0 stands for "none".
         counts = (len(points), len(uvs), len(normals))
         a, b, c = (

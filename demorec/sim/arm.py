@@ -13,6 +13,7 @@ from demorec.scene.episode import Action
 from demorec.scene.kinematics import ArmKinematics
 from demorec.scene.robot import RobotSpec
 from demorec.scene.scene import POSITION_GAIN, RobotPlacement
+from demorec.scene.urdf import Urdf
 from demorec.sim.urdf_file import urdf_file
 
 FINGER_STIFFNESS, FINGER_DAMPING = 30_000.0, 1_000.0
@@ -175,10 +176,9 @@ class Arm:
 def arm_kinematics(spec: RobotSpec, *, scale: float = 1.0) -> ArmKinematics:
     """Kinematics of a robot from its URDF."""
     return ArmKinematics.from_urdf(
-        asset_path(spec.urdf),
+        Urdf.load(asset_path(spec.urdf), scale=scale),
         arm_joints=spec.arm_joints,
         tcp_link=spec.tcp_link,
         lower=spec.position_lower,
         upper=spec.position_upper,
-        scale=scale,
     )

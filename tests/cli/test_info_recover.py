@@ -14,6 +14,7 @@ from support.recording import make_episode, write_episode
 
 from demorec.cli import COMMANDS, main, run_command
 from demorec.recording import EpisodeWriter, Recording
+from demorec.runs.find import find
 
 
 def run(name: str, *args: str | Path) -> int:
@@ -254,16 +255,44 @@ def test_recover(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert run("recover", part, "--out", tmp_path / "d.mcap") == 0
 
 
+def test_a_whole_recording_is_not_made_twice(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source = tmp_path / "a.mcap"
+    source.write_bytes((folder / "a.mcap").read_bytes())
+    assert run("recover", source) == 0
+    assert capsys.readouterr().out == f"Nothing to recover, the recording is whole: {source}\n"
+    assert list(tmp_path.iterdir()) == [source]
+
+
 def test_recovering_a_complete_file_keeps_everything(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     source = tmp_path / "a.mcap"
     source.write_bytes((folder / "a.mcap").read_bytes())
-    assert run("recover", source) == 0
+    assert run("recover", source, "--out", tmp_path / "again.mcap") == 0
     assert "Complete: all 45 frames" in capsys.readouterr().out
-    with Recording(source) as one, Recording(tmp_path / "a.recovered.mcap") as other:
+    with Recording(source) as one, Recording(tmp_path / "again.mcap") as other:
         assert one.digest() == other.digest()
         assert one.pixel_statistics("front").counts.tolist() == other.pixel_statistics("front").counts.tolist()
+
+
+@pytest.mark.parametrize("mark", ["run.json", "evaluation.json", ""])
+@pytest.mark.parametrize("is_inside", [True, False])
+def test_what_is_recovered_is_no_further_episode_of_its_run(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mark: str, is_inside: bool
+) -> None:
+    damaged = tmp_path / "run" / "episodes" / "a.mcap"
+    damaged.parent.mkdir(parents=True)
+    damaged.write_bytes((folder / "a.mcap").read_bytes()[:-3000])
+    if mark:
+        (tmp_path / "run" / mark).write_text("{}")
+    if is_inside:
+        monkeypatch.chdir(damaged.parent)
+    assert run("recover", damaged.name if is_inside else damaged) == 0
+    place = tmp_path / "run" / ("recovered" if mark else "episodes") / "a.recovered.mcap"
+    with Recording(place) as recording:
+        assert recording.num_frames > 0
+    if mark:
+        assert find(tmp_path / "run").recordings == (damaged,)
 
 
 def test_recovering_onto_a_full_disk_leaves_nothing(

@@ -220,6 +220,8 @@ def test_datasets_can_be_merged(run: Path, dataset: Path, tmp_path: Path) -> Non
     merged = merge_datasets([open_dataset(other), open_dataset(dataset)], "d/d", tmp_path / "merged")
     assert merged.num_episodes == len(LENGTHS) + 2
     assert_readable(tmp_path / "merged", (*LENGTHS[:2], *LENGTHS))
+    assert (dataset / "demorec" / "robots").is_dir()  # what docs/dataset-format.md says of LeRobot's tools
+    assert not any((tmp_path / name / "demorec").exists() for name in ("both", "merged"))
 
 
 @pytest.mark.slow
@@ -233,6 +235,7 @@ def test_features_can_be_added_and_removed(dataset: Path, tmp_path: Path) -> Non
     assert float(added[40]["extra"]) == 40
     removed = remove_feature(open_dataset(dataset), "observation.velocity", tmp_path / "b")
     assert "observation.velocity" not in removed.features
+    assert not any((tmp_path / name / "demorec").exists() for name in ("a", "b"))
 
 
 def lerobot_command(name: str, *arguments: str, timeout: float = 280) -> str:
@@ -257,6 +260,7 @@ def test_lerobots_editing_command_deletes_and_splits(dataset: Path, tmp_path: Pa
 
     parts = split_dataset(open_dataset(root), {"train": [0, 1, 2, 3], "test": [4, 5]}, tmp_path / "split")
     assert [parts["train"].num_frames, parts["test"].num_frames] == [61, 43]
+    assert not any((part / "demorec").exists() for part in (tmp_path / "less", *(tmp_path / "split").iterdir()))
 
 
 @pytest.mark.slow

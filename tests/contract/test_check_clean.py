@@ -61,6 +61,18 @@ def test_pictures_of_every_kind(config: dict[str, Any], tmp_path: Path) -> None:
     assert [r for r in checked(path).results if r.level in ("warn", "fail")] == []
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("task", "robot", "index"), [("place_in_tray", "panda", 0), ("line_up", "iiwa", 5), ("unstack", "iiwa", 3)]
+)
+def test_what_is_held_close_to_a_camera_that_is_off(task: str, robot: str, index: int, tmp_path: Path) -> None:
+    """The camera's calibration error moves what is near farther than what is far: one shift is not enough for both."""
+    path = simulate(
+        tmp_path / "e.mcap", task=task, robot=robot, variation="full", seed=77, episode_index=index, cameras=("wrist",)
+    )
+    assert [r for r in checked(path).results if r.level in ("warn", "fail")] == []
+
+
 def test_every_check_says_what_it_measures() -> None:
     for name in CHECKS.names():
         check = CHECKS.load(name)

@@ -16,6 +16,7 @@ from support.faults import Good, Rows
 from demorec.check.cells import ImageKind
 from demorec.check.drawn import DrawnPictures, PictureComparison, fill_between, frames_to_draw
 from demorec.check.episode import CheckedEpisode
+from demorec.check.episode_drawn import DrawnEpisode
 from demorec.geometry import Array
 from demorec.render.recorded import RecordedWorld
 from demorec.tables import CHECKS
@@ -218,21 +219,21 @@ def poses(good: Good) -> Array:
 def drawn_in_part(good: Good, changed: Mapping[tuple[str, ImageKind], Rows], poses: Array) -> CheckedEpisode:
     """The episode with other pictures, as if it had colour alone: only some of its frames are drawn."""
     episode, whole = good.with_pictures(changed), good.episode._drawn
-    assert isinstance(whole, DrawnPictures)
+    assert isinstance(whole, DrawnEpisode)
     frames = frames_to_draw([episode.pictures(camera).cells for camera in episode.cameras], poses)
-    cells = {key: rows.copy() for key, rows in whole.cells.items() if key[1] == "color"}
+    cells = {key: rows.copy() for key, rows in whole.pictures.cells.items() if key[1] == "color"}
     for rows in cells.values():
         rows[np.setdiff1d(np.arange(len(rows)), frames)] = 0  # so that nothing but what is drawn counts
         fill_between(rows, frames)
-    episode.__dict__["_drawn"] = DrawnPictures(frames=frames, cells=cells)
+    episode.__dict__["_drawn"] = DrawnEpisode(pictures=DrawnPictures(frames=frames, cells=cells), shift={})
     episode._comparisons.clear()
     return episode
 
 
 def test_the_good_one_passes_drawn_in_part(good: Good, poses: Array) -> None:
     episode = drawn_in_part(good, {}, poses)
-    assert isinstance(episode._drawn, DrawnPictures)
-    assert len(episode._drawn.frames) < 0.9 * episode.num_frames
+    assert isinstance(episode._drawn, DrawnEpisode)
+    assert len(episode._drawn.pictures.frames) < 0.9 * episode.num_frames
     for name in sorted({check for *_, check in COLOR} - {"picture_lag"}):  # it also asks for depth and labels
         result = CHECKS.load(name).run(episode)
         assert result.level == "pass", (name, result.value, result.detail)
@@ -274,6 +275,7 @@ class RecordedStill:
         first = {key: np.repeat(rows[:1], len(rows), axis=0) for key, rows in good.pictures.items()}
         self.episode = good.with_pictures(first)
         drawn = good.episode._drawn
-        assert isinstance(drawn, DrawnPictures)
-        still = {key: np.repeat(cells[:1], len(cells), axis=0) for key, cells in drawn.cells.items()}
-        self.episode.__dict__["_drawn"] = DrawnPictures(frames=drawn.frames, cells=still)
+        assert isinstance(drawn, DrawnEpisode)
+        still = {key: np.repeat(cells[:1], len(cells), axis=0) for key, cells in drawn.pictures.cells.items()}
+        pictures = DrawnPictures(frames=drawn.pictures.frames, cells=still)
+        self.episode.__dict__["_drawn"] = DrawnEpisode(pictures=pictures, shift={})

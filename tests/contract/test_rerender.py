@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,11 @@ from support.check import checked, simulate
 from support.commands import exit_code
 
 from demorec.errors import ConfigError
+from demorec.geometry import Pose
 from demorec.recording import Recording
 from demorec.render.warm import WarmRenderer
 from demorec.replay.free_camera import read_cameras
-from demorec.replay.rerender import RerenderOptions, rerender
+from demorec.replay.rerender import RerenderOptions, SceneView, rerender, view_behaviour
 
 SIDE = """
 [side]
@@ -56,6 +58,20 @@ def test_calibration_errors_are_kept(tmp_path: Path) -> None:
     report = rerender(source, tmp_path / "again.mcap", RerenderOptions())
     assert report.compared == ("front",)
     assert not report.differing
+
+
+def test_a_new_camera_has_no_calibration_error(filmed: Path) -> None:
+    """Though it has the name of one that had."""
+    with Recording(filmed) as recording:
+        info = recording.info
+    names = ("front", "wrist", "wrist_2")
+    values = {f"calibration_{name}_{what}": 0.001 for name in names for what in ("x", "y", "z", "angle")}
+    info = replace(info, behaviour={"speed": 1.0, **values})
+    view = SceneView(scene=info.scene, true_cameras=info.scene.cameras, true_from_recorded={"wrist": Pose()})
+    assert view_behaviour(info, view) == {
+        "speed": 1.0,
+        **{f"calibration_wrist_{what}": 0.001 for what in ("x", "y", "z", "angle")},
+    }
 
 
 @pytest.mark.slow

@@ -223,5 +223,22 @@ def test_pngs_of_others_are_refused() -> None:
 
     buffer = io.BytesIO()
     Image.new("RGB", (4, 4)).save(buffer, format="PNG")
-    with pytest.raises(ValueError, match="of the kind 'RGB'"):
+    with pytest.raises(ValueError, match="no PNG file of 16-bit numbers"):
         decode_labels(buffer.getvalue(), (4, 4))
+    with pytest.raises(ValueError, match="no PNG file of 16-bit numbers"):
+        decode_labels(b"x" * 100, (4, 4))
+
+
+def test_damaged_pngs_are_refused() -> None:
+    labels = np.arange(64 * 48, dtype=np.int32).reshape(48, 64) % 200
+    good = encode_labels(labels)
+    assert np.array_equal(decode_labels(good, (48, 64)), labels)
+    flipped = bytearray(good)
+    flipped[len(good) // 2] ^= 16
+    for spoilt in (bytes(flipped), good[: len(good) // 2], good[:40]):
+        with pytest.raises(ValueError, match="that is damaged"):
+            decode_labels(spoilt, (48, 64))
+    with pytest.raises(ValueError, match="that is cut off"):
+        decode_labels(good[:20], (48, 64))
+    with pytest.raises(ValueError, match="of 64x48 pixels"):  # before anything is unpacked
+        decode_labels(good, (4, 4))

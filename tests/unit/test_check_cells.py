@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from support.recording import write_episode
 
 from demorec.check.cells import DEPTH_RANGE, CellGrid, Cells, cell_counts
-from demorec.check.drawn import compare, draw_all, frames_to_draw
+from demorec.check.drawn import compare, frames_to_draw
+from demorec.check.episode_drawn import draw_episode
 from demorec.errors import RecordingError
 from demorec.geometry import Array
 from demorec.recording import Recording
@@ -68,7 +69,7 @@ def test_drawn_pictures_have_the_grid_of_the_recorded_ones(tmp_path: Path) -> No
     """500x224 is drawn as 112x50: by itself that would have 12 rows of cells, and not 13."""
     path = write_episode(tmp_path / "e.mcap", num_frames=2, cameras=("front",), width=500, height=224)
     with Recording(path) as recording:
-        drawn = draw_all(recording.info, recording.columns(), {"front": ("color",)})
+        drawn = draw_episode(recording.info, recording.columns(), {"front": ("color",)}).pictures
     assert drawn.cells["front", "color"].shape == (2, 13, 28, 3)
 
 
@@ -108,6 +109,14 @@ def test_frames_are_drawn_that_are_not_what_lies_between_their_neighbours() -> N
     assert frames_to_draw([seen], poses).tolist() == [0, 3, 5, 6, 9, 12, 13]
 
 
+def test_frames_are_drawn_that_the_neighbours_drawn_at_last_do_not_tell() -> None:
+    """4 lies between 3 and 6, but not between 3 and 5, which is odd and therefore drawn."""
+    seen = np.full((7, 4, 4, 3), 100.0, dtype=np.float32)
+    seen[5] += 8.0
+    seen[4] += 1.0
+    assert frames_to_draw([seen], np.zeros((7, 1, 7))).tolist() == [0, 3, 4, 5, 6]
+
+
 def test_frames_without_a_readable_neighbour_are_drawn() -> None:
     """The camera's pictures end after frame 7: nothing tells 7 from both sides."""
     poses = np.zeros((14, 1, 7))
@@ -119,9 +128,9 @@ def test_pictures_that_are_not_drawn_are_means_of_those_around(tmp_path: Path) -
     path = write_episode(tmp_path / "e.mcap", num_frames=5, cameras=("front",), width=64, height=64)
     with Recording(path) as recording:
         info, columns = recording.info, recording.columns()
-        whole = draw_all(info, columns, {"front": ("color",)}).cells["front", "color"]
+        whole = draw_episode(info, columns, {"front": ("color",)}).pictures.cells["front", "color"]
         still = np.zeros_like(whole)
-        drawn = draw_all(info, columns, {"front": ("color",)}, [still])
+        drawn = draw_episode(info, columns, {"front": ("color",)}, {"front": still}, draw_each=False).pictures
     found = drawn.cells["front", "color"]
     assert drawn.frames.tolist() == [0, 3, 4]
     for frame in drawn.frames.tolist():

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rerun.chunk import RrdReader
 from support.collected import TOP, WRIST, make_collected, write_collected
 
 from demorec.errors import ConfigError
@@ -54,7 +55,13 @@ def test_meshes_that_are_not_here_leave_the_rest_visible(tmp_path: Path, caplog:
     mesh = given.info.urdf.replace('<box size="0.1 0.1 0.1"/>', '<mesh filename="package://arm/base.stl"/>')
     path = write_collected(tmp_path / "a.mcap", replace(given, info=replace(given.info, urdf=mesh)))
     save(find_episodes([path])[0], tmp_path / "a.rrd")
-    assert "The robot is not drawn" in caplog.text
+    assert "The robot is drawn as rods between its joints" in caplog.text
+    drawn = {
+        chunk.entity_path.rsplit("/", 1)[-1]
+        for chunk in RrdReader(tmp_path / "a.rrd").stream()
+        if "Mesh3D:vertex_positions" in chunk.to_record_batch().schema.names
+    }
+    assert drawn == {"base", "upper"}  # rods to the joints that they carry
 
 
 def test_two_of_them_are_not_laid_over_each_other(tmp_path: Path) -> None:

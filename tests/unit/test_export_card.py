@@ -67,6 +67,22 @@ def test_the_commands_of_a_card_make_the_dataset(tmp_path: Path) -> None:
     assert "demorec reproduce path/of/this/folder --out copy" in (tmp_path / "d" / "README.md").read_text()
 
 
+@pytest.mark.parametrize("language", [None, (), ("subtask", "plan")])
+def test_the_flags_of_an_export_are_parsed_to_it(language: tuple[str, ...] | None) -> None:
+    options = ExportOptions(repo_id="me/cubes", language=language, progress=True)
+    words = ["run", "--repo-id", "me/cubes", *shlex.split(" ".join(flags(options, ExportOptions(repo_id="me/cubes"))))]
+    parsed = parse(Export, ["lerobot", *words, "--out", "d"], prog="", defaults=Export.defaults(["lerobot", *words]))
+    assert parsed.options == options
+
+
+def test_language_columns_are_explained(tmp_path: Path) -> None:
+    export(make_run(tmp_path / "run", (6,)), tmp_path / "d", language=("subtask",))
+    rows = [line for line in (tmp_path / "d" / "README.md").read_text().splitlines() if line.startswith("| `language_")]
+    assert [row.split("`")[1] for row in rows] == ["language_persistent", "language_events"]
+    assert "until the next one of its style" in rows[0]
+    assert "at this row alone" in rows[1]
+
+
 def test_an_appended_dataset_has_no_such_commands(tmp_path: Path) -> None:
     run = make_run(tmp_path / "run", (6, 5))
     export(run, tmp_path / "d", episodes="0")
@@ -90,14 +106,14 @@ def test_an_edited_card_stays_when_the_dataset_is_appended_to(tmp_path: Path) ->
 def test_thumbnails_are_labelled(tmp_path: Path) -> None:
     export(make_run(tmp_path / "run", (31, 16)), tmp_path / "d")
     sheet = np.asarray(Image.open(tmp_path / "d" / "demorec" / "thumbnails.jpg")).astype(int)
-    assert sheet.shape == (2 * (18 + 120), 5 * 160, 3)
+    assert sheet.shape == (2 * (18 + 120), 5 * 160 + 4 * 2, 3)
     labels = [sheet[row * 138 : row * 138 + 18] for row in range(2)]
     for label in labels:
         assert label.max() > 240  # black on white
         assert label.min() < 60
     assert np.abs(labels[0] - labels[1]).max() > 100  # of another episode
     small = [
-        sheet[18 + 138 * row : 138 * (row + 1), 160 * column : 160 * (column + 1)]
+        sheet[18 + 138 * row : 138 * (row + 1), 162 * column : 162 * column + 160]
         for row in (0, 1)
         for column in range(5)
     ]

@@ -9,7 +9,8 @@ from typing import Any
 import pytest
 
 from demorec.errors import ConfigError
-from demorec.generate.options import RunOptions, available_cores, default_out, default_repo_id
+from demorec.generate.options import RunOptions, default_out, default_repo_id
+from demorec.processes import available_cores
 
 
 @pytest.mark.parametrize(

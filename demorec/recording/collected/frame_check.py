@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from demorec.errors import RecordingError
+from demorec.recording.collected.depth import DEPTH_TYPES
 from demorec.registry import nearest_match
 from demorec.scene.collected import CollectedCamera, CollectedFrame, CollectedInfo
 
 MAX_STAMP_NS = 2**31 * 1_000_000_000 - 1
 """The seconds of a stamp have 31 bits in ROS messages."""
+
+MAX_SUBTASK = 1000
+"""Characters."""
 
 
 class CollectedCheck:
@@ -25,7 +30,7 @@ class CollectedCheck:
         self._num_pictures = dict.fromkeys(self._cameras, 0)
         self._num_frames = 0
 
-    def check_picture(self, camera: str, stamp_ns: int, data: NDArray[np.uint8] | bytes) -> None:
+    def check_picture(self, camera: str, stamp_ns: int, data: NDArray[Any] | bytes) -> None:
         """Raise RecordingError unless it can be the next picture of the camera."""
         known = self._cameras.get(camera)
         if known is None:
@@ -64,6 +69,8 @@ class CollectedCheck:
                 raise RecordingError(
                     f"The camera {camera!r} has no picture {number} for {what}, it has {count} so far."
                 )
+        if len(frame.subtask) > MAX_SUBTASK or not frame.subtask.isprintable():
+            raise RecordingError(f"The subtask of {what} is no single line of at most {MAX_SUBTASK} characters.")
         for name in self._features:
             stamp = frame.samples[name].stamp_ns
             self._check_stamp(f"the feature {name!r} of {what}", "feature " + name, stamp, may_repeat=True)
@@ -90,20 +97,21 @@ class CollectedCheck:
             )
 
 
-def _check_picture(camera: CollectedCamera, data: NDArray[np.uint8] | bytes) -> None:
-    if camera.kept:
+def _check_picture(camera: CollectedCamera, data: NDArray[Any] | bytes) -> None:
+    if camera.kept and not camera.is_depth:
         if not isinstance(data, bytes) or not data:
             raise RecordingError(
                 f"The picture of the camera {camera.name!r} is {type(data).__name__}, it must be bytes of "
                 f"{camera.kept}."
             )
         return
-    shape = (camera.height, camera.width, 3)
-    if not isinstance(data, np.ndarray) or data.dtype != np.uint8 or data.shape != shape:
+    kind = np.dtype(DEPTH_TYPES.get(camera.kept, np.uint8))
+    shape: tuple[int, ...] = (camera.height, camera.width) if camera.is_depth else (camera.height, camera.width, 3)
+    if not isinstance(data, np.ndarray) or data.dtype != kind or data.shape != shape:
         found = f"{data.dtype} of shape {data.shape}" if isinstance(data, np.ndarray) else type(data).__name__
         raise RecordingError(
-            f"The picture of the camera {camera.name!r} is {found}, it must be uint8 of shape {shape}: height, "
-            "width, RGB."
+            f"The picture of the camera {camera.name!r} is {found}, it must be {kind} of shape {shape}: height, "
+            f"width{'' if camera.is_depth else ', RGB'}."
         )
 
 

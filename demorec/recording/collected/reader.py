@@ -17,13 +17,17 @@ from demorec.recording import messages
 from demorec.recording.channels import description_topic, video_topic
 from demorec.recording.chunks import Block
 from demorec.recording.collected import metadata
-from demorec.recording.collected.streams import FRAMES, FeatureStream, feature_streams, frames_layout
+from demorec.recording.collected.depth import decode_distances
+from demorec.recording.collected.streams import FRAMES, SUBTASK, FeatureStream, feature_streams, frames_layout
 from demorec.recording.collected.validity import what_is_wrong
 from demorec.recording.container import damage_as_recording_error
 from demorec.recording.episode_file import EpisodeFile
 from demorec.recording.metadata import COLLECTED, OUTCOME
 from demorec.recording.video import Rgb, VideoPacket, VideoSettings, is_keyframe
-from demorec.scene.collected import NO_PICTURE, CollectedColumns, CollectedInfo, CollectedOutcome
+from demorec.scene.collected import DEPTH_UNITS, NO_PICTURE, CollectedColumns, CollectedInfo, CollectedOutcome
+
+_READERS = {"av1": messages.read_protobuf_video, "32FC1": messages.read_image}
+"""Codec -> what takes a packet out of its message, where that is no CompressedImage."""
 
 
 class CollectedRecording(EpisodeFile):
@@ -75,7 +79,17 @@ class CollectedRecording(EpisodeFile):
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """Names of the cameras."""
+        """Names of the cameras that see colours."""
+        return tuple(camera.name for camera in self.info.cameras if not camera.is_depth)
+
+    @property
+    def depth_cameras(self) -> tuple[str, ...]:
+        """Names of the cameras that measure distances."""
+        return tuple(camera.name for camera in self.info.cameras if camera.is_depth)
+
+    @property
+    def _cameras_in_order(self) -> tuple[str, ...]:
+        """All of them, as `/frames` has them."""
         return tuple(camera.name for camera in self.info.cameras)
 
     def video_settings(self, camera: str) -> VideoSettings:
@@ -95,7 +109,7 @@ class CollectedRecording(EpisodeFile):
     def _columns(self) -> CollectedColumns:
         """Read once: an export and a check look at them from several sides."""
         streams = feature_streams(self.info)
-        picture_topics = {camera: self._picture_topic(camera) for camera in self.cameras}
+        picture_topics = {camera: self._picture_topic(camera) for camera in self._cameras_in_order}
         blocks = self._container.blocks((FRAMES, *(stream.topic for stream in streams.values())))
         layout = frames_layout(self.info)
         with damage_as_recording_error(self.path):
@@ -105,7 +119,7 @@ class CollectedRecording(EpisodeFile):
             raise RecordingError(f"The frames of the recording are not in the order of their times: {self.path}")
         features = {name: self._feature(stream, blocks[stream.topic], time_ns) for name, stream in streams.items()}
         stamps = {name: rows[:, index].copy() for index, name in enumerate(streams)}
-        pictures = {name: rows[:, len(streams) + index].copy() for index, name in enumerate(self.cameras)}
+        pictures = {name: rows[:, len(streams) + index].copy() for index, name in enumerate(self._cameras_in_order)}
         picture_stamps = {name: self._stamps(topic) for name, topic in picture_topics.items()}
         for name, numbers in pictures.items():
             count = len(picture_stamps[name])
@@ -116,6 +130,18 @@ class CollectedRecording(EpisodeFile):
         return CollectedColumns(
             time_ns=time_ns, features=features, stamps=stamps, pictures=pictures, picture_stamps=picture_stamps
         )
+
+    @cached_property
+    def subtasks(self) -> tuple[tuple[int, str], ...]:
+        """(frame, what is begun there), in order; empty where nobody said any."""
+        found = []
+        for message in self._container.messages((SUBTASK,)):
+            frame = int(np.searchsorted(self._columns.time_ns, message.time_ns))
+            if frame == self.num_frames or self._columns.time_ns[frame] != message.time_ns:
+                raise RecordingError(f"A subtask of the recording begins where no frame is: {self.path}")
+            with damage_as_recording_error(self.path):
+                found.append((frame, messages.read_string(message.data)))
+        return tuple(found)
 
     def _stamps(self, topic: str) -> NDArray[np.int64]:
         """(N,) of the messages of a topic, one chunk of them in memory at a time: pictures may take gigabytes."""
@@ -136,13 +162,34 @@ class CollectedRecording(EpisodeFile):
     def packets(self, camera: str) -> Iterator[VideoPacket]:
         """The coded pictures of a camera in order; `frame_index` is their number, by which frames hold them."""
         codec = self.video_settings(camera).codec
-        read = messages.read_protobuf_video if codec == "av1" else messages.read_compressed_image
+        read = _READERS.get(codec, messages.read_compressed_image)
         for number, message in enumerate(self._container.messages((self._picture_topic(camera),))):
             with damage_as_recording_error(self.path):
                 data = read(message.data)
             yield VideoPacket(
                 frame_index=number, time_ns=message.time_ns, data=data, is_keyframe=is_keyframe(codec, data)
             )
+
+    def images(self, camera: str) -> Iterator[Rgb]:
+        """The decoded pictures of a camera, (H, W, 3) uint8 RGB, in order; RecordingError for a depth camera."""
+        if camera in self.depth_cameras:
+            raise RecordingError(f"The camera {camera!r} measures distances and sees no colours: {self.path}")
+        return super().images(camera)
+
+    def distances(self, camera: str) -> Iterator[NDArray[np.uint16] | NDArray[np.float32]]:
+        """The pictures of a depth camera in order, as they came: (H, W) uint16 millimetres or float32 metres."""
+        if camera not in self.depth_cameras:
+            raise RecordingError(f"The recording has no depth camera {camera!r}: {self.path}")
+        settings = self.video_settings(camera)
+        for packet in self.packets(camera):
+            with damage_as_recording_error(self.path):
+                yield decode_distances(settings.codec, packet.data, (settings.height, settings.width))
+
+    def depth(self, camera: str) -> Iterator[NDArray[np.float32]]:
+        """The same in metres, (H, W) float32."""
+        unit = np.float32(DEPTH_UNITS[self.video_settings(camera).codec])
+        for values in self.distances(camera):
+            yield values.astype(np.float32) / unit
 
     def coded_pictures(self, camera: str) -> Block:
         """All coded pictures of a camera, in memory together."""
@@ -175,7 +222,9 @@ class CollectedRecording(EpisodeFile):
         for mapping in (columns.features, columns.stamps, columns.pictures, columns.picture_stamps):
             for name in sorted(mapping):
                 result.update(name.encode() + mapping[name].tobytes())
-        for camera in self.cameras:
+        for frame, text in self.subtasks:
+            result.update(f"subtask {frame} {text}".encode())
+        for camera in self._cameras_in_order:
             for packet in self.packets(camera):
                 result.update(hashlib.sha256(packet.data).digest())
         return result.hexdigest()

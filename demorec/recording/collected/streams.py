@@ -19,6 +19,8 @@ from demorec.recording.cdr import CdrWriter, Layout
 from demorec.scene.collected import CollectedFeature, CollectedInfo
 
 FRAMES = "/frames"
+SUBTASK = "/language/subtask"
+"""What is begun at a frame, where somebody said it: std_msgs/String."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -12,7 +12,7 @@ from demorec.scene.urdf import Urdf
 
 _FEATURE = re.compile(r"[A-Za-z][A-Za-z0-9_]*(\.[A-Za-z][A-Za-z0-9_]*)*")
 _CAMERA = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
-_RESERVED = ("frames", "tf", "tf_static", "robot_description", "camera")
+_RESERVED = ("frames", "tf", "tf_static", "robot_description", "camera", "language")
 """First words of topics that are no feature's."""
 _DATASET = ("timestamp", "frame_index", "episode_index", "index", "task_index", "task", "next", "observation.images")
 """What datasets call their own columns."""

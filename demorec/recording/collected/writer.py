@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +18,9 @@ from demorec.errors import ConfigError, RecordingError
 from demorec.recording import messages
 from demorec.recording.channels import TF, TF_STATIC, camera_topic, description_topic
 from demorec.recording.collected import metadata
+from demorec.recording.collected.depth import DepthMessages, encode_distances
 from demorec.recording.collected.frame_check import CollectedCheck
-from demorec.recording.collected.streams import FRAMES, feature_streams, frames_layout
+from demorec.recording.collected.streams import FRAMES, SUBTASK, feature_streams, frames_layout
 from demorec.recording.collected.transforms import CollectedTree
 from demorec.recording.collected.validity import what_is_wrong
 from demorec.recording.metadata import COLLECTED, OUTCOME
@@ -33,6 +34,8 @@ from demorec.recording.writer import WriteStats
 from demorec.scene.collected import NO_PICTURE, CollectedCamera, CollectedFrame, CollectedInfo, CollectedOutcome
 
 _SECOND_NS = 1_000_000_000
+_PIXEL_FORMATS = {"jpeg": "yuvj420p", "16UC1": "gray16le", "32FC1": "grayf32le"}
+"""Codec -> FFmpeg's name of the pixel format, of codecs whose every picture stands by itself."""
 
 
 class CollectedWriter:
@@ -110,14 +113,15 @@ class CollectedWriter:
                 self._file.log(topic, messages.CAMERA_INFO, data, 0, latched=True)
         self._file.flush()
 
-    def picture(self, camera: str, stamp_ns: int, data: NDArray[np.uint8] | bytes) -> int:
+    def picture(self, camera: str, stamp_ns: int, data: NDArray[Any] | bytes) -> int:
         """Add the next picture of a camera, and return its number, by which frames hold it.
 
         Args:
             camera: One of the episode's.
             stamp_ns: When it was taken, by the camera's clock; later than the one before.
             data: (H, W, 3) uint8 RGB; for a camera whose pictures are kept an access unit (H.264 and H.265 with start
-                codes), a temporal unit (AV1) or a JPEG file, which stays as it is.
+                codes), a temporal unit (AV1) or a JPEG file, which stays as it is; for a depth camera (H, W) uint16
+                millimetres or float32 metres.
 
         Raises:
             RecordingError: An unknown camera, another size or type, or a stamp that goes backwards.
@@ -166,6 +170,8 @@ class CollectedWriter:
         for index, time in enumerate(times):
             for log, data in encoded:
                 log(data[index], log_time=time)
+            if text := frames[index].subtask:
+                self._file.log(SUBTASK, messages.STRING, messages.string(text), time)
         self._file.flush()
         del self._pending[: len(frames)]
 
@@ -203,6 +209,7 @@ class CollectedWriter:
             raise RecordingError(f"The video encoder kept pictures of the last {len(self._pending)} frames to itself.")
         for camera in self._cameras.values():
             if camera.pixels is not None and camera.num_taken:
+                assert isinstance(camera.messages, ColorMessages)
                 topic, schema, data = camera.messages.statistics(camera.pixels)
                 self._file.log(topic, schema, data, camera.last_stamp)
         self._file.metadata(OUTCOME, metadata.collected_outcome_metadata(outcome))
@@ -240,17 +247,19 @@ class _Pictures:
             self._encoder = make_encoder(video=video, width=camera.width, height=camera.height, fps=fps)
             self.pixels = PixelCounter()
             self.settings = self._encoder.settings
-        self.messages = ColorMessages(camera.name, self.settings.codec)
+        self.messages = DepthMessages(camera) if camera.is_depth else ColorMessages(camera.name, self.settings.codec)
         self.num_taken = self.num_bytes = self.last_stamp = 0
         self._num_pictures = 0
         self._stamps: list[int] = []
         self._packets: list[bytes] = []
 
-    def add(self, stamp_ns: int, data: NDArray[np.uint8] | bytes) -> int:
+    def add(self, stamp_ns: int, data: NDArray[Any] | bytes) -> int:
         """Take the next picture; return its number."""
         self._stamps.append(stamp_ns)
-        if self._encoder is None or self.pixels is None or isinstance(data, bytes):
-            self._packets.append(bytes(data))
+        if isinstance(data, bytes):
+            self._packets.append(data)
+        elif self._encoder is None or self.pixels is None:
+            self._packets.append(encode_distances(data))
         else:
             self.pixels.add(data)
             self._packets += self._encoder.encode(data)
@@ -282,8 +291,8 @@ def _kept_settings(camera: CollectedCamera, fps: int) -> VideoSettings:
         width=camera.width,
         height=camera.height,
         fps=fps,
-        pix_fmt="yuvj420p" if camera.kept == "jpeg" else "yuv420p",
-        gop=1 if camera.kept == "jpeg" else 0,
+        pix_fmt=_PIXEL_FORMATS.get(camera.kept, "yuv420p"),
+        gop=1 if camera.kept in _PIXEL_FORMATS else 0,
         crf=None,
         preset="",
         options={},

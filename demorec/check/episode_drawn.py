@@ -1,0 +1,132 @@
+"""The pictures of an episode as its recorded numbers make them.
+
+Recorded camera poses may be off on purpose, as those of a real camera are (`--variation full`). The recording tells the
+error's offset, and how far but not about which axis it turns. The turn is found in the pictures, as far as it is no
+larger than what is told; so that they can be compared as exactly as those of other episodes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from demorec.check.cells import Cells, ImageKind, cell_counts
+from demorec.check.drawn import DrawnPictures, draw, fit, frames_to_draw
+from demorec.geometry import Array, Pose
+from demorec.render.recorded import RecordedWorld
+from demorec.scene.episode import EpisodeColumns, EpisodeInfo
+from demorec.scene.scene import Camera, Scene
+
+_NUM_FITTED = 9
+"""Frames that are drawn to find how far a camera is turned."""
+_NUM_STEPS = 2
+"""Fits, each from where the last one led: the first comes out too large by a tenth or two, since cells blur edges."""
+_TURN_MARGIN = 1.3
+"""A turn that comes out larger than what is told, by this factor, is no calibration error."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class DrawnEpisode:
+    """What the cameras of an episode must have seen.
+
+    Attributes:
+        pictures: Of all frames, but for the cameras' calibration errors.
+        shift: Camera name -> (2,) by how much the errors' turn moves its pictures to the right and down, of the height.
+    """
+
+    pictures: DrawnPictures
+    shift: Mapping[str, Array]
+
+
+def draw_episode(
+    info: EpisodeInfo,
+    columns: EpisodeColumns,
+    kinds: Mapping[str, Iterable[ImageKind]],
+    colors: Mapping[str, Cells] | None = None,
+    *,
+    draw_each: bool = True,
+) -> DrawnEpisode:
+    """The pictures of an episode, as the recorded numbers make them.
+
+    Args:
+        info, columns: Of the recording.
+        kinds: Camera name -> what is to be drawn of it.
+        colors: Camera name -> its recorded colour pictures, by which turns are found and frames chosen.
+        draw_each: Whether every frame is drawn, also those that can be told from their neighbours.
+
+    Raises:
+        SceneError, RenderError: A model is not there, or cannot be drawn.
+    """
+    # The recorded pictures' grid: the small ones' own may have a row more or less.
+    counts = {camera.name: cell_counts(camera.width, camera.height) for camera in info.scene.cameras}
+    scene = drawable_scene(info)
+    world = RecordedWorld(info.robot, scene, joint_position=columns.joint_position, object_poses=columns.object_poses)
+    turns = {} if colors is None else _turns(info, world, counts, colors)
+    cameras = tuple(_turned_back(camera, turns.get(camera.name)) for camera in scene.cameras)
+    if draw_each or colors is None:
+        frames = np.flatnonzero(np.ones(columns.num_frames))
+    else:
+        frames = frames_to_draw(colors.values(), world.all_poses[: columns.num_frames])
+    return DrawnEpisode(
+        pictures=draw(world, cameras, frames, kinds, counts),
+        shift={
+            camera.name: np.array([turns[camera.name][1], -turns[camera.name][0]]) / _height(camera)
+            for camera in cameras
+            if camera.name in turns
+        },
+    )
+
+
+def drawable_scene(info: EpisodeInfo) -> Scene:
+    """The recorded scene, its cameras without the offset of their calibration error.
+
+    One shift of all pictures makes up for most of a turn, but not for an offset: what is near moves farther by it than
+    what is far.
+    """
+    return replace(info.scene, cameras=tuple(_moved_back(camera, info.behaviour) for camera in info.scene.cameras))
+
+
+def _moved_back(camera: Camera, behaviour: Mapping[str, float]) -> Camera:
+    offset = np.array([behaviour.get(f"calibration_{camera.name}_{axis}", 0.0) for axis in "xyz"])
+    if not offset.any():
+        return camera
+    # recorded = true @ error: so but for the error's turn, which is small, true = recorded @ Pose(-offset).
+    return replace(camera, mount_from_camera=camera.mount_from_camera @ Pose(position=-offset))
+
+
+def _turned_back(camera: Camera, turn: Array | None) -> Camera:
+    """The camera before it was turned by a small rotation vector, rad in its own axes."""
+    if turn is None:
+        return camera
+    quat = np.array([*(-turn / 2), 1.0])
+    return replace(camera, mount_from_camera=camera.mount_from_camera @ Pose(quat_xyzw=quat / np.linalg.norm(quat)))
+
+
+def _turns(
+    info: EpisodeInfo, world: RecordedWorld, counts: Mapping[str, tuple[int, int]], colors: Mapping[str, Cells]
+) -> dict[str, Array]:
+    """Camera name -> (3,) rotation vector of its calibration error, rad in its own axes, where pictures show one."""
+    told = {camera.name: info.behaviour.get(f"calibration_{camera.name}_angle", 0.0) for camera in world.scene.cameras}
+    cameras = [camera for camera in world.scene.cameras if told[camera.name] and len(colors[camera.name])]
+    if not cameras:
+        return {}
+    count = min(len(colors[camera.name]) for camera in cameras)
+    frames = np.unique(np.linspace(0, count - 1, _NUM_FITTED).round().astype(np.int64))
+    turns: dict[str, Array] = {camera.name: np.zeros(3) for camera in cameras}
+    for _ in range(_NUM_STEPS):
+        now = [_turned_back(camera, turns[camera.name]) for camera in cameras]
+        drawn = draw(world, now, frames, dict.fromkeys(turns, ("color",)), counts)
+        for camera in cameras:
+            right, down, _, about = fit(colors[camera.name][:count], drawn.cells[camera.name, "color"], frames)
+            columns, rows = counts[camera.name]
+            # What is seen in the direction (x, y, 1) moves by the turn's cross product with it.
+            size = np.array([-1 / rows, camera.width / camera.height / columns]) * _height(camera)
+            turns[camera.name] = turns[camera.name] + np.array([size[0] * down, size[1] * right, about])
+    return {name: turn for name, turn in turns.items() if np.linalg.norm(turn) <= _TURN_MARGIN * told[name]}
+
+
+def _height(camera: Camera) -> float:
+    """Of the picture, at a distance of 1."""
+    return float(2 * np.tan(camera.fov_y / 2))

@@ -1,0 +1,288 @@
+"""HDF5 files of unknown origin, read within bounds and in pieces.
+
+Anyone writes HDF5 files, and people pass them on. A link in one can lead into any other file of the machine, a dataset
+can have its numbers elsewhere or claim rows that nobody wrote, and a few kB can unpack to terabytes: all of these are
+refused. No objects are made of what is in a file but numbers and short texts.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import Literal, Self
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.errors import DemorecError, resource_error
+from demorec.recording.limits import LimitError, Limits
+from demorec.registry import nearest_match
+from demorec.safety.files import HDF5_MAGIC, open_regular
+
+Kind = Literal["group", "dataset", "other"]
+Scalar = str | bool | int | float
+_MAX_CHILDREN = 100_000
+_MAX_CHUNK_BYTES = 1 << 28
+_MAX_ATTRIBUTE_BYTES = 16 << 20
+_MAX_NAME = 1000
+_MAX_DEPTH = 6
+_BLOCK_BYTES = 8 << 20
+"""Of rows that are read at once; whole chunks of the file, unless these are larger than `_MAX_BLOCK_BYTES`."""
+_MAX_BLOCK_BYTES = 64 << 20
+_REASONS = (
+    ("truncated file", "it is cut off"),
+    ("required filter", "it is compressed in a way that is not installed here"),
+    ("can't open directory", "it is compressed in a way that is not installed here"),  # that of filters
+    ("No NumPy equivalent", "it is of a kind that is no plain number"),
+)
+"""What the HDF5 library says, and what it means; all else means that the file is damaged."""
+
+
+class Hdf5Error(DemorecError):
+    """An HDF5 file cannot be read, or does not hold what it should."""
+
+
+class StoredArray:
+    """A dataset whose numbers are all in the file.
+
+    Attributes:
+        place: Its name in the file.
+        shape: Of all rows.
+        dtype: Of a number: integer, float or bool.
+    """
+
+    def __init__(self, file: Path, place: str, dataset: h5py.Dataset) -> None:
+        self.place = place
+        self.shape: tuple[int, ...] = dataset.shape
+        self.dtype: np.dtype[np.generic] = dataset.dtype
+        self._file, self._dataset = file, dataset
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def read(self, begin: int, end: int) -> NDArray[np.generic]:
+        """Rows from `begin` to before `end`; Hdf5Error when they cannot be read."""
+        try:
+            rows: NDArray[np.generic] = self._dataset[begin:end]
+        except (OSError, RuntimeError, ValueError, KeyError, TypeError, MemoryError) as error:
+            raise _unreadable(error, f"{self.place} cannot be read", self._file) from error
+        return rows
+
+    def rows(self) -> Iterator[NDArray[np.generic]]:
+        """One row after the other, some of them in memory at a time."""
+        step = self._rows_at_once()
+        for begin in range(0, len(self), step):
+            yield from self.read(begin, min(begin + step, len(self)))
+
+    def attribute(self, name: str) -> Scalar | None:
+        """An attribute of the dataset, as of `ForeignFile.attribute`."""
+        return _attribute(self._dataset, name, self.place, self._file)
+
+    def _rows_at_once(self) -> int:
+        row = max(1, math.prod(self.shape[1:]) * self.dtype.itemsize)
+        chunk = self._dataset.chunks[0] if self._dataset.chunks else 1
+        step = chunk * max(1, _BLOCK_BYTES // (chunk * row))
+        return step if step * row <= _MAX_BLOCK_BYTES else max(1, _MAX_BLOCK_BYTES // row)
+
+
+class ForeignFile:
+    """An HDF5 file that anyone may have written; a context manager.
+
+    Attributes:
+        path: Of it.
+
+    Raises:
+        Hdf5Error: It is none, cut off or damaged; so do all methods.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._claimed: dict[str, int] = {}
+        try:
+            with open_regular(path) as file:
+                if file.read(len(HDF5_MAGIC)) != HDF5_MAGIC:
+                    raise Hdf5Error(f"This is no HDF5 file: {path}")
+                self._limits = Limits.of_file(os.fstat(file.fileno()).st_size)
+            self._root = h5py.File(path, "r", locking=False)
+        except (OSError, RuntimeError, ValueError) as error:
+            raise _unreadable(error, "The HDF5 file cannot be read", path) from error
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._root.close()
+
+    def children(self, place: str) -> dict[str, Kind]:
+        """What a group holds: name -> what it is; links are "other"."""
+        group = self._group(place)
+        try:
+            if len(group) > _MAX_CHILDREN:
+                raise Hdf5Error(f"{_shown(place)} has {len(group):,} entries, at most {_MAX_CHILDREN:,} are read")
+            return {str(name): self._kind(group, str(name)) for name in group}
+        except (OSError, RuntimeError, ValueError, KeyError, TypeError) as error:
+            raise _unreadable(error, f"{_shown(place)} cannot be read", self.path) from error
+        except Hdf5Error as error:
+            raise Hdf5Error(f"{error}: {self.path}") from error
+
+    def datasets(self, place: str) -> Iterator[str]:
+        """The places of all datasets below a group, some levels deep: a group may be in itself."""
+        waiting, found = [(place, 0)], 0
+        while waiting:
+            group, depth = waiting.pop()
+            below = [(f"{group}/{name}".lstrip("/"), kind) for name, kind in self.children(group).items()]
+            names = [name for name, kind in below if kind == "dataset"]
+            found += len(below)
+            yield from names
+            if depth < _MAX_DEPTH and found < _MAX_CHILDREN:
+                waiting += [(name, depth + 1) for name, kind in reversed(below) if kind == "group"]
+
+    def has(self, place: str) -> bool:
+        """Whether there is a group or dataset of that name; what a link leads to is not there."""
+        try:
+            self._find(place)
+        except Hdf5Error:
+            return False
+        return True
+
+    def is_group(self, place: str) -> bool:
+        """Whether there is a group of that name."""
+        try:
+            return isinstance(self._find(place), h5py.Group)
+        except Hdf5Error:
+            return False
+
+    def attribute(self, place: str, name: str) -> Scalar | None:
+        """A text, number or boolean that is an attribute of a group or dataset; None when it has none of that name."""
+        return _attribute(self._find(place), name, _shown(place), self.path)
+
+    def array(self, place: str) -> StoredArray:
+        """A dataset of rows.
+
+        Raises:
+            Hdf5Error: There is none, it holds no plain numbers, has no rows, was never written, leads out of the file,
+                or claims more than a file of this size may unpack to.
+        """
+        found = self._find(place)
+        try:
+            reason = _why_unusable(found)
+            if not reason:
+                self._claimed[place] = found.nbytes
+                self._limits.check_total(sum(self._claimed.values()))
+        except LimitError as error:
+            raise Hdf5Error(f"The HDF5 file is not read, since {error}: {self.path}") from error
+        except (OSError, RuntimeError, ValueError, TypeError) as error:
+            raise _unreadable(error, f"{place} cannot be read", self.path) from error
+        if reason:
+            raise Hdf5Error(f"{place} cannot be used, since {reason}: {self.path}")
+        return StoredArray(self.path, place, found)
+
+    def names(self, place: str) -> list[str]:
+        """A dataset of texts, as robomimic's masks are.
+
+        Raises:
+            Hdf5Error: There is none, or it is no list of so many short texts.
+        """
+        found = self._find(place)
+        try:
+            is_list = isinstance(found, h5py.Dataset) and len(found.shape or ()) == 1 and not found.is_virtual
+            kind = h5py.check_string_dtype(found.dtype) if is_list else None
+            if kind is None or found.external or len(found) > _MAX_CHILDREN or (kind.length or 0) > _MAX_NAME:
+                raise Hdf5Error(f"{place} is no list of texts: {self.path}")
+            return [str(text) for text in found.asstr(errors="replace")[:]]
+        except (OSError, RuntimeError, ValueError, TypeError) as error:
+            raise _unreadable(error, f"{place} cannot be read", self.path) from error
+
+    def _group(self, place: str) -> h5py.Group:
+        found = self._find(place)
+        if not isinstance(found, h5py.Group):
+            raise Hdf5Error(f"{_shown(place)} is no group: {self.path}")
+        return found
+
+    def _find(self, place: str) -> h5py.Group | h5py.Dataset:
+        """What has a name, by hard links alone: others can lead out of the file, or in circles."""
+        found: h5py.Group | h5py.Dataset = self._root
+        walked = ""
+        try:
+            for part in filter(None, place.split("/")):
+                names = found if isinstance(found, h5py.Group) else ()
+                if part not in names:
+                    near = nearest_match(part, list(names)[:_MAX_CHILDREN]).rstrip("?")
+                    raise Hdf5Error(f"There is no {walked}{part}.{near and f'{near}?'}".rstrip(".") + f": {self.path}")
+                if self._kind(found, part) == "other":
+                    raise Hdf5Error(
+                        f"{walked}{part} is a link or a type, only groups and datasets within the file are read: "
+                        f"{self.path}"
+                    )
+                found, walked = found[part], f"{walked}{part}/"
+        except (OSError, RuntimeError, ValueError, KeyError, TypeError) as error:
+            raise _unreadable(error, f"{walked}{part} cannot be read", self.path) from error
+        return found
+
+    @staticmethod
+    def _kind(group: h5py.Group, name: str) -> Kind:
+        if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+            return "other"
+        kind = group.get(name, getclass=True)
+        return "group" if kind is h5py.Group else "dataset" if kind is h5py.Dataset else "other"
+
+
+def _why_unusable(found: h5py.Group | h5py.Dataset) -> str:
+    """Why the numbers of a dataset are not read, in words; "" when they are."""
+    if not isinstance(found, h5py.Dataset):
+        return "it is a group"
+    if found.dtype.kind not in "fiub" or found.dtype.itemsize > 8:
+        return f"it holds {found.dtype.name if found.dtype.kind != 'O' else 'objects'}, no plain numbers"
+    if not found.shape:
+        return "it has no rows"
+    if found.is_virtual or found.external:
+        return "its numbers are in other files"
+    if found.chunks and math.prod(found.chunks) * found.dtype.itemsize > _MAX_CHUNK_BYTES:
+        return f"its chunks have more than {_MAX_CHUNK_BYTES >> 20} MB"
+    return "" if found.size == 0 or _is_written(found) else "not all of its rows were written"
+
+
+def _is_written(dataset: h5py.Dataset) -> bool:
+    """Whether all rows are in the file; HDF5 invents zeros for those that are not."""
+    if dataset.chunks:
+        counts = [-(-size // chunk) for size, chunk in zip(dataset.shape, dataset.chunks, strict=True)]
+        return bool(dataset.id.get_num_chunks() == math.prod(counts))
+    return bool(dataset.id.get_storage_size() >= dataset.nbytes)
+
+
+def _attribute(found: h5py.Group | h5py.Dataset, name: str, place: str, path: Path) -> Scalar | None:
+    try:
+        if name not in found.attrs:
+            return None
+        stored = found.attrs.get_id(name)
+        is_empty = stored.get_space().get_simple_extent_type() == h5py.h5s.NULL
+        if is_empty or stored.shape not in ((), (1,)) or stored.get_storage_size() > _MAX_ATTRIBUTE_BYTES:
+            return None
+        value = found.attrs[name]
+        return _scalar(value.item() if isinstance(value, np.ndarray) else value)
+    except (OSError, RuntimeError, ValueError, KeyError, TypeError) as error:
+        raise _unreadable(error, f"The attribute {name} of {place} cannot be read", path) from error
+
+
+def _scalar(value: object) -> Scalar | None:
+    if isinstance(value, bytes):
+        return value.decode(errors="replace")
+    if isinstance(value, np.generic):
+        value = value.item()
+    return value if isinstance(value, str | bool | int | float) else None
+
+
+def _shown(place: str) -> str:
+    return place or "The file's root"
+
+
+def _unreadable(error: BaseException, what: str, path: Path) -> DemorecError:
+    reason = error.strerror if isinstance(error, OSError) else ""
+    reason = reason or next((words for said, words in _REASONS if said in str(error)), "it is damaged")
+    return resource_error(error, path) or Hdf5Error(f"{what} ({reason}): {path}")

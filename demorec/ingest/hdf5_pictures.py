@@ -1,0 +1,148 @@
+"""The pictures of a camera in an HDF5 file: JPEG files, pixels and distances as they are."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.config import MAX_PIXELS
+from demorec.hdf5.foreign import StoredArray
+from demorec.ingest.fields import FieldError
+from demorec.ingest.frames_writer import Picture
+from demorec.ingest.hdf5_features import Hdf5FitError
+from demorec.ingest.hdf5_mapping import CameraDataset
+from demorec.ingest.picture_messages import PictureHead, decode_picture, picture_head
+from demorec.scene.collected import CollectedCamera, Kept
+
+_JPEG_END = b"\xff\xd9"
+
+
+class StoredCamera:
+    """A camera of an episode.
+
+    Attributes:
+        width, height: Pixels.
+        kept: "jpeg" where JPEG files stay as they are, "16UC1" or "32FC1" of distances; "" for pixels, which are coded
+            once.
+        told: What becomes of the pictures, in words.
+
+    Args:
+        name: Of the camera.
+        camera: What the mapping says of it.
+        array: Its dataset.
+        lengths: (C, T) of the JPEG files of all cameras, in an order of cameras that nobody tells; None where the file
+            has none.
+
+    Raises:
+        Hdf5FitError: They are no pictures.
+        Hdf5Error: They cannot be read.
+    """
+
+    def __init__(
+        self, name: str, camera: CameraDataset, array: StoredArray, lengths: NDArray[np.generic] | None
+    ) -> None:
+        self.name = name
+        self._camera, self._array, self._lengths = camera, array, lengths
+        self.kept: Kept = ""
+        shape = array.shape
+        form = picture_form(array)
+        if form is None:
+            found = f"{array.dtype.name} of {'x'.join(map(str, shape))}"
+            raise Hdf5FitError(
+                f"{array.place} is {found}, pictures are uint8 of rows, height, width and 3 colours, or rows of JPEG, "
+                "distances uint16 or float32 of rows, height and width"
+            )
+        self._form = form
+        if form == "jpeg":
+            head = self._head(self._jpeg(array.read(0, 1)[0], 0), 0)
+            self.width, self.height = head.width, head.height
+            self.kept = "jpeg" if camera.colors == "rgb" else ""
+            self.told = "jpeg kept as it is" if self.kept else "jpeg with red and blue exchanged, coded once"
+        elif form == "depth":
+            self.height, self.width = shape[1:3]
+            self.kept = "16UC1" if array.dtype.itemsize == 2 else "32FC1"
+            self.told = f"distances ({self.kept}) kept as they are"
+        else:
+            self.height, self.width = shape[1:3]
+            self.told = f"pixels{'' if camera.colors == 'rgb' else ' with red and blue exchanged'}, coded once"
+        if not 1 <= self.width * self.height <= MAX_PIXELS:
+            raise Hdf5FitError(f"{array.place} has {self.width}x{self.height} pixels, allowed are 1 to {MAX_PIXELS}")
+
+    def described(self) -> CollectedCamera:
+        """The camera as recordings know it."""
+        return CollectedCamera(
+            name=self.name, width=self.width, height=self.height, kept=self.kept, source=self._camera.dataset
+        )
+
+    def pictures(self) -> Iterator[Picture]:
+        """One a row.
+
+        Raises:
+            Hdf5FitError: A JPEG file is cut off, or of another size.
+            Hdf5Error: They cannot be read.
+        """
+        for number, row in enumerate(self._array.rows()):
+            if self._form != "jpeg":
+                yield self._plain(row)
+                continue
+            data = self._jpeg(row, number)
+            head = self._head(data, number)
+            if (head.width, head.height) != (self.width, self.height):
+                raise Hdf5FitError(
+                    f"{self._array.place} changes its size to {head.width}x{head.height} in row {number}"
+                )
+            yield data if self.kept else self._ordered(self._decoded(data, number))
+
+    def _plain(self, row: NDArray[np.generic]) -> Picture:
+        if self._form == "depth":
+            return row.reshape(self.height, self.width).astype(row.dtype.newbyteorder("="), copy=False)
+        return self._ordered(row.astype(np.uint8, copy=False))
+
+    def _ordered(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        return picture if self._camera.colors == "rgb" else np.ascontiguousarray(picture[:, :, ::-1])
+
+    def _jpeg(self, row: NDArray[np.generic], number: int) -> bytes:
+        """The JPEG file of a row, without what pads it: it ends with its own mark, and never with a zero."""
+        data = row.tobytes().rstrip(b"\0")
+        if not data.endswith(_JPEG_END):
+            raise Hdf5FitError(f"{self._array.place} holds no whole JPEG file in row {number}")
+        if self._lengths is not None and len(data) not in self._lengths[:, number].tolist():
+            raise Hdf5FitError(
+                f"{self._array.place} holds {len(data):,} bytes of JPEG in row {number}, which is none of the lengths "
+                "that compress_len tells"
+            )
+        return data
+
+    def _head(self, data: bytes, number: int) -> PictureHead:
+        try:
+            head = picture_head({"format": "jpeg", "data": data})
+        except FieldError as error:
+            raise Hdf5FitError(f"{self._array.place} cannot be used in row {number}, since {error}") from error
+        if head.format != "jpeg":
+            raise Hdf5FitError(f"{self._array.place} holds {head.format} in row {number}, no JPEG file")
+        return head
+
+    def _decoded(self, data: bytes, number: int) -> NDArray[np.uint8]:
+        try:
+            return decode_picture({"format": "jpeg", "data": data})
+        except FieldError as error:
+            raise Hdf5FitError(f"{self._array.place} cannot be used in row {number}, since {error}") from error
+
+
+def picture_form(array: StoredArray) -> Literal["pixels", "jpeg", "depth"] | None:
+    """What the rows of a dataset can be as pictures; None for numbers that are none."""
+    shape, kind = array.shape, array.dtype
+    if kind == np.uint8:
+        return "jpeg" if len(shape) == 2 else "pixels" if len(shape) == 4 and shape[3] == 3 else None
+    is_flat = len(shape) == 3 or (len(shape) == 4 and shape[3] == 1)
+    return "depth" if is_flat and (kind.kind, kind.itemsize) in (("u", 2), ("f", 4)) else None
+
+
+def picture_lengths(array: StoredArray, num_rows: int) -> NDArray[np.generic]:
+    """(C, T) of ALOHA's `compress_len`; Hdf5FitError when it is of another shape."""
+    if len(array.shape) != 2 or array.shape[1] != num_rows:
+        raise Hdf5FitError(f"{array.place} has the shape {array.shape}, it must have {num_rows} columns")
+    return array.read(0, len(array))

@@ -1,0 +1,178 @@
+"""What all mappings have in common: parts of features, their units, and the strict reading of TOML into dataclasses."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import tomllib
+import typing
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, Protocol
+
+from demorec.errors import ConfigError
+from demorec.plain import from_plain
+from demorec.registry import nearest_match
+from demorec.safety.files import read_text_limited
+
+Unit = Literal["", "rad", "degree", "percent", "m", "mm"]
+STATE = "observation.state"
+ACTION = "action"
+MAX_FPS = 1000
+MAX_ELEMENTS = 4096
+"""Of a part: more is a picture or a point cloud, not a vector."""
+_MAX_FILE_BYTES = 1 << 20
+
+
+@dataclass(frozen=True, kw_only=True)
+class Part:
+    """A part of a feature: which numbers of a vector are taken, what they are called, and in which unit.
+
+    Attributes:
+        elements: By number, in this order (auto: all).
+        names: Of the elements in the feature (auto: as the source calls them).
+        prefix: In front of each name, for two arms with the same names.
+        unit: Of the source.
+        to: Unit of the feature (auto: the source's, so that no bit changes).
+        limits: [lowest, highest] of each element in the unit `to`, which -100..100 ("percent") stands for.
+        next: In place of a source: the feature whose value at the next row this one has.
+    """
+
+    elements: tuple[int, ...] = ()
+    names: tuple[str, ...] = ()
+    prefix: str = ""
+    unit: Unit = ""
+    to: Unit = ""
+    limits: tuple[tuple[float, float], ...] = ()
+    next: str = ""
+
+
+class AnyMapping(Protocol):
+    """A mapping, of whatever kind of file."""
+
+    def problems(self) -> Iterator[str]:
+        """What is impossible in it, whatever the file."""
+
+
+def feature_problems(features: Mapping[str, Sequence[Part]]) -> Iterator[str]:
+    """What is impossible in features, whatever their parts are taken from."""
+    if STATE not in features:
+        yield f"there is no feature {STATE!r}"
+    for name, parts in features.items():
+        if "/" in name or not name or name.startswith("observation.images"):
+            yield f"a feature cannot be called {name!r}"
+        if not parts:
+            yield f"the feature {name!r} has no source"
+        for part in parts:
+            yield from _part_problems(f"the feature {name!r}", name, part, features)
+
+
+def _part_problems(place: str, name: str, part: Part, features: Mapping[str, Sequence[Part]]) -> Iterator[str]:
+    if part.next and len(features[name]) > 1:
+        yield f"{place} has other sources beside next"
+    if part.next:
+        known = [other for other in features if other != name]
+        if part.next not in known:
+            yield f"{place} follows {part.next!r}, which is no feature.{nearest_match(part.next, known)}".rstrip(".")
+        elif any(other.next for other in features[part.next]):
+            yield f"{place} follows {part.next!r}, which follows another feature itself"
+    if len(set(part.elements)) != len(part.elements):
+        yield f"{place} names an element twice"
+    if any(element < 0 for element in part.elements):
+        yield f"{place} names an element below 0"
+    pair = (part.unit, part.to or part.unit)
+    if pair not in _CONVERSIONS and pair[0] != pair[1]:
+        yield f"{place} cannot turn {part.unit or 'no unit'} into {part.to}"
+    if "percent" in pair and pair[0] != pair[1] and not part.limits:
+        yield f"{place} needs limits, since -100..100 stands for each joint's own range"
+    if any(not low < high for low, high in part.limits):
+        yield f"{place} has limits that are not [lowest, highest]"
+
+
+def camera_name_problems(cameras: Mapping[str, object]) -> Iterator[str]:
+    """Names that no camera can have."""
+    for name in cameras:
+        if not name.isidentifier():
+            yield f"a camera cannot be called {name!r}: letters, digits and underscores are allowed"
+
+
+_CONVERSIONS: Mapping[tuple[str, str], float] = {
+    ("degree", "rad"): math.pi / 180,
+    ("rad", "degree"): 180 / math.pi,
+    ("mm", "m"): 1e-3,
+    ("m", "mm"): 1e3,
+    ("percent", "rad"): math.nan,
+    ("percent", "degree"): math.nan,
+    ("percent", "m"): math.nan,
+}
+"""(unit of the source, unit of the feature) -> factor; NaN where each element has its own."""
+
+
+def conversion_factor(unit: str, to: str) -> float | None:
+    """What numbers are multiplied with; None for not at all, NaN where `Part.limits` say it for each element."""
+    return _CONVERSIONS.get((unit, to or unit))
+
+
+def recorded_unit(unit: str) -> str:
+    """What recordings call a unit."""
+    return "deg" if unit == "degree" else unit
+
+
+def read_mapping_file[M: AnyMapping](path: Path, kind: type[M]) -> M:
+    """A mapping from its TOML file; ConfigError tells all that is wrong with it at once."""
+    try:
+        data = tomllib.loads(read_text_limited(path, _MAX_FILE_BYTES))
+    except OSError as error:
+        raise ConfigError(f"The mapping cannot be read ({error.strerror}): {path}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise ConfigError(f"The mapping is no valid TOML ({error}): {path}") from error
+    unknown = list(_unknown_keys(data, kind, ""))
+    if unknown:
+        raise ConfigError(f"The mapping cannot be used: {'; '.join(unknown)}: {path}")
+    try:
+        mapping = from_plain(_whole_numbers_as_floats(data, kind), kind)
+    except ValueError as error:
+        raise ConfigError(f"The mapping cannot be used: {error}: {path}") from error
+    if problems := list(mapping.problems()):
+        raise ConfigError(f"The mapping cannot be used: {'; '.join(problems)}: {path}")
+    return mapping
+
+
+def _children(value: Any, kind: Any) -> Iterator[tuple[str, Any, Any]]:
+    """(key, value, type) of what is in a table or list that a type describes."""
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if dataclasses.is_dataclass(kind) and isinstance(value, dict):
+        hints = typing.get_type_hints(kind)
+        for key, item in value.items():
+            if key in hints:
+                yield key, item, hints[key]
+    elif origin is not None and isinstance(value, dict) and len(arguments) == 2:
+        for key, item in value.items():
+            yield key, item, arguments[1]
+    elif origin is tuple and isinstance(value, list):
+        for item in value:
+            yield "", item, arguments[0]
+
+
+def _unknown_keys(value: Any, kind: Any, place: str) -> Iterator[str]:
+    if dataclasses.is_dataclass(kind) and isinstance(value, dict):
+        known = [row.name for row in dataclasses.fields(kind)]
+        where = f" in {place}" if place else ""
+        for key in value:
+            if key not in known:
+                yield f"unknown key {key!r}{where}.{nearest_match(key, known)}".rstrip(".")
+    for key, item, child in _children(value, kind):
+        yield from _unknown_keys(item, child, f"{place}.{key}".strip("."))
+
+
+def _whole_numbers_as_floats(value: Any, kind: Any) -> Any:
+    """The same, with `max_age_s = 1` as 1.0, which people write and the strict reader of dataclasses refuses."""
+    if isinstance(value, int) and not isinstance(value, bool) and float in (kind, *typing.get_args(kind)):
+        return float(value)
+    if isinstance(value, list) and typing.get_origin(kind) is tuple:
+        arguments = typing.get_args(kind)
+        return [_whole_numbers_as_floats(item, arguments[0]) for item in value]
+    if isinstance(value, dict):
+        return value | {key: _whole_numbers_as_floats(item, child) for key, item, child in _children(value, kind)}
+    return value

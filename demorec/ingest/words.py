@@ -1,0 +1,27 @@
+"""Words of mappings: the task that a file's name tells, names that are not taken yet, texts as TOML."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Container
+
+_NUMBER = re.compile(r"[_\-. \d]*\d$")
+"""Of an episode or a day. Names are foreign: a repetition within another would take exponential time."""
+
+
+def task_in_name(name: str) -> str:
+    """The task that a file's name tells: "stack the cups" of "stack_the_cups_003"."""
+    return _NUMBER.sub("", name).replace("_", " ").replace("-", " ").strip()
+
+
+def unique_name(name: str, taken: Container[str]) -> str:
+    """The name, or one like it where it is taken."""
+    while name in taken:
+        name += "_2"
+    return name
+
+
+def quoted(text: str) -> str:
+    """A TOML string."""
+    return json.dumps(text, ensure_ascii=False)

@@ -1,0 +1,583 @@
+"""HDF5 files in the documented layouts of robomimic and ALOHA, written by h5py alone, become runs: h5py judges."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from support.collected import TOP, make_collected
+from support.collected import write_collected as write_collected_recording
+from support.commands import exit_code
+from support.export import data_table, export, make_run
+from support.hdf5 import (
+    ALOHA_CAMERAS,
+    HEIGHT,
+    ROBOMIMIC_LENGTHS,
+    WIDTH,
+    jpeg,
+    pictures,
+    write_aloha,
+    write_robomimic,
+)
+
+from demorec.errors import ConfigError
+from demorec.hdf5.foreign import ForeignFile, Hdf5Error, StoredArray
+from demorec.ingest.frames_writer import Picture
+from demorec.ingest.hdf5_features import Hdf5FitError, stored_feature
+from demorec.ingest.hdf5_import import Hdf5Import, import_hdf5
+from demorec.ingest.hdf5_mapping import DatasetPart
+from demorec.ingest.hdf5_pictures import StoredCamera
+from demorec.ingest.hdf5_suggest import suggested_hdf5_mapping
+from demorec.recording import CollectedRecording, Recording
+from demorec.runs.collected import load_collected_run
+
+DEMOS = ("demo_0", "demo_1", "demo_10")
+Vectors = dict[str, NDArray[np.generic]]
+
+
+def recordings(run: Path) -> list[Path]:
+    return sorted((run / "episodes").glob("*.mcap"))
+
+
+def suggested(file: Path, changes: dict[str, str] | None = None) -> Path:
+    """The suggested mapping of a file, with some texts exchanged."""
+    text = "\n".join(suggested_hdf5_mapping(file))
+    for old, new in (changes or {}).items():
+        assert old in text
+        text = text.replace(old, new)
+    path = file.with_suffix(".toml")
+    path.write_text(text)
+    return path
+
+
+def imported(*files: Path, changes: dict[str, str] | None = None) -> tuple[Hdf5Import, Path]:
+    """Files imported by the suggested mapping of the first."""
+    run = files[0].with_name("run")
+    return import_hdf5(files, suggested(files[0], changes), run), run
+
+
+@pytest.fixture(scope="module")
+def robomimic(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A file of robomimic's, and the run that was made of it by its suggested mapping."""
+    file = write_robomimic(tmp_path_factory.mktemp("robomimic") / "demo.hdf5", compression="gzip")
+    return file, imported(file)[1]
+
+
+def test_numbers_of_robomimic_are_those_of_the_file(robomimic: tuple[Path, Path]) -> None:
+    source, run = robomimic
+    with h5py.File(source) as file:
+        for demo, length, path in zip(DEMOS, ROBOMIMIC_LENGTHS, recordings(run), strict=True):
+            obs = {name: file[f"data/{demo}/obs/{name}"][:] for name in file[f"data/{demo}/obs"]}
+            expected = {
+                "observation.state": np.hstack([obs["robot0_joint_pos"], obs["robot0_gripper_qpos"]]),
+                "observation.velocity": np.hstack([obs["robot0_joint_vel"], obs["robot0_gripper_qvel"]]),
+                "observation.ee_pose": np.hstack([obs["robot0_eef_pos"], obs["robot0_eef_quat"]]),
+                "observation.environment_state": obs["object"],
+                "action": file[f"data/{demo}/actions"][:],
+            }
+            with CollectedRecording(path) as recording:
+                columns, info = recording.columns(), recording.info
+            assert columns.features.keys() == expected.keys()
+            for name, values in expected.items():
+                assert columns.features[name].dtype == np.float64
+                np.testing.assert_array_equal(columns.features[name], values)
+            assert (info.robot, info.fps, info.instruction) == ("Panda", 20, "Lift")
+            assert columns.time_ns.tolist() == [50_000_000 * row for row in range(length)]
+            assert {camera.name: (camera.width, camera.height) for camera in info.cameras} == {
+                "agentview": (WIDTH, HEIGHT),
+                "robot0_eye_in_hand": (WIDTH, HEIGHT),
+            }
+
+
+def nearest(shown: NDArray[np.uint8], candidates: NDArray[np.uint8]) -> int:
+    """Which of some pictures one is like."""
+    return int(np.abs(candidates.astype(int) - shown).mean(axis=(1, 2, 3)).argmin())
+
+
+def test_each_row_shows_its_own_picture(robomimic: tuple[Path, Path]) -> None:
+    source, run = robomimic
+    with h5py.File(source) as file:
+        for demo, path in zip(DEMOS, recordings(run), strict=True):
+            with CollectedRecording(path) as recording:
+                for camera in ("agentview", "robot0_eye_in_hand"):
+                    given = file[f"data/{demo}/obs/{camera}_image"][:]
+                    shown = list(recording.images(camera))
+                    assert [nearest(picture, given) for picture in shown] == list(range(len(given)))
+                    assert np.abs(np.array(shown).astype(int) - given).mean() < 8
+
+
+def test_a_mask_chooses_and_a_dataset_tells_the_outcome(tmp_path: Path) -> None:
+    file = write_robomimic(tmp_path / "demo.hdf5")
+    changes = {'# mask = "train"': 'mask = "train"', '# success = "rewards"': 'success = "rewards"'}
+    with h5py.File(file, "r+") as opened:
+        opened["data/demo_10/rewards"][-1] = 0
+    result, run = imported(file, changes=changes)
+    assert (result.num_episodes, result.num_frames) == (2, 13)
+    lines = load_collected_run(run).episodes
+    assert [(line.num_frames, line.success) for line in lines] == [(7, True), (6, False)]
+    assert result.left_out == ("dones", "states", "next_obs")
+
+
+@pytest.mark.parametrize("is_compressed", [False, True])
+def test_aloha_becomes_a_run(is_compressed: bool, tmp_path: Path) -> None:
+    files = [write_aloha(tmp_path / f"episode_{k}.hdf5", is_compressed=is_compressed, seed=k) for k in range(2)]
+    result, run = imported(*files)
+    kept = "jpeg kept as it is" if is_compressed else "pixels, coded once"
+    assert result.cameras == dict.fromkeys(ALOHA_CAMERAS, f"64x48, {kept}")
+    for source, path in zip(files, recordings(run), strict=True):
+        with h5py.File(source) as file, CollectedRecording(path) as recording:
+            actions = [file[name][:] for name in ("action", "base_action") if name in file]
+            expected = {
+                "observation.state": file["observations/qpos"][:],
+                "observation.velocity": file["observations/qvel"][:],
+                "action": np.hstack(actions),
+            }
+            columns = recording.columns()
+            for name, values in expected.items():
+                assert columns.features[name].dtype == np.float32
+                np.testing.assert_array_equal(columns.features[name], values)
+            assert columns.time_ns.tolist() == [20_000_000 * row for row in range(8)]
+            for k, camera in enumerate(ALOHA_CAMERAS):
+                given = pictures(8, 10 * k)
+                if is_compressed:
+                    packets = [packet.data for packet in recording.packets(camera)]
+                    assert packets == [jpeg(picture, 60 + 5 * row) for row, picture in enumerate(given)]
+                assert [nearest(picture, given) for picture in recording.images(camera)] == list(range(8))
+
+
+@pytest.mark.parametrize("is_compressed", [False, True])
+def test_exchanged_colours_are_put_right(is_compressed: bool, tmp_path: Path) -> None:
+    file = write_aloha(tmp_path / "episode_0.hdf5", is_compressed=is_compressed)
+    dataset = 'dataset = "observations/images/cam_high"'
+    result, run = imported(file, changes={dataset: f'{dataset}\ncolors = "bgr"'})
+    assert result.cameras["cam_high"].endswith("with red and blue exchanged, coded once")
+    with CollectedRecording(recordings(run)[0]) as recording:
+        shown = recording.picture("cam_high", 0)
+    red, blue = shown[: HEIGHT // 2, : WIDTH // 2 - 4, 0].mean(), shown[: HEIGHT // 2, : WIDTH // 2 - 4, 2].mean()
+    assert blue - red > 200  # the corner is red in the file
+
+
+def test_the_action_can_be_the_next_state(tmp_path: Path) -> None:
+    file = write_aloha(tmp_path / "episode_0.hdf5")
+    _, run = imported(file, changes={'dataset = "action"': 'next = "observation.state"'})
+    with h5py.File(file) as opened, CollectedRecording(recordings(run)[0]) as recording:
+        columns = recording.columns()
+        np.testing.assert_array_equal(columns.features["action"], opened["observations/qpos"][1:])
+        np.testing.assert_array_equal(columns.features["observation.state"], opened["observations/qpos"][:-1])
+        assert len(columns.pictures["cam_high"]) == 7
+
+
+def test_our_own_file_comes_back_to_the_bit(tmp_path: Path) -> None:
+    export(make_run(tmp_path / "simulated", (8, 7)), tmp_path / "a.hdf5", "hdf5", privileged=True)
+    result, run = imported(tmp_path / "a.hdf5")
+    assert (result.num_episodes, result.num_frames) == (2, 15)
+    with h5py.File(tmp_path / "a.hdf5") as file:
+        for index, path in enumerate(recordings(run)):
+            with (
+                CollectedRecording(path) as recording,
+                Recording(tmp_path / f"simulated/episodes/{path.name}") as simulated,
+            ):
+                found, original, info = recording.columns().features, simulated.columns(), recording.info
+                assert (info.instruction, info.fps) == (simulated.info.instruction, simulated.info.fps)
+                assert info.urdf == simulated.description()
+                assert recording.outcome is not None
+                assert recording.outcome.success is True
+            demo = file[f"data/demo_{index}"]
+            np.testing.assert_array_equal(found["action"], demo["actions"][:])
+            np.testing.assert_array_equal(found["observation.ee_pose"][:, :3], demo["obs/robot0_eef_pos"][:])
+            state = np.hstack([original.joint_position[:, :7], original.gripper_width[:, np.newaxis]])
+            np.testing.assert_array_equal(found["observation.state"], state.astype(np.float32))
+            assert [feature.dtype for feature in info.features] == ["float32"] * len(info.features)
+            assert info.features[0].joints[:7] == simulated.info.robot.joint_names[:7]
+
+
+def test_our_own_file_of_collected_episodes_comes_back(tmp_path: Path) -> None:
+    (tmp_path / "given" / "episodes").mkdir(parents=True)
+    given = make_collected(cameras=(TOP,), num_frames=20, success=False)
+    write_collected_recording(tmp_path / "given" / "episodes" / "episode_000000.mcap", given)
+    export(tmp_path / "given", tmp_path / "a.hdf5", "hdf5", include_failures=True)
+    _, run = imported(tmp_path / "a.hdf5")
+    with CollectedRecording(recordings(run)[0]) as recording:
+        for name in ("observation.state", "observation.force", "action"):
+            expected = [frame.samples[name].vector.astype(np.float32) for frame in given.frames]
+            np.testing.assert_array_equal(recording.columns().features[name], np.array(expected))
+        assert [feature.names for feature in recording.info.features if feature.name == "action"] == [
+            ("shoulder.pos", "elbow.pos", "gripper.pos")
+        ]
+        assert (recording.info.robot, recording.outcome and recording.outcome.success) == ("two_joints", False)
+
+
+@pytest.mark.parametrize("kind", ["uint16", ">f4"])
+def test_distances_stay(kind: str, tmp_path: Path) -> None:
+    file = write_aloha(tmp_path / "episode_0.hdf5")
+    given = np.random.default_rng(3).uniform(0, 5000, (8, HEIGHT, WIDTH)).astype(kind)
+    with h5py.File(file, "r+") as opened:
+        opened["observations/images/cam_high_depth"] = given
+    result, run = imported(file)
+    assert result.cameras["cam_high_depth"].endswith("kept as they are")
+    with CollectedRecording(recordings(run)[0]) as recording:
+        assert recording.depth_cameras == ("cam_high_depth",)
+        found = np.array(list(recording.distances("cam_high_depth")))
+    assert found.dtype == given.dtype.newbyteorder("=")
+    np.testing.assert_array_equal(found, given)
+
+
+def test_distances_of_our_own_file_come_back(tmp_path: Path) -> None:
+    export(make_run(tmp_path / "simulated", (4,), depth=True), tmp_path / "a.hdf5", "hdf5", depth=True)
+    _, run = imported(tmp_path / "a.hdf5")
+    with h5py.File(tmp_path / "a.hdf5") as file, CollectedRecording(recordings(run)[0]) as recording:
+        assert recording.depth_cameras
+        for camera in recording.depth_cameras:
+            expected = file[f"data/demo_0/obs/{camera}"][..., 0]
+            np.testing.assert_array_equal(np.array(list(recording.depth(camera))), expected)
+
+
+@pytest.mark.usefixtures("hf_datasets_cache")
+def test_it_is_checked_and_exported(robomimic: tuple[Path, Path], tmp_path: Path) -> None:
+    from demorec.check.report import CheckOptions, Subject, check_subject
+
+    source, run = robomimic
+    report = check_subject(Subject(path=recordings(run)[0], kind="recording"), CheckOptions())
+    assert not [result.check for result in report.results if result.level == "fail"]
+    export(run, tmp_path / "dataset")
+    actions = np.array(data_table(tmp_path / "dataset").column("action").to_pylist())
+    with h5py.File(source) as file:
+        expected = np.vstack([file[f"data/{demo}/actions"][:] for demo in DEMOS]).astype(np.float32)
+    np.testing.assert_array_equal(actions, expected)
+
+
+def test_the_same_command_again_goes_on(robomimic: tuple[Path, Path], tmp_path: Path) -> None:
+    source, run = robomimic
+    shutil.copytree(run, tmp_path / "run")
+    recordings(tmp_path / "run")[1].unlink()
+    result = import_hdf5([source], source.with_suffix(".toml"), tmp_path / "run")
+    assert (result.num_new, result.num_episodes) == (1, 3)
+    again = [path.read_bytes() for path in recordings(tmp_path / "run")]
+    assert again == [path.read_bytes() for path in recordings(run)]
+
+
+def test_interrupting_leaves_nothing_half_written(
+    robomimic: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source, run = robomimic
+    words = ("import", "hdf5", source, "--mapping", source.with_suffix(".toml"), "--out", tmp_path / "run")
+    given, calls = StoredCamera._ordered, iter(range(1000))
+
+    def interrupted(self: StoredCamera, picture: NDArray[np.uint8]) -> Picture:
+        if next(calls) == 19:  # in the second episode
+            raise KeyboardInterrupt
+        return given(self, picture)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(StoredCamera, "_ordered", interrupted)
+        assert exit_code(*words) == 130
+    assert [path.name for path in (tmp_path / "run/episodes").iterdir()] == ["episode_000000.mcap"]
+    assert exit_code(*words) == 0
+    assert "1 of 3 episodes had been imported before." in capsys.readouterr().err
+    assert [path.read_bytes() for path in recordings(tmp_path / "run")] == [
+        path.read_bytes() for path in recordings(run)
+    ]
+
+
+def test_pictures_are_read_by_whole_chunks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    given = pictures(23, 0)
+    with h5py.File(tmp_path / "a.hdf5", "w") as file:
+        file.create_dataset("images", data=given, chunks=(4, 12, 16, 3), compression="gzip")
+    read, asked = StoredArray.read, list[tuple[int, int]]()
+
+    def noted(self: StoredArray, begin: int, end: int) -> NDArray[np.generic]:
+        asked.append((begin, end))
+        return read(self, begin, end)
+
+    monkeypatch.setattr(StoredArray, "read", noted)
+    monkeypatch.setattr("demorec.hdf5.foreign._BLOCK_BYTES", 9 * given[0].nbytes)
+    with ForeignFile(tmp_path / "a.hdf5") as opened:
+        np.testing.assert_array_equal(np.array(list(opened.array("images").rows())), given)
+    assert asked == [(0, 8), (8, 16), (16, 23)]
+    assert all(before[1] == after[0] for before, after in pairwise(asked))
+
+
+def _soft_link(file: h5py.File) -> None:
+    del file["data/demo_1/actions"]
+    file["data/demo_1/actions"] = h5py.SoftLink("/data/demo_0/actions")
+
+
+def _external_link(file: h5py.File) -> None:
+    del file["data/demo_1"]
+    file["data/demo_1"] = h5py.ExternalLink("/etc/passwd", "/x")
+
+
+def _replaced(name: str, make: Callable[[h5py.Group, str], object]) -> Callable[[h5py.File], None]:
+    def replace(file: h5py.File) -> None:
+        group = file["data/demo_1"]
+        del group[name]
+        make(group, name)
+
+    return replace
+
+
+def _external_storage(group: h5py.Group, name: str) -> None:
+    group.create_dataset(name, (5, 7), "f8", external=[("/etc/passwd", 0, 280)])
+
+
+def _virtual(group: h5py.Group, name: str) -> None:
+    layout = h5py.VirtualLayout((5, 7), "f8")
+    layout[:] = h5py.VirtualSource("/tmp/other.hdf5", "x", shape=(5, 7))
+    group.create_virtual_dataset(name, layout)
+
+
+def _set(place: str, row: int, value: float) -> Callable[[h5py.File], None]:
+    def change(file: h5py.File) -> None:
+        file[place][row] = value
+
+    return change
+
+
+def _without_masked(file: h5py.File) -> None:
+    del file["mask"]
+    file["mask/train"] = np.array(["demo_7"], dtype="S")
+
+
+def _attribute(place: str, name: str, value: object) -> Callable[[h5py.File], None]:
+    return lambda file: file[place].attrs.__setitem__(name, value)
+
+
+FAULTS: dict[str, tuple[Callable[[h5py.File], object], str]] = {
+    "no such key": (lambda file: file["data/demo_1/obs"].move("object", "objekt"), "Did you mean 'objekt'"),
+    "no episodes": (lambda file: [file.__delitem__(f"data/{name}") for name in DEMOS], "no episodes in data"),
+    "other lengths": (
+        _replaced("actions", lambda group, name: group.__setitem__(name, np.zeros((4, 7)))), "demo_1/actions has 4 rows"
+    ),
+    "num_samples": (_attribute("data/demo_1", "num_samples", 9), "num_samples says 9"),
+    "nan": (_set("data/demo_1/obs/object", 3, float("nan")), "data/demo_1/obs/object is nan in row 3 (object_0)"),
+    "infinite": (_set("data/demo_10/actions", 0, float("inf")), "data/demo_10/actions is inf in row 0"),
+    "texts": (_replaced("actions", lambda group, name: group.__setitem__(name, ["a"] * 5)), "it holds objects"),
+    "claims": (
+        _replaced("actions", lambda group, name: group.create_dataset(name, (10**12, 7), "f8", chunks=(10**6, 7))),
+        "not all of its rows were written",
+    ),
+    "unwritten": (
+        _replaced("actions", lambda group, name: group.create_dataset(name, (5, 7), "f8")), "not all of its rows"
+    ),
+    "another shape": (
+        _replaced("actions", lambda group, name: group.__setitem__(name, np.zeros((5, 2, 7)))), "is an array of 5x2x7"
+    ),
+    "another width": (
+        _replaced("actions", lambda group, name: group.__setitem__(name, np.zeros((5, 8)))), "The episodes differ"
+    ),
+    "pictures of floats": (
+        lambda file: (
+            file.__delitem__("data/demo_1/obs/agentview_image"),
+            file.__setitem__("data/demo_1/obs/agentview_image", np.zeros((5, 8, 8, 3))),
+        ),
+        "pictures are uint8",
+    ),
+    "soft link": (_soft_link, "data/demo_1/actions is a link"),
+    "external link": (_external_link, "data/demo_1 is a link"),
+    "masked external link": (_external_link, "data/demo_1 is a link"),
+    "whole numbers": (
+        _replaced("actions", lambda group, name: group.__setitem__(name, np.full((5, 7), 2**53 + 1))),
+        "whole numbers that float64 cannot hold",
+    ),
+    "external storage": (_replaced("actions", _external_storage), "its numbers are in other files"),
+    "virtual": (_replaced("actions", _virtual), "its numbers are in other files"),
+    "rate": (_attribute("data", "env_args", '{"env_kwargs": {"control_freq": 12.5}}'), "12.5 rows a second"),
+    "no rate": (_attribute("data", "env_args", "{"), "give clock.fps in the mapping"),
+    "mask": (_without_masked, "demo_7"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", sorted(FAULTS))
+def test_bad_input_is_refused_in_one_sentence(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    fault, told = FAULTS[name]
+    file = write_robomimic(tmp_path / "demo.hdf5")
+    changes = {'# mask = "train"': 'mask = "train"'} if name == "mask" else {}
+    mapping, before = suggested(file, changes), file.read_bytes()
+    if name == "masked external link":
+        mapping.write_text(mapping.read_text().replace('# mask = "train"', 'mask = "valid"'))
+    with h5py.File(file, "r+") as opened:
+        fault(opened)
+    assert file.read_bytes() != before
+    _refused(file, mapping, told, capsys)
+
+
+def _refused(file: Path, mapping: Path, told: str, capsys: pytest.CaptureFixture[str]) -> None:
+    run = file.with_name("run")
+    capsys.readouterr()
+    assert exit_code("import", "hdf5", file, "--mapping", mapping, "--out", run) in (1, 2)
+    out, err = capsys.readouterr()
+    assert told in err
+    assert err.startswith("demorec import: ")
+    assert (err.count("\n"), out) == (1, "")
+    assert not list(run.rglob("*.mcap*"))
+
+
+def test_a_mask_leaves_links_out(tmp_path: Path) -> None:
+    file = write_robomimic(tmp_path / "demo.hdf5")
+    mapping = suggested(file, {'# mask = "train"': 'mask = "train"'})
+    with h5py.File(file, "r+") as opened:
+        _external_link(opened)
+    assert import_hdf5([file], mapping, tmp_path / "run").num_episodes == 2
+
+
+@pytest.mark.parametrize("edge", [2**53, -(2**53)])
+def test_whole_numbers_are_exact(edge: int, tmp_path: Path) -> None:
+    def array(name: str) -> StoredArray:
+        return opened.array(name)
+
+    with h5py.File(tmp_path / "a.hdf5", "w") as file:
+        file["held"] = np.array([[edge]])
+        file["other"] = np.array([[edge + (1 if edge > 0 else -1)]])
+        file["unsigned"] = np.array([[2**64 - 1]], np.uint64)
+    with ForeignFile(tmp_path / "a.hdf5") as opened:
+        held = stored_feature("a", [DatasetPart(dataset="held")], [array("held")], shift=0)
+        assert [vector.tolist() for vector in held.vectors(1)] == [[edge]]
+        for name in ("other", "unsigned"):
+            feature = stored_feature("a", [DatasetPart(dataset=name)], [array(name)], shift=0)
+            with pytest.raises(Hdf5FitError, match="whole numbers that float64 cannot hold"):
+                list(feature.vectors(1))
+
+
+def test_rows_of_a_file_without_groups_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = write_aloha(tmp_path / "episode_0.hdf5")
+    mapping = suggested(file)
+    with h5py.File(file, "r+") as opened:
+        opened.attrs["num_samples"] = 9
+    _refused(file, mapping, "file: the episode has 8 rows, but its attribute num_samples says 9", capsys)
+
+
+def test_objects_of_unknown_types_are_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = write_robomimic(tmp_path / "demo.hdf5")
+    mapping = suggested(file)
+
+    def unknown(group: h5py.Group, name: str) -> str:
+        raise TypeError("Unknown object type")  # as h5py does
+
+    monkeypatch.setattr(ForeignFile, "_kind", staticmethod(unknown))
+    with ForeignFile(file) as opened, pytest.raises(Hdf5Error, match="The file's root cannot be read"):
+        opened.children("")
+    _refused(file, mapping, "data cannot be read", capsys)
+
+
+def test_a_suggestion_lists_what_no_filter_reads(tmp_path: Path) -> None:
+    file = write_aloha(tmp_path / "episode_0.hdf5")
+    with h5py.File(file, "r+") as opened:
+        settings = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        settings.set_chunk((8, 7))
+        settings.set_filter(32015, h5py.h5z.FLAG_OPTIONAL, ())  # Zstandard, which h5py does not come with
+        space = h5py.h5s.create_simple((8, 7))
+        group = opened["observations"].id
+        stored = h5py.h5d.create(group, b"effort", h5py.h5t.NATIVE_DOUBLE, space, settings)
+        stored.write_direct_chunk((0, 0), bytes(8 * 7 * 8), 0)
+    lines = suggested_hdf5_mapping(file)
+    told = "observations/effort cannot be read (it is compressed in a way that is not installed here)"
+    assert f"#     {told}" in lines
+    assert 'dataset = "observations/qpos"' in lines
+
+
+def test_other_models_are_refused_at_once_and_the_same_is_kept_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def with_model(name: str, robot: str) -> Path:
+        file = write_aloha(tmp_path / name)
+        with h5py.File(file, "r+") as opened:
+            opened.attrs["model_file"] = f'<robot name="{robot}"><link name="base"/></robot>'
+        return file
+
+    first, same, other = (with_model(f"{k}.hdf5", robot) for k, robot in enumerate(("a", "a", "b")))
+    mapping = suggested(first)
+    assert 'urdf_attribute = "model_file"' in mapping.read_text()
+    (tmp_path / "damaged.hdf5").write_bytes(other.read_bytes()[:2000])
+    with pytest.raises(ConfigError, match=r"The episodes differ \(URDF"):
+        import_hdf5([first, other, tmp_path / "damaged.hdf5"], mapping, tmp_path / "run")
+    planned: list[Any] = []
+
+    def noted(plans: list[Any], *others: object) -> int:
+        planned.extend(plans)
+        return 0
+
+    monkeypatch.setattr("demorec.ingest.hdf5_import._write", noted)
+    import_hdf5([first, same], mapping, tmp_path / "run")
+    assert len(planned) == 2
+    assert planned[0].info.urdf is planned[1].info.urdf
+
+
+def test_a_file_that_is_cut_off_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = write_robomimic(tmp_path / "demo.hdf5")
+    mapping = suggested(file)
+    data = file.read_bytes()
+    for length, told in ((0, "This is no HDF5 file"), (9, "HDF5 file cannot"), (len(data) // 2, "it is cut off")):
+        file.write_bytes(data[:length])
+        _refused(file, mapping, told, capsys)
+
+
+def test_compression_that_is_damaged_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = write_robomimic(tmp_path / "demo.hdf5", compression="gzip")
+    mapping = suggested(file)
+    with h5py.File(file) as opened:
+        chunk = opened["data/demo_1/obs/agentview_image"].id.get_chunk_info(0)
+    data = bytearray(file.read_bytes())
+    data[chunk.byte_offset : chunk.byte_offset + 40] = bytes(40)
+    file.write_bytes(data)
+    assert exit_code("import", "hdf5", file, "--mapping", mapping, "--out", tmp_path / "run") == 1
+    assert "data/demo_1/obs/agentview_image cannot be read" in capsys.readouterr().err
+
+
+JPEG_FAULTS: dict[str, tuple[Callable[[bytes], bytes], str]] = {
+    "cut off": (lambda row: row[:300].ljust(len(row), b"\0"), "holds no whole JPEG file in row 2"),
+    "no jpeg": (lambda row: b"\x89PNG".ljust(200, b"x") + b"\xff\xd9", "in row 2"),
+    "another size": (lambda row: jpeg(np.zeros((16, 16, 3), np.uint8), 50), "compress_len"),
+    "empty": (lambda row: b"", "holds no whole JPEG file in row 2"),
+}
+
+
+@pytest.mark.parametrize("name", sorted(JPEG_FAULTS))
+def test_jpeg_files_must_be_whole(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    change, told = JPEG_FAULTS[name]
+    file = write_aloha(tmp_path / "episode_0.hdf5", is_compressed=True)
+    mapping = suggested(file)
+    with h5py.File(file, "r+") as opened:
+        stored = opened["observations/images/cam_high"]
+        before = stored[2].tobytes()
+        after = change(before).ljust(stored.shape[1], b"\0")
+        stored[2] = np.frombuffer(after, np.uint8)
+        assert after != before
+    _refused(file, mapping, told, capsys)
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("import", "hdf5"), "Name HDF5 files"),
+        (("import", "hdf5", "demo.hdf5"), "An import needs --mapping and --out"),
+        (("import", "hdf5", "demo.toml", "--suggest"), "The file is no recording"),
+        (("import", "hdf5", "none.hdf5", "--suggest"), "There is no such file"),
+        (("import", "hdf5", "other.hdf5", "--suggest"), "This is neither robomimic's layout"),
+        (("import", "hdf5", "demo.hdf5", "demo.hdf5", "--mapping", "demo.toml", "--out", "run"), "given twice"),
+        (("import", "hdf5", "demo.hdf5", "--mapping", "bad.toml", "--out", "run"), "Did you mean 'dataset'?"),
+    ],
+)
+def test_wrong_requests_are_refused(
+    words: tuple[str, ...], told: str, robomimic: tuple[Path, Path], tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    shutil.copy(robomimic[0], tmp_path)
+    text = robomimic[0].with_suffix(".toml").read_text()
+    (tmp_path / "demo.toml").write_text(text)
+    (tmp_path / "bad.toml").write_text(text.replace("dataset = ", "datset = ", 1))
+    with h5py.File(tmp_path / "other.hdf5", "w") as file:
+        file["numbers"] = [1, 2]
+    monkeypatch.chdir(tmp_path)
+    assert exit_code(*words) in (1, 2)
+    out, err = capsys.readouterr()
+    assert told in err
+    assert (err.count("\n"), out) == (1, "")

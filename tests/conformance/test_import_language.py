@@ -1,0 +1,154 @@
+"""What somebody said of subtasks in a bag is what the language columns of a dataset have, row by row, and no more."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from support import bag_mappings, bags
+from support.commands import exit_code
+from support.export import export
+
+from demorec.check.report import CheckOptions, Subject, check_subject
+from demorec.errors import ConfigError
+from demorec.recording import CollectedRecording, CollectedWriter, recover
+
+pytestmark = pytest.mark.usefixtures("hf_datasets_cache")
+ARM = [note for note in bags.so101(3.0) if "joint_states" in note.topic]
+MAPPING = bag_mappings.SO101.split("[cameras.front]")[0]
+SUBTASKS = '[subtasks]\ntopic = "/subtask"\n'
+SAID = ((0.41, "grasp the cup"), (0.7, "grasp the cup"), (1.013, "lift  the\tcup"), (1.5, ""), (2.2, "put it down"))
+
+
+def texts(topic: str, said: Sequence[tuple[float, str]]) -> bags.Notes:
+    """std_msgs/String, which has no header: the time of recording counts."""
+    return [
+        bags.Note(
+            topic=topic, type="std_msgs/msg/String", log_ns=bags.EPOCH_NS + round(at * bags.NS), header_ns=0,
+            body={"data": text},
+        )
+        for at, text in said
+    ]  # fmt: skip
+
+
+def imported(notes: bags.Notes, mapping: str, folder: Path) -> int:
+    bag = bags.write_mcap(bags.in_order([*ARM, *notes]), folder / "bag.mcap")
+    path = bag_mappings.write_mapping(f"{MAPPING}\n{mapping}", folder / "robot.toml")
+    return exit_code("import", bag, "--mapping", path, "--out", folder / "run")
+
+
+def row_at(recording: Path, at_s: float) -> int:
+    """The first frame that is not before a moment."""
+    with CollectedRecording(recording) as opened:
+        times = opened.columns().time_ns
+    return next(row for row, time in enumerate(times.tolist()) if time >= bags.EPOCH_NS + round(at_s * bags.NS))
+
+
+def recordings(run: Path) -> list[Path]:
+    return sorted((run / "episodes").glob("*.mcap"))
+
+
+def rows_of(dataset: Path) -> list[dict[str, Any]]:
+    (file,) = sorted((dataset / "data").rglob("*.parquet"))
+    found: list[dict[str, Any]] = pq.read_table(file).to_pylist()
+    return found
+
+
+def test_a_dataset_has_exactly_what_was_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert imported(texts("/subtask", SAID), SUBTASKS, tmp_path) == 0
+    (recording,) = recordings(tmp_path / "run")
+    begun = ((0.41, "grasp the cup"), (1.013, "lift the cup"), (2.2, "put it down"))
+    expected = [(row_at(recording, at), text) for at, text in begun]
+    with CollectedRecording(recording) as opened:
+        assert list(opened.subtasks) == expected
+    words = ("export", "lerobot", tmp_path / "run", "--out", tmp_path / "dataset", "--language", "subtask")
+    assert exit_code(*words, "--no-verify") == 0
+    assert "Nobody said" not in capsys.readouterr().out
+    for row in rows_of(tmp_path / "dataset"):
+        told = row["language_persistent"]
+        assert [(entry["content"], entry["timestamp"]) for entry in told] == [
+            (text, float(np.float32(frame / 30))) for frame, text in expected
+        ]
+        assert {(entry["role"], entry["style"], entry["camera"]) for entry in told} == {("assistant", "subtask", None)}
+        assert not row["language_events"]
+    report = check_subject(Subject(path=tmp_path / "dataset", kind="dataset"), CheckOptions())
+    assert not [result.check for result in report.results if result.level in ("fail", "warn")]
+
+
+def test_all_kinds_are_as_much_as_is_known(tmp_path: Path) -> None:
+    assert imported(texts("/subtask", SAID), SUBTASKS, tmp_path) == 0
+    export(tmp_path / "run", tmp_path / "all", language=())
+    assert {entry["style"] for row in rows_of(tmp_path / "all") for entry in row["language_persistent"]} == {"subtask"}
+    with pytest.raises(ConfigError, match="nothing is known but the subtasks"):
+        export(tmp_path / "run", tmp_path / "plans", language=("subtask", "plan"))
+
+
+def test_markers_with_other_texts_are_subtasks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    said = [(0.3, "start"), (0.5, "reach"), (1.2, "success"), (1.5, "start"), (2.4, "stop"), (2.6, "wave")]
+    text = '[episodes]\ncut = "marker"\ntopic = "/marker"\n[subtasks]\ntopic = "/marker"\n'
+    assert imported(texts("/marker", said), text, tmp_path) == 0
+    first, second = recordings(tmp_path / "run")
+    with CollectedRecording(first) as opened:
+        assert [said for _, said in opened.subtasks] == ["reach"]
+    with CollectedRecording(second) as opened:
+        assert opened.subtasks == ()
+    capsys.readouterr()
+    words = ("export", "lerobot", tmp_path / "run", "--out", tmp_path / "dataset", "--language", "--no-verify")
+    assert exit_code(*words) == 0
+    told = "Nobody said a subtask, so nothing is written of it, in episode_000001.mcap."
+    assert told in capsys.readouterr().out
+    assert [len(row["language_persistent"]) for row in rows_of(tmp_path / "dataset")].count(0) == len(
+        [row for row in rows_of(tmp_path / "dataset") if row["episode_index"] == 1]
+    )
+
+
+def test_where_nobody_says_anything_none_is_invented(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert imported([], "", tmp_path) == 0
+    words = ("export", "lerobot", tmp_path / "run", "--out", tmp_path / "dataset", "--language", "subtask")
+    capsys.readouterr()
+    assert exit_code(*words, "--no-verify") == 2
+    err = capsys.readouterr().err
+    assert "nobody said a subtask in any of them" in err
+    assert err.count("\n") == 1
+    assert not (tmp_path / "dataset").exists()
+
+
+FAULTS: dict[str, tuple[bags.Notes, str, int, str]] = {
+    "no topic": ([], SUBTASKS, 1, "there is no message of '/subtask'"),
+    "no text": ([], SUBTASKS.replace("/subtask", "/leader/joint_states") + 'field = "position"\n', 1, "is no text"),
+    "no field": (texts("/subtask", SAID), SUBTASKS + 'field = "dta"\n', 1, "Did you mean 'data'?"),
+    "another field": (
+        texts("/subtask", SAID),
+        SUBTASKS + 'field = "data"\n[episodes]\ncut = "marker"\ntopic = "/subtask"\nfield = "x"\n', 2, "subtasks.field",
+    ),
+    "a control character": (texts("/subtask", [(1.0, "a\x1b[2J")]), SUBTASKS, 1, "no single line"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", sorted(FAULTS))
+def test_bad_input_is_refused(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    notes, mapping, code, told = FAULTS[name]
+    assert imported(notes, mapping, tmp_path) == code
+    err = capsys.readouterr().err
+    assert told in err
+    assert err.count("\n") == 1
+    assert not recordings(tmp_path / "run")
+
+
+def test_recovery_keeps_what_was_said(tmp_path: Path) -> None:
+    from dataclasses import replace
+
+    from support.collected import make_collected
+
+    given = make_collected(cameras=())
+    with CollectedWriter(tmp_path / "a.mcap", given.info) as writer:
+        for number, frame in enumerate(given.frames):
+            writer.write(replace(frame, subtask={0: "reach", 9: "grasp"}.get(number, "")))
+        writer.flush()
+    recover(tmp_path / "a.mcap.part", tmp_path / "b.mcap")
+    with CollectedRecording(tmp_path / "b.mcap") as recording:
+        assert recording.subtasks == ((0, "reach"), (9, "grasp"))

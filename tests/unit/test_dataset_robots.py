@@ -1,0 +1,270 @@
+"""The robot's description beside a dataset: other tools place the arm by it, checks know when it is another one's."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pybullet
+import pytest
+from rerun.chunk import RrdReader
+from support.check import level_of
+from support.collected import TOP, URDF, Episode, make_collected, write_collected
+from support.export import data_table, export
+
+from demorec.errors import ExportError, MissingDependencyError
+from demorec.lerobot.robots import RobotRecord, portable_urdf, read_robot
+from demorec.plain import digest, from_json, to_json
+from demorec.playback import robot as played_robot
+from demorec.playback.collected import PlayedCollected
+from demorec.playback.episode import PlayedEpisode
+from demorec.playback.from_dataset import open_dataset_episode
+from demorec.playback.save import save
+from demorec.playback.sources import find_episodes
+from demorec.recording import Recording
+
+SAMPLE = Path(__file__).parents[2] / "recordings" / "sample" / "format_1.mcap"
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("robots") / "cubes"
+    export(SAMPLE, folder)
+    return folder
+
+
+@pytest.fixture
+def dataset(exported: Path, tmp_path: Path) -> Path:
+    """A copy to be spoilt."""
+    return Path(shutil.copytree(exported, tmp_path / "cubes"))
+
+
+def files_of(root: Path) -> tuple[Path, Path]:
+    """The only JSON file and the only URDF."""
+    (record,), (urdf,) = ((root / "demorec" / "robots").glob(f"*{kind}") for kind in (".json", ".urdf"))
+    return record, urdf
+
+
+def collected(**arguments: Any) -> Episode:
+    return make_collected(cameras=(TOP,), **arguments)
+
+
+def test_another_program_places_the_arm_as_it_was_recorded(exported: Path, tmp_path: Path) -> None:
+    """PyBullet's own reader of URDFs, given that file alone, and the element names of the JSON file."""
+    record_file, urdf_file = files_of(exported)
+    record = json.loads(record_file.read_text())
+    alone = Path(shutil.copy(urdf_file, tmp_path))
+    rows = data_table(exported).to_pylist()
+    with Recording(SAMPLE) as recording:
+        recorded = recording.columns().base_from_tcp
+    client = pybullet.connect(pybullet.DIRECT)
+    try:
+        body = pybullet.loadURDF(str(alone), useFixedBase=True, physicsClientId=client)
+        joints, links = {}, {}
+        for index in range(pybullet.getNumJoints(body, physicsClientId=client)):
+            told = pybullet.getJointInfo(body, index, physicsClientId=client)
+            joints[told[1].decode()], links[told[12].decode()] = index, index
+        drawn = {shape[1] for shape in pybullet.getVisualShapeData(body, physicsClientId=client)}
+        tcp = links[record["spec"]["tcp_link"]]
+        for frame in range(0, len(rows), 20):
+            for feature, names in record["joints"].items():
+                for name, value in zip(names, rows[frame][feature], strict=True):
+                    if name:
+                        pybullet.resetJointState(body, joints[name], value, physicsClientId=client)
+            state = pybullet.getLinkState(body, tcp, computeForwardKinematics=True, physicsClientId=client)
+            assert np.abs(np.array(state[4]) - recorded[frame, :3]).max() < 1e-5
+            turned = np.array(state[5]) / np.linalg.norm(state[5])
+            assert abs(abs(float(np.dot(turned, recorded[frame, 3:]))) - 1.0) < 1e-9
+    finally:
+        pybullet.disconnect(client)
+    assert {-1, *(index for link, index in links.items() if link in record["meshes"])} <= drawn  # the base is -1
+
+
+def test_meshes_are_named_and_not_copied(exported: Path) -> None:
+    record_file, urdf_file = files_of(exported)
+    record = json.loads(record_file.read_text())
+    assert record["spec"]["urdf"] == "franka_panda/panda.urdf"
+    assert record["meshes"]["panda_link1"] == ["package://meshes/visual/link1.obj"]
+    assert "<mesh" not in urdf_file.read_text()
+    assert {path.suffix for path in (exported / "demorec" / "robots").iterdir()} == {".json", ".urdf"}
+    assert urdf_file.name in (exported / "README.md").read_text()
+
+
+def test_no_path_of_the_machine_gets_into_a_dataset() -> None:
+    home, installed = "/home/somebody/ws", "/opt/ros/jazzy/share"
+    mesh = '<link name="l{0}"><visual><geometry><mesh filename="{1}" scale="1 1 1"/></geometry></visual></link>'
+    names = {
+        "package://arm/link.stl": "package://arm/link.stl",
+        "meshes/link.stl": "meshes/link.stl",
+        f"file://{installed}/arm_description/meshes/link.dae": "package://arm_description/meshes/link.dae",
+        f"{installed}/arm_description/meshes/link.dae": "package://arm_description/meshes/link.dae",
+        f"file://{home}/src/arm/link.stl": "link.stl",
+        f"{home}/link.stl": "link.stl",
+        "~/arm/link.stl": "link.stl",
+        "C:\\Users\\somebody\\link.stl": "link.stl",
+    }
+    links = "".join(mesh.format(number, name) for number, name in enumerate(names))
+    joints = "".join(
+        f'<joint name="j{n}" type="fixed"><parent link="l0"/><child link="l{n}"/></joint>' for n in range(1, len(names))
+    )
+    text = (
+        f"<robot name='arm'><!-- autogenerated by xacro from {home}/arm.urdf.xacro -->{links}{joints}"
+        f"<gazebo><parameters>{home}/controllers.yaml</parameters></gazebo></robot>"
+    )
+    found = portable_urdf(text)
+    for word in ("somebody", "/opt", "xacro", "gazebo"):
+        assert word in text
+        assert word not in found
+    for name in names.values():
+        assert f'filename="{name}"' in found
+    assert portable_urdf(found) == found
+
+
+def spoil_text(root: Path) -> None:
+    """A link a centimetre longer."""
+    _, urdf = files_of(root)
+    text = urdf.read_text()
+    changed = text.replace('xyz="0 -0.316 0"', 'xyz="0 -0.326 0"')
+    assert changed != text
+    urdf.write_text(changed)
+
+
+def spoil_record(root: Path) -> None:
+    record, _ = files_of(root)
+    text = record.read_text()
+    assert '"panda_grasptarget"' in text
+    record.write_text(text.replace('"panda_grasptarget"', '"panda_hand"'))
+
+
+def swap_joints(root: Path) -> None:
+    record, _ = files_of(root)
+    text = record.read_text().replace("panda_joint1", "x").replace("panda_joint2", "panda_joint1")
+    record.write_text(text.replace('"x"', '"panda_joint2"'))
+
+
+FAULTS: dict[str, Callable[[Path], object]] = {
+    "no URDF": lambda root: files_of(root)[1].unlink(),
+    "no JSON": lambda root: files_of(root)[0].unlink(),
+    "another URDF": spoil_text,
+    "another TCP": spoil_record,
+    "joints swapped": swap_joints,
+    "no JSON in it": lambda root: files_of(root)[0].write_text("[1"),
+    "no folder": lambda root: shutil.rmtree(root / "demorec" / "robots"),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_description_that_changed_is_found(name: str, dataset: Path) -> None:
+    assert level_of(dataset, "dataset_robots", "dataset") == "pass"
+    FAULTS[name](dataset)
+    assert level_of(dataset, "dataset_robots", "dataset") == "fail"
+
+
+def test_another_arm_is_found_though_all_digests_fit(dataset: Path) -> None:
+    record_file, urdf_file = files_of(dataset)
+    spoil_text(dataset)
+    record = from_json(record_file.read_text(), RobotRecord)
+    sha256 = hashlib.sha256(urdf_file.read_bytes()).hexdigest()
+    changed = replace(record, urdf_sha256=sha256)
+    rename(dataset, record_file, urdf_file, changed)
+    assert level_of(dataset, "dataset_robots", "dataset") == "pass"
+    assert level_of(dataset, "dataset_forward_kinematics", "dataset") == "fail"
+    record_file, urdf_file = files_of(dataset)
+    assert changed.spec is not None
+    rename(dataset, record_file, urdf_file, replace(changed, spec=replace(changed.spec, tcp_link="panda_hand")))
+    assert level_of(dataset, "dataset_robots", "dataset") == "fail"
+
+
+def rename(root: Path, record_file: Path, urdf_file: Path, record: RobotRecord) -> None:
+    """Put another record in the place of one, under its own name, in the table of episodes too."""
+    name = digest(record)
+    assert name != record_file.stem
+    record_file.unlink()
+    record_file.with_name(f"{name}.json").write_text(to_json(record))
+    urdf_file.rename(urdf_file.with_name(f"{name}.urdf"))
+    (path,) = (root / "demorec" / "episodes").rglob("*.parquet")
+    table = pq.read_table(path)
+    column = table.schema.get_field_index("robot_digest")
+    pq.write_table(table.set_column(column, table.schema.field(column), [[name] * table.num_rows]), path)
+
+
+def test_a_dataset_of_before_is_as_good_as_it_was(dataset: Path) -> None:
+    (path,) = (dataset / "demorec" / "episodes").rglob("*.parquet")
+    pq.write_table(pq.read_table(path).drop_columns(["robot_digest"]), path)
+    shutil.rmtree(dataset / "demorec" / "robots")
+    assert level_of(dataset, "dataset_robots", "dataset") == "skip"
+    assert level_of(dataset, "dataset_forward_kinematics", "dataset") == "pass"
+    with open_dataset_episode(dataset, 0) as episode:
+        assert isinstance(episode, PlayedEpisode)
+        assert episode.robot_description is None
+    export(SAMPLE, dataset, append=True, allow_duplicates=True)
+    assert level_of(dataset, "dataset_robots", "dataset") == "pass"
+
+
+def test_an_arm_whose_model_is_not_installed_is_drawn_from_the_dataset(
+    exported: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def missing(name: str) -> Path:
+        raise MissingDependencyError("Loading robot models", "pybullet", "pip install pybullet")
+
+    played_robot.robot_model.cache_clear()
+    monkeypatch.setattr(played_robot, "asset_path", missing)
+    save(find_episodes([exported])[0], tmp_path / "a.rrd")
+    played_robot.robot_model.cache_clear()
+    assert {"panda_link0", "panda_link6", "panda_hand"} <= meshes_in(tmp_path / "a.rrd")
+
+
+def meshes_in(path: Path) -> set[str]:
+    """Names of the links that a Rerun file draws."""
+    return {
+        chunk.entity_path.rsplit("/", 1)[-1]
+        for chunk in RrdReader(path).stream()
+        if "Mesh3D:vertex_positions" in chunk.to_record_batch().schema.names
+    }
+
+
+def test_a_collected_arm_moves_as_its_numbers_say(tmp_path: Path) -> None:
+    given = collected(num_frames=12)
+    degrees = [replace(feature, units=("deg", "rad", "")) for feature in given.info.features[:1]]
+    given = replace(given, info=replace(given.info, features=(*degrees, *given.info.features[1:])))
+    export(write_collected(tmp_path / "a.mcap", given), tmp_path / "d")
+    assert level_of(tmp_path / "d", "dataset_robots", "dataset") == "pass"
+    with open_dataset_episode(tmp_path / "d", 0) as episode:
+        assert isinstance(episode, PlayedCollected)
+        state = np.array([frame.samples["observation.state"].vector for frame in given.frames])
+        np.testing.assert_allclose(episode.joint_position["shoulder"], np.deg2rad(state[:, 0]), atol=1e-7)
+        np.testing.assert_array_equal(episode.joint_position["elbow"], state[:, 1])
+    save(find_episodes([tmp_path / "d"])[0], tmp_path / "a.rrd")
+    assert meshes_in(tmp_path / "a.rrd") == {"base", "upper", "lower"}
+
+
+def test_arms_that_differ_stand_in_one_dataset(tmp_path: Path) -> None:
+    longer = URDF.replace('xyz="0.3 0 0"', 'xyz="0.4 0 0"')
+    assert longer != URDF
+    for number, urdf in enumerate((URDF, longer, URDF, "")):
+        episode = collected(num_frames=10, urdf=urdf, episode_index=number)
+        if not urdf:
+            info = episode.info
+            plain = tuple(replace(feature, joints=()) for feature in info.features)
+            episode = replace(episode, info=replace(info, features=plain))
+        export(write_collected(tmp_path / f"{number}.mcap", episode), tmp_path / "d", append=True)
+    tables = sorted((tmp_path / "d" / "demorec" / "episodes").rglob("*.parquet"))
+    names = [name for table in tables for name in pq.read_table(table).column("robot_digest").to_pylist()]
+    assert names[0] == names[2] != names[1]
+    assert names[3] is None
+    assert len(list((tmp_path / "d" / "demorec" / "robots").iterdir())) == 4
+    assert 'xyz="0.4 0 0"' in read_robot(tmp_path / "d", names[1]).urdf
+    assert level_of(tmp_path / "d", "dataset_robots", "dataset") == "pass"
+
+
+@pytest.mark.parametrize("name", ["", "../../secret", "0123456789abcdef"])
+def test_a_name_that_is_none_is_refused(name: str, exported: Path) -> None:
+    with pytest.raises(ExportError, match="description of the robot cannot be read"):
+        read_robot(exported, name)

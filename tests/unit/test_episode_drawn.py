@@ -1,0 +1,30 @@
+"""Where the checks take a camera to be whose recorded pose is off on purpose."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from demorec.check.episode_drawn import drawable_scene
+from demorec.config import EpisodePlan, GenerateConfig
+from demorec.loop import prepare
+from demorec.scene.motion import angle_between
+
+
+@pytest.mark.parametrize("index", range(3))
+def test_the_offset_of_a_calibration_error_is_taken_back(index: int) -> None:
+    episode = prepare(EpisodePlan(config=GenerateConfig(variation="full"), episode_index=index))
+    info = episode.info
+    for true, recorded, found in zip(episode.cameras, info.scene.cameras, drawable_scene(info).cameras, strict=True):
+        before, after, truth = recorded.mount_from_camera, found.mount_from_camera, true.mount_from_camera
+        offset = float(np.linalg.norm(before.position - truth.position))
+        angle = angle_between(before, truth)
+        assert offset > 2e-4
+        # All but what the unknown rotation turns the offset by.
+        assert np.linalg.norm(after.position - truth.position) <= angle * offset + 1e-9
+        assert angle_between(after, truth) == pytest.approx(angle)
+
+
+def test_cameras_without_an_error_stay() -> None:
+    info = prepare(EpisodePlan(config=GenerateConfig(variation="mild"), episode_index=0)).info
+    assert drawable_scene(info) == info.scene
