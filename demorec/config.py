@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from demorec.errors import ConfigError, OptionError, check_option
-from demorec.plain import from_plain, leave_out_default
+from demorec.plain import from_plain, leave_out_defaults
 from demorec.safety.user_modules import modules_of
 from demorec.scene.variation import PRESET_NAMES, Preset, Ranges
 
@@ -185,7 +185,7 @@ class GenerateConfig:
         self.video.validate()
 
 
-leave_out_default(GenerateConfig, "interject")
+leave_out_defaults(GenerateConfig, "interject")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -114,9 +114,12 @@ def write_flat(owner: type, name: str, part: type, keys: Mapping[str, str]) -> N
     _converter.register_unstructure_hook(owner, to_flat)
 
 
-def leave_out_default(owner: type, name: str) -> None:
-    """Write a field of a dataclass only where it differs from its default, which is what files from before it mean."""
-    kept: Any = {name: override(omit_if_default=True)}
+def leave_out_defaults(owner: type, *names: str) -> None:
+    """Write fields of a dataclass only where they differ from their defaults, which files from before them mean.
+
+    All such fields of a dataclass are named in one call.
+    """
+    kept: Any = {name: override(omit_if_default=True) for name in names}
     _converter.register_unstructure_hook(owner, make_dict_unstructure_fn(owner, _converter, **kept))
 
 

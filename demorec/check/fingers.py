@@ -13,7 +13,7 @@ from demorec.geometry import Array
 from demorec.scene.scene import Shape
 from demorec.scene.urdf_shapes import UrdfShape, read_links
 
-NEAR = 0.001
+NEAR = 0.002
 """Gap between a finger and an object, metres, from which on there is something to measure."""
 _RING = 64
 """Corners of a cylinder's end: its outline is met within 30 micrometres at a radius of 25 mm."""
@@ -87,14 +87,14 @@ def _reach(body: Convex, world_from_body: Array, axes: Array) -> tuple[Array, Ar
     measures="depth to which a finger is inside an object",
     unit="m",
     warn=0.001,
-    fail=0.002,
+    fail=0.0015,
     reads=("/joint_states", "/robot_description", "/object/{body}/pose", "info.scene.bodies.shape.size"),
 )
 def finger_depth(episode: CheckedEpisode) -> Measurement | None:
     """Fingers press on the outside of what they hold (boxes, spheres, cylinders, capsules).
 
     The fingers are those of the recorded description, within a tenth of a millimetre. Not measured where no finger
-    comes within a millimetre of an object.
+    comes within two millimetres of an object.
     """
     robot = episode.info.robot
     links = {link.name: link for link in read_links(episode.description)}

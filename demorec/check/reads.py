@@ -42,6 +42,7 @@ UNCHECKED: Mapping[str, str] = {
     "info.scene.bodies.yaw_symmetry": "of the task's code; a new run of the script shows it (--deep)",
     "info.scene.physics.solver_iterations": "shows only in a replay (--replay, --deep)",
     "info.scene.physics.contact_breaking_threshold": "shows only in a replay (--replay, --deep)",
+    "info.scene.physics.finger_stiffness": "shows only in a replay (--replay, --deep)",
     "info.scene.goals.yaw_symmetry": "of the task's code; a new run of the script shows it (--deep)",
     "outcome.final_state_digest": "velocities of the last moment are in no recording; a replay compares it",
     "outcome.checks.unit": "a word for people",

@@ -17,7 +17,7 @@ from demorec.safety.user_modules import modules_of
 from demorec.scene.assets import allow_models, model_name
 from demorec.scene.episode import EpisodeInfo
 from demorec.scene.motion import angle_between
-from demorec.scene.scene import CONTACT_BREAKING_THRESHOLD, Camera, Scene
+from demorec.scene.scene import CONTACT_BREAKING_THRESHOLD, FINGER_STIFFNESS, Camera, Scene
 from demorec.scene.variation import Ranges, resolve
 from demorec.seeding import Purpose, generator
 from demorec.sim.world import World
@@ -100,7 +100,12 @@ def prepare(plan: EpisodePlan) -> Episode:
     for module in modules_of([config.task]):
         scene = _with_model_names(scene, module)
     robot = robot.scaled(scene.robot.scale)
-    physics = replace(scene.physics, hz=config.physics_hz, contact_breaking_threshold=CONTACT_BREAKING_THRESHOLD)
+    physics = replace(
+        scene.physics,
+        hz=config.physics_hz,
+        contact_breaking_threshold=CONTACT_BREAKING_THRESHOLD,
+        finger_stiffness=FINGER_STIFFNESS,
+    )
     scene = replace(scene, physics=physics)
     scene = vary_looks(vary_physics(scene, ranges, _rng(plan, "physics")), ranges, _rng(plan, "looks"))
     behaviour = draw_behaviour(ranges, _rng(plan, "behaviour"))

@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 
 from demorec.geometry import Array, Pose, intrinsic_matrix
-from demorec.plain import leave_out_default
+from demorec.plain import leave_out_defaults
 
 Rgba = tuple[float, float, float, float]
 Vector3 = tuple[float, float, float]
@@ -174,19 +174,25 @@ class Physics:
         gravity: m/s^2.
         contact_breaking_threshold: How far two bodies may move along each other until Bullet forgets a contact point
             that it found before, as a share of the smaller one's radius.
+        finger_stiffness: Of the contact of a finger, N/m: a finger that pushes with a force at one point is as deep in
+            what it holds as the force divided by it.
     """
 
     hz: int = 240
     solver_iterations: int = 50
     gravity: Vector3 = (0.0, 0.0, -9.81)
     contact_breaking_threshold: float = 0.02
+    finger_stiffness: float = 30_000.0
 
 
-leave_out_default(Physics, "contact_breaking_threshold")
+leave_out_defaults(Physics, "contact_breaking_threshold", "finger_stiffness")
 
 CONTACT_BREAKING_THRESHOLD = 0.05
 """Of new episodes; recordings that do not say it have 0.02. With that, a small, light, slippery cube could rock between
 fingers that touched it in one point each, and they sank into it (docs/simulation.md)."""
+FINGER_STIFFNESS = 120_000.0
+"""Of new episodes; recordings that do not say it have 30,000, with which a finger that pushes with 20 N is 0.7 mm deep
+in what it touches in one point, and more than a millimetre when that meets the table (docs/simulation.md)."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,8 +16,8 @@ from demorec.scene.scene import POSITION_GAIN, RobotPlacement
 from demorec.scene.urdf import Urdf
 from demorec.sim.urdf_file import urdf_file
 
-FINGER_STIFFNESS, FINGER_DAMPING = 30_000.0, 1_000.0
-"""Contact of the finger pads, N/m and N s/m (the values of panda.urdf)."""
+FINGER_DAMPING = 1_000.0
+"""Contact of the finger pads, N s/m (the value of panda.urdf)."""
 
 
 class Arm:
@@ -33,7 +33,7 @@ class Arm:
         world_from_base: Pose of the base.
     """
 
-    def __init__(self, client: Any, spec: RobotSpec, placement: RobotPlacement) -> None:
+    def __init__(self, client: Any, spec: RobotSpec, placement: RobotPlacement, *, finger_stiffness: float) -> None:
         self.spec = spec
         self.world_from_base = placement.world_from_base
         self._client = client
@@ -74,12 +74,12 @@ class Arm:
         self.kinematics = arm_kinematics(spec, scale=placement.scale)
         self._forces = list(spec.torque_limit)
         self._gains = [POSITION_GAIN] * len(self._arm)
-        self._make_gripper()
+        self._make_gripper(finger_stiffness)
         self.place(np.array(placement.joint_position), placement.gripper_width)
         self.target = np.array(placement.joint_position, dtype=np.float64)
         self.gripper_target = placement.gripper_width
 
-    def _make_gripper(self) -> None:
+    def _make_gripper(self, stiffness: float) -> None:
         for link in self.finger_links:
             self._client.changeDynamics(
                 self.body,
@@ -89,7 +89,7 @@ class Arm:
                 rollingFriction=0.0,
                 # Without the anchor a held object creeps by a millimetre in ten seconds.
                 frictionAnchor=1,
-                contactStiffness=FINGER_STIFFNESS,
+                contactStiffness=stiffness,
                 contactDamping=FINGER_DAMPING,
             )
         # PyBullet ignores the URDF's mimic joint; without a gear the fingers do not centre the object.

@@ -93,7 +93,7 @@ class World:
         self._specs: dict[str, Body] = {body.name: body for body in scene.bodies}
         for body in scene.fixed:
             self._bodies[body.name] = add_body(self.client, body)
-        self.arm = Arm(self.client, self.robot, scene.robot)
+        self.arm = Arm(self.client, self.robot, scene.robot, finger_stiffness=scene.physics.finger_stiffness)
         for body in scene.movable:
             self._bodies[body.name] = add_body(self.client, body)
         self._inertial = {name: base_from_inertial(self.client, index) for name, index in self._bodies.items()}

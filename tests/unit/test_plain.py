@@ -13,6 +13,7 @@ from demorec.geometry import Pose, look_at
 from demorec.plain import digest, from_json, from_plain, to_json, to_plain
 from demorec.scene.scene import (
     CONTACT_BREAKING_THRESHOLD,
+    FINGER_STIFFNESS,
     Body,
     Camera,
     Physics,
@@ -82,15 +83,19 @@ def test_the_digest_depends_on_content_only() -> None:
     assert digest(GenerateConfig(seed=1)) != digest(GenerateConfig(seed=2))
 
 
-def test_physics_says_its_contact_threshold_only_where_it_is_not_that_of_older_recordings() -> None:
-    """Recordings from before the field keep their digests, and are simulated as they were."""
-    assert "contact_breaking_threshold" not in to_plain(Physics())
-    assert from_plain(to_plain(Physics()), Physics).contact_breaking_threshold == 0.02
-    new = Physics(contact_breaking_threshold=CONTACT_BREAKING_THRESHOLD)
-    assert to_plain(new)["contact_breaking_threshold"] == 0.05
-    assert from_plain(to_plain(new), Physics) == new
-
-
-def test_a_list_of_another_length_is_told_with_the_one_that_is_needed() -> None:
-    with pytest.raises(ValueError, match=r"not enough values, expected tuple\[float, float, float\] @ .*position"):
-        from_plain({"position": [0.4, 0.1]}, Placed)
+@pytest.mark.parametrize(
+    ("name", "before", "now"),
+    [
+        ("contact_breaking_threshold", 0.02, CONTACT_BREAKING_THRESHOLD),
+        ("finger_stiffness", 30_000.0, FINGER_STIFFNESS),
+    ],
+)
+def test_physics_says_of_contacts_only_what_is_not_that_of_older_recordings(
+    name: str, before: float, now: float
+) -> None:
+    """Recordings from before a field keep their digests, and are simulated as they were."""
+    assert name not in to_plain(Physics())
+    assert getattr(from_plain(to_plain(Physics()), Physics), name) == before != now
+    new = from_plain(to_plain(Physics()) | {name: now}, Physics)
+    assert getattr(new, name) == now
+    assert to_plain(new)[name] == now
