@@ -175,7 +175,7 @@ class Dataset:
         return [
             DescribedEpisode(number=row["episode_index"], rows=self.rows[row["episode_index"]], kept=row, info=info)
             for row, info in zip(simulated, self.infos, strict=True)
-            if row["episode_index"] < len(self.rows)
+            if row["episode_index"] in range(len(self.rows))
         ]
 
     def action_kind(self, info: EpisodeInfo) -> ActionKind | None:

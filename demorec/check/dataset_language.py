@@ -140,7 +140,7 @@ def dataset_language_truth(dataset: Dataset) -> Found:
         return NotMeasured(why="the episodes were collected, and what they say is as it came")
     wrong = []
     boxes = _Boxes(dataset)
-    for each in dataset.described():
+    for each in (each for each in dataset.described() if each.number < len(dataset.spoken)):
         number, row, info, episode = each.number, each.kept, each.info, dataset.spoken[each.number]
         start = situation(info.scene)
         faults = [
