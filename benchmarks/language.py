@@ -4,7 +4,8 @@
     python benchmarks/language.py --run recordings/cubes --rounds 9
 
 Every round exports the same run with each choice one after the other; CPU time of the process, medians, and the ratio
-to the plain export of the same round. Items are read by LeRobot, with pictures and without, in the same order.
+to the plain export of the same round. The same random items are read by LeRobot and by demorec, with pictures (by each
+decoder that works here) and without.
 """
 
 from __future__ import annotations
@@ -32,6 +33,9 @@ CHOICES: dict[str, dict[str, Any]] = {
 """What is exported, and with which options; `states` is all language but what is about single pictures."""
 
 
+BATCH = 32
+
+
 def size_of(folder: Path) -> int:
     return sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
 
@@ -54,28 +58,54 @@ def exports(run: Path, work: Path, rounds: int) -> None:
         print(f"  {name:9} {cost:7.3f} {ratio:6.2f} {sizes[name] / frames:8.0f}")
 
 
+def decoders() -> list[str]:
+    """Those that work here; torchcodec needs an FFmpeg of the system's."""
+    try:
+        import torchcodec.decoders  # noqa: F401
+    except (ImportError, RuntimeError, OSError):
+        return ["pyav"]
+    return ["pyav", "torchcodec"]
+
+
 def items(run: Path, work: Path, rounds: int, *, pictures: bool) -> None:
-    """Reading single items by LeRobot, from datasets with and without language."""
+    """Reading random items in batches, by LeRobot and by `FastDataset`, from datasets with and without language."""
+    import numpy as np
+    import torch
     from lerobot.datasets import LeRobotDataset
 
+    from demorec.training.dataset import FastDataset
+
+    torch.set_num_threads(1)  # threads that wait for each other count as CPU time
     features = () if pictures else ("observation.state", "action")
-    datasets = {}
-    for name in ("plain", "subtask", "states"):
+    names = ("plain", "subtask", "states", "language")
+    readers: dict[tuple[str, str, str], Any] = {}
+    for name in names:
         out = work / f"items-{name}-{pictures}"
         export_lerobot([run], out, ExportOptions(verify=False, features=features, **CHOICES[name]))
-        datasets[name] = LeRobotDataset("local/x", root=out, video_backend="pyav")
-    seconds: dict[str, list[float]] = {name: [] for name in datasets}
-    count = min(len(datasets["plain"]), 100 if pictures else 400)
-    for _ in range(rounds):
-        for name, dataset in datasets.items():
+        for decoder in decoders() if pictures else ["pyav"]:
+            for reader in (LeRobotDataset, FastDataset):
+                cache: dict[str, Any] = {} if reader is LeRobotDataset else {"frame_cache_bytes": 0}
+                made = reader("local/x", root=out, video_backend=decoder, **cache)
+                readers[reader.__name__, decoder if pictures else "", name] = made
+    seconds: dict[tuple[str, str, str], list[float]] = {key: [] for key in readers}
+    rng, count = np.random.default_rng(0), BATCH * (2 if pictures else 12)
+    for number in range(rounds + 1):
+        chosen = rng.permutation(len(readers[next(iter(readers))]))[:count].tolist()
+        for key, dataset in readers.items():
             start = time.process_time()
-            for index in range(count):
-                dataset[index * len(dataset) // count]
-            seconds[name].append((time.process_time() - start) / count)
+            for first in range(0, len(chosen), BATCH):
+                batch = chosen[first : first + BATCH]
+                if key[0] == "FastDataset":
+                    dataset.__getitems__(batch)
+                else:
+                    [dataset[index] for index in batch]
+            if number:
+                seconds[key].append((time.process_time() - start) / len(chosen))
     print(f"an item {'with' if pictures else 'without'} pictures: CPU ms, ratio to plain")
-    for name, found in seconds.items():
-        ratio = statistics.median(a / b for a, b in zip(found, seconds["plain"], strict=True))
-        print(f"  {name:9} {1e3 * statistics.median(found):7.3f} {ratio:6.2f}")
+    for (reader_name, decoder, name), found in seconds.items():
+        plain = seconds[reader_name, decoder, "plain"]
+        ratio = statistics.median(a / b for a, b in zip(found, plain, strict=True))
+        print(f"  {reader_name:14} {decoder:10} {name:9} {1e3 * statistics.median(found):7.3f} {ratio:6.2f}")
 
 
 def main() -> None:

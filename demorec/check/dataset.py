@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,23 @@ from demorec.scene.features import ACTION, IMAGE_PREFIX, STATE, ActionKind, acti
 from demorec.scene.validity import read_episode_info
 
 Rows = Mapping[str, NDArray[Any]]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class DescribedEpisode:
+    """A simulated episode of a dataset, and what the sidecar keeps of it.
+
+    Attributes:
+        number: Its `episode_index`.
+        rows: Feature -> (T, D).
+        kept: Its row of the sidecar.
+        info: What was known before its first frame.
+    """
+
+    number: int
+    rows: Rows
+    kept: dict[str, Any]
+    info: EpisodeInfo
 
 
 class Dataset:
@@ -94,7 +112,8 @@ class Dataset:
         """Camera -> how each episode begins in its pictures, against states and scene; only with a sidecar."""
         keys = {key.removeprefix(IMAGE_PREFIX): key for key in self.colour_keys}
         found = []
-        for number, (rows, info) in enumerate(self.described()):
+        for each in self.described():
+            number, rows, info = each.number, each.rows, each.info
             names = [camera.name for camera in info.scene.cameras if camera.name in keys]
             seen = {name: self.pictures(keys[name])[number].cells.astype(np.float32) for name in names}
             found.append(compare_beginning(info, rows[STATE].astype(np.float64), self.info.fps, seen))
@@ -113,8 +132,8 @@ class Dataset:
         return rows
 
     @cached_property
-    def robot_digests(self) -> list[str | None]:
-        """By what name each row of `sidecar` calls its arm; None where that is not known, as in older datasets."""
+    def robot_digests(self) -> dict[int, str | None]:
+        """Episode -> by what name the sidecar calls its arm; None where that is not known, as in older datasets."""
         found: list[str | None] = []
         for path in sorted((self.path / SIDECAR_DIR / "episodes").glob("*/*.parquet")):
             table = open_table(path)
@@ -122,12 +141,12 @@ class Dataset:
                 found += read_table(path, ["robot_digest"], schema=EPISODE_SCHEMA).column(0).to_pylist()
             else:
                 found += [None] * table.metadata.num_rows
-        return found
+        return {row["episode_index"]: name for row, name in zip(self.sidecar, found, strict=True)}
 
     @cached_property
     def robots(self) -> dict[str, DatasetRobot]:
         """Name -> arm, of all that the episodes call by name."""
-        return {name: read_robot(self.path, name) for name in sorted(filter(None, set(self.robot_digests)))}
+        return {name: read_robot(self.path, name) for name in sorted(filter(None, set(self.robot_digests.values())))}
 
     @cached_property
     def spoken(self) -> list[SpokenEpisode]:
@@ -150,9 +169,14 @@ class Dataset:
                 f"{self.path}"
             )
 
-    def described(self) -> list[tuple[Rows, EpisodeInfo]]:
-        """(rows, info) of each episode that the sidecar describes."""
-        return list(zip(self.rows, self.infos, strict=False))
+    def described(self) -> list[DescribedEpisode]:
+        """The simulated episodes that the sidecar describes, if not all: LeRobot's `resume` adds some without."""
+        simulated = [row for row in self.sidecar if row["episode_info"] is not None]
+        return [
+            DescribedEpisode(number=row["episode_index"], rows=self.rows[row["episode_index"]], kept=row, info=info)
+            for row, info in zip(simulated, self.infos, strict=True)
+            if row["episode_index"] in range(len(self.rows))
+        ]
 
     def action_kind(self, info: EpisodeInfo) -> ActionKind | None:
         """What the action column holds, by the names of its components; None when it is none of ours."""

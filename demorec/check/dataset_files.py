@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import reprlib
 import subprocess
 import sys
 import tempfile
@@ -123,21 +124,26 @@ def dataset_sidecar(dataset: Dataset) -> Measurement | None:
     """Task, success and content digest of each episode are those that the sidecar keeps."""
     if not dataset.sidecar:
         return None
-    wrong = []
-    if len(dataset.sidecar) != len(dataset.rows):
-        wrong.append(f"{len(dataset.sidecar)} rows for {len(dataset.rows)} episodes")
-    digests = episode_digests(dataset.path, dataset.info)
-    for number, (row, rows, info, place) in enumerate(
-        zip(dataset.sidecar, dataset.rows, dataset.infos, dataset.places, strict=False)
-    ):
-        if row["episode_index"] != number:
-            wrong.append(f"row {number} is of episode {row['episode_index']}")
-        elif place.tasks != (info.instruction,):
-            wrong.append(f"episode {number} has another instruction")
-        elif "next.success" in rows and bool(rows["next.success"][-1, 0]) != row["success"]:
-            wrong.append(f"episode {number} has another outcome")
-        elif digests[number] != row["content_digest"]:
-            wrong.append(f"episode {number} has changed since it was exported")
+    wrong, known = [], [row["episode_index"] for row in dataset.sidecar]
+    if any(number not in range(len(dataset.rows)) for number in known) or sorted(set(known)) != known:
+        wrong.append(f"its rows are of the episodes {reprlib.repr(known)}, the dataset has {len(dataset.rows)}")
+    elif missing := sorted(set(range(len(dataset.rows))) - set(known)):
+        wrong.append(
+            f"of episode {', '.join(map(str, missing[:5]))} it knows nothing: LeRobot recorded {len(missing)} of "
+            f"{len(dataset.rows)} into the dataset, or its rows were lost"
+        )
+    if all(number in range(len(dataset.rows)) for number in known):
+        infos = {each.number: each.info for each in dataset.described()}
+        digests = episode_digests(dataset.path, dataset.info)
+        for row in dataset.sidecar:
+            number = row["episode_index"]
+            rows, info = dataset.rows[number], infos.get(number)
+            if info is not None and dataset.places[number].tasks != (info.instruction,):
+                wrong.append(f"episode {number} has another instruction")
+            elif "next.success" in rows and bool(rows["next.success"][-1, 0]) != row["success"]:
+                wrong.append(f"episode {number} has another outcome")
+            elif digests[number] != row["content_digest"]:
+                wrong.append(f"episode {number} has changed since it was exported")
     return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{len(dataset.sidecar)} episodes")
 
 

@@ -140,7 +140,8 @@ def dataset_language_truth(dataset: Dataset) -> Found:
         return NotMeasured(why="the episodes were collected, and what they say is as it came")
     wrong = []
     boxes = _Boxes(dataset)
-    for number, (episode, row, info) in enumerate(zip(dataset.spoken, dataset.sidecar, dataset.infos, strict=False)):
+    for each in (each for each in dataset.described() if each.number < len(dataset.spoken)):
+        number, row, info, episode = each.number, each.kept, each.info, dataset.spoken[each.number]
         start = situation(info.scene)
         faults = [
             *_wrong_phases(episode, row, dataset.info.fps),

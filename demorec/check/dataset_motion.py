@@ -60,7 +60,8 @@ def dataset_coverage(dataset: Dataset) -> Measurement | None:
 def dataset_joint_limits(dataset: Dataset) -> Measurement | None:
     """States are rad and metres within the robot's limits."""
     found = []
-    for number, (rows, info) in enumerate(dataset.described()):
+    for each in dataset.described():
+        number, rows, info = each.number, each.rows, each.info
         robot, state = info.robot, rows[STATE].astype(np.float64)
         low = np.array([*robot.position_lower, 0.0])
         high = np.array([*robot.position_upper, robot.gripper.max_width])
@@ -116,7 +117,8 @@ def dataset_forward_kinematics(dataset: Dataset) -> Measurement | None:
     if EE_POSE not in dataset.info.features:
         return None
     found = []
-    for number, (rows, info) in enumerate(dataset.described()):
+    for each in dataset.described():
+        number, rows, info = each.number, each.rows, each.info
         if (name := dataset.robot_digests[number]) is not None:
             urdf = dataset.robots[name].model
         else:
@@ -151,7 +153,8 @@ def dataset_action_lag(dataset: Dataset) -> Measurement | None:
     state, all episodes together, and two frames are allowed.
     """
     found, wishes, changes = [], [], []
-    for number, (rows, info) in enumerate(dataset.described()):
+    for each in dataset.described():
+        number, rows, info = each.number, each.rows, each.info
         kind = dataset.action_kind(info)
         if kind is None:
             continue

@@ -91,7 +91,8 @@ def _off_colour(said: Any, mean: Array, detail: str) -> Measurement:
 def dataset_pictures_as_drawn(dataset: Dataset) -> Found:
     """Each video shows its own episode by its own camera, drawn anew until the fingers close, for 3 s at most."""
     found: list[Found] = []
-    for number, compared in enumerate(dataset.compared):
+    for each, compared in zip(dataset.described(), dataset.compared, strict=True):
+        number = each.number
         if isinstance(compared, NotMeasured):
             found.append(compared)
             continue
@@ -117,7 +118,8 @@ def dataset_pictures_as_drawn(dataset: Dataset) -> Found:
 def dataset_picture_lag(dataset: Dataset) -> Found:
     """Picture t shows state t, in each episode and camera, until the fingers close, for 3 s at most."""
     found: list[Found] = []
-    for number, compared in enumerate(dataset.compared):
+    for each, compared in zip(dataset.described(), dataset.compared, strict=True):
+        number = each.number
         if isinstance(compared, NotMeasured):
             found.append(compared)
             continue

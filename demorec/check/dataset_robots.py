@@ -20,10 +20,10 @@ def dataset_robots(dataset: Dataset) -> Measurement | None:
 
     That it is the arm that moved shows in the kinematics: the EE pose follows from it (`dataset_forward_kinematics`).
     """
-    used = {name: number for number, name in reversed(list(enumerate(dataset.robot_digests))) if name is not None}
+    used = {name: number for number, name in reversed(dataset.robot_digests.items()) if name is not None}
     if not used:
         return None
-    wrong = []
+    wrong, specs = [], {each.number: each.info.robot for each in dataset.described()}
     for name, number in used.items():
         try:
             robot = read_robot(dataset.path, name)
@@ -36,7 +36,7 @@ def dataset_robots(dataset: Dataset) -> Measurement | None:
             there = dataset.info.features.get(feature)
             if there is not None and there.shape != (len(joints),):
                 wrong.append(f"{name} has joints for {len(joints)} elements of {feature}, it has {there.shape}")
-        spec = dataset.infos[number].robot if number < len(dataset.infos) else None
+        spec = specs.get(number)
         if robot.record.spec != spec:
             wrong.append(f"{name} is not the robot of episode {number}")
         elif spec is not None and spec.tcp_link not in robot.model.link_poses({}):

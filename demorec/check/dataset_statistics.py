@@ -16,6 +16,7 @@ from demorec.lerobot.files import read_json, read_table
 from demorec.lerobot.layout import STATS_PATH
 from demorec.lerobot.stats import NAMES, QUANTILES
 
+_NUMBERING = ("index", "episode_index", "task_index")
 _SMALLEST_DEVIATION = 1e-4
 """A component that hardly moves is measured against this."""
 
@@ -116,8 +117,11 @@ def statistics_of(values: Array) -> dict[str, Array]:
 
 
 def _numeric(dataset: Dataset) -> list[str]:
+    """Columns of numbers, less those that number the rows: LeRobot's delete, split and merge number rows anew and leave
+    their statistics as they were, and nobody normalises by them.
+    """
     features = dataset.info.features
-    return [name for name, feature in features.items() if feature.is_numeric]
+    return [name for name, feature in features.items() if feature.is_numeric and name not in _NUMBERING]
 
 
 def _flat(rows: Any) -> Array:

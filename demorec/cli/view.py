@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -70,8 +69,6 @@ class View:
     def run(self) -> int:
         """Convert, then show, save, photograph or serve."""
         self._validate()
-        # Rerun's reader of datasets warns of every column that it leaves out, and only pictures are taken from it.
-        os.environ.setdefault("RUST_LOG", "warn,re_lerobot=error")
         allow_models(allowed_modules(self.allow))
         if any(path.suffix == ".rrd" for path in self.paths):
             return self._show_rrd()

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +17,6 @@ from typing import Any, Literal, cast
 import av
 import numpy as np
 import pyarrow as pa
-from av.bitstream import BitStreamFilterContext
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -27,13 +26,9 @@ from demorec.ingest.channel import BagError
 from demorec.ingest.frames_writer import Picture
 from demorec.lerobot.files import check_video, open_table
 from demorec.lerobot.layout import VIDEO_PATH, DatasetInfo
+from demorec.lerobot.packets import PACKET_CODECS, PacketCodec, access_units
 from demorec.lerobot.reader import EpisodePlace
 from demorec.recording.video import is_keyframe
-
-_CODECS: dict[str, Literal["h264", "h265", "av1"]] = {"h264": "h264", "hevc": "h265", "av1": "av1", "libdav1d": "av1"}
-_TO_START_CODES = {"h264": "h264_mp4toannexb", "h265": "hevc_mp4toannexb"}
-_TEMPORAL_DELIMITER = b"\x12\x00"
-"""In front of every temporal unit of AV1 (its specification, section 7.5); mp4 files leave it out."""
 
 
 class DatasetCamera(ABC):
@@ -49,7 +44,7 @@ class DatasetCamera(ABC):
     key: str
     width: int
     height: int
-    kept: Literal["", "h264", "h265", "av1"] = ""
+    kept: Literal[""] | PacketCodec = ""
     told: str
 
     @abstractmethod
@@ -105,7 +100,7 @@ class VideoCamera(DatasetCamera):
         position, first = place.videos[self.key]
         return self._root / position.path(self._template, self.key), first
 
-    def _look(self, places: list[EpisodePlace]) -> tuple[Literal["h264", "h265", "av1"], str]:
+    def _look(self, places: list[EpisodePlace]) -> tuple[PacketCodec, str]:
         """The codec, and why its packets cannot be kept, "" if they can; sets the size."""
         firsts: dict[Path, set[int]] = {}
         for place in places:
@@ -114,7 +109,8 @@ class VideoCamera(DatasetCamera):
         codecs, sizes, reason = set(), set(), ""
         for path, beginnings in firsts.items():
             with _opened(path) as (container, stream):
-                codec, convert = _codec(stream, path), _converter(stream, path)
+                codec = _codec(stream, path)
+                convert = access_units(stream, codec)
                 codecs.add(codec)
                 sizes.add((stream.codec_context.width, stream.codec_context.height))
                 for number, packet in enumerate(packet for packet in container.demux(stream) if packet.size):
@@ -130,7 +126,7 @@ class VideoCamera(DatasetCamera):
     def _packets(self, path: Path) -> Iterator[bytes]:
         """Access units with start codes, and with parameter sets in front of keyframes; temporal units of AV1."""
         with _opened(path) as (container, stream):
-            convert = _converter(stream, path)
+            convert = access_units(stream, _codec(stream, path))
             for packet in container.demux(stream):
                 if packet.size:
                     yield convert(packet)
@@ -143,20 +139,11 @@ class VideoCamera(DatasetCamera):
                 yield cast(NDArray[np.uint8], frame.to_ndarray(format="rgb24"))
 
 
-def _codec(stream: av.video.stream.VideoStream, path: Path) -> Literal["h264", "h265", "av1"]:
+def _codec(stream: av.video.stream.VideoStream, path: Path) -> PacketCodec:
     name = stream.codec_context.name
-    if name not in _CODECS:
+    if name not in PACKET_CODECS:
         raise BagError(f"The video's codec is {name}; h264, hevc and av1 are read: {path}")
-    return _CODECS[name]
-
-
-def _converter(stream: av.video.stream.VideoStream, path: Path) -> Callable[[av.Packet], bytes]:
-    """What makes of a sample of an mp4 file what recordings hold: start codes, or a temporal delimiter, in front."""
-    name = _TO_START_CODES.get(_codec(stream, path))
-    if name is None:
-        return lambda packet: _TEMPORAL_DELIMITER + bytes(packet).removeprefix(_TEMPORAL_DELIMITER)
-    bits = BitStreamFilterContext(name, stream)
-    return lambda packet: b"".join(bytes(part) for part in bits.filter(packet))
+    return PACKET_CODECS[name]
 
 
 @contextmanager

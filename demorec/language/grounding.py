@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.geometry import Array, Pose
+from demorec.geometry import Array
 from demorec.recording import Recording
 from demorec.scene.scene import Camera
 
@@ -58,36 +58,30 @@ def spoken_bodies(recording: Recording) -> tuple[str, ...]:
     return tuple(body.name for body in recording.info.scene.bodies if body.role in ("object", "target", "distractor"))
 
 
-def seen_things(labels: NDArray[np.int32], values: dict[str, int]) -> dict[str, Seen]:
+def seen_things(labels: NDArray[np.uint16], numbers: dict[str, int]) -> dict[str, Seen]:
     """Name -> what a picture shows of it; things that no pixel shows are left out.
 
     Args:
-        labels: (H, W) segmentation as in `CameraImages`.
-        values: Name of a body -> its number in the segmentation.
+        labels: (H, W) as of `Recording.segmentation_at`.
+        numbers: Name of a body -> its label.
     """
-    # Bodies that are spoken of have no links, so that their numbers are the labels themselves.
-    known = {value: name for name, value in values.items()}
-    flat, (height, width) = labels.ravel(), labels.shape
-    pixels = np.flatnonzero((flat >= min(known, default=0)) & (flat <= max(known, default=-1)))
-    shown = flat[pixels]
-    rows, columns = np.divmod(pixels, width)
-    by_column = columns * height + rows  # few pixels are put in order, not all of the picture
-    found = {
-        known[value]: np.sort(by_column[shown == value])
-        for value in np.flatnonzero(np.bincount(shown))
-        if value in known
-    }
-    return {name: Seen(name=name, pixels=found[name], height=height) for name in values if name in found}
+    # Bodies that are spoken of have no links, and so one label each.
+    known = {number: name for name, number in numbers.items()}
+    by_column, height = labels.T.ravel(), labels.shape[0]
+    pixels = np.flatnonzero((by_column >= min(known, default=1)) & (by_column <= max(known, default=0)))
+    shown = by_column[pixels]
+    found = {name: pixels[shown == number] for number, name in known.items()}
+    return {name: Seen(name=name, pixels=found[name], height=height) for name in numbers if len(found[name])}
 
 
-def body_values(recording: Recording) -> dict[str, int]:
-    """Name of each body that is spoken of -> its number in the segmentation pictures.
+def body_labels(recording: Recording) -> dict[str, int]:
+    """Name of each body that is spoken of -> its label in the segmentation pictures.
 
     Raises:
         RecordingError: The recording is damaged.
     """
     spoken = set(spoken_bodies(recording))
-    return {name: value for value, name in recording.segment_names().items() if name in spoken}
+    return {name: label for label, name in recording.segment_labels().items() if name in spoken}
 
 
 def project(camera: Camera, world_from_camera: Array, points: Array) -> Array:
@@ -98,11 +92,27 @@ def project(camera: Camera, world_from_camera: Array, points: Array) -> Array:
         world_from_camera: (7,) pose at the moment of the picture.
         points: In the world frame.
     """
-    pose = Pose(position=world_from_camera[:3], quat_xyzw=world_from_camera[3:])
-    seen = pose.inverse().apply(points)
-    depth = np.where(seen[:, 2] > camera.near, seen[:, 2], np.nan)
+    return np.asarray(project_each(camera, world_from_camera[np.newaxis], points[np.newaxis])[0])
+
+
+def project_each(camera: Camera, world_from_camera: Array, points: Array) -> Array:
+    """(T, N, 2) the same of T moments at once: poses (T, 7), points (T, N, 3)."""
+    x, y, z, w = (world_from_camera[:, index, np.newaxis] for index in range(3, 7))
+    # Of the conjugate quaternion; sums written out, as in demorec.geometry, and to the same bit.
+    x, y, z = -x, -y, -z
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
+        (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
+        (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
+    )
+    eye = [world_from_camera[:, index, np.newaxis] for index in range(3)]
+    seen = [
+        points[..., 0] * a + points[..., 1] * b + points[..., 2] * c - (a * eye[0] + b * eye[1] + c * eye[2])
+        for a, b, c in rows
+    ]
+    depth = np.where(seen[2] > camera.near, seen[2], np.nan)
     k = camera.intrinsics
-    return np.stack([k[0, 0] * seen[:, 0] / depth + k[0, 2], k[1, 1] * seen[:, 1] / depth + k[1, 2]], axis=1)
+    return np.stack([k[0, 0] * seen[0] / depth + k[0, 2], k[1, 1] * seen[1] / depth + k[1, 2]], axis=-1)
 
 
 def pixel_of(camera: Camera, point: Array) -> tuple[int, int] | None:

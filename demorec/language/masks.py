@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.geometry import Array, Pose
-from demorec.language.grounding import body_values, project, seen_things
+from demorec.language.grounding import body_labels, project, seen_things
 from demorec.language.situation import nouns_of
 from demorec.recording import Recording
 from demorec.scene.episode import EpisodeColumns
@@ -55,11 +55,11 @@ def seen_objects(
         RecordingError: The recording is damaged.
     """
     row_of = {int(frame): row for row, frame in enumerate(rows.tolist())}
-    values = body_values(recording)
+    numbers = body_labels(recording)
     bodies = {body.name: body for body in recording.info.scene.bodies}
     for _, frame, labels in recording.segmentation_at([camera.name], row_of):
         extrinsics = columns.world_from_camera[camera.name][frame]
-        for name, seen in seen_things(labels, values).items():
+        for name, seen in seen_things(labels, numbers).items():
             body = bodies[name]
             pose = columns.object_poses[name][frame] if name in columns.object_poses else body.world_from_body.vector()
             x_min, y_min, x_max, y_max = seen.box

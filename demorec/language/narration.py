@@ -14,7 +14,7 @@ from demorec.language.interjections import interjection
 from demorec.language.kinds import KINDS, LanguageKind
 from demorec.language.questions import questions, traces
 from demorec.language.referring import phrase_for
-from demorec.language.situation import Surroundings, situation
+from demorec.language.situation import Situations, Surroundings
 from demorec.language.subtasks import GoalWords, goal_words, memories, plan, subtask, tcp_motion
 from demorec.language.tries import Story, story_of
 from demorec.language.wordings import task_wordings
@@ -85,6 +85,7 @@ class _Told:
         self._recording = recording
         self._info, self._columns, self._rows, self._story = recording.info, columns, rows, story
         self._scene: Scene = recording.info.scene
+        self._situations = Situations(self._scene)
         self._words = {
             attempt.first: goal_words(self._scene, attempt.goal, self._situation(attempt.first))
             for attempt in story.tries
@@ -92,7 +93,7 @@ class _Told:
 
     def _situation(self, frame: int) -> Surroundings:
         poses: dict[str, Array] = {name: values[frame] for name, values in self._columns.object_poses.items()}
-        return situation(self._scene, poses)
+        return self._situations.at(poses)
 
     def _row_of(self, frame: int) -> int:
         """The first row of the dataset that is not before a frame; T when there is none."""

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.geometry import Array
-from demorec.language.grounding import MIN_PIXELS, Seen, body_values, pixel_of, project, seen_things
+from demorec.language.grounding import MIN_PIXELS, Seen, body_labels, pixel_of, project, project_each, seen_things
 from demorec.language.referring import phrases_for
-from demorec.language.situation import NamedThing, Surroundings, situation
+from demorec.language.situation import NamedThing, Situations, Surroundings
 from demorec.recording import Recording
 from demorec.scene.episode import EpisodeColumns
 from demorec.scene.scene import Camera, Scene
@@ -103,9 +103,15 @@ class _View:
         }
         return {name: found[0] for name, found in phrases.items() if found}
 
+    @cached_property
+    def _middles(self) -> dict[str, Array]:
+        positions = self.moment.positions
+        pixels = project(self.camera, self.world_from_camera, np.array(list(positions.values())).reshape(-1, 3))
+        return dict(zip(positions, pixels, strict=True))
+
     def middle(self, name: str) -> Array:
         """(2,) where the middle of a thing is in the picture, px."""
-        return np.asarray(project(self.camera, self.world_from_camera, self.moment.positions[name][np.newaxis])[0])
+        return self._middles[name]
 
 
 def asked_rows(rows: NDArray[np.intp], fps: int) -> list[int]:
@@ -135,17 +141,17 @@ def questions(
     }
     if not chosen:
         return
-    values = body_values(recording)
+    numbers, situations = body_labels(recording), Situations(recording.info.scene)
     moments: dict[int, _Moment] = {}
     found: dict[str, list[Question | None]] = {name: [] for name in chosen}
     for name, frame, labels in recording.segmentation_at(list(chosen), anchors):
         if frame not in moments:
-            moments[frame] = _moment(recording.info.scene, columns, frame)
+            moments[frame] = _moment(recording.info.scene, situations, columns, frame)
         number, camera = chosen[name]
         view = _View(
             camera=camera,
             world_from_camera=columns.world_from_camera[name][frame],
-            seen=seen_things(labels, values),
+            seen=seen_things(labels, numbers),
             moment=moments[frame],
         )
         asked = _ask(view, len(found[name]) + number)
@@ -156,11 +162,11 @@ def questions(
         yield from (question for question in told if question is not None)
 
 
-def _moment(scene: Scene, columns: EpisodeColumns, frame: int) -> _Moment:
+def _moment(scene: Scene, situations: Situations, columns: EpisodeColumns, frame: int) -> _Moment:
     poses = {name: values[frame] for name, values in columns.object_poses.items()}
     positions = {body.name: body.world_from_body.position for body in scene.bodies}
     positions |= {name: np.asarray(pose[:3]) for name, pose in poses.items()}
-    return _Moment(positions=positions, now=situation(scene, poses))
+    return _Moment(positions=positions, now=situations.at(poses))
 
 
 def _ask(view: _View, turn: int) -> tuple[str, dict[str, Any]] | None:
@@ -277,11 +283,13 @@ def traces(
     for camera in info.scene.cameras:
         if camera.name not in cameras:
             continue
-        for row in asked_rows(rows, fps):
-            frame = int(rows[row])
-            tcp = world_from_tcp[np.minimum(frame + steps, columns.num_frames - 1)]
+        asked = asked_rows(rows, fps)
+        frames = rows[asked]
+        tcp = world_from_tcp[np.minimum(frames[:, np.newaxis] + steps, columns.num_frames - 1)]
+        projected = project_each(camera, columns.world_from_camera[camera.name][frames], tcp)
+        for row, points in zip(asked, projected, strict=True):
             pixels: list[list[int]] = []
-            for point in project(camera, columns.world_from_camera[camera.name][frame], tcp):
+            for point in points:
                 if (pixel := pixel_of(camera, point)) is None:
                     break
                 pixels.append(list(pixel))

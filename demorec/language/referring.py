@@ -29,13 +29,13 @@ def resolve(phrase: str, situation: Surroundings) -> frozenset[str]:
     Nothing when the phrase is none of this grammar, or when it could mean several things: ARTICLE [ORDER] [COLOUR]
     NOUN [nearest to the robot | farthest from the robot], where ARTICLE is "the" or "every".
     """
-    match = _grammar(situation).fullmatch(phrase.strip().lower())
+    match = _grammar(situation.nouns).fullmatch(phrase.strip().lower())
     return frozenset() if match is None else _resolved(match, situation)
 
 
 def references(text: str, situation: Surroundings) -> Iterator[tuple[str, frozenset[str]]]:
     """Each phrase of a text that refers to something, and what it refers to; nothing where that is unclear."""
-    for match in _grammar(situation).finditer(text.lower()):
+    for match in _grammar(situation.nouns).finditer(text.lower()):
         yield match[0], _resolved(match, situation)
 
 
@@ -67,8 +67,8 @@ def phrase_for(name: str, situation: Surroundings) -> str:
 
 
 @lru_cache(maxsize=64)
-def _grammar(situation: Surroundings) -> re.Pattern[str]:
-    nouns = "|".join(sorted({re.escape(noun) for thing in situation.things for noun in thing.nouns}, key=len)[::-1])
+def _grammar(known: frozenset[str]) -> re.Pattern[str]:
+    nouns = "|".join(sorted((re.escape(noun) for noun in known), key=len)[::-1])
     return re.compile(
         rf"\b(?P<article>the|every) (?:(?P<order>{'|'.join(_IN_FRONT)}) )?(?:(?P<color>{'|'.join(COLORS)}) )?"
         rf"(?P<noun>{nouns})\b(?: (?P<behind>{'|'.join(_BEHIND)})\b)?"

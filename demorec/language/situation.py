@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -56,6 +58,11 @@ class Surroundings:
 
     things: tuple[NamedThing, ...]
 
+    @cached_property
+    def nouns(self) -> frozenset[str]:
+        """What any of them may be called."""
+        return frozenset(noun for thing in self.things for noun in thing.nouns)
+
     def thing(self, name: str) -> NamedThing:
         """The thing of that name; KeyError when there is none."""
         for thing in self.things:
@@ -64,31 +71,44 @@ class Surroundings:
         raise KeyError(name)
 
 
-def situation(scene: Scene, world_from_object: Mapping[str, Array] | None = None) -> Surroundings:
-    """The things of a scene.
+class Situations:
+    """The things of a scene at any moment; what stays the same about them is found out once.
 
     Args:
         scene: At the episode's start.
-        world_from_object: Body -> (7,) pose (xyz, quaternion xyzw) at the moment; the scene's own where left out.
     """
-    base_from_world = scene.robot.world_from_base.inverse()
-    moved = world_from_object or {}
-    bodies = [body for body in scene.bodies if body.role != "fixture"]
-    places = [moved[body.name][:3] if body.name in moved else body.world_from_body.position for body in bodies]
-    positions = base_from_world.apply(np.array(places).reshape(-1, 3))
-    things = [
-        NamedThing(
-            name=body.name,
-            nouns=nouns_of(body),
-            color=body.color_name,
-            size=max(body.shape.extents),
-            position=position,
-            height=body.shape.extents[2],
-            can_be_held=body.movable,
-        )
-        for body, position in zip(bodies, positions, strict=True)
-    ]
-    return Surroundings(things=tuple(things))
+
+    def __init__(self, scene: Scene) -> None:
+        self._base_from_world = scene.robot.world_from_base.inverse()
+        self._bodies = [body for body in scene.bodies if body.role != "fixture"]
+        self._traits: list[dict[str, Any]] = [
+            {
+                "name": body.name,
+                "nouns": nouns_of(body),
+                "color": body.color_name,
+                "size": max(body.shape.extents),
+                "height": body.shape.extents[2],
+                "can_be_held": body.movable,
+            }
+            for body in self._bodies
+        ]
+
+    def at(self, world_from_object: Mapping[str, Array] | None = None) -> Surroundings:
+        """The things where they are.
+
+        Args:
+            world_from_object: Body -> (7,) pose (xyz, quaternion xyzw) at the moment; the scene's own where left out.
+        """
+        moved = world_from_object or {}
+        places = [moved[b.name][:3] if b.name in moved else b.world_from_body.position for b in self._bodies]
+        positions = self._base_from_world.apply(np.array(places).reshape(-1, 3))
+        things = (NamedThing(position=place, **traits) for place, traits in zip(positions, self._traits, strict=True))
+        return Surroundings(things=tuple(things))
+
+
+def situation(scene: Scene, world_from_object: Mapping[str, Array] | None = None) -> Surroundings:
+    """The things of a scene at one moment; arguments as of `Situations`."""
+    return Situations(scene).at(world_from_object)
 
 
 def nouns_of(body: Body) -> tuple[str, ...]:

@@ -8,8 +8,9 @@ which reads as 0.01 m, closer than any camera sees.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from dataclasses import replace
+import reprlib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any, cast
 
@@ -40,10 +41,47 @@ def quantised(depth: NDArray[np.float32]) -> NDArray[np.uint16]:
     return np.asarray(np.rint(scaled * _LARGEST_CODE).clip(0, _LARGEST_CODE), dtype=np.uint16)
 
 
+@dataclass(frozen=True, kw_only=True)
+class DepthScale:
+    """What codes stand for, by the metadata of a depth feature: metres, and whether steps grow with the distance."""
+
+    nearest: float = _NEAREST
+    farthest: float = _FARTHEST
+    shift: float = _SHIFT
+    use_log: bool = True
+
+    @classmethod
+    def of(cls, info: Mapping[str, Any]) -> DepthScale:
+        """From the `info` of a feature, whoever wrote it; ValueError for what is no scale."""
+        numbers = [info.get(f"video.{name}") for name in ("depth_min", "depth_max", "shift")]
+        use_log = info.get("video.use_log")
+        if not isinstance(use_log, bool) or not all(_is_number(number) for number in numbers):
+            raise ValueError(f"its scale of depth is {reprlib.repr([*numbers, use_log])}")
+        nearest, farthest, shift = (float(number) for number in numbers if number is not None)
+        if not nearest < farthest or (use_log and not nearest + shift > 0):
+            raise ValueError(f"its depth is from {nearest} to {farthest} m, shifted by {shift}")
+        return cls(nearest=nearest, farthest=farthest, shift=shift, use_log=use_log)
+
+    def values(self) -> Array:
+        """(4096,) distance in metres that each code stands for."""
+        codes = np.arange(_LARGEST_CODE + 1)
+        if not self.use_log:
+            return np.asarray(self.nearest + codes * ((self.farthest - self.nearest) / _LARGEST_CODE))
+        low, high = math.log(self.nearest + self.shift), math.log(self.farthest + self.shift)
+        return np.asarray(np.exp(low + codes * ((high - low) / _LARGEST_CODE)) - self.shift)
+
+    def shown(self) -> NDArray[np.float32]:
+        """(4096,) the same for people's eyes: 0, nothing measured, for the lowest code."""
+        return np.concatenate([[0], self.values()[1:]]).astype(np.float32)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e6
+
+
 def code_values() -> Array:
-    """(4096,) distance in metres that each code stands for."""
-    low, high = math.log(_NEAREST + _SHIFT), math.log(_FARTHEST + _SHIFT)
-    return np.asarray(np.exp(low + np.arange(_LARGEST_CODE + 1) * ((high - low) / _LARGEST_CODE)) - _SHIFT)
+    """(4096,) distance in metres that each code of ours stands for."""
+    return DepthScale().values()
 
 
 def depth_video(pictures: Iterable[NDArray[np.float32]], *, fps: int) -> tuple[CodedVideo, PixelHistogram]:

@@ -73,7 +73,7 @@ def send_video(recording: rr.RecordingStream, entity: str, frame_times: NDArray[
 
 def _frame_depth(episode: PlayedEpisode, camera: str) -> Iterator[tuple[int, Distances]]:
     for time_ns, metres in zip(episode.time_ns.tolist(), episode.depth[camera](), strict=False):
-        yield time_ns, np.rint(metres * 1000).astype(np.uint16)
+        yield time_ns, np.rint(metres * 1000).clip(0, 65535).astype(np.uint16)
 
 
 def send_depth(

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,7 @@ def collected_of_dataset(
     data: Mapping[str, Array],
     time_ns: NDArray[np.int64],
     videos: Mapping[str, Video],
+    depth: Mapping[str, Callable[[], Iterator[NDArray[np.float32]]]],
     robot: DatasetRobot | None,
 ) -> PlayedCollected:
     """An episode as its dataset knows it, at the dataset's rate.
@@ -41,6 +43,7 @@ def collected_of_dataset(
         data: Feature -> (T, D) of the episode's rows.
         time_ns: (T,) of the rows.
         videos: Camera -> coded pictures.
+        depth: Depth camera -> reads (H, W) metres of every row.
         robot: The arm, if it is known.
 
     Raises:
@@ -77,7 +80,7 @@ def collected_of_dataset(
             cameras=tuple(
                 CollectedCamera(name=camera["name"], width=camera["width"], height=camera["height"])
                 for camera in row["cameras"]
-                if camera["name"] in videos
+                if camera["name"] in videos or camera["name"] in depth
             ),
             origin=from_json(row["origin"], Origin),
         ),
@@ -86,4 +89,11 @@ def collected_of_dataset(
         joint_position=dict(zip(positions.joints, values, strict=True)),
         curves={name: Curves(time_ns=time_ns, values=data[name], names=parts) for name, parts in names.items()},
         videos=videos,
+        depth={name: partial(_timed, time_ns, read) for name, read in depth.items()},
     )
+
+
+def _timed(
+    time_ns: NDArray[np.int64], read: Callable[[], Iterator[NDArray[np.float32]]]
+) -> Iterator[tuple[int, NDArray[np.float32]]]:
+    return zip(time_ns.tolist(), read(), strict=False)

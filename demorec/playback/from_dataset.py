@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
-from itertools import islice
+from itertools import batched, islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rerun.experimental import LeRobotReader
 
 from demorec.errors import RecordingError, in_words, resource_error
 from demorec.geometry import Array, Pose
 from demorec.lerobot.boxes import BOXES_DIR, read_boxes
-from demorec.lerobot.files import check_video, read_json, read_table
+from demorec.lerobot.files import read_json, read_table
 from demorec.lerobot.language import COLUMNS, spoken_episodes
-from demorec.lerobot.layout import DatasetInfo, Feature
+from demorec.lerobot.layout import DatasetInfo
+from demorec.lerobot.packets import PACKET_CODECS, episode_distances, episode_packets
 from demorec.lerobot.paths import SIDECAR_DIR
+from demorec.lerobot.reader import EpisodePlace, episode_places
 from demorec.lerobot.robots import DatasetRobot, read_robot
 from demorec.playback.collected import PlayedCollected
 from demorec.playback.collected_dataset import collected_of_dataset
@@ -27,13 +28,12 @@ from demorec.playback.episode import Box, Curves, PlayedEpisode, Video, VideoBat
 from demorec.playback.held_objects import held_object_poses
 from demorec.scene.assets import asset_path
 from demorec.scene.episode import EpisodeInfo, Outcome, SuccessCheck, frame_time_ns
-from demorec.scene.features import ENVIRONMENT_STATE, IMAGE_PREFIX
+from demorec.scene.features import DEPTH_SUFFIX, ENVIRONMENT_STATE, IMAGE_PREFIX
 from demorec.scene.kinematics import ArmKinematics
 from demorec.scene.urdf import Urdf, check_primitives
 from demorec.scene.validity import read_episode_info
 
 _PICTURES_AT_ONCE = 256
-_CODECS = {"h264": "h264", "hevc": "h265", "av1": "av1"}
 
 
 def dataset_episodes(root: Path) -> list[int]:
@@ -63,12 +63,13 @@ def open_dataset_episode(root: Path, episode_index: int) -> Iterator[PlayedEpiso
 def _read_episode(root: Path, episode_index: int) -> PlayedEpisode | PlayedCollected:
     row = _episode_row(root, episode_index)
     described = DatasetInfo.load(root)
+    place = _place(root, described, episode_index)
     columns = [name for name, feature in described.features.items() if feature.is_numeric]
     if row["episode_info"] is None:
         data = _data(root, episode_index, columns)
         time_ns = _times(len(data["index"]), described)
-        videos = _videos(root, episode_index, time_ns, described.features)
-        return collected_of_dataset(root, row, described, data, time_ns, videos, _robot(root, row))
+        videos, depth = _videos(root, described, place, time_ns), _depth(root, described, place)
+        return collected_of_dataset(root, row, described, data, time_ns, videos, depth, _robot(root, row))
     export = dict(read_json(root / SIDECAR_DIR / "export.json"))
     info = read_episode_info(row["episode_info"])
     missing = {"observation.state", "action"} - described.features.keys()
@@ -102,7 +103,8 @@ def _read_episode(root: Path, episode_index: int) -> PlayedEpisode | PlayedColle
         world_from_camera=_camera_poses(root, episode_index),
         phase=_phases(row, num_frames),
         curves=_curves(info, data, base_from_tcp, time_ns, with_targets=export.get("action") == "joint"),
-        videos=_videos(root, episode_index, time_ns, described.features),
+        videos=_videos(root, described, place, time_ns),
+        depth={name.removesuffix(DEPTH_SUFFIX): read for name, read in _depth(root, described, place).items()},
         statements=_statements(root, episode_index, described, time_ns),
         boxes=_boxes(root, described, data["index"][:, 0]),
     )
@@ -127,6 +129,13 @@ def _episode_row(root: Path, episode_index: int) -> dict[str, Any]:
     for row in _rows(root, f"{SIDECAR_DIR}/episodes", None, episode_index):
         return row
     raise RecordingError(f"The dataset has no episode {episode_index}: {root}")
+
+
+def _place(root: Path, described: DatasetInfo, episode_index: int) -> EpisodePlace:
+    for place in episode_places(root, described):
+        if place.episode_index == episode_index:
+            return place
+    raise RecordingError(f"The dataset has no episode {episode_index} in its own tables: {root}")
 
 
 def _robot(root: Path, row: dict[str, Any]) -> DatasetRobot | None:
@@ -244,47 +253,37 @@ def _curves(
     return result
 
 
-def _videos(
-    root: Path, episode_index: int, time_ns: NDArray[np.int64], features: dict[str, Feature]
-) -> dict[str, Video]:
+def _videos(root: Path, described: DatasetInfo, place: EpisodePlace, time_ns: NDArray[np.int64]) -> dict[str, Video]:
+    """Camera -> its coded pictures."""
     result = {}
-    for key, feature in features.items():
-        codec = _CODECS.get(str((feature.info or {}).get("video.codec")))
+    for key, feature in described.features.items():
+        codec = PACKET_CODECS.get(str((feature.info or {}).get("video.codec")))
         if feature.is_video and codec is not None and not feature.is_depth:
-            batches = partial(_video_batches, root, episode_index, key, time_ns)
+            batches = partial(_video_batches, root, described, key, place, time_ns)
             result[key.removeprefix(IMAGE_PREFIX)] = Video(codec=codec, batches=batches)
     return result
 
 
-def _video_batches(root: Path, episode_index: int, key: str, time_ns: NDArray[np.int64]) -> Iterator[VideoBatch]:
-    """Coded pictures as Rerun's own reader of LeRobot datasets cuts them out of the mp4 files."""
-    samples: list[tuple[int, bytes]] = []
-    keyframes: set[int] = set()
-    for path in sorted((root / "videos" / key).glob("*/*.mp4")):
-        check_video(path)
-    try:
-        for chunk in LeRobotReader(root).stream(episode_index):
-            if chunk.entity_path.strip("/") != key or chunk.is_static:
-                continue
-            batch = chunk.to_record_batch()
-            frames = batch.column("frame_index").to_pylist()
-            if "VideoStream:is_keyframe" in batch.schema.names:
-                flags = batch.column("VideoStream:is_keyframe").to_pylist()
-                keyframes.update(frame for frame, flag in zip(frames, flags, strict=True) if flag and flag[0])
-            if "VideoStream:sample" in batch.schema.names:
-                blobs = batch.column("VideoStream:sample")
-                samples += [(frame, bytes(blobs[row].values[0].values)) for row, frame in enumerate(frames)]
-    except (ValueError, OSError, RuntimeError) as error:
-        raise RecordingError(f"Rerun cannot read the dataset ({' '.join(str(error).split())[:200]}): {root}") from error
-    samples.sort()
-    first = samples[0][0] if samples else 0
-    for start in range(0, len(samples), _PICTURES_AT_ONCE):
-        part = samples[start : start + _PICTURES_AT_ONCE]
+def _video_batches(
+    root: Path, described: DatasetInfo, key: str, place: EpisodePlace, time_ns: NDArray[np.int64]
+) -> Iterator[VideoBatch]:
+    for packets in batched(episode_packets(root, described, key, place), _PICTURES_AT_ONCE):
         yield VideoBatch(
-            time_ns=time_ns[[frame - first for frame, _ in part]],
-            samples=[data for _, data in part],
-            is_keyframe=np.array([frame in keyframes for frame, _ in part]),
+            time_ns=time_ns[[packet.frame for packet in packets]],
+            samples=[packet.data for packet in packets],
+            is_keyframe=np.array([packet.is_keyframe for packet in packets]),
         )
+
+
+def _depth(
+    root: Path, described: DatasetInfo, place: EpisodePlace
+) -> dict[str, Callable[[], Iterator[NDArray[np.float32]]]]:
+    """Depth feature, without its prefix -> reads (H, W) metres of every frame."""
+    return {
+        key.removeprefix(IMAGE_PREFIX): partial(episode_distances, root, described, key, place)
+        for key, feature in described.features.items()
+        if feature.is_video and feature.is_depth
+    }
 
 
 def _statements(

@@ -63,28 +63,48 @@ def encode_labels(segmentation: NDArray[np.int32]) -> bytes:
 
 
 def decode_labels(data: bytes, size: tuple[int, int]) -> NDArray[np.int32]:
-    """Inverse of `encode_labels`; ValueError when the bytes are no such file of that (height, width).
+    """Inverse of `encode_labels`; ValueError when the bytes are no such file of that (height, width)."""
+    return LabelDecoder(size).decode(data)
 
-    FFmpeg unpacks a picture in a third of the time that Pillow takes.
+
+class LabelDecoder:
+    """Reads the segmentation pictures of one camera.
+
+    FFmpeg unpacks a picture in a third of the time that Pillow takes; to set it up costs as much as to unpack one.
+
+    Args:
+        size: (height, width) of all pictures.
     """
-    if len(data) < _PNG_HEAD.size:
-        raise ValueError("a segmentation picture that is cut off")
-    signature, width, height, depth, color = _PNG_HEAD.unpack_from(data)
-    if signature != _PNG_SIGNATURE or (depth, color) != _GREY_16:
-        raise ValueError("a segmentation picture that is no PNG file of 16-bit numbers")
-    if (height, width) != size:  # before anything is unpacked
-        raise ValueError(f"a segmentation picture of {width}x{height} pixels")
-    decoder = av.CodecContext.create("png", "r")
-    decoder.thread_count = 1
-    decoder.options = {"err_detect": "crccheck+explode"}
-    try:
-        frames = decoder.decode(av.Packet(data))
-    except av.FFmpegError as error:
-        raise ValueError("a segmentation picture that is damaged") from error
-    if len(frames) != 1 or frames[0].format.name != "gray16be" or (frames[0].height, frames[0].width) != size:
-        raise ValueError("a segmentation picture that is damaged")
-    lines = np.frombuffer(frames[0].planes[0], dtype=">u2").reshape(height, -1)  # FFmpeg may pad lines
-    return from_labels(lines[:, :width].astype(np.uint16))
+
+    def __init__(self, size: tuple[int, int]) -> None:
+        self._size = size
+        self._decoder = av.CodecContext.create("png", "r")
+        self._decoder.thread_count = 1
+        self._decoder.options = {"err_detect": "crccheck+explode"}
+
+    def decode(self, data: bytes) -> NDArray[np.int32]:
+        """As of `decode_labels`."""
+        return from_labels(self.labels(data))
+
+    def labels(self, data: bytes) -> NDArray[np.uint16]:
+        """(H, W) the labels as they are in the file, of which half of the time is saved; ValueError as of `decode`."""
+        if len(data) < _PNG_HEAD.size:
+            raise ValueError("a segmentation picture that is cut off")
+        signature, width, height, depth, color = _PNG_HEAD.unpack_from(data)
+        if signature != _PNG_SIGNATURE or (depth, color) != _GREY_16:
+            raise ValueError("a segmentation picture that is no PNG file of 16-bit numbers")
+        if (height, width) != self._size:  # before anything is unpacked
+            raise ValueError(f"a segmentation picture of {width}x{height} pixels")
+        packet = av.Packet(data)
+        packet.is_keyframe = True  # else FFmpeg takes it for the difference to the picture before
+        try:
+            frames = self._decoder.decode(packet)
+        except av.FFmpegError as error:
+            raise ValueError("a segmentation picture that is damaged") from error
+        if len(frames) != 1 or frames[0].format.name != "gray16be" or (frames[0].height, frames[0].width) != self._size:
+            raise ValueError("a segmentation picture that is damaged")
+        lines = np.frombuffer(frames[0].planes[0], dtype=">u2").reshape(height, -1)  # FFmpeg may pad lines
+        return lines[:, :width].astype(np.uint16)
 
 
 def segment_names(info: EpisodeInfo) -> Iterator[tuple[int, str]]:

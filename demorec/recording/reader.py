@@ -17,7 +17,7 @@ from demorec.recording.chunks import Block
 from demorec.recording.container import damage_as_recording_error
 from demorec.recording.depth import decode_depth
 from demorec.recording.episode_file import EpisodeFile
-from demorec.recording.labels import decode_labels, from_labels
+from demorec.recording.labels import LabelDecoder, from_labels
 from demorec.recording.streams import Columns, FrameStream, frame_streams, merged_columns
 from demorec.recording.video import Rgb, VideoPacket, VideoSettings, is_keyframe
 from demorec.scene.episode import EpisodeColumns, Event, JointSample, frame_time_ns
@@ -194,17 +194,21 @@ class RecordingReader(EpisodeFile):
 
     def segmentation(self, camera: str) -> Iterator[NDArray[np.int32]]:
         """Segmentation pictures, (H, W) int32 as in `CameraImages`, one a frame; `segment_names` tells what is what."""
-        for _, labels in self._pictures(self._segmentation_topic(camera), lambda data: self._decoded(data, camera)):
+        topic, decoder = self._segmentation_topic(camera), LabelDecoder(self._size(camera))
+        for _, labels in self._pictures(topic, lambda data: decoder.decode(messages.read_compressed_image(data))):
             yield labels
 
     def segmentation_at(
         self, cameras: Sequence[str], frames: Collection[int]
-    ) -> Iterator[tuple[str, int, NDArray[np.int32]]]:
-        """(camera, frame, segmentation picture) of some frames, read in one pass; the other pictures stay packed.
+    ) -> Iterator[tuple[str, int, NDArray[np.uint16]]]:
+        """(camera, frame, (H, W) labels) of some frames, read in one pass; the other pictures stay packed.
+
+        Labels are what `segment_labels` tells, less to compute than the values of `segmentation`.
 
         Those of one camera come in the order of its frames; how those of several cameras alternate is not said.
         """
         topics = {camera: self._segmentation_topic(camera) for camera in cameras}
+        decoders = {camera: LabelDecoder(self._size(camera)) for camera in cameras}
         times, counts = self._frame_times(), dict.fromkeys(cameras, 0)
         for blocks in self._container.blocks_by_chunk(topics.values()):
             for camera, topic in topics.items():
@@ -214,8 +218,11 @@ class RecordingReader(EpisodeFile):
                 counts[camera] += len(block)
                 if not np.array_equal(block.time_ns, times[first : counts[camera]]):
                     raise RecordingError(f"Pictures of {topic} are not at the times of the frames: {self.path}")
-                for index in [index for index in range(len(block)) if first + index in frames]:
-                    yield camera, first + index, self._decoded(next(block.select(np.array([index])).messages()), camera)
+                chosen = np.array([index for index in range(len(block)) if first + index in frames], dtype=np.intp)
+                for index, message in zip(chosen.tolist(), block.select(chosen).messages(), strict=True):
+                    with damage_as_recording_error(self.path):
+                        labels = decoders[camera].labels(messages.read_compressed_image(message))
+                    yield camera, first + index, labels
         for camera, count in counts.items():
             self._check_num_pictures(topics[camera], count)
 
@@ -224,10 +231,6 @@ class RecordingReader(EpisodeFile):
             raise RecordingError(f"The recording has no segmentation pictures of the camera {camera!r}: {self.path}")
         return channels.camera_topic(camera, "segmentation")
 
-    def _decoded(self, message: bytes, camera: str) -> NDArray[np.int32]:
-        with damage_as_recording_error(self.path):
-            return decode_labels(messages.read_compressed_image(message), self._size(camera))
-
     def _size(self, camera: str) -> tuple[int, int]:
         """(height, width) of all pictures of a camera."""
         settings = self.video_settings(camera)
@@ -235,11 +238,15 @@ class RecordingReader(EpisodeFile):
 
     def segment_names(self) -> dict[int, str]:
         """Segmentation value -> name of the body, or ROBOT/LINK; empty when no segmentation was recorded."""
+        labels = self.segment_labels()
+        values = from_labels(np.array(list(labels), dtype=np.uint16)).tolist()
+        return dict(zip(values, labels.values(), strict=True))
+
+    def segment_labels(self) -> dict[int, str]:
+        """Label in the files -> name, as of `segment_names`."""
         for message in self._container.messages((channels.LABELS,)):
             with damage_as_recording_error(self.path):
-                labels = messages.read_label_info(message.data)
-                values = from_labels(np.array([list(labels)], dtype=np.uint16))[0].tolist()
-            return dict(zip(values, labels.values(), strict=True))
+                return messages.read_label_info(message.data)
         return {}
 
     def _pictures[P](self, topic: str, read: Callable[[bytes], P]) -> Iterator[tuple[int, P]]:

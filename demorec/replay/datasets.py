@@ -35,11 +35,11 @@ def dataset_demonstrations(
     if not dataset.sidecar:
         raise ConfigError(f"The dataset does not say how its scenes were (no demorec/episodes): {path}")
     dataset.check_simulated()
-    numbers = [number for number in range(len(dataset.rows)) if wanted(number)]
-    if limit is not None and len(numbers) > limit:
-        numbers = [numbers[k * len(numbers) // limit] for k in range(limit)]
-    for number in numbers:
-        rows, row, info = dataset.rows[number], dataset.sidecar[number], dataset.infos[number]
+    chosen = [each for each in dataset.described() if wanted(each.number)]
+    if limit is not None and len(chosen) > limit:
+        chosen = [chosen[k * len(chosen) // limit] for k in range(limit)]
+    for each in chosen:
+        number, rows, row, info = each.number, each.rows, each.kept, each.info
         kind = dataset.action_kind(info)
         if kind is None:
             raise ConfigError(f"The dataset's actions are none that demorec writes, so they cannot be replayed: {path}")

@@ -21,6 +21,8 @@ from support.export import export
 from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.errors import ConfigError
 from demorec.lerobot.depth import quantised
+from demorec.playback.collected import PlayedCollected
+from demorec.playback.from_dataset import open_dataset_episode
 from demorec.playback.sources import find_episodes
 from demorec.recording import CollectedRecording
 from demorec.recording.depth import encode_millimetres
@@ -194,6 +196,11 @@ def test_exports_have_it_where_it_is_asked_for(kind: str, tmp_path: Path) -> Non
         np.testing.assert_array_equal(picture, expected)
     report = export(run, tmp_path / "dataset", depth=True)
     assert report.depth_left_out == ()
+    with open_dataset_episode(tmp_path / "dataset", 0) as episode:
+        assert isinstance(episode, PlayedCollected)
+        times, shown = zip(*episode.depth["wrist_depth"](), strict=True)
+    assert list(times) == episode.time_ns.tolist()
+    np.testing.assert_allclose(shown, np.nan_to_num(stored, posinf=0).clip(max=10), atol=2e-3)
 
 
 def test_what_was_not_measured_has_code_0() -> None:

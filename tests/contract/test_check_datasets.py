@@ -8,9 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from support.check import checked, copy, edit_column, edit_json, level_of, simulate_run
+from support.collected import make_collected, write_collected
 
 from demorec.check.coverage import draw_coverage, largest_gap
 from demorec.config import EpisodePlan, GenerateConfig
@@ -225,6 +227,50 @@ def test_an_outcome_that_was_changed(dataset: Path, tmp_path: Path) -> None:
     spoilt = copy(dataset, tmp_path / "ds")
     edit_column(spoilt, "next.success", np.zeros_like)
     assert level_of(spoilt, "dataset_sidecar", "dataset") == "fail"
+
+
+def test_episodes_that_the_sidecar_does_not_know(dataset: Path, tmp_path: Path) -> None:
+    """As after LeRobot's resume: those that it knows are judged by their own rows."""
+    spoilt = copy(dataset, tmp_path / "ds")
+    path = next((spoilt / "demorec" / "episodes").glob("*/*.parquet"))
+    pq.write_table(pq.read_table(path).slice(1), path)
+    before, after = (checked(each, "dataset", pictures=False).results for each in (dataset, spoilt))
+    differing = [(b.check, a.level) for b, a in zip(before, after, strict=True) if b.level != a.level]
+    assert differing == [("dataset_sidecar", "fail")]
+    (sidecar,) = [result for result in after if result.check == "dataset_sidecar"]
+    assert sidecar.detail.startswith("of episode 0 it knows nothing: LeRobot recorded 1 of 3 into the dataset, or")
+
+
+def test_a_sidecar_of_other_episodes(dataset: Path, tmp_path: Path) -> None:
+    spoilt = copy(dataset, tmp_path / "ds")
+    path = next((spoilt / "demorec" / "episodes").glob("*/*.parquet"))
+    table = pq.read_table(path)
+    numbers = pa.array([0, 1, 7], table.schema.field("episode_index").type)
+    pq.write_table(table.set_column(table.schema.get_field_index("episode_index"), "episode_index", numbers), path)
+    (result,) = checked(spoilt, "dataset", only=["dataset_sidecar"]).results
+    assert (result.level, result.detail) == ("fail", "its rows are of the episodes [0, 1, 7], the dataset has 3")
+
+
+def test_statistics_of_numbers_of_rows_are_nobodys_business(dataset: Path, tmp_path: Path) -> None:
+    """LeRobot's delete and split number rows anew and keep the statistics of the old numbers."""
+    spoilt = copy(dataset, tmp_path / "ds")
+
+    def renumbered(stats: dict[str, Any]) -> None:
+        stats["index"]["max"] = [10**6]
+        stats["episode_index"]["mean"] = [17.0]
+
+    edit_json(spoilt / "meta" / "stats.json", renumbered)
+    assert level_of(spoilt, "dataset_statistics", "dataset") == "pass"
+    edit_json(spoilt / "meta" / "stats.json", lambda stats: stats["timestamp"].update(max=[10**6]))
+    assert level_of(spoilt, "dataset_statistics", "dataset") == "fail"
+
+
+def test_a_number_of_a_collected_episode_that_was_changed(tmp_path: Path) -> None:
+    path = write_collected(tmp_path / "e.mcap", make_collected(cameras=(), num_frames=12))
+    export_lerobot([path], tmp_path / "ds", ExportOptions(verify=False))
+    assert level_of(tmp_path / "ds", "dataset_sidecar", "dataset") == "pass"
+    edit_column(tmp_path / "ds", "action", lambda rows: rows + 1e-3)
+    assert level_of(tmp_path / "ds", "dataset_sidecar", "dataset") == "fail"
 
 
 def test_an_episode_twice_in_a_dataset(run: Path, tmp_path: Path) -> None:

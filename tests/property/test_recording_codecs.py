@@ -23,7 +23,7 @@ from demorec.geometry import Pose
 from demorec.recording.cdr import CdrReader, CdrWriter
 from demorec.recording.depth import decode_depth, encode_depth
 from demorec.recording.description import body_description, robot_description
-from demorec.recording.labels import decode_labels, encode_labels
+from demorec.recording.labels import LabelDecoder, decode_labels, encode_labels
 from demorec.recording.messages import JOINT_STATE
 from demorec.recording.ros2 import DEFINITIONS
 from demorec.recording.shapes import Primitive, fit_primitives
@@ -242,3 +242,15 @@ def test_damaged_pngs_are_refused() -> None:
         decode_labels(good[:20], (48, 64))
     with pytest.raises(ValueError, match="of 64x48 pixels"):  # before anything is unpacked
         decode_labels(good, (4, 4))
+
+
+def test_a_segmentation_picture_owes_nothing_to_the_one_before() -> None:
+    """FFmpeg adds up pictures that are not said to be keyframes."""
+    from PIL import Image
+
+    decoder, table, cube = LabelDecoder((6, 8)), np.full((6, 8), 1, np.int32), np.full((6, 8), 2, np.int32)
+    shown = [decoder.decode(encode_labels(picture)) for picture in (table, cube, cube, table)]
+    for found, picture in zip(shown, (table, cube, cube, table), strict=True):
+        np.testing.assert_array_equal(found, picture)
+    numbers = np.asarray(Image.open(io.BytesIO(encode_labels(cube))))
+    np.testing.assert_array_equal(decoder.labels(encode_labels(cube)), numbers)
