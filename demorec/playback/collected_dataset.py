@@ -16,7 +16,7 @@ from demorec.lerobot.reader import read_tasks
 from demorec.lerobot.robots import DatasetRobot
 from demorec.plain import from_json
 from demorec.playback.collected import PlayedCollected
-from demorec.playback.episode import Curves, Video
+from demorec.playback.episode import Curves, Statements, Video
 from demorec.recording.collected.transforms import JointPositions
 from demorec.scene.collected import CollectedCamera, CollectedFeature, CollectedInfo, CollectedOutcome, Origin
 
@@ -31,6 +31,7 @@ def collected_of_dataset(
     time_ns: NDArray[np.int64],
     videos: Mapping[str, Video],
     robot: DatasetRobot | None,
+    statements: Statements,
 ) -> PlayedCollected:
     """An episode as its dataset knows it, at the dataset's rate.
 
@@ -42,6 +43,7 @@ def collected_of_dataset(
         time_ns: (T,) of the rows.
         videos: Camera -> coded pictures.
         robot: The arm, if it is known.
+        statements: What is said of the episode.
 
     Raises:
         RecordingError, ExportError, ValueError, KeyError, TypeError: Its tables hold something odd.
@@ -86,4 +88,5 @@ def collected_of_dataset(
         joint_position=dict(zip(positions.joints, values, strict=True)),
         curves={name: Curves(time_ns=time_ns, values=data[name], names=parts) for name, parts in names.items()},
         videos=videos,
+        statements=statements,
     )
