@@ -13,6 +13,7 @@ from typing import Self
 import h5py
 
 from demorec.errors import in_words
+from demorec.hdf5 import trial
 from demorec.safety.files import HDF5_MAGIC, open_regular
 from demorec.safety.replacing import ReplaceableKind
 
@@ -43,7 +44,7 @@ def _begins_as_hdf5(path: Path) -> bool:
 
 
 def _is_our_dataset(path: Path) -> bool:
-    if not _begins_as_hdf5(path):
+    if not _begins_as_hdf5(path) or trial.why_not_read(path):
         return False
     try:
         with h5py.File(path, "r", locking=False) as file:

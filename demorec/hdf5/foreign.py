@@ -19,15 +19,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.errors import DemorecError, resource_error
+from demorec.hdf5 import trial
 from demorec.recording.limits import LimitError, Limits
 from demorec.registry import nearest_match
 from demorec.safety.files import HDF5_MAGIC, open_regular
 
 Kind = Literal["group", "dataset", "other"]
 Scalar = str | bool | int | float
-_MAX_CHILDREN = 100_000
+_MAX_CHILDREN = trial.MAX_OBJECTS
 _MAX_CHUNK_BYTES = 1 << 28
-_MAX_ATTRIBUTE_BYTES = 16 << 20
+_MAX_ATTRIBUTE_BYTES = trial.MAX_ATTRIBUTE_BYTES
 _MAX_NAME = 1000
 _MAX_DEPTH = 6
 _BLOCK_BYTES = 8 << 20
@@ -107,6 +108,8 @@ class ForeignFile:
                 if file.read(len(HDF5_MAGIC)) != HDF5_MAGIC:
                     raise Hdf5Error(f"This is no HDF5 file: {path}")
                 self._limits = Limits.of_file(os.fstat(file.fileno()).st_size)
+            if reason := trial.why_not_read(path):
+                raise Hdf5Error(f"The HDF5 file cannot be read ({reason}): {path}")
             self._root = h5py.File(path, "r", locking=False)
         except (OSError, RuntimeError, ValueError) as error:
             raise _unreadable(error, "The HDF5 file cannot be read", path) from error

@@ -48,13 +48,21 @@ def timeline(stream: Stream, mapping: BagMapping) -> Timeline:
     stamped = (stream.header_ns != NO_STAMP) & (stream.header_ns > 0)
     is_header = mapping.clock.stamp == "header" and bool(len(stamped)) and bool(np.mean(stamped) > 0.5)
     times = stream.header_ns if is_header else stream.log_ns
-    usable = np.flatnonzero(stamped) if is_header else np.arange(len(times))
+    if (not is_header or stamped.all()) and bool(np.all(times[1:] > times[:-1])):
+        order: Int = np.arange(len(times))
+        ordered = times
+    else:
+        ordered, order = _put_in_order(times, np.flatnonzero(stamped) if is_header else np.arange(len(times)))
+    period, is_regular = _period(ordered)
+    return Timeline(times_ns=ordered, order=order, is_header=is_header, period_ns=period, is_regular=is_regular)
+
+
+def _put_in_order(times: Int, usable: Int) -> tuple[Int, Int]:
+    """The times of the usable messages, each once, and which messages they are."""
     order = usable[np.argsort(times[usable], kind="stable")]
     ordered = times[order]
     first = np.concatenate(([True], np.diff(ordered) > 0)) if len(ordered) else np.zeros(0, bool)
-    ordered, order = ordered[first], order[first]
-    period, is_regular = _period(ordered)
-    return Timeline(times_ns=ordered, order=order, is_header=is_header, period_ns=period, is_regular=is_regular)
+    return ordered[first], order[first]
 
 
 def _period(times: Int) -> tuple[int, bool]:
@@ -116,22 +124,30 @@ def choose(times_ns: Int, rows_ns: Int, sample: Sampling) -> Chosen:
     return Chosen(index=before, fraction=fraction, age_ns=np.where(is_outside, MISSING, since), reach_ns=reach)
 
 
-def sampled(values: Numbers, chosen: Chosen, *, unit: str, quaternions: tuple[int, ...]) -> Numbers:
+def sampled(
+    values: Numbers, chosen: Chosen, *, unit: str, quaternions: tuple[int, ...], order: Int | None = None
+) -> Numbers:
     """(R, D) the numbers of some rows.
 
     Args:
-        values: (M, D) in the order of the timeline.
+        values: (M, D) in the order of the timeline, or of the bag if `order` is given.
         chosen: For the rows; all of them have a message.
         unit: Of the values: the line between two angles (rad, degree) is the short way round.
         quaternions: First elements of x, y, z, w, which are mixed on the sphere.
+        order: Of the timeline; None where `values` are in it.
 
     Returns:
         The very bits of a message where one is taken; where two are mixed, float64.
     """
+
+    def at(index: Int) -> Numbers:
+        return values[index if order is None else order[index]]
+
     if chosen.fraction is None or not np.any(chosen.fraction):
-        return values[chosen.index]
-    first = values[chosen.index].astype(np.float64)
-    second = values[np.minimum(chosen.index + 1, len(values) - 1)].astype(np.float64)
+        return at(chosen.index)
+    last = len(values if order is None else order) - 1
+    first = at(chosen.index).astype(np.float64)
+    second = at(np.minimum(chosen.index + 1, last)).astype(np.float64)
     fraction = chosen.fraction[:, np.newaxis]
     step = second - first
     turn = {"rad": 2 * np.pi, "degree": 360.0}.get(unit)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.ingest.clock import NS, Int, Timeline
+from demorec.ingest.clock import NS, Int, Numbers, Timeline
 from demorec.ingest.mapping import BagMapping
 from demorec.ingest.mapping_file import ACTION, STATE
 from demorec.ingest.streams import NO_STAMP, BagStreams, Stream
@@ -123,46 +123,74 @@ def _clock_findings(stream: Stream) -> Iterator[tuple[str, str]]:
 def _value_findings(stream: Stream, line: Timeline) -> Iterator[tuple[str, str]]:
     if stream.values is None or stream.layout is None or len(line.order) < 2:
         return
-    values, names = stream.values[line.order].astype(np.float64), stream.layout.names
-    bad = ~np.isfinite(values)
-    if bad.any():
-        column = int(np.argwhere(bad)[0][1])
-        kind = "nan" if np.isnan(values[bad]).any() else "infinite"
-        yield kind, f"{int(bad.any(axis=1).sum())} messages hold no finite number, the first in {names[column]!r}"
-        values = np.where(bad, 0.0, values)
+    elements, names = _Elements(stream.values, line.order), stream.layout.names
+    yield from _number_findings(elements, names)
     for start in stream.layout.quaternions:
-        off = float(np.abs(np.linalg.norm(values[:, start : start + 4], axis=1) - 1).max())
+        off = float(np.abs(np.linalg.norm(elements.quaternion(start), axis=1) - 1).max())
         if off > 1e-3:
             yield "quaternion", f"the length of a quaternion is off by {off:.3g}"
-    if len(names) > 1 and not np.any(values):
+    if len(names) > 1 and not any(np.any(element) for element in elements):
         yield "zeros", "all numbers are 0"
         return
-    yield from _still_findings(values, names, line)
+    yield from _still_findings(elements, names, line)
+    signs: dict[int, NDArray[np.float64]] = {}
     for start in stream.layout.quaternions:
-        _follow_signs(values[:, start : start + 4])
-    steps = np.abs(np.diff(values, axis=0))
-    for column, name in enumerate(names):
-        usual = float(np.percentile(steps[:, column], 90))
-        largest = int(steps[:, column].argmax())
-        if usual > 0 and steps[largest, column] > _SPIKE * usual:
+        signs |= dict.fromkeys(range(start, start + 4), _signs(elements.quaternion(start)))
+    for column, (name, element) in enumerate(zip(names, elements, strict=True)):
+        steps = np.abs(np.diff(element * signs[column] if column in signs else element))
+        usual = float(np.percentile(steps, 90))
+        largest = int(steps.argmax())
+        if usual > 0 and steps[largest] > _SPIKE * usual:
             at = (line.times_ns[largest + 1] - line.times_ns[0]) / NS
-            yield "jump", f"{name!r} jumps by {steps[largest, column]:.3g} at {at:.2f} s, usual are {usual:.2g}"
+            yield "jump", f"{name!r} jumps by {steps[largest]:.3g} at {at:.2f} s, usual are {usual:.2g}"
             break
 
 
-def _follow_signs(quaternions: NDArray[np.float64]) -> None:
-    """Give each of (T, 4), in place, the sign that is nearer to the one before: both mean the same rotation."""
+class _Elements:
+    """A stream's numbers, one element of the vector at a time: all at once take several times the stream's memory.
+
+    What is no finite number is 0 in them.
+    """
+
+    def __init__(self, values: Numbers, order: Int) -> None:
+        self.values, self.order = values, order
+
+    def __iter__(self) -> Iterator[NDArray[np.float64]]:
+        """(T,) of each element, in the order of the times."""
+        for column in range(self.values.shape[1]):
+            yield self._finite(self.values[self.order, column])
+
+    def quaternion(self, start: int) -> NDArray[np.float64]:
+        """(T, 4) of four elements."""
+        return self._finite(self.values[self.order, start : start + 4])
+
+    def _finite(self, part: Numbers) -> NDArray[np.float64]:
+        return np.nan_to_num(part.astype(np.float64), nan=0.0, posinf=0.0, neginf=0.0)
+
+
+def _number_findings(elements: _Elements, names: tuple[str, ...]) -> Iterator[tuple[str, str]]:
+    """Numbers that are none."""
+    are_finite = np.asarray(np.isfinite(elements.values).all(axis=1))
+    rows = elements.values[elements.order[~are_finite[elements.order]]]
+    if len(rows):
+        column = int(np.flatnonzero(~np.isfinite(rows[0]))[0])
+        kind = "nan" if np.isnan(rows).any() else "infinite"
+        yield kind, f"{len(rows)} messages hold no finite number, the first in {names[column]!r}"
+
+
+def _signs(quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(T,) by which each of (T, 4) is nearest to the one before: both signs mean the same rotation."""
     flips = np.where((quaternions[1:] * quaternions[:-1]).sum(axis=1) < 0, -1.0, 1.0)
-    quaternions[1:] *= np.cumprod(flips)[:, np.newaxis]
+    return np.concatenate(([1.0], np.cumprod(flips)))
 
 
-def _still_findings(values: NDArray[np.float64], names: tuple[str, ...], line: Timeline) -> Iterator[tuple[str, str]]:
+def _still_findings(elements: _Elements, names: tuple[str, ...], line: Timeline) -> Iterator[tuple[str, str]]:
     """Elements with noise that suddenly have none."""
     stuck = []
-    for column, name in enumerate(names):
-        begin, end = _longest_run(values[:, column])
+    for name, element in zip(names, elements, strict=True):
+        begin, end = _longest_run(element)
         seconds = (line.times_ns[end] - line.times_ns[begin]) / NS
-        others = np.concatenate((values[:begin, column], values[end + 1 :, column]))
+        others = np.concatenate((element[:begin], element[end + 1 :]))
         if seconds < _STILL_S or end - begin < 10 or len(others) < 10:
             continue
         if np.mean(np.diff(others) != 0) > 0.8:
@@ -181,11 +209,11 @@ def _longest_run(numbers: NDArray[Any]) -> tuple[int, int]:
 
 
 def _picture_findings(stream: Stream, line: Timeline) -> Iterator[tuple[str, str]]:
-    formats = {(head.format, head.encoding) for head in stream.heads}
+    formats = {(head.format, head.encoding) for head in stream.heads.kinds()}
     if len(formats) > 1:
         told = ", ".join(sorted(f"{name} {encoding}".strip() for name, encoding in formats))
         yield "format", f"its pictures are of several kinds ({told})"
-    sizes = {(head.width, head.height) for head in stream.heads if head.width}
+    sizes = {(head.width, head.height) for head in stream.heads.kinds() if head.width}
     if len(sizes) > 1:
         yield "size", f"its pictures change their size ({', '.join(f'{w}x{h}' for w, h in sorted(sizes))})"
     sums = stream.picture_sums[line.order]
@@ -194,7 +222,8 @@ def _picture_findings(stream: Stream, line: Timeline) -> Iterator[tuple[str, str
         at = (line.times_ns[begin] - line.times_ns[0]) / NS
         yield "frozen", f"{end - begin + 1} pictures from {at:.2f} s on have the very same bytes"
     if stream.heads and stream.heads[0].format in ("h264", "h265", "av1") and not stream.heads[0].is_keyframe:
-        first = next((k for k, head in enumerate(stream.heads) if head.is_keyframe), len(stream.heads))
+        keyframes = np.flatnonzero(stream.heads.are_keyframes)
+        first = int(keyframes[0]) if len(keyframes) else len(stream.heads)
         yield "keyframe", f"its first {first} pictures cannot be decoded, since no keyframe is before them"
 
 

@@ -10,11 +10,13 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from demorec.config import VideoConfig
 from demorec.errors import ConfigError
 from demorec.ingest.bag import Bag, open_bag
 from demorec.ingest.channel import BagError
-from demorec.ingest.clock import NS
+from demorec.ingest.clock import NS, Int
 from demorec.ingest.description import describe, origin_of, urdf_text
 from demorec.ingest.episode_writer import ImportedEpisodeWriter, PicturePlan, picture_plan
 from demorec.ingest.episodes import Window, subtask_rows, task_text, windows
@@ -209,15 +211,16 @@ class _Import:
 
     def _pictures(self, episodes: Sequence[_Episode]) -> Iterator[tuple[str, int, dict[str, object]]]:
         """(topic, number, values) of the pictures that any episode takes."""
-        wanted: dict[str, set[int]] = {}
+        taken: dict[str, list[Int]] = {}
         for episode in episodes:
             for plan in episode.plans.values():
-                wanted.setdefault(plan.topic, set()).update(plan.numbers.tolist())
+                taken.setdefault(plan.topic, []).append(plan.numbers)
+        wanted = {topic: np.bincount(np.concatenate(numbers)) > 0 for topic, numbers in taken.items()}
         decoder, counts = BagDecoder(), dict.fromkeys(wanted, 0)
         for message in self._bag.messages([], wanted.keys()):
             topic = message.channel.topic
             number, counts[topic] = counts[topic], counts[topic] + 1
-            if number in wanted[topic]:
+            if number < len(wanted[topic]) and wanted[topic][number]:
                 try:
                     values = decoder.values(message)
                 except ValueError as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from array import array
 from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple, cast
 
@@ -44,6 +45,40 @@ class PictureHead(NamedTuple):
     width: int
     height: int
     is_keyframe: bool
+
+
+class PictureHeads:
+    """The heads of a camera's pictures in order: a bag has a million of them, which are of a few kinds."""
+
+    def __init__(self) -> None:
+        self._kinds: list[PictureHead] = []
+        self._places: dict[PictureHead, int] = {}
+        self._of = array("I")
+
+    def append(self, head: PictureHead) -> None:
+        """Add the next one."""
+        place = self._places.get(head)
+        if place is None:
+            place = self._places[head] = len(self._kinds)
+            self._kinds.append(head)
+        self._of.append(place)
+
+    def __len__(self) -> int:
+        return len(self._of)
+
+    def __getitem__(self, index: int) -> PictureHead:
+        return self._kinds[self._of[index]]
+
+    def kinds(self, among: NDArray[np.int64] | None = None) -> list[PictureHead]:
+        """The different ones, of all or of the pictures of these numbers."""
+        if among is None:
+            return list(self._kinds)
+        return [self._kinds[place] for place in np.unique(np.array(self._of)[among]).tolist()]
+
+    @property
+    def are_keyframes(self) -> NDArray[np.bool_]:
+        """(N,) of each whether it can be decoded without those before it."""
+        return np.array([head.is_keyframe for head in self._kinds], bool)[np.array(self._of, np.intp)]
 
 
 def picture_head(values: Values) -> PictureHead:

@@ -187,9 +187,9 @@ class Timelines:
         inside = np.flatnonzero((line.times_ns >= begin) & (line.times_ns <= end))
         if heads:
             # Video that begins with a keyframe goes into a dataset as it is.
-            keyframes = [place for place in inside if heads[int(line.order[place])].is_keyframe]
+            keyframes = inside[heads.are_keyframes[line.order[inside]]]
             limit = window.begin_ns + round(clock.max_trim_s * NS)
-            if keyframes and line.times_ns[keyframes[0]] <= limit:
+            if len(keyframes) and line.times_ns[keyframes[0]] <= limit:
                 inside = inside[inside >= keyframes[0]]
         return line.times_ns[inside]
 
@@ -225,7 +225,7 @@ class Timelines:
                 return f"{self._label(key)} holds no finite number at {len(bad)} rows, from {at:.2f} s on"
             return ""
         first, last = int(chosen.index.min()), int(chosen.index.max())
-        heads = [stream.heads[index] for index in line.order[first : last + 1]]
+        heads = stream.heads.kinds(line.order[first : last + 1])
         sizes = sorted({(head.width, head.height) for head in heads if head.width})
         formats = sorted({head.format for head in heads})
         if len(sizes) > 1:
@@ -242,7 +242,9 @@ class Timelines:
             assert stream.values is not None
             assert stream.layout is not None
             unit = source.to or source.unit
-            parts.append(sampled(stream.values[line.order], rows, unit=unit, quaternions=stream.layout.quaternions))
+            parts.append(
+                sampled(stream.values, rows, unit=unit, quaternions=stream.layout.quaternions, order=line.order)
+            )
             names += stream.layout.names
             units += [unit] * len(stream.layout.names)
             ages.append(rows.age_ns)
@@ -258,7 +260,8 @@ def _from_keyframe(stream: Stream, line: Timeline) -> Timeline:
     """Of video only what can be decoded: from the first keyframe on."""
     if not stream.heads:
         return line
-    first = next((k for k, index in enumerate(line.order) if stream.heads[index].is_keyframe), len(line.order))
+    keyframes = np.flatnonzero(stream.heads.are_keyframes[line.order])
+    first = int(keyframes[0]) if len(keyframes) else len(line.order)
     return replace(line, times_ns=line.times_ns[first:], order=line.order[first:]) if first else line
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import zlib
 from array import array
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -33,7 +32,7 @@ from demorec.ingest.fields import (
     stamp_of,
 )
 from demorec.ingest.mapping import BagMapping, CameraSource, Source
-from demorec.ingest.picture_messages import PictureHead, picture_head
+from demorec.ingest.picture_messages import PictureHeads, picture_head
 from demorec.ingest.ros_types import Values
 from demorec.ingest.service_calls import CallReader, ServiceCall
 from demorec.registry import nearest_match
@@ -52,7 +51,7 @@ class Stream:
         topic, type: Of its messages.
         log_ns: (N,) int64, when each was recorded.
         header_ns: (N,) int64, the time in each header, or NO_STAMP.
-        numbers: (N,) int64, which of the topic's messages it is, from 0.
+        numbers: (N,) int64, which of the topic's messages it is, from 0; empty for others than cameras.
         values: (N, D) in the unit of the feature; None for cameras.
         layout: Of the values; None for cameras.
         heads: (N,) what is known of each picture; empty for others.
@@ -71,7 +70,7 @@ class Stream:
     numbers: NDArray[np.int64]
     values: NDArray[np.floating[Any]] | None
     layout: SourceLayout | None
-    heads: Sequence[PictureHead]
+    heads: PictureHeads
     checksums: NDArray[np.uint32]
     picture_sums: NDArray[np.uint32]
     frame_ids: tuple[str, ...]
@@ -137,9 +136,9 @@ class _Growing:
     numbers: array[int] = field(default_factory=lambda: array("q"))
     checksums: array[int] = field(default_factory=lambda: array("I"))
     picture_sums: array[int] = field(default_factory=lambda: array("I"))
-    vectors: list[NDArray[np.floating[Any]]] = field(default_factory=list)
-    blocks: list[NDArray[np.floating[Any]]] = field(default_factory=list)
-    heads: list[PictureHead] = field(default_factory=list)
+    vectors: bytearray = field(default_factory=bytearray)
+    dtype: np.dtype[np.floating[Any]] | None = None
+    heads: PictureHeads = field(default_factory=PictureHeads)
     frame_ids: dict[str, None] = field(default_factory=dict)
     num_malformed: int = 0
     first_problem: str = ""
@@ -153,12 +152,11 @@ class _Growing:
                 if self.reader is None:
                     self.layout = layout_of(self.source, values)
                     self.reader = SourceReader(self.source, self.layout)
-                self.vectors.append(self.reader.read(values))
-                if len(self.vectors) >= 4096:
-                    self._pack()
+                self._add_vector(self.reader.read(values))
             else:
                 self.heads.append(picture_head(values))
                 self.picture_sums.append(zlib.crc32(picture_bytes(values)))
+                self.numbers.append(number)
         except OtherPublisherError as error:
             self.first_refusal = self.first_refusal or str(error)
             return
@@ -168,7 +166,6 @@ class _Growing:
         stamp = stamp_of(values)
         self.log_ns.append(message.log_ns)
         self.header_ns.append(NO_STAMP if stamp is None else stamp)
-        self.numbers.append(number)
         self.checksums.append(checksum)
         if len(self.frame_ids) < 16:
             self.frame_ids.setdefault(frame_id_of(values))
@@ -178,29 +175,33 @@ class _Growing:
         self.num_malformed += 1
         self.first_problem = self.first_problem or problem
 
-    def _pack(self) -> None:
-        if self.vectors:
-            self.blocks.append(np.stack(self.vectors))
-            self.vectors.clear()
+    def _add_vector(self, vector: NDArray[np.floating[Any]]) -> None:
+        # Bytes behind each other: an array for each of a million messages takes three times as much, and leaves holes.
+        if self.dtype is None:
+            self.dtype = vector.dtype
+        elif self.dtype != vector.dtype:  # float64 holds both
+            self.vectors = bytearray(np.frombuffer(self.vectors, self.dtype).astype(np.float64).data)
+            self.dtype = np.dtype(np.float64)
+        self.vectors += vector.astype(self.dtype, copy=False).data
 
     def finished(self) -> Stream:
         """The stream as it is now."""
-        self._pack()
         values = None
-        if self.source is not None and self.blocks:
-            values = converted(self.source, np.concatenate(self.blocks))
+        if self.source is not None and self.layout is not None and self.log_ns:
+            rows = np.frombuffer(self.vectors, self.dtype).reshape(len(self.log_ns), -1)
+            values = converted(self.source, rows)
         return Stream(
             label=self.label,
             topic=self.topic,
             type=self.type,
-            log_ns=np.frombuffer(self.log_ns, np.int64) if self.log_ns else np.empty(0, np.int64),
-            header_ns=np.frombuffer(self.header_ns, np.int64) if self.header_ns else np.empty(0, np.int64),
-            numbers=np.frombuffer(self.numbers, np.int64) if self.numbers else np.empty(0, np.int64),
+            log_ns=np.asarray(self.log_ns),
+            header_ns=np.asarray(self.header_ns),
+            numbers=np.asarray(self.numbers),
             values=values,
             layout=self.layout,
             heads=self.heads,
-            checksums=np.array(self.checksums, dtype=np.uint32),
-            picture_sums=np.array(self.picture_sums, dtype=np.uint32),
+            checksums=np.asarray(self.checksums),
+            picture_sums=np.asarray(self.picture_sums),
             frame_ids=tuple(self.frame_ids),
             num_malformed=self.num_malformed,
             first_problem=self.first_problem,
@@ -341,7 +342,7 @@ class _Reading:
                 problems.append(f"{stream.label} cannot be taken from {stream.topic} ({stream.type}): {reason}")
         problems += self._double_names()
         for camera in self._cameras.values():
-            if camera.heads and not any(head.is_keyframe for head in camera.heads):
+            if camera.heads and not camera.heads.are_keyframes.any():
                 problems.append(f"{camera.topic} has no keyframe with its parameter sets, so it cannot be decoded")
         if problems:
             raise BagError(f"The mapping does not fit the bag: {'; '.join(problems)}: {bag.path}")

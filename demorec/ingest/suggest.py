@@ -33,7 +33,7 @@ _SHOWN = 4
 _LONGEST = 40
 _ACTION = re.compile(r"leader|master|gello|command|cmd|target|desired|goal|teleop|/action")
 _STATE = re.compile(r"follower|puppet|measured|joint_states?$|joints/state$|robot_state")
-_TASK = re.compile(r"task|instruction|prompt")
+_TASK = re.compile(r"(?<!sub)(?<!sub[_/-])task|instruction|prompt")
 _POSE_TYPES = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/PoseStamped", "foxglove.PoseInFrame")
 _VECTOR_FIELDS = ("position", "positions", "joints.position", "points[0].positions", "data")
 _STOP_WORDS = {"camera", "cam", "color", "image", "raw", "rect", "compressed", "rgb", "cameras", "images", "video"}
@@ -102,6 +102,7 @@ def suggested_mapping(path: Path) -> list[str]:
     lines += ["", "[task]", *_task(topics, bag)]
     lines += ["", "[clock]", *_clock(topics, cameras, vectors)]
     lines += list(_services(topics))
+    lines += list(_subtasks(topics))
     lines += list(_features(vectors))
     lines += list(_poses(topics))
     for camera, topic in cameras.items():
@@ -240,10 +241,20 @@ def _robot_model(topics: Mapping[str, _Topic]) -> list[str]:
 
 
 def _task(topics: Mapping[str, _Topic], bag: Bag) -> list[str]:
-    told = [name for name, topic in sorted(topics.items()) if _TASK.search(name.lower()) and _is_text(topic)]
-    if told:
+    if told := _task_topics(topics):
         return [f"topic = {quoted(told[0])}"]
     return [f"text = {quoted(bag.name.replace('_', ' '))}  # what the robot was asked to do", "# file_name = true"]
+
+
+def _task_topics(topics: Mapping[str, _Topic]) -> list[str]:
+    return [name for name, topic in sorted(topics.items()) if _TASK.search(name.lower()) and _is_text(topic)]
+
+
+def _subtasks(topics: Mapping[str, _Topic]) -> Iterator[str]:
+    """Texts that may say what the robot does."""
+    others = {*_task_topics(topics)[:1], *(name for name in topics if name.endswith("robot_description"))}
+    for name in (name for name in sorted(topics) if name not in others and _is_text(topics[name])):
+        yield from ("", "# [subtasks]", f"# topic = {quoted(name)}  # if its texts say what the robot does")
 
 
 def _is_text(topic: _Topic) -> bool:

@@ -20,12 +20,13 @@ from numpy.typing import NDArray
 from demorec.errors import DemorecError, as_reason
 from demorec.geometry import Pose
 from demorec.playback.cameras import Distances, send_depth, send_video
-from demorec.playback.episode import Curves, Video, VideoBatch
+from demorec.playback.episode import Curves, Statements, Video, VideoBatch
 from demorec.playback.meshes import SurfaceMesh, skeleton_meshes, urdf_meshes
 from demorec.playback.paths import Paths
 from demorec.playback.robot import log_model
 from demorec.playback.style import series_colors
 from demorec.playback.times import SECONDS, indexes
+from demorec.playback.words import log_words
 from demorec.recording import CollectedRecording
 from demorec.recording.collected.transforms import JointPositions
 from demorec.scene.collected import NO_PICTURE, CollectedColumns, CollectedInfo, CollectedOutcome
@@ -46,6 +47,7 @@ class PlayedCollected:
         curves: Feature -> its elements over time.
         videos: Camera -> coded pictures, each at the time of the first frame that holds it.
         depth: Depth camera -> reads (time, distances as they came) of each of its pictures.
+        statements: As of `PlayedEpisode`: the subtasks that somebody said.
     """
 
     name: str
@@ -59,6 +61,7 @@ class PlayedCollected:
     curves: Mapping[str, Curves]
     videos: Mapping[str, Video]
     depth: Mapping[str, Callable[[], Iterator[tuple[int, Distances]]]] = field(default_factory=dict)
+    statements: Statements = ()
 
     @property
     def num_frames(self) -> int:
@@ -113,6 +116,7 @@ def open_collected(path: Path, *, group: str) -> Iterator[PlayedCollected]:
                 for camera in recording.depth_cameras
                 if len(columns.picture_stamps[camera])
             },
+            statements=tuple((int(time_ns[frame]), "subtask", text) for frame, text in recording.subtasks),
         )
 
 
@@ -192,6 +196,7 @@ def log_collected(recording: rr.RecordingStream, episode: PlayedCollected) -> No
         recording.log(entity, rr.SeriesLines(names=list(curves.names), colors=colors), static=True)
         columns = rr.Scalars.columns(scalars=curves.values)
         recording.send_columns(entity, indexes(curves.time_ns, episode.time_ns), columns)
+    log_words(recording, paths, episode.statements, episode.time_ns)
     recording.log(paths.summary, rr.TextDocument(_summary(episode), media_type="text/markdown"), static=True)
 
 
@@ -237,7 +242,8 @@ def collected_layout(episode: PlayedCollected, *, is_alone: bool = False) -> rrb
         )
         for name in episode.curves
     ]
-    bottom = rrb.Horizontal(*plots, rrb.TextDocumentView(origin=paths.summary, name="episode"))
+    pages = [rrb.TextDocumentView(origin=paths.words, name="in words")] if episode.statements else []
+    bottom = rrb.Horizontal(*plots, *pages, rrb.TextDocumentView(origin=paths.summary, name="episode"))
     return rrb.Blueprint(
         rrb.Vertical(rrb.Horizontal(*top), bottom, row_shares=[5.0, 3.0]) if top else bottom,
         rrb.TimePanel(state="collapsed", timeline=SECONDS, fps=float(episode.info.fps), loop_mode="all"),

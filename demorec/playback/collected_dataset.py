@@ -17,7 +17,7 @@ from demorec.lerobot.reader import read_tasks
 from demorec.lerobot.robots import DatasetRobot
 from demorec.plain import from_json
 from demorec.playback.collected import PlayedCollected
-from demorec.playback.episode import Curves, Video
+from demorec.playback.episode import Curves, Statements, Video
 from demorec.recording.collected.transforms import JointPositions
 from demorec.scene.collected import CollectedCamera, CollectedFeature, CollectedInfo, CollectedOutcome, Origin
 
@@ -33,6 +33,7 @@ def collected_of_dataset(
     videos: Mapping[str, Video],
     depth: Mapping[str, Callable[[], Iterator[NDArray[np.float32]]]],
     robot: DatasetRobot | None,
+    statements: Statements,
 ) -> PlayedCollected:
     """An episode as its dataset knows it, at the dataset's rate.
 
@@ -45,6 +46,7 @@ def collected_of_dataset(
         videos: Camera -> coded pictures.
         depth: Depth camera -> reads (H, W) metres of every row.
         robot: The arm, if it is known.
+        statements: What is said of the episode.
 
     Raises:
         RecordingError, ExportError, ValueError, KeyError, TypeError: Its tables hold something odd.
@@ -90,6 +92,7 @@ def collected_of_dataset(
         curves={name: Curves(time_ns=time_ns, values=data[name], names=parts) for name, parts in names.items()},
         videos=videos,
         depth={name: partial(_timed, time_ns, read) for name, read in depth.items()},
+        statements=statements,
     )
 
 

@@ -12,6 +12,8 @@ from demorec.geometry import Array
 from demorec.scene.episode import EpisodeInfo, Event, Outcome
 
 Box = tuple[float, float, float, float]
+Statements = tuple[tuple[int, str, str], ...]
+"""(time_ns, kind, sentence), each holds until the next one of its kind."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -104,7 +106,7 @@ class PlayedEpisode:
     depth: Mapping[str, Callable[[], Iterator[NDArray[np.float32]]]] = field(default_factory=dict)
     segmentation: Mapping[str, Callable[[], Iterator[NDArray[np.int32]]]] = field(default_factory=dict)
     segment_names: Mapping[int, str] = field(default_factory=dict)
-    statements: tuple[tuple[int, str, str], ...] = ()
+    statements: Statements = ()
     boxes: Mapping[str, Mapping[int, Sequence[tuple[str, Box]]]] = field(default_factory=dict)
 
     @property

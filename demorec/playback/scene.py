@@ -48,7 +48,7 @@ def log_episode(
     log_curves(recording, paths, episode, label, is_second=tint is not None)
     log_phases(recording, paths, episode)
     log_events(recording, paths, episode)
-    log_words(recording, paths, episode)
+    log_words(recording, paths, episode.statements, episode.time_ns)
     log_boxes(recording, paths, episode)
     recording.log(paths.summary, rr.TextDocument(summary(episode), media_type="text/markdown"), static=True)
 

@@ -6,8 +6,9 @@ from itertools import groupby
 
 import numpy as np
 import rerun as rr
+from numpy.typing import NDArray
 
-from demorec.playback.episode import PlayedEpisode
+from demorec.playback.episode import PlayedEpisode, Statements
 from demorec.playback.paths import Paths
 from demorec.playback.style import segment_colors
 from demorec.playback.times import indexes
@@ -16,18 +17,20 @@ _HEADINGS = {"subtask": "Now", "motion": "Motion", "plan": "Plan", "memory": "So
 """Kind of statement -> its heading, in the order of the page."""
 
 
-def log_words(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisode) -> None:
-    """The page of what holds, anew whenever something changes."""
+def log_words(
+    recording: rr.RecordingStream, paths: Paths, statements: Statements, frames_ns: NDArray[np.int64]
+) -> None:
+    """The page of what holds, anew whenever something changes; `frames_ns` (T,) are the times of all frames."""
     holds: dict[str, str] = {}
     times, pages = [], []
-    told = sorted((item for item in episode.statements if item[1] in _HEADINGS), key=lambda item: item[0])
+    told = sorted((item for item in statements if item[1] in _HEADINGS), key=lambda item: item[0])
     for time_ns, group in groupby(told, key=lambda item: item[0]):
         holds |= {kind: text for _, kind, text in group}
         times.append(time_ns)
         pages.append("\n\n".join(f"**{title}**\n\n{holds[kind]}" for kind, title in _HEADINGS.items() if kind in holds))
     if pages:
         columns = rr.TextDocument.columns(text=pages, media_type=["text/markdown"] * len(pages))
-        recording.send_columns(paths.words, indexes(np.array(times, dtype=np.int64), episode.time_ns), columns)
+        recording.send_columns(paths.words, indexes(np.array(times, dtype=np.int64), frames_ns), columns)
 
 
 def log_boxes(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisode) -> None:

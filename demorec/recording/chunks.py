@@ -35,7 +35,8 @@ _MESSAGE_HEAD = np.dtype(
         ("publish_time", "<u8"),
     ]
 )
-_HEAD_BYTES = np.arange(_MESSAGE_HEAD.itemsize)
+_GATHERED_ROWS = 4096
+"""Messages that are taken out of a chunk at once: the places of their bytes take eight times as much as the bytes."""
 _CHUNK_HEAD = struct.Struct("<QQQII")
 _PLACE_HEAD = struct.Struct("<QQQQI")
 
@@ -68,6 +69,20 @@ class ChunkPlace:
         return cls(
             start=start, length=length, channels=frozenset(channels.tolist()), uncompressed_size=uncompressed_size
         )
+
+    @classmethod
+    def together(cls, places: Iterable[ChunkPlace], num_bytes: int) -> Iterator[list[ChunkPlace]]:
+        """Neighbours that have at most so many bytes together, at least one each."""
+        group: list[ChunkPlace] = []
+        total = 0
+        for place in places:
+            if group and total + place.uncompressed_size > num_bytes:
+                yield group
+                group, total = [], 0
+            group.append(place)
+            total += place.uncompressed_size
+        if group:
+            yield group
 
 
 def chunk_content(record: bytes | memoryview, limits: Limits, expected_size: int | None = None) -> bytes:
@@ -156,8 +171,7 @@ class Block:
         """(N, length): the first bytes of every message; ValueError when one is shorter."""
         if len(self) and int(self.lengths.min()) < length:
             raise ValueError(f"a message of {int(self.lengths.min())} bytes where at least {length} were expected")
-        values = np.frombuffer(self.content, dtype=np.uint8)
-        return values[self.starts[:, np.newaxis] + np.arange(length)]
+        return _gathered(np.frombuffer(self.content, dtype=np.uint8), self.starts, length)
 
     def rows(self, length: int) -> NDArray[np.uint8]:
         """(N, length): the messages, if all have that length; else ValueError."""
@@ -185,7 +199,7 @@ def blocks_of(contents: Iterable[bytes], topics: Mapping[str, int], limits: Limi
     starts = starts[values[starts] == _MESSAGE]
     if len(starts) and int(starts[-1]) + _MESSAGE_HEAD.itemsize > len(values):
         raise ValueError("a message that ends within its head")
-    heads = np.ascontiguousarray(values[starts[:, np.newaxis] + _HEAD_BYTES]).view(_MESSAGE_HEAD).reshape(-1)
+    heads = _gathered(values, starts, _MESSAGE_HEAD.itemsize).view(_MESSAGE_HEAD).reshape(-1)
     lengths = heads["length"].astype(np.int64) - (_MESSAGE_HEAD.itemsize - RECORD_HEAD.size)
     if len(lengths) and int(lengths.min()) < 0:
         raise ValueError("a message that ends within its head")
@@ -196,6 +210,16 @@ def blocks_of(contents: Iterable[bytes], topics: Mapping[str, int], limits: Limi
         chosen = np.flatnonzero(heads["channel"] == channel)
         blocks[topic] = Block(content=content, time_ns=times[chosen], starts=starts[chosen], lengths=lengths[chosen])
     return blocks
+
+
+def _gathered(values: NDArray[np.uint8], starts: NDArray[np.int64], length: int) -> NDArray[np.uint8]:
+    """(N, length): as many bytes from each start on."""
+    rows = np.empty((len(starts), length), dtype=np.uint8)
+    places = np.arange(length)
+    for first in range(0, len(starts), _GATHERED_ROWS):
+        part = slice(first, first + _GATHERED_ROWS)
+        rows[part] = values[starts[part, np.newaxis] + places]
+    return rows
 
 
 def _find_records(content: bytes, offset: int, found: Callable[[int], None]) -> None:

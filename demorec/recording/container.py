@@ -227,27 +227,28 @@ class Container:
         """Messages of some topics in the order of the file; chunks without them are not read."""
         wanted = {self.channels[topic].id: topic for topic in topics if topic in self.channels}
         with damage_as_recording_error(self.path):
-            yield from _messages_of(self._contents(wanted), wanted, self._limits)
+            yield from _messages_of(self._unpacked(self._places(wanted)), wanted, self._limits)
 
     def blocks(self, topics: Collection[str]) -> dict[str, Block]:
         """topic -> all its messages; the chunks that hold any of them are in memory together."""
         wanted = {topic: self.channels[topic].id if topic in self.channels else -1 for topic in topics}
         with damage_as_recording_error(self.path):
-            return blocks_of(self._contents(wanted.values()), wanted, self._limits)
+            return blocks_of(self._unpacked(self._places(wanted.values())), wanted, self._limits)
 
-    def blocks_by_chunk(self, topics: Collection[str]) -> Iterator[dict[str, Block]]:
-        """As `blocks`, one chunk after the other: only one is in memory."""
-        wanted = {topic: self.channels[topic].id for topic in topics if topic in self.channels}
+    def blocks_by_chunk(self, topics: Collection[str], *, num_bytes: int = 0) -> Iterator[dict[str, Block]]:
+        """As `blocks`, one chunk after the other, or a few of them: no more than have that many bytes unpacked."""
+        wanted = {topic: self.channels[topic].id if topic in self.channels else -1 for topic in topics}
         with damage_as_recording_error(self.path):
-            for content in self._contents(wanted.values()):
-                yield blocks_of([content], wanted, self._limits)
+            for places in ChunkPlace.together(self._places(wanted.values()), num_bytes):
+                yield blocks_of(self._unpacked(places), wanted, self._limits)
 
-    def _contents(self, channels: Collection[int]) -> Iterator[bytes]:
-        """The chunks that hold messages of any of these channels, unpacked."""
-        for place in self._chunks:
-            if not place.channels.isdisjoint(channels):
-                record = self._content_at(place.start, place.length, Opcode.CHUNK)
-                yield chunk_content(record, self._limits, place.uncompressed_size)
+    def _places(self, channels: Collection[int]) -> list[ChunkPlace]:
+        return [place for place in self._chunks if not place.channels.isdisjoint(channels)]
+
+    def _unpacked(self, places: Iterable[ChunkPlace]) -> Iterator[bytes]:
+        for place in places:
+            record = self._content_at(place.start, place.length, Opcode.CHUNK)
+            yield chunk_content(record, self._limits, place.uncompressed_size)
 
 
 def _read[R: McapRecord](content: bytes | memoryview, kind: type[R]) -> R:

@@ -212,9 +212,7 @@ class RecordingReader(EpisodeFile):
         times, counts = self._frame_times(), dict.fromkeys(cameras, 0)
         for blocks in self._container.blocks_by_chunk(topics.values()):
             for camera, topic in topics.items():
-                block, first = blocks.get(topic), counts[camera]
-                if block is None:
-                    continue
+                block, first = blocks[topic], counts[camera]
                 counts[camera] += len(block)
                 if not np.array_equal(block.time_ns, times[first : counts[camera]]):
                     raise RecordingError(f"Pictures of {topic} are not at the times of the frames: {self.path}")

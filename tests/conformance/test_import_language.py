@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from rerun.chunk import RrdReader
 from support import bag_mappings, bags
 from support.commands import exit_code
 from support.export import export
@@ -77,6 +79,48 @@ def test_a_dataset_has_exactly_what_was_said(tmp_path: Path, capsys: pytest.Capt
         assert not row["language_events"]
     report = check_subject(Subject(path=tmp_path / "dataset", kind="dataset"), CheckOptions())
     assert not [result.check for result in report.results if result.level in ("fail", "warn")]
+
+
+@pytest.mark.parametrize("kind", ["recording", pytest.param("dataset", marks=pytest.mark.slow)])
+def test_what_was_said_is_shown_when_it_was_said(kind: str, tmp_path: Path) -> None:
+    assert imported(texts("/subtask", SAID), SUBTASKS, tmp_path) == 0
+    (recording,) = recordings(tmp_path / "run")
+    place = recording
+    if kind == "dataset":
+        place = tmp_path / "dataset"
+        export(tmp_path / "run", place, language=("subtask",))
+    with CollectedRecording(recording) as opened:
+        times = opened.columns().time_ns
+        expected = [(int(times[frame] - times[0]) / 1e9, text) for frame, text in opened.subtasks]
+    assert len(expected) == 3
+    assert exit_code("view", place, "--save", tmp_path / "x.rrd") == 0
+    shown: list[tuple[float, str]] = []
+    for chunk in RrdReader(tmp_path / "x.rrd").stream():
+        if chunk.entity_path == "/words":
+            batch = chunk.to_record_batch()
+            seconds = batch.column("time").cast("int64").to_pylist()
+            pages = batch.column("TextDocument:text").to_pylist()
+            shown += [(time / 1e9, page) for time, (page,) in zip(seconds, pages, strict=True)]
+    assert [page for _, page in shown] == [f"**Now**\n\n{text}" for _, text in expected]
+    assert [time for time, _ in shown] == pytest.approx([time for time, _ in expected], abs=1e-6)
+
+
+def test_a_suggestion_names_the_texts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    notes = [*ARM, *texts("/subtask", SAID), *texts("/task", ((0.0, "stack the cups"),))]
+    bag = bags.write_mcap(bags.in_order(notes), tmp_path / "bag.mcap")
+    assert exit_code("import", "--suggest", bag) == 0
+    text = capsys.readouterr().out
+    assert tomllib.loads(text)["task"]["topic"] == "/task"
+    assert "subtasks" not in tomllib.loads(text)
+    lines = text.splitlines()
+    first = lines.index("# [subtasks]")
+    chosen = "\n".join(
+        [*lines[:first], *(line.removeprefix("# ") for line in lines[first : first + 2]), *lines[first + 2 :]]
+    )
+    mapping = bag_mappings.write_mapping(chosen, tmp_path / "robot.toml")
+    assert exit_code("import", bag, "--mapping", mapping, "--out", tmp_path / "run") == 0
+    with CollectedRecording(recordings(tmp_path / "run")[0]) as opened:
+        assert [said for _, said in opened.subtasks] == ["grasp the cup", "lift the cup", "put it down"]
 
 
 def test_all_kinds_are_as_much_as_is_known(tmp_path: Path) -> None:

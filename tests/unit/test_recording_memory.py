@@ -72,6 +72,27 @@ def test_memory_does_not_grow_with_length(
         assert long < 1.3 * short + 200_000, name
 
 
+def test_numbers_of_a_long_collected_episode_take_little_more_memory_than_they_are(tmp_path: Path) -> None:
+    short = make_collected(cameras=(), num_frames=60)
+    peaks, num_bytes = [], []
+    for count in (60, 1500, 6000):  # the first loads what is loaded once
+        with CollectedWriter(tmp_path / f"{count}.mcap", short.info) as writer:
+            for index in range(count):
+                frame = short.frames[index % 60]
+                later = (index // 60) * 10_000_000_000
+                samples = {
+                    name: replace(sample, stamp_ns=sample.stamp_ns + later) for name, sample in frame.samples.items()
+                }
+                writer.write(replace(frame, time_ns=frame.time_ns + later, samples=samples))
+            writer.finish(replace(short.outcome, num_frames=count))
+        with CollectedRecording(tmp_path / f"{count}.mcap") as recording:
+            peaks.append(peak_bytes(recording.columns))
+            columns = recording.columns()
+            arrays = [columns.time_ns, *columns.features.values(), *columns.stamps.values()]
+            num_bytes.append(sum(array.nbytes for array in arrays))
+    assert peaks[2] - peaks[1] < 4 * (num_bytes[2] - num_bytes[1])
+
+
 def test_numbers_of_a_collected_episode_are_read_without_its_pictures(tmp_path: Path) -> None:
     given = make_collected(cameras=(replace(TOP, kept="jpeg"),), num_frames=120)
     noise = np.random.default_rng(0)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,7 @@ from demorec.recording.channels import description_topic, video_topic
 from demorec.recording.chunks import Block
 from demorec.recording.collected import metadata
 from demorec.recording.collected.depth import decode_distances
-from demorec.recording.collected.streams import FRAMES, SUBTASK, FeatureStream, feature_streams, frames_layout
+from demorec.recording.collected.streams import FRAMES, SUBTASK, feature_streams, frames_layout
 from demorec.recording.collected.validity import what_is_wrong
 from demorec.recording.container import damage_as_recording_error
 from demorec.recording.episode_file import EpisodeFile
@@ -28,6 +29,33 @@ from demorec.scene.collected import DEPTH_UNITS, NO_PICTURE, CollectedColumns, C
 
 _READERS = {"av1": messages.read_protobuf_video, "32FC1": messages.read_image}
 """Codec -> what takes a packet out of its message, where that is no CompressedImage."""
+
+
+_TABLE_BYTES = 1 << 20
+"""Of chunks whose numbers are taken out together: taking out takes several times as much memory as they have."""
+
+
+class _Table:
+    """The numbers of a topic, while the chunks that hold them are read.
+
+    Args:
+        length: Of each message, bytes.
+        decode: Of messages as rows of bytes: their numbers.
+    """
+
+    def __init__(self, length: int, decode: Callable[[NDArray[np.uint8]], NDArray[Any]]) -> None:
+        self._length, self._decode = length, decode
+        self._times: list[NDArray[np.int64]] = []
+        self._values = [decode(np.empty((0, length), np.uint8))]  # tells how many there are in a row
+
+    def add(self, block: Block) -> None:
+        """Take messages; ValueError for those of another layout."""
+        self._times.append(block.time_ns)
+        self._values.append(self._decode(block.rows(self._length)))
+
+    def whole(self) -> tuple[NDArray[np.int64], NDArray[Any]]:
+        """(N,) times and (N, D) numbers of all messages."""
+        return np.concatenate([np.empty(0, np.int64), *self._times]), np.concatenate(self._values)
 
 
 class CollectedRecording(EpisodeFile):
@@ -110,14 +138,21 @@ class CollectedRecording(EpisodeFile):
         """Read once: an export and a check look at them from several sides."""
         streams = feature_streams(self.info)
         picture_topics = {camera: self._picture_topic(camera) for camera in self._cameras_in_order}
-        blocks = self._container.blocks((FRAMES, *(stream.topic for stream in streams.values())))
         layout = frames_layout(self.info)
+        tables = {FRAMES: _Table(len(layout.constant), layout.decode_rows)}
+        for stream in streams.values():
+            tables[stream.topic] = _Table(len(stream.layout.constant), stream.decode_rows)
         with damage_as_recording_error(self.path):
-            rows: NDArray[np.int64] = layout.decode_rows(blocks[FRAMES].rows(len(layout.constant)))
-        time_ns = blocks[FRAMES].time_ns
+            for blocks in self._container.blocks_by_chunk(tables, num_bytes=_TABLE_BYTES):
+                for topic, table in tables.items():
+                    table.add(blocks[topic])
+        time_ns, rows = tables[FRAMES].whole()
         if len(time_ns) > 1 and int(np.diff(time_ns).min()) <= 0:
             raise RecordingError(f"The frames of the recording are not in the order of their times: {self.path}")
-        features = {name: self._feature(stream, blocks[stream.topic], time_ns) for name, stream in streams.items()}
+        features = {
+            name: self._feature(stream.topic, *tables.pop(stream.topic).whole(), time_ns)
+            for name, stream in streams.items()
+        }
         stamps = {name: rows[:, index].copy() for index, name in enumerate(streams)}
         pictures = {name: rows[:, len(streams) + index].copy() for index, name in enumerate(self._cameras_in_order)}
         picture_stamps = {name: self._stamps(topic) for name, topic in picture_topics.items()}
@@ -147,14 +182,15 @@ class CollectedRecording(EpisodeFile):
         """(N,) of the messages of a topic, one chunk of them in memory at a time: pictures may take gigabytes."""
         return np.fromiter((message.time_ns for message in self._container.messages((topic,))), dtype=np.int64)
 
-    def _feature(self, stream: FeatureStream, block: Block, time_ns: NDArray[np.int64]) -> NDArray[np.generic]:
-        if not np.array_equal(block.time_ns, time_ns):
+    def _feature(
+        self, topic: str, times: NDArray[np.int64], values: NDArray[Any], time_ns: NDArray[np.int64]
+    ) -> NDArray[Any]:
+        if not np.array_equal(times, time_ns):
             raise RecordingError(
-                f"The recording has {len(block)} messages on {stream.topic} at other times than its {len(time_ns)} "
+                f"The recording has {len(times)} messages on {topic} at other times than its {len(time_ns)} "
                 f"frames: {self.path}"
             )
-        with damage_as_recording_error(self.path):
-            return stream.decode_rows(block.rows(len(stream.layout.constant)))
+        return values
 
     def _picture_topic(self, camera: str) -> str:
         return video_topic(camera, self.video_settings(camera).codec)
