@@ -10,6 +10,7 @@ import pytest
 from support.recording import PANDA, make_episode
 
 from demorec.check.base import Measurement
+from demorec.check.dataset import DescribedEpisode
 from demorec.check.dataset_motion import dataset_joint_limits
 from demorec.scene.features import STATE
 
@@ -21,6 +22,7 @@ def test_the_opening_of_a_scaled_gripper_is_scaled_once(width: float, beyond: fl
     placement = replace(info.scene.robot, scale=1.3)
     info = replace(info, robot=PANDA.scaled(1.3), scene=replace(info.scene, robot=placement))
     state = np.array([[*PANDA.home_q, width]], dtype=np.float32)
-    found = dataset_joint_limits.measure(SimpleNamespace(described=lambda: [({STATE: state}, info)]))
+    episode = DescribedEpisode(number=0, rows={STATE: state}, kept={}, info=info)
+    found = dataset_joint_limits.measure(SimpleNamespace(described=lambda: [episode]))
     assert isinstance(found, Measurement)
     assert found.value == pytest.approx(beyond, abs=1e-6)
