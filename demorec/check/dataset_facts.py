@@ -31,8 +31,8 @@ def dataset_facts(dataset: Dataset) -> Measurement | None:
         if set(names) <= set(open_table(path).schema_arrow.names):  # LeRobot's own recordings have none of them
             rows.update({row["episode_index"]: row for row in read_table(path, ["episode_index", *names]).to_pylist()})
     wrong = []
-    for kept, info in zip(dataset.sidecar, dataset.infos, strict=True):
-        number = kept["episode_index"]
+    for each in dataset.described():
+        number, kept, info = each.number, each.kept, each.info
         if (row := rows.get(number)) is None:
             wrong.append(f"episode {number} has none")
             continue

@@ -164,9 +164,9 @@ def dataset_description(dataset: Dataset) -> Measurement | None:
     if not dataset.infos:
         return None
     wrong = [
-        f"episode {number}: {words}"
-        for number, (row, info) in enumerate(zip(dataset.sidecar, dataset.infos, strict=True))
-        for words in _described(dataset, info, int(row["frame_stride"]))
+        f"episode {each.number}: {words}"
+        for each in dataset.described()
+        for words in _described(dataset, each.info, int(each.kept["frame_stride"]))
     ]
     return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{len(dataset.infos)} episodes")
 

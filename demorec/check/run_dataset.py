@@ -79,7 +79,7 @@ def run_dataset_content(run: CheckedRun) -> Measurement | None:
 
 
 def dataset_episodes(dataset: Dataset) -> Iterator[DatasetEpisode]:
-    """Every episode in order; ExportError when a file cannot be read."""
+    """Every episode that the sidecar knows, in order; ExportError when a file cannot be read."""
     tables = sorted((dataset.path / SIDECAR_DIR / "episodes").glob("*/*.parquet"))
     told = [row for path in tables for row in read_table(path, EPISODE_SCHEMA.names).to_pylist()]
     with ExitStack() as stack:
@@ -87,9 +87,12 @@ def dataset_episodes(dataset: Dataset) -> Iterator[DatasetEpisode]:
             key: stack.enter_context(closing(PacketReader(dataset.path, dataset.info, key)))
             for key in dataset.info.video_keys
         }
-        for number, (row, rows, place) in enumerate(zip(told, dataset.rows, dataset.places, strict=False)):
-            videos = {key: _digest(reader.read(place)) for key, reader in readers.items()}
-            yield DatasetEpisode(number=number, rows=rows, videos=videos, tasks=place.tasks, told=row)
+        for row in sorted(told, key=lambda row: int(row["episode_index"])):
+            if (number := int(row["episode_index"])) in range(len(dataset.rows)):
+                place = dataset.places[number]
+                videos = {key: _digest(reader.read(place)) for key, reader in readers.items()}
+                rows = dataset.rows[number]
+                yield DatasetEpisode(number=number, rows=rows, videos=videos, tasks=place.tasks, told=row)
 
 
 def _digest(samples: Iterable[bytes]) -> str:

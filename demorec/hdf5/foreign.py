@@ -29,7 +29,7 @@ Scalar = str | bool | int | float
 _MAX_CHILDREN = trial.MAX_OBJECTS
 _MAX_CHUNK_BYTES = 1 << 28
 _MAX_ATTRIBUTE_BYTES = trial.MAX_ATTRIBUTE_BYTES
-_MAX_NAME = 1000
+_MAX_NAME = trial.MAX_NAME
 _MAX_DEPTH = 6
 _BLOCK_BYTES = 8 << 20
 """Of rows that are read at once; whole chunks of the file, unless these are larger than `_MAX_BLOCK_BYTES`."""

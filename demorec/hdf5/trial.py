@@ -20,21 +20,33 @@ from pathlib import Path
 
 import h5py
 
+from demorec.errors import ResourceError
+from demorec.processes import start_program
+
 MAX_ATTRIBUTE_BYTES = 16 << 20
 MAX_OBJECTS = 100_000
+MAX_NAME = 1000
+"""Characters of each text in a list of texts."""
 _MAX_ROW_BYTES = 64 << 20
 _MEMORY_BYTES = 1 << 29
 """Beside what a process has when it begins; rows and texts within the limits take less."""
 _WALK_SECONDS = 20.0
-"""Of CPU time, after which a walk ends: tens of thousands of objects were whole."""
+"""Of CPU time, after which a walk ends: some twenty thousand objects were whole."""
 _END_SECONDS = 40
 """Of CPU time, after which the process ends: a single call into the library has not returned."""
-_TOO_MUCH = 3
-"""Exit code when something in the file claims more memory than there is."""
+_PATIENCE_S = 300.0
+"""Of waiting for the process, which may wait for a disk itself."""
+_TOO_MUCH = 65
+"""Exit code when something in the file claims more memory than there is; no signal has that number."""
+_CRASHES = {signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGFPE, signal.SIGILL}
 
 
 def why_not_read(path: Path) -> str:
-    """Why a file is left alone, for the inside of a sentence, or ""; tried once for each state of a file."""
+    """Why a file is left alone, for the inside of a sentence, or ""; tried once for each state of a file.
+
+    Raises:
+        ResourceError: It could not be tried.
+    """
     state = path.stat()
     return _tried(path.absolute(), (state.st_dev, state.st_ino, state.st_size, state.st_mtime_ns))
 
@@ -42,12 +54,25 @@ def why_not_read(path: Path) -> str:
 @lru_cache(maxsize=1024)
 def _tried(path: Path, state: tuple[int, ...]) -> str:
     command = [sys.executable, "-P", "-m", __name__, str(path)]
-    code = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, check=False).returncode
+    with start_program(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+        try:
+            code = abs(process.wait(_PATIENCE_S))
+        except subprocess.TimeoutExpired:
+            code = signal.SIGTERM
+        finally:
+            process.terminate()
     if code == _TOO_MUCH:
-        return "it is damaged: a length in it is larger than what it holds"
-    if code == -signal.SIGXCPU:
+        return f"it is damaged, or has texts of more than {_MEMORY_BYTES >> 20} MB"
+    if code == signal.SIGXCPU:
         return "it is damaged: the HDF5 library does not come to an end with it"
-    return "it is damaged: the HDF5 library crashes when it reads it" if code < 0 else ""
+    if code in _CRASHES:
+        return "it is damaged: the HDF5 library crashes when it reads it"
+    if code:  # another time it may be another one: not kept
+        raise ResourceError(
+            f"The HDF5 file could not be tried in a process of its own, which ended with {code}; is there too little "
+            f"memory? {path}"
+        )
+    return ""
 
 
 def walk(path: Path) -> None:
@@ -74,35 +99,48 @@ def _errors_ignored() -> Iterator[None]:
 
 
 def _objects(file: h5py.h5f.FileID) -> Iterator[h5py.h5g.GroupID | h5py.h5d.DatasetID]:
-    """Everything that hard links lead to, once; by h5py's lower level, which takes a fraction of the other's time."""
+    """Everything that hard links lead to, once; by h5py's lower level, which takes a fraction of the other's time.
+
+    Nothing is held open but the groups on the way down: the library keeps up to 85 kB of each open dataset.
+    """
     end = time.process_time() + _WALK_SECONDS
-    waiting = [h5py.h5g.open(file, b"/")]
-    seen: set[int] = set()
-    while waiting and len(seen) < MAX_OBJECTS:
+    root = h5py.h5g.open(file, b"/")
+    yield root
+    groups = [(root, _names(root))]
+    seen = {h5py.h5o.get_info(root).addr}
+    while groups and len(seen) < MAX_OBJECTS:
         if len(seen) % 256 == 0 and time.process_time() > end:  # asking takes as long as looking
             return
-        found = waiting.pop()
-        address = h5py.h5o.get_info(found).addr
-        if address in seen:
+        group, names = groups[-1]
+        if not names:
+            groups.pop()
             continue
-        seen.add(address)
-        yield found
-        if isinstance(found, h5py.h5g.GroupID) and found.get_num_objs() <= MAX_OBJECTS:
-            for name in found:
-                with _errors_ignored():
-                    if found.links.get_info(name).type == h5py.h5l.TYPE_HARD:
-                        waiting.append(h5py.h5o.open(found, name))
+        with _errors_ignored():
+            name = names.pop()
+            if group.links.get_info(name).type != h5py.h5l.TYPE_HARD:
+                continue
+            address = h5py.h5o.get_info(group, name).addr
+            if address in seen:
+                continue
+            seen.add(address)
+            found = h5py.h5o.open(group, name)
+            yield found
+            if isinstance(found, h5py.h5g.GroupID):
+                groups.append((found, _names(found)))
+
+
+def _names(group: h5py.h5g.GroupID) -> list[bytes]:
+    with _errors_ignored():
+        return list(group) if group.get_num_objs() <= MAX_OBJECTS else []
+    return []
 
 
 def _read_attribute(found: h5py.h5g.GroupID | h5py.h5d.DatasetID, attribute: h5py.h5a.AttrID) -> None:
     is_empty = attribute.get_space().get_simple_extent_type() == h5py.h5s.NULL
     if is_empty or attribute.shape not in ((), (1,)) or attribute.get_storage_size() > MAX_ATTRIBUTE_BYTES:
         return
-    value = h5py.AttributeManager(h5py.Group(found) if isinstance(found, h5py.h5g.GroupID) else h5py.Dataset(found))[
-        attribute.name
-    ]
-    if isinstance(value, str | bytes) and len(value) > MAX_ATTRIBUTE_BYTES:
-        raise MemoryError
+    owner = h5py.Group(found) if isinstance(found, h5py.h5g.GroupID) else h5py.Dataset(found)
+    owner.attrs[attribute.name]
 
 
 def _read_dataset(found: h5py.h5d.DatasetID) -> None:
@@ -115,20 +153,28 @@ def _read_dataset(found: h5py.h5d.DatasetID) -> None:
     if not found.shape or not (is_chunked or is_text):
         return
     dataset = h5py.Dataset(found)
-    if is_text and len(dataset) <= MAX_OBJECTS:
-        dataset[:]
+    if is_text:
+        kind = h5py.check_string_dtype(dataset.dtype)
+        if dataset.ndim == 1 and len(dataset) <= MAX_OBJECTS and kind is not None and (kind.length or 0) <= MAX_NAME:
+            dataset[:]
     elif is_chunked and dataset.size and dataset.nbytes // len(dataset) * dataset.chunks[0] <= _MAX_ROW_BYTES:
         for index in (0, -1):
             with _errors_ignored():
                 dataset[index]
 
 
+def _limit(what: int, value: int) -> None:
+    """Set a limit, unless there is a lower one."""
+    hard = resource.getrlimit(what)[1]
+    resource.setrlimit(what, (value if hard == resource.RLIM_INFINITY else min(value, hard), hard))
+
+
 def main() -> int:
     """Of the process that can be spared."""
     begun = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    resource.setrlimit(resource.RLIMIT_AS, (begun + _MEMORY_BYTES,) * 2)
-    resource.setrlimit(resource.RLIMIT_CPU, (_END_SECONDS, _END_SECONDS + 1))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    _limit(resource.RLIMIT_AS, begun + _MEMORY_BYTES)
+    _limit(resource.RLIMIT_CPU, _END_SECONDS)
+    _limit(resource.RLIMIT_CORE, 0)
     try:
         walk(Path(sys.argv[1]))
     except MemoryError:

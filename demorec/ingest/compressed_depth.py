@@ -6,7 +6,7 @@ import io
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from demorec.config import MAX_PIXELS
 from demorec.errors import in_words
@@ -40,6 +40,8 @@ def decode_compressed_depth(data: bytes) -> NDArray[np.uint16]:
                     raise ValueError(f"its pixels are {image.mode}, not of 16 bits")
                 return np.asarray(image).astype(np.uint16)
         return decode_millimetres(data, (height, width))
+    except UnidentifiedImageError as error:
+        raise FieldError("its distances cannot be decoded (they are no whole PNG file)") from error
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise FieldError(f"its distances cannot be decoded ({in_words(error)})") from error
 

@@ -99,16 +99,17 @@ def _times_of(stream: Stream, line: Timeline, rows: CameraRows) -> Int:
 @dataclass(kw_only=True, eq=False)
 class _Waiting:
     plan: PicturePlan
+    first: int
     places: Int
     num_written: int = 0
     pictures: dict[int, tuple[bytes | Any, int]] = field(default_factory=dict)
     num_bytes: int = 0
 
 
-def _places(numbers: Int) -> Int:
-    """(max + 1,) of each message of a topic: which of the taken pictures it is, -1 for none."""
-    places: Int = np.full(int(numbers.max(initial=-1)) + 1, -1)
-    places[numbers] = np.arange(len(numbers))
+def _places(numbers: Int, first: int) -> Int:
+    """(K,) of each message of a topic, from the first taken one to the last: which taken one it is, -1 for none."""
+    places: Int = np.full(int(numbers.max(initial=first - 1)) - first + 1, -1)
+    places[numbers - first] = np.arange(len(numbers))
     return places
 
 
@@ -135,7 +136,10 @@ class ImportedEpisodeWriter:
         video: VideoConfig,
     ) -> None:
         self._rows, self._subtasks = rows, subtasks
-        self._waiting = {name: _Waiting(plan=plan, places=_places(plan.numbers)) for name, plan in plans.items()}
+        self._waiting: dict[str, _Waiting] = {}
+        for name, plan in plans.items():
+            first = int(plan.numbers.min()) if len(plan.numbers) else 0
+            self._waiting[name] = _Waiting(plan=plan, first=first, places=_places(plan.numbers, first))
         self._next_row = 0
         self._writer = CollectedWriter(path, info, video=video)
         self._is_finished = False
@@ -160,8 +164,9 @@ class ImportedEpisodeWriter:
             RecordingError: It cannot be written.
         """
         for name, waiting in self._waiting.items():
-            if waiting.plan.topic == topic and number < len(waiting.places) and waiting.places[number] >= 0:
-                self._take(name, waiting, int(waiting.places[number]), values)
+            place = number - waiting.first
+            if waiting.plan.topic == topic and 0 <= place < len(waiting.places) and waiting.places[place] >= 0:
+                self._take(name, waiting, int(waiting.places[place]), values)
         self._write_rows()
 
     def _take(self, name: str, waiting: _Waiting, place: int, values: Values) -> None:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import math
 import re
+import reprlib
+import sys
 from collections.abc import Iterator
 from typing import Any
 
@@ -42,7 +45,8 @@ def episode_places(file: ForeignFile, episodes: Hdf5Episodes) -> list[str]:
 
 
 def _natural(name: str) -> list[Any]:
-    return [int(part) if part.isdecimal() else part for part in _NUMBER.split(name)]
+    parts = [(part.lstrip("0") if part.isdecimal() else part) for part in _NUMBER.split(name)]
+    return [(len(part) if part.isdecimal() else 0, part) for part in parts]
 
 
 def found_attribute(file: ForeignFile, place: str, name: str) -> Scalar | None:
@@ -71,7 +75,7 @@ def _in_json(text: str, keys: list[str]) -> Scalar | None:
         return None
     for key in keys:
         if isinstance(value, list):
-            value = value[int(key)] if key.isdecimal() and int(key) < len(value) else None
+            value = value[int(key)] if key.isdecimal() and len(key) < 10 and int(key) < len(value) else None
         else:
             value = value.get(key) if isinstance(value, dict) else None
     return value if isinstance(value, str | bool | int | float) else None
@@ -99,7 +103,7 @@ def told_rate(file: ForeignFile, place: str) -> float | None:
     for name in _RATES:
         found = found_attribute(file, place, name)
         if isinstance(found, int | float) and not isinstance(found, bool):
-            return float(found)
+            return float(found) if abs(found) <= sys.float_info.max else math.inf
     return None
 
 
@@ -125,7 +129,12 @@ def success_of(file: ForeignFile, place: str, mapping: Hdf5Mapping, num_rows: in
     if not name:
         return None
     found = file.attribute(place, name)
-    if isinstance(found, bool | int | float):
+    if isinstance(found, str) or (isinstance(found, float) and not math.isfinite(found)):
+        raise Hdf5Error(
+            f"{place or 'The episode'} says {name} = {reprlib.repr(found)}, allowed are booleans and numbers: "
+            f"{file.path}"
+        )
+    if found is not None:
         return bool(found)
     if not file.has(f"{place}/{name}"):
         near = nearest_match(name, list(file.children(place)))

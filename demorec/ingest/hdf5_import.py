@@ -6,6 +6,7 @@ goes on: episodes that are there are not written.
 
 from __future__ import annotations
 
+import reprlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -228,7 +229,9 @@ def _check_lengths(file: ForeignFile, place: str, arrays: Sequence[StoredArray],
             raise Hdf5FitError(f"{array.place} has {len(array)} rows, other datasets of the episode have {num_rows}")
     told = file.attribute(place, "num_samples")
     if told is not None and told != num_rows:
-        raise Hdf5FitError(f"{place or 'the episode'} has {num_rows} rows, but its attribute num_samples says {told}")
+        raise Hdf5FitError(
+            f"{place or 'the episode'} has {num_rows} rows, but its attribute num_samples says {reprlib.repr(told)}"
+        )
 
 
 def _unnamed(file: ForeignFile, place: str, mapping: Hdf5Mapping) -> tuple[str, ...]:

@@ -132,7 +132,7 @@ def read_mapping_file[M: AnyMapping](path: Path, kind: type[M]) -> M:
         raise ConfigError(f"The mapping cannot be used: {'; '.join(unknown)}: {path}")
     try:
         mapping = from_plain(_whole_numbers_as_floats(data, kind), kind)
-    except ValueError as error:
+    except (ValueError, OverflowError) as error:
         raise ConfigError(f"The mapping cannot be used: {error}: {path}") from error
     if problems := list(mapping.problems()):
         raise ConfigError(f"The mapping cannot be used: {'; '.join(problems)}: {path}")

@@ -32,12 +32,13 @@ _PARAMETERS = "lossless=1"
 def quantised(depth: NDArray[np.float32]) -> NDArray[np.uint16]:
     """(H, W) codes of distances in metres; in float32 arithmetic, to the code as LeRobot's `quantize_depth`.
 
-    What is not finite was not measured, and has code 0.
+    What is not finite, or behind the camera, was not measured, and has code 0.
     """
     shift = np.float32(_SHIFT)
     low = math.log(float(np.float32(_NEAREST) + shift))
     high = math.log(float(np.float32(_FARTHEST) + shift))
-    scaled = (np.log(np.nan_to_num(depth, nan=0.0, posinf=0.0, neginf=0.0) + shift) - low) / (high - low)
+    metres = np.maximum(np.nan_to_num(depth, nan=0.0, posinf=0.0, neginf=0.0), np.float32(0))
+    scaled = (np.log(metres + shift) - low) / (high - low)
     return np.asarray(np.rint(scaled * _LARGEST_CODE).clip(0, _LARGEST_CODE), dtype=np.uint16)
 
 

@@ -18,6 +18,7 @@ from demorec.errors import ExportError, in_words
 from demorec.lerobot.depth import DepthScale
 from demorec.lerobot.files import check_video
 from demorec.lerobot.layout import VIDEO_PATH, DatasetInfo
+from demorec.lerobot.paths import INFO_PATH
 from demorec.lerobot.reader import EpisodePlace
 
 PacketCodec = Literal["h264", "h265", "av1"]
@@ -62,6 +63,9 @@ def episode_packets(root: Path, info: DatasetInfo, key: str, place: EpisodePlace
         codec = PACKET_CODECS.get(stream.codec_context.name)
         if codec is None:
             raise ValueError(f"its codec is {stream.codec_context.name}; {', '.join(PACKET_CODECS)} are read")
+        told = str((info.features[key].info or {}).get("video.codec"))
+        if PACKET_CODECS.get(told, codec) != codec:
+            raise ValueError(f"its codec is {codec}, and meta/info.json says {told}")
         convert, left = access_units(stream, codec), place.length
         for packet in container.demux(stream):
             if not packet.size or packet.pts is None:
@@ -83,8 +87,13 @@ def episode_distances(root: Path, info: DatasetInfo, key: str, place: EpisodePla
         ExportError: The video cannot be read, or lacks one of them.
     """
     height, width = info.features[key].shape[:2]
-    with _at_episode(root, info, key, place) as (container, stream, rate):
+    try:
         metres = DepthScale.of(info.features[key].info or {}).shown()
+    except ValueError as error:
+        raise ExportError(f"The depth of {key} cannot be read ({error}): {root / INFO_PATH}") from error
+    with _at_episode(root, info, key, place) as (container, stream, rate):
+        if (found := (stream.codec_context.height, stream.codec_context.width)) != (height, width):
+            raise ValueError(f"it has {found[1]}x{found[0]} pixels, and meta/info.json says {width}x{height}")
         # A few bytes can announce pictures of gigabytes; coded pictures are whole blocks of at most 128 pixels.
         stream.codec_context.options = {"max_pixels": str((height + 128) * (width + 128))}
         number = 0

@@ -66,7 +66,7 @@ def _read_episode(root: Path, episode_index: int) -> PlayedEpisode | PlayedColle
     place = _place(root, described, episode_index)
     columns = [name for name, feature in described.features.items() if feature.is_numeric]
     if row["episode_info"] is None:
-        data = _data(root, episode_index, columns)
+        data = _data(root, place, columns)
         time_ns = _times(len(data["index"]), described)
         videos, depth = _videos(root, described, place, time_ns), _depth(root, described, place)
         robot, statements = _robot(root, row), _statements(root, episode_index, described, time_ns)
@@ -76,7 +76,7 @@ def _read_episode(root: Path, episode_index: int) -> PlayedEpisode | PlayedColle
     missing = {"observation.state", "action"} - described.features.keys()
     if missing:
         raise RecordingError(f"The dataset has no {' and no '.join(sorted(missing))}, so it cannot be shown: {root}")
-    data = _data(root, episode_index, columns)
+    data = _data(root, place, columns)
     num_frames = len(data["action"])
     if not num_frames or data["observation.state"].shape[1] != len(info.robot.arm_joints) + 1:
         raise RecordingError(f"The dataset has no rows of episode {episode_index}, or of another robot: {root}")
@@ -145,8 +145,13 @@ def _robot(root: Path, row: dict[str, Any]) -> DatasetRobot | None:
     return None if name is None else read_robot(root, str(name))
 
 
-def _data(root: Path, episode_index: int, columns: list[str]) -> dict[str, Array]:
-    rows = _rows(root, "data", columns, episode_index)
+def _data(root: Path, place: EpisodePlace, columns: list[str]) -> dict[str, Array]:
+    rows = _rows(root, "data", columns, place.episode_index)
+    if len(rows) != place.length:
+        raise RecordingError(
+            f"Episode {place.episode_index} of the dataset has {len(rows)} rows, its table of episodes says "
+            f"{place.length}: {root}"
+        )
     result = {}
     for name in columns:
         try:

@@ -30,9 +30,10 @@ from support.hdf5 import (
 from demorec.errors import ConfigError
 from demorec.hdf5.foreign import ForeignFile, Hdf5Error, StoredArray
 from demorec.ingest.frames_writer import Picture
+from demorec.ingest.hdf5_episodes import episode_places
 from demorec.ingest.hdf5_features import Hdf5FitError, stored_feature
 from demorec.ingest.hdf5_import import Hdf5Import, import_hdf5
-from demorec.ingest.hdf5_mapping import DatasetPart
+from demorec.ingest.hdf5_mapping import DatasetPart, Hdf5Episodes
 from demorec.ingest.hdf5_pictures import StoredCamera
 from demorec.ingest.hdf5_suggest import suggested_hdf5_mapping
 from demorec.recording import CollectedRecording, Recording
@@ -390,6 +391,10 @@ FAULTS: dict[str, tuple[Callable[[h5py.File], object], str]] = {
     "virtual": (_replaced("actions", _virtual), "its numbers are in other files"),
     "rate": (_attribute("data", "env_args", '{"env_kwargs": {"control_freq": 12.5}}'), "12.5 rows a second"),
     "no rate": (_attribute("data", "env_args", "{"), "give clock.fps in the mapping"),
+    "huge rate": (
+        _attribute("data", "env_args", '{"env_kwargs": {"control_freq": 1' + "0" * 400 + "}}"), "inf rows a second"
+    ),
+    "text of a number": (_attribute("data/demo_1", "num_samples", "5"), "num_samples says '5'"),
     "mask": (_without_masked, "demo_7"),
 }  # fmt: skip
 
@@ -417,6 +422,28 @@ def _refused(file: Path, mapping: Path, told: str, capsys: pytest.CaptureFixture
     assert err.startswith("demorec import: ")
     assert (err.count("\n"), out) == (1, "")
     assert not list(run.rglob("*.mcap*"))
+
+
+@pytest.mark.parametrize(("value", "shown"), [("true", "'true'"), (float("nan"), "nan")])
+def test_an_outcome_is_a_boolean_or_a_number(
+    value: object, shown: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = write_robomimic(tmp_path / "demo.hdf5")
+    mapping = suggested(file, {'# success = "rewards"': 'success = "outcome"'})
+    with h5py.File(file, "r+") as opened:
+        for name in DEMOS:
+            opened[f"data/{name}"].attrs["outcome"] = value
+    _refused(file, mapping, f"says outcome = {shown}, allowed are booleans and numbers", capsys)
+
+
+def test_episodes_are_in_the_order_of_their_numbers_however_long_these_are(tmp_path: Path) -> None:
+    names = ["demo_2", "demo_010", "demo_" + "9" * 5000, "demo_9"]
+    with h5py.File(tmp_path / "many.hdf5", "w") as file:
+        for name in names:
+            file[f"data/{name}/actions"] = np.zeros((2, 1))
+    with ForeignFile(tmp_path / "many.hdf5") as opened:
+        places = episode_places(opened, Hdf5Episodes(group="data"))
+    assert [place.removeprefix("data/") for place in places] == ["demo_2", "demo_9", "demo_010", names[2]]
 
 
 def test_a_mask_leaves_links_out(tmp_path: Path) -> None:

@@ -282,3 +282,19 @@ def test_a_recording_with_nan_is_not_exported(tmp_path: Path) -> None:
     with pytest.raises(ExportError, match=r"observation.state is not finite in frame 11"):
         export_lerobot([tmp_path / "b.mcap"], tmp_path / "ds", ExportOptions(verify=False))
     assert not (tmp_path / "ds").exists()
+
+
+def test_episodes_are_told_of_by_their_numbers(run: Path, tmp_path: Path) -> None:
+    """Where the sidecar lacks one, as after LeRobot's resume, the others are not taken for their neighbours."""
+    from demorec.check.dataset import Dataset
+    from demorec.check.run_dataset import dataset_episodes
+
+    spoilt = tmp_path / "run"
+    shutil.copytree(run, spoilt)
+    (path,) = (spoilt / "dataset" / "demorec" / "episodes").glob("*/*.parquet")
+    pq.write_table(pq.read_table(path).slice(1), path)
+    for episode in dataset_episodes(Dataset(spoilt / "dataset")):
+        assert episode.told["episode_index"] == episode.number == int(episode.rows["episode_index"][0, 0])
+    assert level_of(spoilt, "run_dataset_content", "run") == "pass"
+    for name in ("dataset_description", "dataset_facts"):
+        assert level_of(spoilt / "dataset", name, "dataset") == "pass"

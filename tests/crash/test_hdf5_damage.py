@@ -17,6 +17,7 @@ import pytest
 from support.commands import exit_code
 from support.hdf5 import write_robomimic
 
+from demorec.errors import ResourceError
 from demorec.hdf5 import trial
 
 _SIZE_OF_FIRST = 24
@@ -45,7 +46,7 @@ def test_a_text_that_claims_gigabytes(file: Path, tmp_path: Path, capsys: pytest
     file.write_bytes(data.replace(reference, struct.pack("<IQ", 2**31 - 1, heap_of(data))))
     assert exit_code("import", "hdf5", file, "--suggest") == 1
     told = capsys.readouterr().err
-    assert "is damaged: a length in it is larger than what it holds" in told
+    assert "it is damaged, or has texts of more than 512 MB" in told
     assert told.strip().count("\n") == 0
 
 
@@ -89,3 +90,53 @@ def test_a_sound_file_is_walked_through_whole(file: Path, monkeypatch: pytest.Mo
         opened.visititems(lambda name, found: attributes_of.append(len(found.attrs)))
     assert sorted(datasets) == sorted(name.encode() for name in names)
     assert len(attributes) == sum(attributes_of) > 5
+
+
+@pytest.mark.slow
+def test_many_datasets_and_long_texts_are_no_damage(tmp_path: Path) -> None:
+    """The library keeps some 70 kB of each open dataset in chunks, which the walk's memory would not hold."""
+    path = tmp_path / "many.h5"
+    with h5py.File(path, "w") as opened:
+        frames = opened.create_group("frames")
+        for number in range(trial._MEMORY_BYTES // 70_000):
+            frames.create_dataset(str(number), shape=(4,), dtype="u1", chunks=(2,))
+        opened.create_dataset("files", (700,), dtype="S1000000", compression="gzip")
+        opened.attrs["about"] = "x" * (trial.MAX_ATTRIBUTE_BYTES + 1)
+    assert trial.why_not_read(path) == ""
+
+
+def test_an_object_that_cannot_be_read_hides_no_other(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[bytes] = []
+
+    def attribute(found: h5py.h5g.GroupID, attribute: h5py.h5a.AttrID) -> None:
+        raise OSError("spoilt")
+
+    names = trial._names
+
+    def spoilt(group: h5py.h5g.GroupID) -> list[bytes]:
+        if h5py.h5i.get_name(group) == b"/data/demo_0":
+            raise OSError("spoilt")
+        return names(group)
+
+    monkeypatch.setattr(trial, "_names", spoilt)
+    monkeypatch.setattr(trial, "_read_attribute", attribute)
+    monkeypatch.setattr(trial, "_read_dataset", lambda found: seen.append(h5py.h5i.get_name(found)))
+    trial.walk(file)
+    with h5py.File(file, "r") as opened:
+        others = [name for name in opened["data"] if name != "demo_0"]
+    assert others
+    assert {name.split(b"/")[2].decode() for name in seen if name.startswith(b"/data/")} == set(others)
+
+
+def test_a_process_that_is_ended_says_nothing_about_the_file(
+    file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As the system does when memory runs out; another time the file is read."""
+    killed = tmp_path / "python"
+    killed.write_text("#!/bin/sh\nkill -KILL $$\n")
+    killed.chmod(0o755)
+    with monkeypatch.context() as patched:
+        patched.setattr(sys, "executable", str(killed))
+        with pytest.raises(ResourceError, match="could not be tried in a process of its own, which ended with 9"):
+            trial.why_not_read(file)
+    assert trial.why_not_read(file) == ""

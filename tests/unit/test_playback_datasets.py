@@ -7,12 +7,14 @@ import shutil
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from rerun.chunk import RrdReader
 from support.export import export, make_run
 from support.recording import write_episode
 
-from demorec.errors import ExportError
+from demorec.errors import ExportError, RecordingError
 from demorec.geometry import Array
 from demorec.playback.episode import PlayedEpisode
 from demorec.playback.from_dataset import open_dataset_episode
@@ -128,8 +130,40 @@ def test_codes_of_depth_mean_what_the_datasets_metadata_say(tmp_path: Path) -> N
         info.write_text(json.dumps(written))
         with open_dataset_episode(tmp_path / "d", 0) as episode:
             assert isinstance(episode, PlayedEpisode)
-            with pytest.raises(ExportError, match=r"The video cannot be read \(its (scale of )?depth is"):
+            with pytest.raises(ExportError, match=r"depth cannot be read \(its (scale of )?depth is.*info\.json"):
                 list(episode.depth["front"]())
+
+
+def test_what_info_says_of_a_video_must_be_true_of_it(tmp_path: Path) -> None:
+    write_episode(tmp_path / "e.mcap", num_frames=3, depth=True, cameras=("front",))
+    export(tmp_path / "e.mcap", tmp_path / "d", depth=True)
+    info = tmp_path / "d" / "meta" / "info.json"
+    written = json.loads(info.read_text())
+    depth, colour = (written["features"][f"observation.images.front{end}"] for end in ("_depth", ""))
+    height, width = depth["shape"][:2]
+    depth["shape"][:2] = [8, 9]
+    assert colour["info"]["video.codec"] == "h264"
+    colour["info"]["video.codec"] = "av1"
+    info.write_text(json.dumps(written))
+    with open_dataset_episode(tmp_path / "d", 0) as episode:
+        assert isinstance(episode, PlayedEpisode)
+        with pytest.raises(ExportError, match=f"it has {width}x{height} pixels, and meta/info.json says 9x8"):
+            list(episode.depth["front"]())
+        with pytest.raises(ExportError, match=r"its codec is h264, and meta/info\.json says av1"):
+            list(episode.videos["front"].batches())
+
+
+def test_an_episode_of_another_length_than_its_rows_is_one_sentence(dataset: Path, tmp_path: Path) -> None:
+    spoilt = tmp_path / "d"
+    shutil.copytree(dataset, spoilt)
+    (path,) = (spoilt / "meta" / "episodes").glob("*/*.parquet")
+    table = pq.read_table(path)
+    (length,) = table.column("length").to_pylist()
+    longer = pa.array([length + 5], table.schema.field("length").type)
+    pq.write_table(table.set_column(table.schema.get_field_index("length"), "length", longer), path)
+    told = f"Episode 0 of the dataset has {length} rows, its table of episodes says {length + 5}"
+    with pytest.raises(RecordingError, match=told), open_dataset_episode(spoilt, 0):
+        pass
 
 
 def test_a_missing_video_is_one_sentence(dataset: Path, tmp_path: Path) -> None:

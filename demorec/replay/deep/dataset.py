@@ -19,7 +19,7 @@ from demorec.scene.episode import EpisodeInfo
 
 
 def deep_dataset_checks(path: Path, *, allowed: Sequence[str] = ()) -> Iterator[DeepReport]:
-    """One report for each episode of a dataset, in order; a single one where that cannot be done.
+    """One report for each episode that the sidecar knows, in order; a single one where that cannot be done.
 
     Raises:
         ResourceError: This machine cannot do it, which says nothing about the dataset.
@@ -30,8 +30,10 @@ def deep_dataset_checks(path: Path, *, allowed: Sequence[str] = ()) -> Iterator[
             raise ConfigError(f"The dataset does not say how its episodes were made (no demorec/episodes): {path}")
         dataset.check_simulated()
         options = export_options(path)
-        for episode, info in zip(dataset_episodes(dataset), dataset.infos, strict=True):
-            yield _report(path / f"episode {episode.number}", episode, info, options, workshop, allowed)
+        infos = {each.number: each.info for each in dataset.described()}
+        for episode in dataset_episodes(dataset):
+            name = path / f"episode {episode.number}"
+            yield _report(name, episode, infos[episode.number], options, workshop, allowed)
     except DemorecError as error:
         if (lack := resource_error(error)) is not None:
             raise lack from error
