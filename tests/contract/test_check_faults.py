@@ -499,7 +499,8 @@ def camera_axes_of_opengl(s: Spoilt) -> None:
 PICTURES: list[tuple[Fault, str]] = [
     (upside_down, "projection"),
     (mirrored, "projection"),
-    (mirrored_wrist, "projection"),
+    # Not projection: what the hand goes for and holds is in the middle of the wrist's pictures.
+    (mirrored_wrist, "pictures_as_drawn"),
     (blue_for_red, "projection"),
     (names_exchanged, "projection"),
     (shifted_pictures, "projection"),
