@@ -14,7 +14,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import lru_cache
 from pathlib import Path
 
@@ -171,8 +171,9 @@ def _limit(what: int, value: int) -> None:
 
 def main() -> int:
     """Of the process that can be spared."""
-    begun = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    _limit(resource.RLIMIT_AS, begun + _MEMORY_BYTES)
+    with suppress(OSError, ValueError):  # only Linux tells what a process has, and holds it to a limit
+        begun = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+        _limit(resource.RLIMIT_AS, begun + _MEMORY_BYTES)
     _limit(resource.RLIMIT_CPU, _END_SECONDS)
     _limit(resource.RLIMIT_CORE, 0)
     try:
