@@ -11,6 +11,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from demorec.check.cells import Cells, ImageKind, cell_counts
 from demorec.check.drawn import DrawnPictures, draw, fit, frames_to_draw
@@ -66,7 +67,7 @@ def draw_episode(
     turns = {} if colors is None else _turns(info, world, counts, colors)
     cameras = tuple(_turned_back(camera, turns.get(camera.name)) for camera in scene.cameras)
     if draw_each or colors is None:
-        frames = np.flatnonzero(np.ones(columns.num_frames))
+        frames: NDArray[np.int64] = np.arange(columns.num_frames)
     else:
         frames = frames_to_draw(colors.values(), world.all_poses[: columns.num_frames])
     return DrawnEpisode(
