@@ -13,6 +13,7 @@ from demorec.check.rows import displacement, matrices
 from demorec.errors import RecordingError
 from demorec.geometry import Array
 from demorec.recording import channels
+from demorec.scene.camera_error import told_error
 from demorec.scene.scene import Camera
 
 UNRELATED = 16.0
@@ -86,7 +87,9 @@ def _expected(episode: CheckedEpisode, camera: Camera) -> Array:
 
 
 def _allowance(episode: CheckedEpisode, camera: Camera) -> float:
-    """By how much pictures may be shifted, of their height, since the recorded calibration is turned on purpose."""
+    """By how much pictures may be shifted, of their height: older recordings do not tell how they are turned."""
+    if told_error(camera.name, episode.info.behaviour) is not None:
+        return 0.0
     angle = episode.info.behaviour.get(f"calibration_{camera.name}_angle", 0.0)
     return angle / (2 * math.tan(camera.fov_y / 2))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -15,7 +16,9 @@ Cells = NDArray[np.float32]
 ImageKind = Literal["color", "depth", "labels"]
 
 CELLS = 28
-"""Cells along the longer side."""
+"""Cells along the longer side, where so many fit."""
+FEWEST_CELLS, MOST_CELLS = 20, 36
+"""The same where other numbers make all cells equal squares: unequal ones shift what they show by a part of a pixel."""
 DEPTH_RANGE = 3.0
 """Metres that are brightness 255; what is farther is not told apart."""
 CHANNELS: dict[ImageKind, int] = {"color": 3, "depth": 1, "labels": 2}
@@ -48,8 +51,10 @@ class CellGrid:
 
     def __init__(self, width: int, height: int, counts: tuple[int, int] | None = None) -> None:
         columns, rows = counts or cell_counts(width, height)
+        # Rounded, halves to even: with cells that all begin early, everything would lie farther right and down.
         self._columns, self._rows = (
-            np.arange(count + 1) * size // count for count, size in ((columns, width), (rows, height))
+            np.rint(np.arange(count + 1) * (size / count)).astype(np.int64)
+            for count, size in ((columns, width), (rows, height))
         )
         self._areas = np.outer(np.diff(self._rows), np.diff(self._columns))[:, :, None]
         self._num_pixels = width * height
@@ -91,7 +96,12 @@ class CellGrid:
 
 
 def cell_counts(width: int, height: int) -> tuple[int, int]:
-    """(columns, rows) of the grid for pictures of a size."""
-    longer = max(width, height)
+    """(columns, rows) of the grid for pictures of a size: equal squares, at least two pixels wide, where it allows."""
+    longer, shared = max(width, height), math.gcd(width, height)
+    sides = [side for side in range(2, shared + 1) if shared % side == 0]
+    fitting = [side for side in sides if FEWEST_CELLS <= longer // side <= MOST_CELLS]
+    if fitting:
+        side = min(fitting, key=lambda side: abs(longer // side - CELLS))
+        return width // side, height // side
     count = min(CELLS, longer // 2)
     return max(round(count * width / longer), 2), max(round(count * height / longer), 2)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,8 @@ from demorec.lerobot.stats import NAMES, QUANTILES
 _NUMBERING = ("index", "episode_index", "task_index")
 _SMALLEST_DEVIATION = 1e-4
 """A component that hardly moves is measured against this."""
+_MERGED = 0.02
+"""Standard deviations by which a quantile is off at most, where it may come from LeRobot's merge: a warning."""
 
 
 @check(
@@ -39,7 +42,8 @@ _SMALLEST_DEVIATION = 1e-4
 def dataset_statistics(dataset: Dataset) -> Measurement | None:
     """meta/stats.json: minimum, maximum, mean, deviation, count and quantiles of every feature.
 
-    A quantile may also be the mean of the episodes' ones, as LeRobot has it.
+    A quantile may also be the mean of the episodes' ones, as LeRobot has it. Its merge takes means of the datasets' own
+    instead, and drops the sidecar: without one, a quantile that lies between the episodes' own is warned of, no more.
     """
     if not dataset.rows:
         return None
@@ -48,11 +52,10 @@ def dataset_statistics(dataset: Dataset) -> Measurement | None:
         episodes = [_flat(rows[name]) for rows in dataset.rows]
         true = statistics_of(np.concatenate(episodes))
         weights = [len(values) for values in episodes]
-        averaged = {
-            q: np.average([np.quantile(values, share, axis=0) for values in episodes], axis=0, weights=weights)
-            for q, share in QUANTILES.items()
-        }
-        found.append(_off(stats.get(name), true, averaged, detail=name))
+        own = {q: [np.quantile(values, share, axis=0) for values in episodes] for q, share in QUANTILES.items()}
+        averaged = {q: np.average(values, axis=0, weights=weights) for q, values in own.items()}
+        between = {} if dataset.sidecar else {q: (np.min(v, axis=0), np.max(v, axis=0)) for q, v in own.items()}
+        found.append(_off(stats.get(name), true, averaged, between, detail=name))
     return worst(*found)
 
 
@@ -74,7 +77,7 @@ def dataset_episode_statistics(dataset: Dataset) -> Measurement | None:
     for number, (row, rows) in enumerate(zip(told, dataset.rows, strict=False)):
         for name in names:
             said = {quantity: row[f"stats/{name}/{quantity}"] for quantity in NAMES}
-            found.append(_off(said, statistics_of(_flat(rows[name])), {}, detail=f"episode {number}, {name}"))
+            found.append(_off(said, statistics_of(_flat(rows[name])), detail=f"episode {number}, {name}"))
     return worst(*found)
 
 
@@ -129,22 +132,33 @@ def _flat(rows: Any) -> Array:
 
 
 def _off(
-    said: Mapping[str, Any] | None, true: Mapping[str, Array], others: Mapping[str, Array], *, detail: str
+    said: Mapping[str, Any] | None,
+    true: Mapping[str, Array],
+    others: Mapping[str, Array] = MappingProxyType({}),
+    between: Mapping[str, tuple[Array, Array]] = MappingProxyType({}),
+    *,
+    detail: str,
 ) -> Measurement:
-    """How far the worst quantity of a feature is off, by the nearer of two values where there are two."""
+    """How far the worst quantity of a feature is off, by the nearer of two values where there are two; by no more than
+    `_MERGED` where it lies between two others.
+    """
     if said is None:
         return Measurement(value=math.inf, detail=f"{detail} has no statistics")
     found = []
     scale = np.maximum(true["std"], _SMALLEST_DEVIATION)
     for quantity, value in true.items():
         told = numbers_of(said.get(quantity, np.inf))
-        off = math.inf
+        off, merged = math.inf, ""
         if told.shape == value.shape:
             distance = np.abs(told - value)
             if quantity in others:
                 distance = np.minimum(distance, np.abs(told - others[quantity]))
-            off = float((distance if quantity == "count" else distance / scale).max())
-        found.append(Measurement(value=off, detail=f"{quantity} of {detail}"))
+            distance = distance if quantity == "count" else distance / scale
+            low, high = between.get(quantity, (np.inf, -np.inf))
+            is_between = (low <= told) & (told <= high) & (distance > _MERGED)
+            off = float(np.where(is_between, _MERGED, distance).max())
+            merged = ", between the episodes' own, as LeRobot's merge leaves it" if off == _MERGED else ""
+        found.append(Measurement(value=off, detail=f"{quantity} of {detail}{merged}"))
     measurement = worst(*found)
     assert measurement is not None
     return measurement

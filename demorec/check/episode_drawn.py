@@ -1,8 +1,8 @@
 """The pictures of an episode as its recorded numbers make them.
 
-Recorded camera poses may be off on purpose, as those of a real camera are (`--variation full`). The recording tells the
-error's offset, and how far but not about which axis it turns. The turn is found in the pictures, as far as it is no
-larger than what is told; so that they can be compared as exactly as those of other episodes.
+Recorded camera poses may be off on purpose, as those of a real camera are (`--variation full`). The recording tells by
+how much, so that the pictures are drawn from where the camera was. Older recordings tell the error's offset, and how
+far but not about which axis it turns: there the turn is found in the pictures, as far as it is no larger than told.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from demorec.check.cells import Cells, ImageKind, cell_counts
 from demorec.check.drawn import DrawnPictures, draw, fit, frames_to_draw
 from demorec.geometry import Array, Pose
 from demorec.render.recorded import RecordedWorld
+from demorec.scene.camera_error import told_error
 from demorec.scene.episode import EpisodeColumns, EpisodeInfo
 from demorec.scene.scene import Camera, Scene
 
@@ -81,7 +82,7 @@ def draw_episode(
 
 
 def drawable_scene(info: EpisodeInfo) -> Scene:
-    """The recorded scene, its cameras without the offset of their calibration error.
+    """The recorded scene, its cameras without their calibration error; in older recordings without its offset.
 
     One shift of all pictures makes up for most of a turn, but not for an offset: what is near moves farther by it than
     what is far.
@@ -90,6 +91,9 @@ def drawable_scene(info: EpisodeInfo) -> Scene:
 
 
 def _moved_back(camera: Camera, behaviour: Mapping[str, float]) -> Camera:
+    error = told_error(camera.name, behaviour)
+    if error is not None:
+        return replace(camera, mount_from_camera=camera.mount_from_camera @ error.inverse())
     offset = np.array([behaviour.get(f"calibration_{camera.name}_{axis}", 0.0) for axis in "xyz"])
     if not offset.any():
         return camera
@@ -109,8 +113,12 @@ def _turns(
     info: EpisodeInfo, world: RecordedWorld, counts: Mapping[str, tuple[int, int]], colors: Mapping[str, Cells]
 ) -> dict[str, Array]:
     """Camera name -> (3,) rotation vector of its calibration error, rad in its own axes, where pictures show one."""
-    told = {camera.name: info.behaviour.get(f"calibration_{camera.name}_angle", 0.0) for camera in world.scene.cameras}
-    cameras = [camera for camera in world.scene.cameras if told[camera.name] and len(colors[camera.name])]
+    told = {
+        camera.name: info.behaviour.get(f"calibration_{camera.name}_angle", 0.0)
+        for camera in world.scene.cameras
+        if told_error(camera.name, info.behaviour) is None
+    }
+    cameras = [camera for camera in world.scene.cameras if told.get(camera.name) and len(colors[camera.name])]
     if not cameras:
         return {}
     count = min(len(colors[camera.name]) for camera in cameras)

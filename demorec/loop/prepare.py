@@ -15,8 +15,8 @@ from demorec.plain import digest, to_plain
 from demorec.render import Renderer
 from demorec.safety.user_modules import modules_of
 from demorec.scene.assets import allow_models, model_name
+from demorec.scene.camera_error import error_values
 from demorec.scene.episode import EpisodeInfo
-from demorec.scene.motion import angle_between
 from demorec.scene.scene import CONTACT_BREAKING_THRESHOLD, FINGER_STIFFNESS, Camera, Scene
 from demorec.scene.variation import Ranges, resolve
 from demorec.seeding import Purpose, generator
@@ -131,7 +131,7 @@ def prepare(plan: EpisodePlan) -> Episode:
         scene=scene,
         fps=config.fps,
         physics_hz=config.physics_hz,
-        behaviour=behaviour.as_mapping() | _calibration_values(errors),
+        behaviour=behaviour.as_mapping() | error_values(errors),
         config=to_plain(config),
         config_digest=digest(config),
         versions=deciding_versions(config),
@@ -170,16 +170,6 @@ def _miscalibrated(camera: Camera, true_from_recorded: Pose) -> Camera:
     if true_from_recorded == Pose():
         return camera
     return replace(camera, mount_from_camera=camera.mount_from_camera @ true_from_recorded)
-
-
-def _calibration_values(errors: Mapping[str, Pose]) -> dict[str, float]:
-    """The errors as recorded numbers: shift (m) and angle (rad) of each camera that has one."""
-    values: dict[str, float] = {}
-    for name, error in errors.items():
-        if error != Pose():
-            values |= {f"calibration_{name}_{axis}": float(v) for axis, v in zip("xyz", error.position, strict=True)}
-            values[f"calibration_{name}_angle"] = angle_between(error, Pose())
-    return values
 
 
 def make_world(info: EpisodeInfo) -> World:

@@ -83,6 +83,8 @@ class RenderSetup:
         light: Light and sky.
         depth, segmentation: Whether these are drawn beside colour.
         antialias: Whether edges are smoothed, where the renderer can.
+        detail: Camera name -> of which height pictures are whose level of detail is drawn, where a renderer has such;
+            its own for the others. For small pictures that shall show what a large one shows.
     """
 
     bodies: tuple[VisualBody, ...]
@@ -92,6 +94,7 @@ class RenderSetup:
     depth: bool = False
     segmentation: bool = False
     antialias: bool = True
+    detail: Mapping[str, int] = field(default_factory=dict)
 
 
 class Renderer(Protocol):

@@ -41,6 +41,7 @@ class Painter:
         true_from_recorded: Camera name -> calibration error, of the cameras that have one.
         depth, segmentation: Whether these are drawn beside colour.
         antialias: Whether edges are smoothed, where the renderer can.
+        detail: As of `RenderSetup`.
     """
 
     def __init__(
@@ -52,11 +53,13 @@ class Painter:
         depth: bool = False,
         segmentation: bool = False,
         antialias: bool = True,
+        detail: Mapping[str, int] | None = None,
     ) -> None:
         self._renderer = renderer
         self._cameras = cameras
         self._true_from_recorded = true_from_recorded or {}
         self._depth, self._segmentation, self._antialias = depth, segmentation, antialias
+        self._detail = detail or {}
         self._world: Drawable | None = None
         self._setup: RenderSetup | None = None
 
@@ -75,6 +78,7 @@ class Painter:
             depth=self._depth,
             segmentation=self._segmentation,
             antialias=self._antialias,
+            detail=self._detail,
         )
         self._renderer.setup(self._setup)
 

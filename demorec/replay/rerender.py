@@ -28,6 +28,7 @@ from demorec.replay.free_camera import FreeCamera
 from demorec.safety.files import make_folder
 from demorec.safety.user_modules import split_name
 from demorec.scene.assets import allow_models
+from demorec.scene.camera_error import told_error
 from demorec.scene.episode import EpisodeInfo, Outcome
 from demorec.scene.scene import Camera, Scene
 from demorec.scene.variation import Ranges, resolve
@@ -106,7 +107,8 @@ def recorded_view(info: EpisodeInfo, allowed: Collection[str]) -> SceneView:
     """The view of a recording.
 
     Recorded extrinsics may be off on purpose, as those of a real camera are; where the cameras really were follows
-    from the seed. Only if the scene cannot be drawn again from it (another version, a scene of somebody else's), the
+    from the seed, to the bit. If the scene cannot be drawn again from it (another version, new looks, a scene of
+    somebody else's), it follows from the error that the recording tells. Older recordings do not tell it: there the
     recorded cameras are taken for the true ones.
 
     Raises:
@@ -126,7 +128,15 @@ def recorded_view(info: EpisodeInfo, allowed: Collection[str]) -> SceneView:
             return SceneView(
                 scene=info.scene, true_cameras=episode.cameras, true_from_recorded=dict(episode.true_from_recorded)
             )
-    return SceneView(scene=info.scene, true_cameras=info.scene.cameras)
+    told = {camera.name: told_error(camera.name, info.behaviour) for camera in info.scene.cameras}
+    errors = {name: error for name, error in told.items() if error is not None}
+    true_cameras = tuple(
+        replace(camera, mount_from_camera=camera.mount_from_camera @ errors[camera.name].inverse())
+        if camera.name in errors
+        else camera
+        for camera in info.scene.cameras
+    )
+    return SceneView(scene=info.scene, true_cameras=true_cameras, true_from_recorded=errors)
 
 
 def new_view(info: EpisodeInfo, options: RerenderOptions) -> SceneView:

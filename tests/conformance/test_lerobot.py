@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.check import checked, edit_json, level_of
 from support.docs import run_examples
 from support.export import data_table, episode_rows, export, make_run
 from support.recording import make_episode
@@ -222,6 +223,12 @@ def test_datasets_can_be_merged(run: Path, dataset: Path, tmp_path: Path) -> Non
     assert_readable(tmp_path / "merged", (*LENGTHS[:2], *LENGTHS))
     assert (dataset / "demorec" / "robots").is_dir()  # what docs/dataset-format.md says of LeRobot's tools
     assert not any((tmp_path / name / "demorec").exists() for name in ("both", "merged"))
+    # The merge takes means of both datasets' quantiles: said, but no failure; other numbers are one.
+    levels = {r.check: r.level for r in checked(tmp_path / "both", "dataset").results}
+    assert levels["dataset_statistics"] == "warn"
+    assert [name for name, level in levels.items() if level == "fail"] == ["dataset_duplicates"]  # they are
+    edit_json(tmp_path / "both/meta/stats.json", lambda data: data["action"].update(q90=data["action"]["max"]))
+    assert level_of(tmp_path / "both", "dataset_statistics", "dataset") == "fail"
 
 
 @pytest.mark.slow

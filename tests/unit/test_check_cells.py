@@ -23,7 +23,8 @@ from demorec.recording import Recording
 def parts(picture: NDArray[Any], width: int, height: int) -> list[list[NDArray[Any]]]:
     """The picture cut into its cells."""
     columns, rows = cell_counts(width, height)
-    x, y = np.arange(columns + 1) * width // columns, np.arange(rows + 1) * height // rows
+    x = [round(j * (width / columns)) for j in range(columns + 1)]
+    y = [round(i * (height / rows)) for i in range(rows + 1)]
     return [[picture[y[i] : y[i + 1], x[j] : x[j + 1]] for j in range(columns)] for i in range(rows)]
 
 
@@ -137,3 +138,31 @@ def test_pictures_that_are_not_drawn_are_means_of_those_around(tmp_path: Path) -
         np.testing.assert_array_equal(found[frame], whole[frame])
     np.testing.assert_allclose(found[1], (2 * whole[0] + whole[3]) / 3, atol=1e-3)
     np.testing.assert_allclose(found[2], (whole[0] + 2 * whole[3]) / 3, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("width", "height", "expected"),
+    [
+        (224, 224, (28, 28)),
+        (128, 128, (32, 32)),
+        (96, 96, (32, 32)),
+        (64, 64, (32, 32)),
+        (640, 480, (32, 24)),
+        (320, 240, (32, 24)),
+        (480, 640, (24, 32)),
+        (1280, 720, (32, 18)),
+        (322, 242, (28, 21)),  # nothing divides it: cells of 11 and 12 pixels
+    ],
+)
+def test_cells_are_equal_squares_where_the_size_allows(width: int, height: int, expected: tuple[int, int]) -> None:
+    assert cell_counts(width, height) == expected
+
+
+@pytest.mark.parametrize("size", [322, 242, 101])
+def test_unequal_cells_are_not_shifted(size: int) -> None:
+    """What rises evenly over the picture is, on the mean, where it would be with equal cells."""
+    ramp = np.broadcast_to(np.arange(size, dtype=np.float32)[None] / size, (size, size)).copy()
+    read = CellGrid(size, size, (28, 28)).read("depth", np.maximum(ramp, 1e-6))
+    middles = (np.arange(28) + 0.5) / 28 - 0.5 / size
+    off = read.cells[0, :, 0] / (255 / DEPTH_RANGE) - middles
+    assert abs(off.mean()) * size < 0.05

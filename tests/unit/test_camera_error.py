@@ -1,0 +1,46 @@
+"""Calibration errors come back from the numbers that tell them; numbers that contradict each other tell nothing."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from demorec.geometry import Pose
+from demorec.scene.camera_error import error_values, told_error
+
+small = st.floats(-0.3, 0.3)
+
+
+@given(position=st.tuples(small, small, small), turn=st.tuples(small, small, small), flip=st.booleans())
+def test_errors_come_back(position: tuple[float, ...], turn: tuple[float, ...], flip: bool) -> None:
+    quat = np.array([*turn, 1.0]) / math.hypot(*turn, 1.0)
+    error = Pose(position=np.array(position), quat_xyzw=-quat if flip else quat)
+    told = told_error("wrist", error_values({"front": Pose(), "wrist": error}))
+    if np.array_equal(error.vector(), Pose().vector()):
+        assert told is None
+    else:
+        assert told is not None
+        np.testing.assert_allclose(told.matrix(), error.matrix(), atol=1e-12)
+    assert told_error("front", error_values({"front": Pose(), "wrist": error})) is None
+
+
+@pytest.mark.parametrize(
+    "lie",
+    [
+        {"calibration_front_angle": 0.02},
+        {"calibration_front_angle": math.nan},
+        {"calibration_front_qx": 0.02},
+        {"calibration_front_qy": 1.5},
+        {"calibration_front_x": math.inf},
+    ],
+)
+def test_numbers_that_contradict_each_other_tell_nothing(lie: dict[str, float]) -> None:
+    turn = Pose(position=np.array([1e-3, 0, 0]), quat_xyzw=np.array([0.003, 0.004, 0.0, math.sqrt(1 - 25e-6)]))
+    values = error_values({"front": turn})
+    assert values["calibration_front_angle"] == pytest.approx(2 * math.asin(0.005))
+    assert told_error("front", values) is not None
+    assert told_error("front", values | lie) is None
