@@ -5,7 +5,7 @@ The same command again goes on: bags that import.json knows are not read, episod
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -179,15 +179,18 @@ class _Import:
         for episode in (episode for episode in waiting if not episode.plans):
             with self._writer(episode) as writer:
                 self._finish(episode, writer)
-        waiting = [episode for episode in waiting if episode.plans]
-        if not waiting:
+        filmed = [episode for episode in waiting if episode.plans]
+        if not filmed:
             return
+        beginning = _first_pictures(filmed)
+        begun: set[int] = set()
         with ExitStack() as stack:
             under_way: list[tuple[_Episode, ImportedEpisodeWriter]] = []
-            for topic, number, values in self._pictures(waiting):
-                for episode in [episode for episode in waiting if _wants(episode, topic, number)]:
-                    under_way.append((episode, stack.enter_context(self._writer(episode))))
-                    waiting.remove(episode)
+            for topic, number, values in self._pictures(filmed):
+                for episode in beginning.get((topic, number), []):
+                    if episode.info.episode_index not in begun:
+                        begun.add(episode.info.episode_index)
+                        under_way.append((episode, stack.enter_context(self._writer(episode))))
                 for pair in list(under_way):
                     episode, writer = pair
                     try:
@@ -231,8 +234,13 @@ class _Import:
         return BagError(f"A picture of {topic} cannot be used, since {error}: {self._bag.path}")
 
 
-def _wants(episode: _Episode, topic: str, number: int) -> bool:
-    return any(plan.topic == topic and number in plan.numbers for plan in episode.plans.values())
+def _first_pictures(episodes: Iterable[_Episode]) -> dict[tuple[str, int], list[_Episode]]:
+    """(topic, number) -> the episodes whose first picture of that topic it is; a topic's messages come in order."""
+    found: dict[tuple[str, int], list[_Episode]] = {}
+    for episode in episodes:
+        for plan in episode.plans.values():
+            found.setdefault((plan.topic, int(plan.numbers.min())), []).append(episode)
+    return found
 
 
 def _made(episode: _Episode, begin_ns: int) -> EpisodeReport:
