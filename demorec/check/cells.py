@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -16,9 +15,10 @@ Cells = NDArray[np.float32]
 ImageKind = Literal["color", "depth", "labels"]
 
 CELLS = 28
-"""Cells along the longer side, where so many fit."""
+"""Cells along the longer side, about."""
 FEWEST_CELLS, MOST_CELLS = 20, 36
-"""The same where other numbers make all cells equal squares: unequal ones shift what they show by a part of a pixel."""
+"""The same at least and at most: all cells of a grid are equal squares, since unequal ones would show things shifted by
+a part of a pixel, and few sizes can be cut into 28."""
 DEPTH_RANGE = 3.0
 """Metres that are brightness 255; what is farther is not told apart."""
 CHANNELS: dict[ImageKind, int] = {"color": 3, "depth": 1, "labels": 2}
@@ -42,7 +42,7 @@ class PictureCells:
 
 
 class CellGrid:
-    """Means over a grid of (nearly) equal areas, for pictures of one size.
+    """Means over a grid of equal squares in the middle of pictures of one size, but for a narrow border of some sizes.
 
     Args:
         width, height: Of the pictures, pixels.
@@ -50,20 +50,19 @@ class CellGrid:
     """
 
     def __init__(self, width: int, height: int, counts: tuple[int, int] | None = None) -> None:
-        columns, rows = counts or cell_counts(width, height)
-        # Rounded, halves to even: with cells that all begin early, everything would lie farther right and down.
-        self._columns, self._rows = (
-            np.rint(np.arange(count + 1) * (size / count)).astype(np.int64)
-            for count, size in ((columns, width), (rows, height))
-        )
-        self._areas = np.outer(np.diff(self._rows), np.diff(self._columns))[:, :, None]
+        columns, rows = counts = counts or cell_counts(width, height)
+        side = cell_side(width, height, counts)
+        self._shape = rows, columns
+        self._area = side * side
+        # The border's cells are added up, too, for what is told of the whole picture.
+        self._columns, self._rows = (_lines(count, side, size) for count, size in ((columns, width), (rows, height)))
         self._num_pixels = width * height
         size = (height, width)
         self._shapes: dict[ImageKind, tuple[int, ...]] = {"color": (*size, 3), "depth": size, "labels": size}
 
     def shape(self, kind: ImageKind) -> tuple[int, int, int]:
         """Of the cells of a picture: (h, w, channels)."""
-        return (len(self._rows) - 1, len(self._columns) - 1, CHANNELS[kind])
+        return (*self._shape, CHANNELS[kind])
 
     def read(self, kind: ImageKind, picture: NDArray[Any]) -> PictureCells:
         """A picture (H, W, 3) uint8 of colours, (H, W) float32 metres or (H, W) int32 labels, as brightnesses.
@@ -78,7 +77,7 @@ class CellGrid:
                 f"A picture ({kind}) has the shape {picture.shape}, those of its camera {self._shapes[kind]}."
             )
         grid = self._rows, self._columns
-        sums = np.empty(self.shape(kind))
+        sums = np.empty((len(self._rows) - 1, len(self._columns) - 1, CHANNELS[kind]))
         dark = bright = 0
         if kind == "color":
             dark, bright = kernels.sum_colors(np.ascontiguousarray(picture), *grid, sums)
@@ -88,20 +87,37 @@ class CellGrid:
         else:
             kernels.sum_labels(np.ascontiguousarray(picture, dtype=np.int32), *grid, sums)
         return PictureCells(
-            cells=(sums / self._areas).astype(np.float32),
+            cells=(sums[1:-1, 1:-1] / self._area).astype(np.float32),
             mean=sums.sum(axis=(0, 1)) / self._num_pixels,
             dark=dark / self._num_pixels,
             bright=bright / self._num_pixels,
         )
 
 
+def _lines(count: int, side: int, size: int) -> NDArray[np.int64]:
+    """(count + 3,) where the border before, the cells and the border after begin, and where that ends."""
+    inner = (size - count * side) // 2 + side * np.arange(count + 1)
+    return np.concatenate([[0], inner, [size]])
+
+
 def cell_counts(width: int, height: int) -> tuple[int, int]:
-    """(columns, rows) of the grid for pictures of a size: equal squares, at least two pixels wide, where it allows."""
-    longer, shared = max(width, height), math.gcd(width, height)
-    sides = [side for side in range(2, shared + 1) if shared % side == 0]
-    fitting = [side for side in sides if FEWEST_CELLS <= longer // side <= MOST_CELLS]
-    if fitting:
-        side = min(fitting, key=lambda side: abs(longer // side - CELLS))
-        return width // side, height // side
-    count = min(CELLS, longer // 2)
-    return max(round(count * width / longer), 2), max(round(count * height / longer), 2)
+    """(columns, rows) of the grid for pictures of a size: it leaves out as little of them as possible.
+
+    What it leaves out is even where that can be, so that it lies in the middle.
+    """
+    longer, shorter = max(width, height), min(width, height)
+    sides = range(max(-(-longer // MOST_CELLS), 2), min(longer // FEWEST_CELLS, shorter // 2) + 1)
+
+    def badness(side: int) -> tuple[bool, int, int]:
+        columns, rows = width // side, height // side
+        true_side = cell_side(width, height, (columns, rows))
+        left = width - columns * true_side, height - rows * true_side
+        return left[0] % 2 + left[1] % 2 > 0, -columns * rows * true_side**2, abs(longer // side - CELLS)
+
+    side = min(sides, key=badness, default=max(min(longer // CELLS, shorter // 2), min(2, shorter // 2), 1))
+    return width // side, height // side
+
+
+def cell_side(width: int, height: int, counts: tuple[int, int]) -> int:
+    """Pixels along the side of each cell of a grid with so many columns and rows."""
+    return min(width // counts[0], height // counts[1])

@@ -11,6 +11,7 @@ the frames around, so is the drawn picture.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
@@ -18,7 +19,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.check.cells import CellGrid, Cells, ImageKind
+from demorec.check.cells import CellGrid, Cells, ImageKind, cell_side
 from demorec.errors import RenderError, SceneError
 from demorec.geometry import Array
 from demorec.render import Renderer
@@ -69,7 +70,7 @@ def draw(
     cameras = tuple(camera for camera in cameras if camera.name in kinds)
     wanted = {kind for of_camera in kinds.values() for kind in of_camera}
     most = PIXELS_PER_CELL if wanted == {"color"} else LOSSLESS_PIXELS_PER_CELL
-    small = tuple(_small(camera, counts[camera.name], most) for camera in cameras)
+    small = tuple(small_camera(camera, counts[camera.name], most) for camera in cameras)
     grids = {camera.name: CellGrid(camera.width, camera.height, counts[camera.name]) for camera in small}
     cells: dict[tuple[str, ImageKind], Cells] = {
         (name, kind): np.empty((frames[-1] + 1, *grid.shape(kind)), dtype=np.float32)
@@ -82,7 +83,10 @@ def draw(
         depth="depth" in wanted,
         segmentation="labels" in wanted,
         # A hand close before its camera shows edges of another level of detail by several pixels elsewhere.
-        detail={camera.name: camera.height for camera in cameras},
+        detail={
+            camera.name: round(few.height * float(camera.intrinsics[1, 1] / few.intrinsics[1, 1]))
+            for camera, few in zip(cameras, small, strict=True)
+        },
     )
     painter.setup(world)
     for frame in frames.tolist():
@@ -170,10 +174,16 @@ def _renderer() -> Renderer:
     return RasterRenderer()
 
 
-def _small(camera: Camera, counts: tuple[int, int], most: int) -> Camera:
-    """The camera with the same number of pixels in each cell, where its own size has that too."""
-    side = min(most, camera.width // counts[0], camera.height // counts[1])
-    return replace(camera, width=counts[0] * side, height=counts[1] * side)
+def small_camera(camera: Camera, counts: tuple[int, int], most: int) -> Camera:
+    """A camera that sees what the grid of the camera's cells covers, and no more, with few pixels."""
+    side = cell_side(camera.width, camera.height, counts)
+    share = counts[1] * side / camera.height
+    return replace(
+        camera,
+        width=counts[0] * min(most, side),
+        height=counts[1] * min(most, side),
+        fov_y=camera.fov_y if share == 1 else 2 * math.atan(share * math.tan(camera.fov_y / 2)),
+    )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

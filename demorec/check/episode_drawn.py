@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.check.cells import Cells, ImageKind, cell_counts
+from demorec.check.cells import Cells, ImageKind, cell_counts, cell_side
 from demorec.check.drawn import DrawnPictures, draw, fit, frames_to_draw
 from demorec.geometry import Array, Pose
 from demorec.render.recorded import RecordedWorld
@@ -129,10 +129,9 @@ def _turns(
         drawn = draw(world, now, frames, dict.fromkeys(turns, ("color",)), counts)
         for camera in cameras:
             right, down, _, about = fit(colors[camera.name][:count], drawn.cells[camera.name, "color"], frames)
-            columns, rows = counts[camera.name]
             # What is seen in the direction (x, y, 1) moves by the turn's cross product with it.
-            size = np.array([-1 / rows, camera.width / camera.height / columns]) * _height(camera)
-            turns[camera.name] = turns[camera.name] + np.array([size[0] * down, size[1] * right, about])
+            size = cell_side(camera.width, camera.height, counts[camera.name]) / camera.height * _height(camera)
+            turns[camera.name] = turns[camera.name] + np.array([-size * down, size * right, about])
     return {name: turn for name, turn in turns.items() if np.linalg.norm(turn) <= _TURN_MARGIN * told[name]}
 
 

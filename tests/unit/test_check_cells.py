@@ -7,24 +7,26 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from support.recording import write_episode
 
-from demorec.check.cells import DEPTH_RANGE, CellGrid, Cells, cell_counts
-from demorec.check.drawn import compare, frames_to_draw
+from demorec.check.cells import DEPTH_RANGE, CellGrid, Cells, cell_counts, cell_side
+from demorec.check.drawn import compare, frames_to_draw, small_camera
 from demorec.check.episode_drawn import draw_episode
 from demorec.errors import RecordingError
-from demorec.geometry import Array
+from demorec.geometry import Array, Pose
 from demorec.recording import Recording
+from demorec.scene.scene import Camera
 
 
 def parts(picture: NDArray[Any], width: int, height: int) -> list[list[NDArray[Any]]]:
     """The picture cut into its cells."""
     columns, rows = cell_counts(width, height)
-    x = [round(j * (width / columns)) for j in range(columns + 1)]
-    y = [round(i * (height / rows)) for i in range(rows + 1)]
+    side = min(width // columns, height // rows)
+    left, top = (width - columns * side) // 2, (height - rows * side) // 2
+    x, y = [left + j * side for j in range(columns + 1)], [top + i * side for i in range(rows + 1)]
     return [[picture[y[i] : y[i + 1], x[j] : x[j + 1]] for j in range(columns)] for i in range(rows)]
 
 
@@ -67,11 +69,11 @@ def test_a_picture_of_another_size_is_refused() -> None:
 
 
 def test_drawn_pictures_have_the_grid_of_the_recorded_ones(tmp_path: Path) -> None:
-    """500x224 is drawn as 112x50: by itself that would have 12 rows of cells, and not 13."""
+    """500x224 is drawn as 93x42: by itself that would have another grid."""
     path = write_episode(tmp_path / "e.mcap", num_frames=2, cameras=("front",), width=500, height=224)
     with Recording(path) as recording:
         drawn = draw_episode(recording.info, recording.columns(), {"front": ("color",)}).pictures
-    assert drawn.cells["front", "color"].shape == (2, 13, 28, 3)
+    assert drawn.cells["front", "color"].shape == (2, 14, 31, 3)
 
 
 def waves(x: Array, y: Array, t: Array) -> Cells:
@@ -151,18 +153,27 @@ def test_pictures_that_are_not_drawn_are_means_of_those_around(tmp_path: Path) -
         (320, 240, (32, 24)),
         (480, 640, (24, 32)),
         (1280, 720, (32, 18)),
-        (322, 242, (28, 21)),  # nothing divides it: cells of 11 and 12 pixels
+        (854, 480, (25, 14)),  # nothing divides it: two rows or columns of pixels are left over on each side
+        (500, 224, (31, 14)),
+        (2, 2, (2, 2)),
     ],
 )
-def test_cells_are_equal_squares_where_the_size_allows(width: int, height: int, expected: tuple[int, int]) -> None:
+def test_sizes_are_cut_into_squares(width: int, height: int, expected: tuple[int, int]) -> None:
     assert cell_counts(width, height) == expected
 
 
-@pytest.mark.parametrize("size", [322, 242, 101])
-def test_unequal_cells_are_not_shifted(size: int) -> None:
-    """What rises evenly over the picture is, on the mean, where it would be with equal cells."""
-    ramp = np.broadcast_to(np.arange(size, dtype=np.float32)[None] / size, (size, size)).copy()
-    read = CellGrid(size, size, (28, 28)).read("depth", np.maximum(ramp, 1e-6))
-    middles = (np.arange(28) + 0.5) / 28 - 0.5 / size
-    off = read.cells[0, :, 0] / (255 / DEPTH_RANGE) - middles
-    assert abs(off.mean()) * size < 0.05
+@given(width=st.integers(40, 2000), height=st.integers(40, 2000))
+@example(848, 480)
+@example(854, 480)
+def test_cells_are_squares_in_the_middle(width: int, height: int) -> None:
+    columns, rows = counts = cell_counts(width, height)
+    side = cell_side(width, height, counts)
+    assert columns * rows <= 36 * 36
+    assert columns * rows * side**2 > (0.6 if max(width, height) > 4 * min(width, height) else 0.85) * width * height
+    # A camera with few pixels sees just that: the same direction at the edges of the grid.
+    camera = Camera(name="front", mount="world", mount_from_camera=Pose(), width=width, height=height, fov_y=1.0)
+    few = small_camera(camera, counts, 3)
+    assert few.width == few.height * columns / rows
+    for place in (0, 1):
+        edge = counts[place] * side / 2 / camera.intrinsics[place, place]
+        assert (few.width, few.height)[place] / 2 / few.intrinsics[place, place] == pytest.approx(edge)
