@@ -207,8 +207,8 @@ class PictureComparison:
     shown: Array
 
 
-_STRAY = 4.0
-"""Of 255: a depth or label that is off by more is another."""
+_STRAY: dict[ImageKind, float] = {"depth": 1.0, "labels": 4.0}
+"""Of 255: what is off by more is another depth (12 mm) or label."""
 _TURNED_STRAY = 16.0
 """The same where a camera's turn was found in its pictures: what is left of it moves edges by a twentieth of a cell."""
 _MAX_LAG = 3
@@ -258,7 +258,7 @@ def compare(seen: Cells, drawn: Cells, frames: NDArray[np.int64]) -> PictureComp
     )
 
 
-def strays(seen: Cells, drawn: Cells, *, is_turned: bool = False) -> Array:
+def strays(seen: Cells, drawn: Cells, kind: ImageKind, *, is_turned: bool = False) -> Array:
     """(T,) share of the cells whose value lies outside those of the drawn cell and its eight neighbours.
 
     For depth and labels, which are coded without loss: edges may lie elsewhere by a cell, nothing else may differ.
@@ -272,7 +272,7 @@ def strays(seen: Cells, drawn: Cells, *, is_turned: bool = False) -> Array:
         np.minimum(low, cells, out=low)
         np.maximum(high, cells, out=high)
     inner = seen[:, 1 : 1 + height, 1 : 1 + width]
-    off = np.maximum(low - inner, inner - high).max(axis=3) > (_TURNED_STRAY if is_turned else _STRAY)
+    off = np.maximum(low - inner, inner - high).max(axis=3) > (_TURNED_STRAY if is_turned else _STRAY[kind])
     return np.asarray(off.sum(axis=(1, 2)) / max(height * width, 1), dtype=np.float64)
 
 

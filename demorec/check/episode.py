@@ -273,7 +273,7 @@ class CheckedEpisode:
         if not len(seen):
             return NotMeasured(why=f"camera {camera.name} has no picture that can be read")
         is_turned = camera.name in self._drawn.shift
-        return strays(seen, self._drawn.pictures.cells[camera.name, kind], is_turned=is_turned)
+        return strays(seen, self._drawn.pictures.cells[camera.name, kind], kind, is_turned=is_turned)
 
     def compared(self, camera: Camera, kind: ImageKind = "color") -> PictureComparison | NotMeasured:
         """A camera's pictures against what the recorded numbers make of them."""

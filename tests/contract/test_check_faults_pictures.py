@@ -102,11 +102,15 @@ def grey(rows: Rows) -> Rows:
     return np.asarray(np.repeat(rows.mean(axis=3, keepdims=True), 3, axis=3), dtype=rows.dtype)
 
 
-def zoomed(rows: Rows) -> Rows:
-    height, width = rows.shape[1:3]
-    edge = height // 12
-    box = (edge, edge, width - edge, height - edge)
-    return np.stack([np.asarray(Image.fromarray(row).resize((width, height), box=box)) for row in rows])
+def zoomed(times: float) -> Fault:
+    def fault(rows: Rows) -> Rows:
+        height, width = rows.shape[1:3]
+        x, y = (size / 2 * (1 - 1 / times) for size in (width, height))
+        box = (x, y, width - x, height - y)
+        resize = Image.Resampling.BILINEAR
+        return np.stack([np.asarray(Image.fromarray(row).resize((width, height), resize, box=box)) for row in rows])
+
+    return fault
 
 
 def swapped_labels(rows: Rows) -> Rows:
@@ -152,7 +156,10 @@ COLOR: list[tuple[str, Fault, str]] = [
     ("mirrored", lambda rows: rows[:, :, ::-1], "projection"),
     ("upside down", lambda rows: rows[:, ::-1], "projection"),
     ("turned by half", lambda rows: rows[:, ::-1, ::-1], "projection"),
-    ("zoomed in", zoomed, "projected_size"),
+    ("shifted to the left by one pixel", rolled(-1), "projection"),
+    ("shifted down by one pixel", rolled(1, axis=1), "projection"),
+    ("zoomed in", zoomed(1.2), "projected_size"),
+    ("zoomed in by three hundredths", zoomed(1.03), "projected_size"),
 ]  # fmt: skip
 
 DEPTH: list[tuple[str, Fault, str]] = [
@@ -166,6 +173,7 @@ DEPTH: list[tuple[str, Fault, str]] = [
     ("one without hits", one(lambda rows: rows * 0), "depth_matches_scene"),
     ("mirrored", lambda rows: rows[:, :, ::-1], "depth_matches_scene"),
     ("upside down", lambda rows: rows[:, ::-1], "depth_matches_scene"),
+    ("five hundredths too far", lambda rows: rows * np.float32(1.05), "depth_matches_scene"),
     ("along the ray", along_the_ray, "depth_matches_scene"),
     ("inverted", lambda rows: rows.max() - rows, "depth_matches_scene"),
 ]
