@@ -60,6 +60,21 @@ def test_calibration_errors_are_kept(tmp_path: Path) -> None:
     assert not report.differing
 
 
+@pytest.mark.slow
+def test_calibration_errors_are_kept_a_second_time(tmp_path: Path) -> None:
+    """What was drawn anew does not follow from a seed; the error that it tells leads to where the camera was."""
+    source = simulate(tmp_path / "e.mcap", seed=2, cameras=("front",), width=64, height=64, variation="full")
+    rerender(source, tmp_path / "again.mcap", RerenderOptions())
+    rerender(tmp_path / "again.mcap", tmp_path / "thrice.mcap", RerenderOptions())
+    with Recording(source) as first, Recording(tmp_path / "thrice.mcap") as last:
+        assert first.info.scene.cameras == last.info.scene.cameras
+        off = [
+            np.abs(a.astype(int) - b.astype(int)).max()
+            for a, b in zip(first.images("front"), last.images("front"), strict=True)
+        ]
+    assert max(off) <= 2  # poses may differ in their last bit
+
+
 def test_a_new_camera_has_no_calibration_error(filmed: Path) -> None:
     """Though it has the name of one that had."""
     with Recording(filmed) as recording:
