@@ -243,7 +243,10 @@ def collected_layout(episode: PlayedCollected, *, is_alone: bool = False) -> rrb
         for name in episode.curves
     ]
     pages = [rrb.TextDocumentView(origin=paths.words, name="in words")] if episode.statements else []
-    bottom = rrb.Horizontal(*plots, *pages, rrb.TextDocumentView(origin=paths.summary, name="episode"))
+    pages.append(rrb.TextDocumentView(origin=paths.summary, name="episode"))
+    # Without pictures above there is room for texts one below the other.
+    texts: list[rrb.View | rrb.Container] = list(pages) if top else [rrb.Vertical(*pages)]
+    bottom = rrb.Horizontal(*plots, *texts, column_shares=[1.6] * len(plots) + [1.0] * len(texts))
     return rrb.Blueprint(
         rrb.Vertical(rrb.Horizontal(*top), bottom, row_shares=[5.0, 3.0]) if top else bottom,
         rrb.TimePanel(state="collapsed", timeline=SECONDS, fps=float(episode.info.fps), loop_mode="all"),
