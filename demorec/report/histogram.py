@@ -54,7 +54,9 @@ class Histogram:
         if not len(finite):
             return
         self._take(float(finite.min()), float(finite.max()), float(finite.sum()), len(finite))
-        numbers, counts = np.unique(np.floor(np.ldexp(finite, -self.exponent)).astype(np.int64), return_counts=True)
+        places = np.floor(np.ldexp(finite, -self.exponent)).astype(np.int64)
+        places[(places == 0) & (finite < 0)] = -1  # so small that dividing it made zero of it
+        numbers, counts = np.unique(places, return_counts=True)
         self._count(zip(numbers.tolist(), counts.tolist(), strict=True), 0)
 
     def merge(self, other: Histogram) -> None:
@@ -81,7 +83,7 @@ class Histogram:
 
     @staticmethod
     def _number(value: float, exponent: int) -> int:
-        return math.floor(math.ldexp(value, -exponent))
+        return math.floor(math.ldexp(value, -exponent)) or -int(value < 0)
 
     def _count(self, counted: Iterable[tuple[int, int]], shift: int) -> None:
         for number, count in counted:

@@ -22,6 +22,7 @@ def counted(*parts: list[float]) -> Histogram:
 
 
 @given(VALUES)
+@example([47.0, -5e-324])
 def test_every_value_is_in_the_bin_that_holds_it(values: list[float]) -> None:
     histogram = counted(values)
     assert len(histogram.bins) <= max(histogram.bins) - min(histogram.bins) + 1 <= MOST_BINS
@@ -35,6 +36,7 @@ def test_every_value_is_in_the_bin_that_holds_it(values: list[float]) -> None:
 
 @given(VALUES, VALUES)
 @example([0.0], [2.9e-205])
+@example([-5e-324], [47.0])
 def test_parts_count_as_the_whole_in_any_order(first: list[float], second: list[float]) -> None:
     whole = counted(first + second)
     merged, other = counted(second), counted(first)
