@@ -46,7 +46,11 @@ ROBOTS: Registry[RobotSpec] = Registry(
 
 CAMERAS: Registry[CameraPreset] = Registry(
     kind="camera",
-    rows={"front": "demorec.render.cameras:FRONT", "wrist": "demorec.render.cameras:WRIST"},
+    rows={
+        "front": "demorec.render.cameras:FRONT",
+        "wrist": "demorec.render.cameras:WRIST",
+        "top": "demorec.render.cameras:TOP",
+    },
     instance_of="demorec.render.cameras:CameraPreset",
 )
 

@@ -56,6 +56,15 @@ FRONT = CameraPreset(
     fov_y=math.radians(44.0),
 )
 
+TOP = CameraPreset(
+    summary="above the table, looking down, the arm comes from below: sees where things stand",
+    mount="world",
+    eye=(0.5, 0.0, 1.25),
+    target=(0.5, 0.0, 0.0),
+    up=(1.0, 0.0, 0.0),
+    fov_y=math.radians(38.0),
+)
+
 # In TCP axes: z out of the hand, y along the fingers' motion; the camera sits on the hand's side, tilted to the tips.
 WRIST = CameraPreset(
     summary="on the hand, looking at the finger tips",

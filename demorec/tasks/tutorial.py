@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 
 from demorec.geometry import Pose
-from demorec.render.cameras import FRONT, CameraPreset
+from demorec.render.cameras import FRONT, TOP, CameraPreset
 from demorec.scene.episode import SuccessCheck
 from demorec.scene.robot import RobotSpec
 from demorec.scene.scene import Body, Goal, RobotPlacement, Scene, Shape
@@ -65,7 +65,8 @@ class Tutorial(Task):
     summary = "the tutorial's scene: a cube dropped onto a table from 80 cm, held by a constraint"
     has_fixed_layout = True
     camera_presets: ClassVar[Mapping[str, CameraPreset]] = {
-        "front": replace(FRONT, eye=(-1.35, 1.75, 1.55), target=(0.66, 0.38, 0.42), fov_y=math.radians(36.0))
+        "front": replace(FRONT, eye=(-1.35, 1.75, 1.55), target=(0.66, 0.38, 0.42), fov_y=math.radians(36.0)),
+        "top": replace(TOP, eye=(0.5, 0.45, 2.6), target=(0.5, 0.45, 0.0), up=(0.0, 1.0, 0.0)),
     }
 
     def sample_scene(self, robot: RobotSpec, sampler: Sampler) -> Scene:

@@ -49,6 +49,16 @@ def test_front_sees_every_place_where_objects_go_and_the_hand_above(world: World
     assert inside(camera, pixel(camera, camera.mount_from_camera, tuple(world.arm.world_from_tcp().position)))
 
 
+def test_top_sees_every_place_where_objects_go_with_the_base_below(world: World) -> None:
+    camera = cameras_of(world)["top"]
+    for x, y, z in itertools.product((0.33, 0.67), (-0.30, 0.30), (0.0, 0.06)):
+        assert inside(camera, pixel(camera, camera.mount_from_camera, (x, y, z)), margin=0.02), (x, y, z)
+    near, far = (pixel(camera, camera.mount_from_camera, (x, 0.0, 0.0)) for x in (0.35, 0.65))
+    assert near[1] > far[1]
+    right = pixel(camera, camera.mount_from_camera, (0.5, -0.2, 0.0))
+    assert right[0] > pixel(camera, camera.mount_from_camera, (0.5, 0.2, 0.0))[0]  # no mirror: y is to the left
+
+
 def test_wrist_sees_the_space_between_the_fingers(world: World) -> None:
     camera = cameras_of(world)["wrist"]
     mount = world.mounts()[camera.mount]
