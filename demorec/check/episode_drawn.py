@@ -17,7 +17,7 @@ from demorec.check.cells import Cells, ImageKind, cell_counts, cell_side
 from demorec.check.drawn import DrawnPictures, draw, fit, frames_to_draw
 from demorec.geometry import Array, Pose
 from demorec.render.recorded import RecordedWorld
-from demorec.scene.camera_error import told_error
+from demorec.scene.camera_error import told_error, true_camera
 from demorec.scene.episode import EpisodeColumns, EpisodeInfo
 from demorec.scene.scene import Camera, Scene
 
@@ -93,7 +93,7 @@ def drawable_scene(info: EpisodeInfo) -> Scene:
 def _moved_back(camera: Camera, behaviour: Mapping[str, float]) -> Camera:
     error = told_error(camera.name, behaviour)
     if error is not None:
-        return replace(camera, mount_from_camera=camera.mount_from_camera @ error.inverse())
+        return true_camera(camera, error)
     offset = np.array([behaviour.get(f"calibration_{camera.name}_{axis}", 0.0) for axis in "xyz"])
     if not offset.any():
         return camera

@@ -28,7 +28,7 @@ from demorec.replay.free_camera import FreeCamera
 from demorec.safety.files import make_folder
 from demorec.safety.user_modules import split_name
 from demorec.scene.assets import allow_models
-from demorec.scene.camera_error import told_error
+from demorec.scene.camera_error import told_error, true_camera
 from demorec.scene.episode import EpisodeInfo, Outcome
 from demorec.scene.scene import Camera, Scene
 from demorec.scene.variation import Ranges, resolve
@@ -131,10 +131,7 @@ def recorded_view(info: EpisodeInfo, allowed: Collection[str]) -> SceneView:
     told = {camera.name: told_error(camera.name, info.behaviour) for camera in info.scene.cameras}
     errors = {name: error for name, error in told.items() if error is not None}
     true_cameras = tuple(
-        replace(camera, mount_from_camera=camera.mount_from_camera @ errors[camera.name].inverse())
-        if camera.name in errors
-        else camera
-        for camera in info.scene.cameras
+        true_camera(camera, errors[camera.name]) if camera.name in errors else camera for camera in info.scene.cameras
     )
     return SceneView(scene=info.scene, true_cameras=true_cameras, true_from_recorded=errors)
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
 from demorec.geometry import Pose
 from demorec.scene.motion import angle_between
+from demorec.scene.scene import Camera
 
 ANGLE_MARGIN = 1e-6
 """Radians by which quaternion and angle may disagree."""
@@ -52,3 +54,8 @@ def told_error(name: str, behaviour: Mapping[str, float]) -> Pose | None:
     if not (np.isfinite(numbers).all() and size < 1.0 and abs(2 * math.asin(size) - angle) <= ANGLE_MARGIN):
         return None
     return Pose(position=position, quat_xyzw=np.array([*turn, math.sqrt(1.0 - size * size)]))
+
+
+def true_camera(recorded: Camera, true_from_recorded: Pose) -> Camera:
+    """The camera where it truly was."""
+    return replace(recorded, mount_from_camera=recorded.mount_from_camera @ true_from_recorded.inverse())
