@@ -1,7 +1,7 @@
-"""A robot and a camera of one's own: an xArm 6 with a parallel gripper, and a camera that looks down on the table.
+"""A robot and a camera of one's own: an xArm 6 with a parallel gripper, and a camera that looks across the table.
 
 cd examples/own_robot
-generate-dataset --robot my_robots:XARM6 --cameras front my_robots:TOP --num-episodes 10 --out recordings/xarm6
+generate-dataset --robot my_robots:XARM6 --cameras front my_robots:CORNER --num-episodes 10 --out recordings/xarm6
 """
 
 from __future__ import annotations
@@ -36,11 +36,10 @@ XARM6 = RobotSpec(
     ),
 )
 
-TOP = CameraPreset(
-    summary="above the table, looking straight down",
+CORNER = CameraPreset(
+    summary="at the table's corner, looking across the workspace at the arm",
     mount="world",
-    eye=(0.45, 0.0, 1.25),
-    target=(0.45, 0.0, 0.0),
-    up=(1.0, 0.0, 0.0),
-    fov_y=math.radians(50.0),
+    eye=(1.15, 0.95, 0.75),
+    target=(0.35, -0.05, 0.12),
+    fov_y=math.radians(42.0),
 )

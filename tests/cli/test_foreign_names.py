@@ -189,12 +189,12 @@ def test_a_policy_sees_cameras_that_the_user_names(tmp_path: Path) -> None:
     from demorec.evaluate.rollouts import settings_for
 
     shape = {"type": "VISUAL", "shape": [3, 48, 64]}
-    inputs = {f"observation.images.{name}": shape for name in ("front", "top")}
+    inputs = {f"observation.images.{name}": shape for name in ("front", "corner")}
     (tmp_path / "config.json").write_text(json.dumps({"type": "act", "input_features": inputs}))
-    named = GenerateConfig(cameras=("my_robots:TOP",))
+    named = GenerateConfig(cameras=("my_robots:CORNER",))
     config = settings_for(tmp_path, named, action="joint").config
-    assert (config.cameras, config.width, config.height) == (("front", "my_robots:TOP"), 64, 48)
-    with pytest.raises(ConfigError, match="Unknown camera 'top'"):
+    assert (config.cameras, config.width, config.height) == (("front", "my_robots:CORNER"), 64, 48)
+    with pytest.raises(ConfigError, match="Unknown camera 'corner'"):
         settings_for(tmp_path, GenerateConfig(cameras=()), action="joint")
 
 

@@ -55,17 +55,17 @@ def test_the_example_makes_checks_and_replays_a_dataset(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = tmp_path / "run"
-    flags = ["--robot", XARM6, "--cameras", "front", "my_robots:TOP", "--width", "64", "--height", "64"]
+    flags = ["--robot", XARM6, "--cameras", "front", "my_robots:CORNER", "--width", "64", "--height", "64"]
     assert exit_code(*flags, "--num-episodes", "2", "--workers", "1", "--out", run, program=generate_dataset_main) == 0
     told = capsys.readouterr().out
     assert "2 of 2 asked" in told
     assert re.search(r"checks +none failed", told)
     recording = run / "episodes" / "episode_000000.mcap"
     with Recording(recording) as opened:
-        assert opened.cameras == ("front", "top")
+        assert opened.cameras == ("front", "corner")
         assert opened.info.robot.urdf == "my_robots:xarm6.urdf"  # and no path of this machine
         assert opened.info.versions == load_run_file(run).versions
-    assert (run / "dataset" / "videos" / "observation.images.top").is_dir()
+    assert (run / "dataset" / "videos" / "observation.images.corner").is_dir()
 
     # Elsewhere, without the module: the recording is enough to look and to check, and says what replaying needs.
     (folder / "xarm6.urdf").rename(tmp_path / "xarm6.urdf")
@@ -93,9 +93,11 @@ def test_the_example_makes_checks_and_replays_a_dataset(
 
 @pytest.mark.slow
 def test_the_robot_does_a_task_and_replays(folder: Path, tmp_path: Path) -> None:
-    path = simulate(tmp_path / "e.mcap", robot=XARM6, cameras=("my_robots:TOP",), renderer="tiny", width=32, height=32)
+    path = simulate(
+        tmp_path / "e.mcap", robot=XARM6, cameras=("my_robots:CORNER",), renderer="tiny", width=32, height=32
+    )
     with Recording(path) as opened:
-        assert opened.cameras == ("top",)
+        assert opened.cameras == ("corner",)
         assert opened.outcome is not None
         assert opened.outcome.success
     options = ReplayOptions(allowed=("my_robots",))
