@@ -26,13 +26,13 @@ class Seen:
 
     Attributes:
         name: Of the body.
-        pixels: (N,) numbers of the pixels that show it, counted column by column from the upper left, in order.
-        height: Of the picture, px.
+        pixels: (N,) numbers of the pixels that show it, counted row by row from the upper left, in order.
+        width: Of the picture, px.
     """
 
     name: str
     pixels: NDArray[np.intp]
-    height: int
+    width: int
 
     @property
     def num_pixels(self) -> int:
@@ -42,13 +42,13 @@ class Seen:
     @cached_property
     def box(self) -> tuple[int, int, int, int]:
         """(x_min, y_min, x_max, y_max), the outermost pixels that show it, both included."""
-        rows = self.pixels % self.height
-        x_min, x_max = int(self.pixels[0]) // self.height, int(self.pixels[-1]) // self.height
-        return x_min, int(rows.min()), x_max, int(rows.max())
+        columns = self.pixels % self.width
+        y_min, y_max = int(self.pixels[0]) // self.width, int(self.pixels[-1]) // self.width
+        return int(columns.min()), y_min, int(columns.max()), y_max
 
     def is_at(self, x: int, y: int) -> bool:
         """Whether a pixel shows it."""
-        number = x * self.height + y
+        number = y * self.width + x
         place = int(np.searchsorted(self.pixels, number))
         return place < len(self.pixels) and int(self.pixels[place]) == number
 
@@ -66,12 +66,12 @@ def seen_things(labels: NDArray[np.uint16], numbers: dict[str, int]) -> dict[str
         numbers: Name of a body -> its label.
     """
     # Bodies that are spoken of have no links, and so one label each.
-    known = {number: name for name, number in numbers.items()}
-    by_column, height = labels.T.ravel(), labels.shape[0]
-    pixels = np.flatnonzero((by_column >= min(known, default=1)) & (by_column <= max(known, default=0)))
-    shown = by_column[pixels]
-    found = {name: pixels[shown == number] for number, name in known.items()}
-    return {name: Seen(name=name, pixels=found[name], height=height) for name in numbers if len(found[name])}
+    by_row = labels.ravel()
+    pixels = np.flatnonzero(by_row >= min(numbers.values(), default=1))
+    shown = by_row[pixels]
+    found = {name: pixels[shown == number] for name, number in numbers.items()}
+    width = labels.shape[1]
+    return {name: Seen(name=name, pixels=pixels, width=width) for name, pixels in found.items() if len(pixels)}
 
 
 def body_labels(recording: Recording) -> dict[str, int]:

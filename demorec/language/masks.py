@@ -72,15 +72,22 @@ def seen_objects(
                 box=(x_min, y_min, x_max - x_min + 1, y_max - y_min + 1),
                 area=seen.num_pixels,
                 visible_fraction=None if whole is None else round(min(1.0, seen.num_pixels / max(whole, 1e-9)), 4),
-                counts=run_lengths(seen.pixels, labels.size),
+                counts=run_lengths(_by_column(seen.pixels, labels.shape), labels.size),
             )
+
+
+def _by_column(pixels: NDArray[np.intp], shape: tuple[int, ...]) -> NDArray[np.intp]:
+    """Pixels of a picture (height, width) that are counted row by row as COCO counts them, column by column."""
+    height, width = shape
+    rows, columns = np.divmod(pixels, width)
+    return np.sort(columns * height + rows)
 
 
 def run_lengths(pixels: NDArray[np.intp], size: int) -> tuple[int, ...]:
     """Lengths of the runs of pixels that are not among the given ones, that are, that are not, and so on.
 
     Args:
-        pixels: (N,) numbers in order.
+        pixels: (N,) numbers in order, as COCO counts them.
         size: How many pixels there are.
     """
     if not len(pixels):

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from demorec.geometry import Array
 from demorec.language.grounding import MIN_PIXELS, Seen, body_labels, pixel_of, project, project_each, seen_things
-from demorec.language.referring import phrases_for
+from demorec.language.referring import each_phrase
 from demorec.language.situation import NamedThing, Situations, Surroundings
 from demorec.recording import Recording
 from demorec.scene.episode import EpisodeColumns
@@ -71,14 +71,17 @@ class _Moment:
 
     positions: dict[str, Array]
     now: Surroundings
-    _phrases: dict[str, list[str]] = field(default_factory=dict)
+    _plainest: dict[str, str] = field(default_factory=dict)
 
-    def phrases(self, name: str) -> list[str]:
+    def phrases(self, name: str) -> Iterator[str]:
         """Phrases for a thing without the robot's left and right, which a camera may see the other way round."""
-        if name not in self._phrases:
-            told = phrases_for(name, self.now)
-            self._phrases[name] = [phrase for phrase in told if not _SIDES & set(phrase.split())]
-        return self._phrases[name]
+        return (phrase for phrase in each_phrase(name, self.now) if not _SIDES & set(phrase.split()))
+
+    def phrase(self, name: str) -> str:
+        """The plainest of them, "" where there is none."""
+        if name not in self._plainest:
+            self._plainest[name] = next(self.phrases(name), "")
+        return self._plainest[name]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -98,10 +101,8 @@ class _View:
     @cached_property
     def clear(self) -> dict[str, str]:
         """Name -> phrase of each thing that is visible enough to be spoken of, in words that mean it alone."""
-        phrases = {
-            name: self.moment.phrases(name) for name, thing in self.seen.items() if thing.num_pixels >= MIN_PIXELS
-        }
-        return {name: found[0] for name, found in phrases.items() if found}
+        large = (name for name, thing in self.seen.items() if thing.num_pixels >= MIN_PIXELS)
+        return {name: phrase for name in large if (phrase := self.moment.phrase(name))}
 
     @cached_property
     def _middles(self) -> dict[str, Array]:
@@ -216,9 +217,9 @@ def _attribute(view: _View, turn: int) -> tuple[str, dict[str, Any]] | None:
     found = []
     for name in view.clear:
         thing = view.now.thing(name)
-        plain = [phrase for phrase in view.moment.phrases(name) if thing.color not in phrase.split()]
-        if thing.color and plain:
-            found.append((plain[0], thing.color))
+        plain = (phrase for phrase in view.moment.phrases(name) if thing.color not in phrase.split())
+        if thing.color and (phrase := next(plain, "")):
+            found.append((phrase, thing.color))
     if not found:
         return None
     phrase, color = found[turn % len(found)]

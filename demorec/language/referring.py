@@ -39,28 +39,31 @@ def references(text: str, situation: Surroundings) -> Iterator[tuple[str, frozen
         yield match[0], _resolved(match, situation)
 
 
-def phrases_for(name: str, situation: Surroundings) -> list[str]:
+def each_phrase(name: str, situation: Surroundings) -> Iterator[str]:
     """Every phrase of the grammar that refers to this thing and nothing else; the plainest with a colour come first."""
     thing = situation.thing(name)
-    found = []
     for noun in thing.nouns:
         for colored in ([f"{thing.color} {noun}"] if thing.color else []) + [noun]:
-            candidates = [f"the {colored}"]
-            candidates += [f"the {order} {colored}" for order in _IN_FRONT]
+            plain = f"the {colored}"
+            if resolve(plain, situation) == {name}:  # where the plain words suffice, nobody says more
+                yield plain
+                continue
+            candidates = [f"the {order} {colored}" for order in _IN_FRONT]
             candidates += [f"the {colored} {order}" for order in _BEHIND]
-            unique = resolve(candidates[0], situation) == {name}
-            # Where the plain words suffice, nobody says more.
-            for candidate in candidates[:1] if unique else candidates[1:]:
+            for candidate in candidates:
                 if resolve(candidate, situation) == {name}:
-                    found.append(candidate)
-    return found
+                    yield candidate
+
+
+def phrases_for(name: str, situation: Surroundings) -> list[str]:
+    """As `each_phrase`, all of them."""
+    return list(each_phrase(name, situation))
 
 
 def phrase_for(name: str, situation: Surroundings) -> str:
     """The plainest phrase for a thing; "a red cube" where none tells it from the others."""
-    found = phrases_for(name, situation)
-    if found:
-        return found[0]
+    for found in each_phrase(name, situation):
+        return found
     thing = situation.thing(name)
     words = f"{thing.color} {thing.noun}".strip()
     return f"{'an' if words[0] in 'aeiou' else 'a'} {words}"

@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 import json
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +44,8 @@ class RecordingReader(EpisodeFile):
 
     _said: tuple[tuple[int, bytes], ...] | None = None
     """(time_ns, message) of all events, once `columns` has come by them: they lie among the numbers in the file."""
+    _packed_labels: Mapping[str, Block] = MappingProxyType({})
+    """topic -> segmentation pictures, once `coded_pictures` has come by them: they lie among the other pictures."""
 
     def _read_metadata(self) -> None:
         found = self._container.metadata(metadata.EPISODE)
@@ -163,7 +166,9 @@ class RecordingReader(EpisodeFile):
         """camera -> its coded pictures, one a frame, all read in one pass; they are in memory together."""
         codecs = {camera: self.video_settings(camera).codec for camera in cameras}
         topics = {camera: channels.video_topic(camera, codec) for camera, codec in codecs.items()}
-        found = self._container.blocks(tuple(topics.values()))
+        labels = [self._segmentation_topic(camera) for camera in cameras if self.has_segmentation(camera)]
+        found = self._container.blocks((*topics.values(), *labels))
+        self._packed_labels = {topic: found[topic] for topic in labels}
         times = self._frame_times()
         pictures = {}
         for camera, topic in topics.items():
@@ -210,7 +215,8 @@ class RecordingReader(EpisodeFile):
         topics = {camera: self._segmentation_topic(camera) for camera in cameras}
         decoders = {camera: LabelDecoder(self._size(camera)) for camera in cameras}
         times, counts = self._frame_times(), dict.fromkeys(cameras, 0)
-        for blocks in self._container.blocks_by_chunk(topics.values()):
+        is_read = self._packed_labels.keys() >= set(topics.values())
+        for blocks in [self._packed_labels] if is_read else self._container.blocks_by_chunk(topics.values()):
             for camera, topic in topics.items():
                 block, first = blocks[topic], counts[camera]
                 counts[camera] += len(block)

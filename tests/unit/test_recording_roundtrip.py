@@ -159,6 +159,23 @@ def test_segmentation_of_several_cameras_in_one_pass(tmp_path: Path) -> None:
         assert len(found) == 2 * len(chosen)
 
 
+@pytest.mark.parametrize("cameras", [("front",), ("front", "wrist")])
+def test_labels_that_were_read_with_the_coded_pictures_are_not_unpacked_again(
+    cameras: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write_episode(tmp_path / "a.mcap", num_frames=70, cameras=cameras, segmentation=True)
+    chosen = {0, 31, 69}
+    with Recording(path) as recording:
+        expected = list(recording.segmentation_at(cameras, chosen))
+        recording.coded_pictures(cameras)
+        monkeypatch.setattr("demorec.recording.container.chunk_content", lambda *_: pytest.fail("a chunk was unpacked"))
+        found = list(recording.segmentation_at(cameras, chosen))
+    for camera in cameras:
+        pictures, again = ([row for row in rows if row[0] == camera] for rows in (expected, found))
+        assert [row[1] for row in again] == [row[1] for row in pictures] == sorted(chosen)
+        assert all(np.array_equal(a[2], b[2]) for a, b in zip(again, pictures, strict=True))
+
+
 def test_without_depth_it_says_so(tmp_path: Path) -> None:
     with Recording(write_episode(tmp_path / "a.mcap", num_frames=3)) as recording:
         assert not recording.has_depth("front")
