@@ -89,6 +89,7 @@ CHECKS: Registry[Check] = Registry(
         "story": "demorec.check.script:story",
         "deliberate_misses": "demorec.check.script:deliberate_misses",
         "config_agrees": "demorec.check.described:config_agrees",
+        "drawn_within_ranges": "demorec.check.described:drawn_within_ranges",
         "robot_as_known": "demorec.check.described:robot_as_known",
         "instruction_fits_scene": "demorec.check.described:instruction_fits_scene",
         "final_state": "demorec.check.outcome:final_state",

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -11,13 +12,18 @@ import numpy as np
 from demorec.check.base import Found, Measurement, NotMeasured, check
 from demorec.check.episode import CheckedEpisode
 from demorec.errors import ConfigError
-from demorec.plain import digest
+from demorec.plain import digest, from_plain
 from demorec.scene.episode import POLICY_PHASE
 from demorec.scene.scene import Scene
+from demorec.scene.variation import Ranges, resolve
 from demorec.tables import ROBOTS, camera_name, load_robot
 
 COLOR_WORDS = frozenset(("red", "green", "blue", "yellow", "orange", "purple", "black", "white", "grey"))
 """Words for colours in instructions."""
+_MARGIN = 1e-9
+"""By how much a drawn number may be beyond its range: it was turned and scaled."""
+_SIGMAS = 8.0
+"""Standard deviations within which every normally distributed number lies."""
 
 
 @check(
@@ -124,6 +130,58 @@ def instruction_fits_scene(episode: CheckedEpisode) -> Found:
 def _goal_colors(scene: Scene) -> list[str]:
     """Colours of the objects that shall go somewhere, each once."""
     return list(dict.fromkeys(name for goal in scene.goals if (name := scene.body(goal.object).color_name)))
+
+
+@check(
+    group="outcome",
+    measures="numbers drawn for the episode that its variation does not allow",
+    warn=0,
+    reads=("info.behaviour", "info.config"),
+)
+def drawn_within_ranges(episode: CheckedEpisode) -> Found:
+    """Speed, heights, misses, errors of perception and calibration lie in the ranges that the config asks for.
+
+    So a calibration error is only as large as the variation makes it, however well it explains the pictures.
+    """
+    info = episode.info
+    try:
+        ranges = resolve(info.config["variation"], from_plain(info.config["ranges"], Ranges))
+        ranges.validate()
+    except (KeyError, TypeError, ValueError, ConfigError):
+        return NotMeasured(why="the config has no ranges that are known")
+    drawn = info.behaviour
+    allowed = dict([*_ranges_drawn(ranges), *_calibration_ranges(drawn, ranges)])
+    wrong = [
+        f"{name} is {drawn[name]:.4g}, allowed are {low:.4g} to {high:.4g}"
+        for name, (low, high) in allowed.items()
+        if name in drawn and not low - _MARGIN <= drawn[name] <= high + _MARGIN
+    ]
+    return Measurement(value=len(wrong), detail="; ".join(wrong[:3]))
+
+
+def _ranges_drawn(ranges: Ranges) -> Iterator[tuple[str, tuple[float, float]]]:
+    """Name of a number -> (low, high) that it was drawn from."""
+    for name in ("speed", "approach_height", "lift_height", "grasp_offset"):
+        yield name, ranges.range(name)
+    # A policy, and the expert who takes over from one, act without noise.
+    yield "action_noise", (0.0, ranges.range("action_noise")[1])
+    miss = ranges.range("miss_distance")[1] if ranges.number("miss_probability") else 0.0
+    error, yaw = _SIGMAS * ranges.number("perception_error"), _SIGMAS * ranges.number("perception_yaw")
+    for name, most in (("miss_x", miss), ("miss_y", miss), ("perception_x", error), ("perception_y", error)):
+        yield name, (-most, most)
+    yield "perception_yaw", (-yaw, yaw)
+
+
+def _calibration_ranges(names: Iterable[str], ranges: Ranges) -> Iterator[tuple[str, tuple[float, float]]]:
+    """The same of those numbers that tell calibration errors, each for one camera and one axis."""
+    position, half = ranges.number("calibration_position"), ranges.number("calibration_rotation") / 2
+    allowed = {"x": position, "y": position, "z": position, "qx": half, "qy": half, "qz": half}
+    for name in names:
+        word = name.rpartition("_")[2]
+        if name.startswith("calibration_") and word == "angle":
+            yield name, (0.0, 2 * math.atan(math.sqrt(3) * half))
+        elif name.startswith("calibration_") and word in allowed:
+            yield name, (-allowed[word], allowed[word])
 
 
 @check(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +13,8 @@ import pytest
 from support.check import simulate
 from support.faults import Changed, Rows, frozen, halved, inverted, judged, late, noisy, one_alien, upside_down
 
+from demorec.geometry import Pose
+from demorec.scene.camera_error import error_values
 from demorec.scene.episode import SuccessCheck
 from demorec.sim.robots.panda import PANDA
 from demorec.tables import CHECKS
@@ -61,6 +64,10 @@ def condition(name: str, **fields: Any) -> Fault:
         )
 
     return fault
+
+
+def behaviour(**values: float) -> Fault:
+    return lambda c: c.with_info(behaviour={**c.info.behaviour, **values})
 
 
 def both_grippers(change: Callable[[Rows], Rows]) -> Fault:
@@ -164,6 +171,16 @@ CASES: list[tuple[str, Fault, str]] = [
         behaviour={**c.info.behaviour, "action_noise": 0.0}), "noise_as_said"),
     ("a tenth of the noise is said", lambda c: c.with_info(
         behaviour={**c.info.behaviour, "action_noise": 0.002}), "noise_as_said"),
+    ("a speed that is not drawn", behaviour(speed=1.3), "drawn_within_ranges"),
+    ("a height that is not drawn", behaviour(approach_height=0.05), "drawn_within_ranges"),
+    ("a miss that is not drawn", behaviour(miss_x=0.04), "drawn_within_ranges"),
+    ("perception that errs", behaviour(perception_yaw=0.1), "drawn_within_ranges"),
+    ("more noise than is drawn", behaviour(action_noise=0.03), "drawn_within_ranges"),
+    ("no number", behaviour(lift_height=math.nan), "drawn_within_ranges"),
+    ("a calibration error that is not drawn", behaviour(**error_values({"front": Pose(
+        position=np.array([0.0, 0.05, 0.0]))})), "drawn_within_ranges"),
+    ("a calibration turn that is not drawn", behaviour(**error_values({"front": Pose(
+        quat_xyzw=np.array([0.0, 0.1, 0.0, math.sqrt(0.99)]))})), "drawn_within_ranges"),
     ("phases one frame late", phases(lambda rows: [rows[0], *rows[:-1]]), "phases_match_motion"),
     ("phases one frame early", phases(lambda rows: [*rows[1:], rows[-1]]), "phases_match_motion"),
     ("phases backwards", phases(lambda rows: rows[::-1]), "phases_match_motion"),
