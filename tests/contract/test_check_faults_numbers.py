@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,11 +15,16 @@ import pytest
 from support.check import simulate
 from support.faults import Changed, Rows, frozen, halved, inverted, judged, late, noisy, one_alien, upside_down
 
+from demorec.check.base import Found, Measurement
+from demorec.check.described import drawn_within_ranges
+from demorec.config import EpisodePlan, GenerateConfig
 from demorec.geometry import Pose
+from demorec.loop import prepare
 from demorec.scene.camera_error import error_values
 from demorec.scene.episode import SuccessCheck
+from demorec.scene.variation import PRESET_NAMES, Preset
 from demorec.sim.robots.panda import PANDA
-from demorec.tables import CHECKS
+from demorec.tables import CHECKS, ROBOTS, TASKS
 
 Fault = Callable[[Changed], Changed]
 
@@ -167,10 +174,8 @@ CASES: list[tuple[str, Fault, str]] = [
         command_joint_target=2 * c.columns.command_joint_target - c.columns.action_joint_target), "noise_as_said"),
     ("labels in place of commands", lambda c: c.with_columns(
         action_joint_target=c.columns.command_joint_target), "noise_as_said"),
-    ("noise where none is said", lambda c: c.with_info(
-        behaviour={**c.info.behaviour, "action_noise": 0.0}), "noise_as_said"),
-    ("a tenth of the noise is said", lambda c: c.with_info(
-        behaviour={**c.info.behaviour, "action_noise": 0.002}), "noise_as_said"),
+    ("noise where none is said", behaviour(action_noise=0.0), "noise_as_said"),
+    ("a tenth of the noise is said", behaviour(action_noise=0.002), "noise_as_said"),
     ("a speed that is not drawn", behaviour(speed=1.3), "drawn_within_ranges"),
     ("a height that is not drawn", behaviour(approach_height=0.05), "drawn_within_ranges"),
     ("a miss that is not drawn", behaviour(miss_x=0.04), "drawn_within_ranges"),
@@ -249,6 +254,40 @@ def test_phases_of_other_tasks_may_mean_anything(good: Path) -> None:
         result = judged(good, name, info(task="my_tasks:Mine"))
         assert result.level == "skip"
         assert "not measured" in result.detail
+
+
+def drawn(config: GenerateConfig, index: int = 0, changes: Mapping[str, float] | None = None) -> Found:
+    """What `drawn_within_ranges` finds of an episode that was drawn, some of its numbers changed."""
+    told = prepare(EpisodePlan(config=config, episode_index=index)).info
+    behaviour = {**told.behaviour, **(changes or {})}
+    return drawn_within_ranges.measure(SimpleNamespace(info=replace(told, behaviour=behaviour)))
+
+
+@pytest.mark.parametrize("variation", PRESET_NAMES)
+@pytest.mark.parametrize("task", TASKS.names())
+def test_what_is_drawn_lies_within_its_ranges(task: str, variation: Preset) -> None:
+    for robot, index in itertools.product(ROBOTS.names(), range(5)):
+        config = GenerateConfig(task=task, robot=robot, variation=variation, seed=3)
+        assert drawn(config, index) == Measurement(value=0)
+
+
+@pytest.mark.parametrize(
+    ("name", "allowed", "beyond"),  # the ranges of docs/simulation.md
+    [
+        ("speed", 1.49, 1.51),
+        ("miss_x", -0.049, -0.051),
+        ("calibration_front_x", 0.0029, 0.0031),
+        ("calibration_wrist_qz", -0.0049, -0.0051),
+        ("calibration_front_angle", 0.0172, 0.0175),  # 0.01 rad about each axis
+    ],
+)
+def test_where_the_ranges_of_full_end(name: str, allowed: float, beyond: float) -> None:
+    config = GenerateConfig(variation="full")
+    assert drawn(config, changes={name: allowed}) == Measurement(value=0)
+    found = drawn(config, changes={name: beyond})
+    assert isinstance(found, Measurement)
+    assert found.value == 1
+    assert name in found.detail
 
 
 def test_the_checks_used_here_are_rows() -> None:
