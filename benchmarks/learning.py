@@ -2,7 +2,8 @@
 
     python benchmarks/learning.py --variants base clean plain_increments --out outputs/learning
     python benchmarks/learning.py --episodes 1000 --steps 8000 --scenes 100 --seeds 3
-    python benchmarks/learning.py --variants pictures --episodes 300 --steps 20000 --scenes 50 --device cuda
+    python benchmarks/learning.py --variants joint_state joint_ee_state --episodes 300 --steps 3000 --scenes 60
+    python benchmarks/learning.py --variants pictures --episodes 700 --batch-size 32 --learning-rate 3e-4 --steps 8400
     python benchmarks/learning.py --variants base clean --plot outputs/learning/learning.png
 
 Every variant is made with the product's own commands (generate-dataset, demorec export lerobot, demorec evaluate).
@@ -18,6 +19,7 @@ import argparse
 import json
 import math
 import os
+import re
 import subprocess
 import sys
 import time
@@ -48,8 +50,10 @@ class Variant:
         action: As of demorec export lerobot.
         plain: Take the way back from noise out of the increments.
         hide: Components of the environment state whose names contain one of these are hidden.
+        see: Pattern of the components that are not hidden; "" for all.
         chunk, execute: Actions predicted at once, and executed before looking again.
-        pictures: From two 96 x 96 cameras in place of the environment state.
+        pictures: From two 56 x 40 cameras in place of the environment state, the TCP's pose in observation.state, and a
+            network of 256 instead of 128.
     """
 
     about: str
@@ -58,6 +62,7 @@ class Variant:
     action: str = "joint_increment"
     plain: bool = False
     hide: tuple[str, ...] = ()
+    see: str = ""
     chunk: int = 16
     execute: int = 16
     pictures: bool = False
@@ -65,6 +70,8 @@ class Variant:
 
 RELATIVE = ("from_", ".yaw.", "tcp.")
 NEAR_FIELD = (".near_",)
+THINGS = r"red_cube\.([xyz]|size\.[xyz]|yaw\.\w+|goal\.[xyz])"
+"""What a perfect eye would tell: where cube and mark are."""
 VARIANTS = {
     "base": Variant(about="noise 0.02 rad, clean labels, increments, all of the state, 16 of 16 executed"),
     "clean": Variant(about="no action noise", generate=("--action-noise", "0", "0")),
@@ -73,6 +80,12 @@ VARIANTS = {
     "joint": Variant(about="absolute joint targets", action="joint"),
     "ee": Variant(about="absolute TCP poses", action="ee"),
     "ee_delta": Variant(about="TCP deltas", action="ee_delta"),
+    "joint_state": Variant(
+        about="TCP deltas; poses of cube and mark and the joints alone", action="ee_delta", see=THINGS
+    ),
+    "joint_ee_state": Variant(
+        about="the same, and the TCP's position and yaw", action="ee_delta", see=rf"{THINGS}|tcp\..*"
+    ),
     "no_velocity": Variant(about="without velocities", hide=(".vel",)),
     "raw_poses": Variant(about="raw poses only: no symmetric yaw, nothing relative", hide=RELATIVE),
     "no_near_field": Variant(about="without the steep components of small offsets", hide=NEAR_FIELD),
@@ -82,7 +95,9 @@ VARIANTS = {
     "execute_1": Variant(about="one action at a time", execute=1),
     "execute_8": Variant(about="half of the chunk of 16", execute=8),
     "chunk_32": Variant(about="chunk of 32, 16 executed", chunk=32, execute=16),
-    "pictures": Variant(about="two 96 x 96 cameras, no environment state", pictures=True),
+    "pictures": Variant(
+        about="TCP deltas; two 56 x 40 cameras, no environment state", action="ee_delta", pictures=True
+    ),
 }
 
 
@@ -106,7 +121,7 @@ def command(*words: str | Path) -> None:
 
 def make_dataset(variant: Variant, args: argparse.Namespace) -> Path:
     """Generate and export, where that was not done yet."""
-    cameras = ("front", "wrist", "--width", "96", "--height", "96") if variant.pictures else ("none",)
+    cameras = ("workspace", "wrist", "--width", "56", "--height", "40") if variant.pictures else ("none",)
     label = "_".join(word.strip("-").replace(".", "") for word in variant.generate) or "base"
     run = args.out / f"run_{label}{'_pictures' if variant.pictures else ''}_{args.episodes}"
     command(
@@ -118,7 +133,7 @@ def make_dataset(variant: Variant, args: argparse.Namespace) -> Path:
     if not dataset.exists():
         command(
             *("demorec", "export", "lerobot", run, "--out", dataset, "--action", variant.action),
-            *("--episodes", f"0:{count}", *(() if variant.pictures else ("--privileged",))),
+            *("--episodes", f"0:{count}", *(("--state", "joint_ee") if variant.pictures else ("--privileged",))),
         )
     return Path(dataset)
 
@@ -138,7 +153,7 @@ def load(dataset: Path, variant: Variant) -> Data:
     stats = {name: statistics(values) for name, values in columns.items()}
     if ENVIRONMENT in columns:
         for i, component in enumerate(info["features"][ENVIRONMENT]["names"]):
-            if any(part in component for part in variant.hide):
+            if any(part in component for part in variant.hide) or not re.fullmatch(variant.see or ".*", component):
                 stats[ENVIRONMENT]["std"][i] = SWITCHED_OFF
     data = Data(columns=columns, end=torch.from_numpy(np.searchsorted(episode, episode, side="right")), stats=stats)
     if variant.pictures:
@@ -201,13 +216,14 @@ def train(data: Data, variant: Variant, args: argparse.Namespace, *, seed: int, 
         ACTConfig(
             use_vae=False,
             dropout=0.0,
-            dim_model=128,
-            n_heads=4,
-            dim_feedforward=512,
+            dim_model=256 if variant.pictures else 128,
+            n_heads=8 if variant.pictures else 4,
+            dim_feedforward=1024 if variant.pictures else 512,
             n_encoder_layers=2,
             chunk_size=variant.chunk,
             n_action_steps=variant.execute,
             pretrained_backbone_weights=None,
+            optimizer_lr_backbone=args.learning_rate,
             device=args.device,
             push_to_hub=False,
             normalization_mapping=dict.fromkeys(("STATE", "ENV", "ACTION", "VISUAL"), NormalizationMode.MEAN_STD),

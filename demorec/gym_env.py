@@ -24,12 +24,12 @@ from demorec.config import EpisodePlan, GenerateConfig
 from demorec.errors import ConfigError, SceneError
 from demorec.geometry import Array
 from demorec.loop import Decision, Episode, Session, make_world, prepare
-from demorec.loop.actions import ActionDecoder, action_bounds, check_action_kind
+from demorec.loop.actions import ActionDecoder, action_bounds, check_action_kind, check_state_kind
 from demorec.render import Renderer
 from demorec.render.painter import Painter
 from demorec.scene import features
 from demorec.scene.episode import POLICY_PHASE, Action, CameraImages, EpisodeInfo, Frame, Observation, SuccessCheck
-from demorec.scene.features import ActionKind, ObservationRows
+from demorec.scene.features import ActionKind, ObservationRows, StateKind
 from demorec.scene.scene import Scene
 from demorec.scene.variation import Preset
 from demorec.sim.world import World
@@ -97,6 +97,7 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         cameras: Names of `demorec list cameras`.
         privileged: Whether to give `environment_state`; None: only without cameras, and only for a task whose scenes
             all have as many numbers to tell, since a space has one length.
+        state: What `agent_pos` holds.
         action: What an action means.
         episode_length: Time limit in frames; None: 15 s for each object to be moved.
         render_mode: None or "rgb_array".
@@ -125,6 +126,7 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         height: int = 224,
         renderer: str | None = None,
         privileged: bool | None = None,
+        state: StateKind = "joint",
         action: ActionKind = "joint",
         episode_length: int | None = None,
         render_mode: str | None = None,
@@ -149,6 +151,7 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
             )
         config.validate()
         check_action_kind(action)
+        self._state_kind: StateKind = check_state_kind(state)
         if render_mode not in (None, "rgb_array"):
             raise ConfigError(f"render_mode is {render_mode!r}, allowed are None and 'rgb_array'.")
         self.config, self.render_mode = config, render_mode
@@ -160,7 +163,7 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         info = self.episode.info
         self._max_episode_steps = episode_length or round(SECONDS_PER_GOAL * config.fps * max(1, len(info.scene.goals)))
         self.privileged = self._is_privileged() if privileged is None else privileged
-        self._vector_lengths = _lengths(info, privileged=self.privileged)
+        self._vector_lengths = _lengths(info, privileged=self.privileged, state=self._state_kind)
         self.observation_space = _observation_space(info, self._vector_lengths)
         self.action_space = _box(action_bounds(info.robot, action, fps=config.fps))
         self._resources = ExitStack()
@@ -227,7 +230,7 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         index = int(self.np_random.integers(2**31)) if seed is None else seed
         self.episode = self._prepare(index, scene)
         info = self.info
-        if _lengths(info, privileged=self.privileged) != self._vector_lengths:
+        if _lengths(info, privileged=self.privileged, state=self._state_kind) != self._vector_lengths:
             raise SceneError(
                 f"Episode {index} of {self.config.task!r} has other objects than episode 0, and an environment has one "
                 "observation space: leave privileged out and use cameras."
@@ -347,6 +350,7 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
             self.info.robot,
             self.info.scene,
             privileged=self.privileged,
+            state=self._state_kind,
         )
         observation: dict[str, Any] = {_KEYS[name]: rows[0] for name, rows in vectors.items()}
         if situation.images:
@@ -354,8 +358,8 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         return observation
 
 
-def _lengths(info: EpisodeInfo, *, privileged: bool) -> dict[str, int]:
-    names = features.observation_names(info.robot, info.scene, privileged=privileged)
+def _lengths(info: EpisodeInfo, *, privileged: bool, state: StateKind = "joint") -> dict[str, int]:
+    names = features.observation_names(info.robot, info.scene, privileged=privileged, state=state)
     return {name: len(components) for name, components in names.items()}
 
 

@@ -50,6 +50,7 @@ CAMERAS: Registry[CameraPreset] = Registry(
         "front": "demorec.render.cameras:FRONT",
         "wrist": "demorec.render.cameras:WRIST",
         "top": "demorec.render.cameras:TOP",
+        "workspace": "demorec.render.cameras:WORKSPACE",
     },
     instance_of="demorec.render.cameras:CameraPreset",
 )

@@ -24,7 +24,16 @@ from demorec.lerobot.reader import EpisodePlace, RowReader, episode_places, read
 from demorec.lerobot.robots import DatasetRobot, read_robot
 from demorec.lerobot.sidecar import EPISODE_SCHEMA
 from demorec.scene.episode import EpisodeInfo
-from demorec.scene.features import ACTION, IMAGE_PREFIX, STATE, ActionKind, action_names
+from demorec.scene.features import (
+    ACTION,
+    IMAGE_PREFIX,
+    STATE,
+    STATE_KINDS,
+    ActionKind,
+    StateKind,
+    action_names,
+    state_names,
+)
 from demorec.scene.validity import read_episode_info
 
 Rows = Mapping[str, NDArray[Any]]
@@ -183,3 +192,8 @@ class Dataset:
         names = self.info.features[ACTION].names if ACTION in self.info.features else None
         kinds: tuple[ActionKind, ...] = ("joint", "joint_increment", "ee", "ee_delta")
         return next((kind for kind in kinds if action_names(info.robot, kind) == names), None)
+
+    def state_kind(self, info: EpisodeInfo) -> StateKind | None:
+        """What observation.state holds, by the names of its components; None when it is none of ours."""
+        names = self.info.features[STATE].names if STATE in self.info.features else None
+        return next((kind for kind in STATE_KINDS if state_names(info.robot, kind) == names), None)

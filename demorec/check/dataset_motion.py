@@ -9,12 +9,13 @@ import numpy as np
 from demorec.check.alignment import servo_response
 from demorec.check.base import Measurement, check, worst
 from demorec.check.coverage import infos_by_task, largest_gap, twins
-from demorec.check.dataset import Dataset
+from demorec.check.dataset import Dataset, Rows
 from demorec.check.rows import LinkMatrices, displacement, matrices
 from demorec.check.run import motion_vector
 from demorec.errors import NotAllowedError
 from demorec.geometry import Array
 from demorec.scene.assets import asset_path
+from demorec.scene.episode import EpisodeInfo
 from demorec.scene.features import ACTION, EE_POSE, STATE, VELOCITY
 from demorec.scene.urdf import Urdf
 
@@ -62,7 +63,8 @@ def dataset_joint_limits(dataset: Dataset) -> Measurement | None:
     found = []
     for each in dataset.described():
         number, rows, info = each.number, each.rows, each.info
-        robot, state = info.robot, rows[STATE].astype(np.float64)
+        robot = info.robot
+        state = rows[STATE].astype(np.float64)[:, : len(robot.arm_joints) + 1]
         low = np.array([*robot.position_lower, 0.0])
         high = np.array([*robot.position_upper, robot.gripper.max_width])
         beyond = np.maximum(np.maximum(low - state, state - high), 0.0)
@@ -88,7 +90,8 @@ def dataset_velocity(dataset: Dataset) -> Measurement | None:
         return None
     product = square = 0.0
     for rows in dataset.rows:
-        state, velocity = rows[STATE].astype(np.float64)[:, :-1], rows[VELOCITY].astype(np.float64)[:, :-1]
+        velocity = rows[VELOCITY].astype(np.float64)[:, :-1]
+        state = rows[STATE].astype(np.float64)[:, : velocity.shape[1]]
         mean = (velocity[1:] + velocity[:-1]) / 2
         product += float((np.diff(state, axis=0) * dataset.info.fps * mean).sum())
         square += float((mean * mean).sum())
@@ -102,7 +105,7 @@ def dataset_velocity(dataset: Dataset) -> Measurement | None:
 @check(
     group="dataset",
     scope="dataset",
-    measures="EE pose against forward kinematics of the state",
+    measures="EE pose against forward kinematics of the joints",
     unit="m",
     warn=1e-4,
     fail=1e-3,
@@ -113,14 +116,14 @@ def dataset_velocity(dataset: Dataset) -> Measurement | None:
     ),
 )
 def dataset_forward_kinematics(dataset: Dataset) -> Measurement | None:
-    """observation.ee_pose is that of observation.state (float32; 0.1 m per rad of rotation)."""
-    if EE_POSE not in dataset.info.features:
-        return None
+    """The TCP's pose is that of the joints, wherever the dataset has it (float32; 0.1 m per rad of rotation)."""
     found = []
     for each in dataset.described():
         number, rows, info = each.number, each.rows, each.info
-        if (name := dataset.robot_digests[number]) is not None:
-            urdf = dataset.robots[name].model
+        if not (told := _tcp_poses(dataset, info, rows)):
+            return None
+        if (model := dataset.robot_digests[number]) is not None:
+            urdf = dataset.robots[model].model
         else:
             try:
                 urdf = Urdf.load(asset_path(info.robot.urdf), scale=info.scene.robot.scale)
@@ -128,10 +131,19 @@ def dataset_forward_kinematics(dataset: Dataset) -> Measurement | None:
                 return None
         joints = dict(zip(info.robot.arm_joints, rows[STATE].astype(np.float64).T, strict=False))
         fk = LinkMatrices(urdf, joints, len(rows[STATE]))[info.robot.tcp_link]
-        off = displacement(matrices(rows[EE_POSE].astype(np.float64)), fk)
-        frame = int(np.argmax(off))
-        found.append(Measurement(value=float(off[frame]), frame=frame, detail=f"episode {number}"))
+        for name, poses in told.items():
+            off = displacement(matrices(poses), fk)
+            frame = int(np.argmax(off))
+            found.append(Measurement(value=float(off[frame]), frame=frame, detail=f"{name}, episode {number}"))
     return worst(*found)
+
+
+def _tcp_poses(dataset: Dataset, info: EpisodeInfo, rows: Rows) -> dict[str, Array]:
+    """Feature -> the TCP's poses (T, 7) that it holds, base frame."""
+    told = {EE_POSE: rows[EE_POSE].astype(np.float64)} if EE_POSE in rows else {}
+    if dataset.state_kind(info) == "joint_ee":
+        told[STATE] = rows[STATE].astype(np.float64)[:, -7:]
+    return told
 
 
 @check(
@@ -161,10 +173,13 @@ def dataset_action_lag(dataset: Dataset) -> Measurement | None:
         action, state = rows[ACTION].astype(np.float64), rows[STATE].astype(np.float64)
         arm = len(info.robot.arm_joints)
         is_joint = kind in ("joint", "joint_increment")
-        if not is_joint and EE_POSE not in rows:
+        if is_joint:
+            reached = state[:, :arm]
+        elif poses := _tcp_poses(dataset, info, rows):
+            reached = next(iter(poses.values()))[:, :3]
+        else:
             continue
-        width = arm if is_joint else 3
-        reached = state[:, :arm] if is_joint else rows[EE_POSE].astype(np.float64)[:, :3]
+        width = reached.shape[1]
         start = np.array(info.scene.robot.joint_position) if is_joint else reached[0]
         substeps = max(info.physics_hz // dataset.info.fps, 1)
         if kind in ("joint_increment", "ee_delta") and not info.behaviour.get("action_noise", 0.0):

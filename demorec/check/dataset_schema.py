@@ -177,7 +177,8 @@ def _described(dataset: Dataset, info: EpisodeInfo, stride: int) -> Iterator[str
         yield f"robot_type is {dataset.info.robot_type}, the robot was {info.robot.name}"
     if stride < 1 or info.fps != dataset.info.fps * stride:
         yield f"fps is {dataset.info.fps}, every {stride}. of {info.fps} frames a second was taken"
-    expected = observation_names(info.robot, info.scene, privileged=ENVIRONMENT_STATE in features)
+    state = dataset.state_kind(info) or "joint"
+    expected = observation_names(info.robot, info.scene, privileged=ENVIRONMENT_STATE in features, state=state)
     for name, names in expected.items():
         if name in features and features[name].names != names:
             yield f"the components of {name} are not those of the robot in their order"

@@ -112,6 +112,7 @@ def export_options(dataset: Path) -> ExportOptions:
         made = read_json(dataset / EXPORT_PATH)
         options = ExportOptions(
             action=made["action"],
+            state=made.get("state", "joint"),
             privileged=made["privileged"],
             features=tuple(made.get("features", ())),
             include_failures=made["include_failures"],

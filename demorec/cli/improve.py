@@ -46,6 +46,8 @@ class Improve:
     """Of the trainings; the scenes of round k have the root seed of the demonstrations plus SEED + k."""
     action: str = "joint_increment"
     """joint, joint_increment, ee or ee_delta."""
+    state: str = "joint"
+    """joint or joint_ee, as of demorec export lerobot."""
     privileged: bool = False
     """As of demorec export lerobot: let the policy see observation.environment_state."""
     features: tuple[str, ...] = ()
@@ -69,7 +71,7 @@ class Improve:
         self.takeover.validate()
         refuse_inside([self.out])
         from demorec.evaluate.improvement import Improvement, Plan
-        from demorec.loop.actions import check_action_kind
+        from demorec.loop.actions import check_action_kind, check_state_kind
         from demorec.processes import available_cores
 
         plan = Plan(
@@ -81,6 +83,7 @@ class Improve:
             num_scenes=self.num_scenes,
             seed=self.seed,
             action=check_action_kind(self.action),
+            state=check_state_kind(self.state),
             privileged=self.privileged,
             features=self.features,
             takeover=self.takeover,

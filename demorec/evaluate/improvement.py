@@ -35,7 +35,7 @@ from demorec.processes import start_program
 from demorec.runs.lock import LOCK_NAME, run_lock
 from demorec.runs.run_file import free_name, load_run_file
 from demorec.safety.files import replace_text
-from demorec.scene.features import ActionKind
+from demorec.scene.features import ActionKind, StateKind
 
 SETTINGS_NAME, TRAINED_NAME, LOG_NAME = "improve.json", "training.json", "training.log"
 
@@ -52,7 +52,7 @@ class Plan:
         num_episodes: Scenes in which the policy of a round is corrected.
         num_scenes: Held-out scenes on which each policy is tried.
         seed: Of the trainings; the scenes of round k have the root seed of the demonstrations' plus `seed` + k.
-        action, privileged, features: As of the export.
+        action, state, privileged, features: As of the export.
         takeover: When the expert takes over.
     """
 
@@ -64,6 +64,7 @@ class Plan:
     num_scenes: int
     seed: int
     action: ActionKind
+    state: StateKind = "joint"
     privileged: bool
     features: tuple[str, ...]
     takeover: TakeOver
@@ -146,8 +147,8 @@ class Improvement:
             replace_text(path, json.dumps(found, indent=1))
             return
         try:
-            before = json.loads(path.read_text())
-        except (OSError, ValueError) as error:
+            before = {"state": "joint", **json.loads(path.read_text())}  # there was no other kind at first
+        except (OSError, ValueError, TypeError) as error:
             raise DemorecError(f"{SETTINGS_NAME} is damaged ({in_words(error)}): {path}") from error
         if lines := plain_differences(before, json.loads(json.dumps(found))):
             raise ConfigError(
@@ -209,6 +210,7 @@ class Improvement:
         options = ExportOptions(
             repo_id="local/improve",
             action=self._plan.action,
+            state=self._plan.state,
             privileged=self._plan.privileged,
             features=(*self._plan.features, "intervention") if self._plan.features else (),
             intervention=True,

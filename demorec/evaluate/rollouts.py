@@ -47,9 +47,10 @@ from demorec.safety.replacing import (
     settle_parts,
 )
 from demorec.scene.episode import Outcome
-from demorec.scene.features import ENVIRONMENT_STATE, IMAGE_PREFIX, ActionKind
+from demorec.scene.features import ENVIRONMENT_STATE, IMAGE_PREFIX, STATE, ActionKind, StateKind, state_names
+from demorec.scene.robot import RobotSpec
 from demorec.sim.world import World
-from demorec.tables import camera_name
+from demorec.tables import ROBOTS, camera_name
 
 MAKE_ROLLOUT = "demorec.evaluate.rollouts:make_rollout"
 
@@ -66,6 +67,7 @@ class Settings:
         action: What the policy's actions mean.
         action_steps: Actions executed before it looks again; None: as trained.
         privileged: Whether it sees observation.environment_state.
+        state: What its observation.state holds.
         episode_length: Time limit; None: the environment's.
         takeover: When the expert takes over from the policy; None: never, as an evaluation of the policy wants it.
     """
@@ -77,6 +79,7 @@ class Settings:
     action: ActionKind
     action_steps: int | None = None
     privileged: bool = False
+    state: StateKind = "joint"
     episode_length: int | None = None
     takeover: TakeOver | None = None
 
@@ -157,8 +160,16 @@ def settings_for(
         action=action,
         action_steps=action_steps,
         privileged=ENVIRONMENT_STATE in inputs,
+        state=_state_kind(inputs, ROBOTS.load(config.robot)),
         episode_length=episode_length,
     )
+
+
+def _state_kind(inputs: Mapping[str, Any], robot: RobotSpec) -> StateKind:
+    """By how many numbers of observation.state the policy takes; "joint" for what is neither, which LeRobot refuses."""
+    if STATE not in inputs:
+        return "joint"
+    return "joint_ee" if list(inputs[STATE]["shape"]) == [len(state_names(robot, "joint_ee"))] else "joint"
 
 
 def evaluate(
@@ -280,6 +291,7 @@ class _Stage:
                 config=self.settings.config,
                 action=self.settings.action,
                 privileged=self.settings.privileged,
+                state=self.settings.state,
                 episode_length=self.settings.episode_length,
             )
             policy = Policy(find_checkpoint(Path(self.settings.policy)), action_steps=self.settings.action_steps)

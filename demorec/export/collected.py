@@ -52,6 +52,10 @@ def check_options(recording: CollectedRecording, options: CommonOptions) -> None
             f"action is {options.action!r}, but the actions of collected episodes are exported as they came: "
             f"{recording.path}"
         )
+    if (state := getattr(options, "state", "joint")) != "joint":
+        raise ConfigError(
+            f"state is {state!r}, but observation.state of collected episodes is exported as it came: {recording.path}"
+        )
     if options.depth and not recording.depth_cameras:
         raise ConfigError(f"depth is asked for, but no camera of the recording measures distances: {recording.path}")
     unknown = [kind for kind in getattr(options, "language", None) or () if kind != "subtask"]

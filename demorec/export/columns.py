@@ -19,6 +19,7 @@ from demorec.scene.features import (
     ENVIRONMENT_STATE,
     IMAGE_PREFIX,
     ObservationRows,
+    StateKind,
     action_vectors,
     observation_vectors,
 )
@@ -71,7 +72,7 @@ def check_feature_names(options: CommonOptions, offered: Collection[str]) -> Non
             )
 
 
-def feature_columns(recording: Recording, options: CommonOptions) -> FeatureColumns:
+def feature_columns(recording: Recording, options: CommonOptions, *, state: StateKind = "joint") -> FeatureColumns:
     """All numbers that recordings and options give, whichever of them `options.features` names.
 
     With frames left out, an observation is that of the first frame of its group and an action the last one of it:
@@ -97,7 +98,11 @@ def feature_columns(recording: Recording, options: CommonOptions) -> FeatureColu
     action_rows = np.minimum(rows + stride - 1, recording.num_frames - 1)
     features: dict[str, NDArray[np.generic]] = dict(
         observation_vectors(
-            ObservationRows.of_columns(columns, rows), info.robot, info.scene, privileged=options.privileged
+            ObservationRows.of_columns(columns, rows),
+            info.robot,
+            info.scene,
+            privileged=options.privileged,
+            state=state,
         )
     )
     features[ACTION] = action_vectors(columns, info.scene, options.action, action_rows)

@@ -205,6 +205,7 @@ def _read_dataset(source: Path) -> Original:
             digests=_digests(source, rows),
             export=ExportOptions(
                 action=made_with["action"],
+                state=made_with.get("state", "joint"),
                 privileged=made_with["privileged"],
                 features=tuple(made_with.get("features", ())),
                 include_failures=made_with["include_failures"],

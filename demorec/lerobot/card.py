@@ -186,6 +186,8 @@ def _meaning(key: str, item: Feature, about: CardFacts) -> str:
         return "as it was collected"
     if key == ACTION:
         return _ACTION_MEANING[about.options.action]
+    if key == STATE and about.options.state == "joint_ee":
+        return f"{_MEANING[STATE]}, {_MEANING[EE_POSE]}"
     if item.is_depth:
         return "distance along the optical axis, 12-bit logarithmic codes of 0.01 to 10 m; 0.01 m: nothing was hit"
     if key.startswith(IMAGE_PREFIX):

@@ -239,6 +239,7 @@ class _Export:
             "episodes": options.episodes,
             "fps": options.fps,
             "depth": options.depth,
+            **({} if options.state == "joint" else {"state": options.state}),
             **({"boxes": True} if options.boxes else {}),
             **({"progress": True} if options.progress else {}),
             **({} if options.language is None else {"language": options.spoken}),

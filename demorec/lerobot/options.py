@@ -10,12 +10,16 @@ from demorec.config import VideoConfig
 from demorec.errors import ConfigError, OptionError
 from demorec.export.options import CommonOptions
 from demorec.language.kinds import KINDS, LanguageKind
+from demorec.scene.features import StateKind
 
 
 @dataclass(frozen=True, kw_only=True)
 class ExportOptions(CommonOptions):
     """How recordings become a LeRobot dataset."""
 
+    state: StateKind = "joint"
+    """What observation.state holds: joint (joint positions, gripper opening), joint_ee (behind them the TCP's pose, for
+    policies that look at one vector alone: LeRobot's ACT and Diffusion learn faster with it)."""
     language: tuple[str, ...] | None = None
     """Add LeRobot's language columns: say in words what the robot does, from what was recorded. Named kinds alone
     (subtask plan memory motion task_aug vqa trace interjection), or all that the recordings support."""

@@ -69,10 +69,8 @@ def dataset_features(recording: AnyRecording, options: ExportOptions) -> dict[st
         return collected_features(recording, options)
     info = recording.info
     stride = frame_stride(info.fps, options.fps)
-    features = {
-        name: Feature(dtype="float32", shape=(len(names),), names=names)
-        for name, names in observation_names(info.robot, info.scene, privileged=options.privileged).items()
-    }
+    vectors = observation_names(info.robot, info.scene, privileged=options.privileged, state=options.state)
+    features = {name: Feature(dtype="float32", shape=(len(names),), names=names) for name, names in vectors.items()}
     for camera in recording.cameras:
         settings = dataset_settings(recording.video_settings(camera), options.transcode, stride=stride)
         height, width = settings.height, settings.width
@@ -123,7 +121,7 @@ def prepare_episode(recording: AnyRecording, options: ExportOptions, *, code_dep
         return PreparedEpisode(data=episode, record=EpisodeRecord.of_collected(row, recording))
     stride = frame_stride(recording.info.fps, options.fps)
     wanted = dataset_features(recording, options)
-    columns = feature_columns(recording, options)
+    columns = feature_columns(recording, options, state=options.state)
     videos, pixels = {}, {}
     cameras = [camera for camera in recording.cameras if IMAGE_PREFIX + camera in wanted]
     for camera, video in coded_videos(recording, cameras, options.transcode, columns.rows).items():
@@ -149,7 +147,7 @@ def prepare_episode(recording: AnyRecording, options: ExportOptions, *, code_dep
     )
     return PreparedEpisode(
         data=data,
-        record=EpisodeRecord.of(recording, columns.recorded, columns.rows),
+        record=EpisodeRecord.of(recording, columns.recorded, columns.rows, options.state),
         boxes=_boxes(recording, columns, cameras) if options.boxes else {},
     )
 

@@ -23,7 +23,7 @@ from demorec.recording import CollectedRecording, Recording
 from demorec.safety.files import read_text_limited
 from demorec.scene.assets import asset_path
 from demorec.scene.collected import CollectedFeature
-from demorec.scene.features import STATE
+from demorec.scene.features import STATE, StateKind
 from demorec.scene.robot import RobotSpec
 from demorec.scene.urdf import MAX_BYTES, Urdf, parse_xml
 from demorec.scene.urdf_shapes import read_links
@@ -78,23 +78,24 @@ class DatasetRobot:
         return Urdf.parse(self.urdf)
 
 
-def robot_of(recording: Recording) -> DatasetRobot:
-    """The arm of a simulated episode, as its recording describes it.
+def robot_of(recording: Recording, state: StateKind) -> DatasetRobot:
+    """The arm of a simulated episode, as its recording describes it, and which of its joints observation.state moves.
 
     Raises:
         RecordingError: The recording is damaged.
     """
-    return _simulated(recording.info.robot, recording.description())
+    return _simulated(recording.info.robot, recording.description(), state)
 
 
 @functools.lru_cache(maxsize=8)  # nearly always the same in all recordings of a run
-def _simulated(spec: RobotSpec, urdf: str) -> DatasetRobot:
+def _simulated(spec: RobotSpec, urdf: str, state: StateKind) -> DatasetRobot:
+    pose = ("m",) * 3 + ("",) * 4 if state == "joint_ee" else ()
     return DatasetRobot(
         record=RobotRecord(
             name=spec.name,
             urdf_sha256=_sha256(urdf),
-            joints={STATE: (*spec.arm_joints, "")},
-            units={STATE: (*("rad" for _ in spec.arm_joints), "m")},
+            joints={STATE: (*spec.arm_joints, "", *("" for _ in pose))},
+            units={STATE: (*("rad" for _ in spec.arm_joints), "m", *pose)},
             spec=spec,
             meshes=_mesh_names(spec.urdf),
         ),

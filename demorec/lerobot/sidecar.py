@@ -33,6 +33,7 @@ from demorec.lerobot.writer import WrittenEpisode, write_text
 from demorec.plain import to_json, to_plain
 from demorec.recording import CollectedRecording, Recording
 from demorec.scene.episode import EpisodeColumns
+from demorec.scene.features import StateKind
 from demorec.scene.scene import Scene
 
 CONFIGS_PATH = f"{SIDECAR_DIR}/configs.json"
@@ -128,7 +129,9 @@ class EpisodeRecord:
         )
 
     @classmethod
-    def of(cls, recording: Recording, columns: EpisodeColumns, rows: NDArray[np.intp]) -> EpisodeRecord:
+    def of(
+        cls, recording: Recording, columns: EpisodeColumns, rows: NDArray[np.intp], state: StateKind
+    ) -> EpisodeRecord:
         """Of a recording of which the frames `rows` are exported; frame numbers are those of the dataset."""
         info, outcome = recording.info, outcome_of(recording)
         row = {
@@ -163,7 +166,7 @@ class EpisodeRecord:
             moving_cameras=moving,
             config_digest=info.config_digest,
             config=info.config,
-            robot=robot_of(recording),
+            robot=robot_of(recording, state),
         )
 
 

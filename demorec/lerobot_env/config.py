@@ -30,6 +30,7 @@ class DemorecEnvConfig(EnvConfig):  # type: ignore[misc]
     observation_height: int = 224
     renderer: str | None = None
     privileged: bool | None = None
+    state: str = "joint"
     action: str = "joint"
     episode_length: int | None = None
     render_mode: str = "rgb_array"
@@ -70,6 +71,7 @@ class DemorecEnvConfig(EnvConfig):  # type: ignore[misc]
             "height": self.observation_height,
             "renderer": self.renderer,
             "privileged": self.privileged,
+            "state": self.state,
             "action": self.action,
             "episode_length": self.episode_length,
             "render_mode": self.render_mode,

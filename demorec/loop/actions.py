@@ -12,7 +12,7 @@ from demorec.geometry import Array, Pose, wrap_angle
 from demorec.registry import nearest_match
 from demorec.scene import features
 from demorec.scene.episode import Action
-from demorec.scene.features import ActionKind
+from demorec.scene.features import STATE_KINDS, ActionKind, StateKind
 from demorec.scene.robot import RobotSpec
 from demorec.sim.world import World
 
@@ -30,6 +30,14 @@ def check_action_kind(name: str) -> ActionKind:
     raise ConfigError(
         f"Unknown action {name!r}.{nearest_match(name, ACTION_KINDS)} Allowed: {', '.join(ACTION_KINDS)}."
     )
+
+
+def check_state_kind(name: str) -> StateKind:
+    """Return `name`; ConfigError unless it is a kind of observation.state."""
+    for kind in STATE_KINDS:
+        if kind == name:
+            return kind
+    raise ConfigError(f"Unknown state {name!r}.{nearest_match(name, STATE_KINDS)} Allowed: {', '.join(STATE_KINDS)}.")
 
 
 def action_bounds(robot: RobotSpec, kind: ActionKind, *, fps: int) -> tuple[Array, Array]:

@@ -28,7 +28,7 @@ from demorec.playback.episode import Box, Curves, PlayedEpisode, Video, VideoBat
 from demorec.playback.held_objects import held_object_poses
 from demorec.scene.assets import asset_path
 from demorec.scene.episode import EpisodeInfo, Outcome, SuccessCheck, frame_time_ns
-from demorec.scene.features import DEPTH_SUFFIX, ENVIRONMENT_STATE, IMAGE_PREFIX
+from demorec.scene.features import DEPTH_SUFFIX, ENVIRONMENT_STATE, IMAGE_PREFIX, STATE_KINDS, state_names
 from demorec.scene.kinematics import ArmKinematics
 from demorec.scene.urdf import Urdf, check_primitives
 from demorec.scene.validity import read_episode_info
@@ -78,10 +78,11 @@ def _read_episode(root: Path, episode_index: int) -> PlayedEpisode | PlayedColle
         raise RecordingError(f"The dataset has no {' and no '.join(sorted(missing))}, so it cannot be shown: {root}")
     data = _data(root, place, columns)
     num_frames = len(data["action"])
-    if not num_frames or data["observation.state"].shape[1] != len(info.robot.arm_joints) + 1:
+    num_arm = len(info.robot.arm_joints)
+    widths = {len(state_names(info.robot, kind)) for kind in STATE_KINDS}
+    if not num_frames or data["observation.state"].shape[1] not in widths:
         raise RecordingError(f"The dataset has no rows of episode {episode_index}, or of another robot: {root}")
     time_ns = _times(num_frames, described)
-    num_arm = len(info.robot.arm_joints)
     state = data["observation.state"]
     if (robot := _robot(root, row)) is not None:
         check_primitives(robot.urdf)
@@ -181,7 +182,7 @@ def _object_poses(
 ) -> dict[str, Array]:
     """Name -> (T, 7): recorded where the dataset has `observation.environment_state`, else as the hand carries them."""
     if ENVIRONMENT_STATE not in data:
-        opening, target = data["observation.state"][:, -1], data["action"][:, -1]
+        opening, target = data["observation.state"][:, len(info.robot.arm_joints)], data["action"][:, -1]
         return held_object_poses(info.scene, ends, base_from_tcp, opening, target, int(described.fps))
     first = {name: column for column, name in enumerate(described.features[ENVIRONMENT_STATE].names or ())}
     base, values = info.scene.robot.world_from_base, data[ENVIRONMENT_STATE]
@@ -248,7 +249,7 @@ def _curves(
 
     result = {
         "position": curves(state[:, :number], joints),
-        "gripper": curves(state[:, number:], ("opening",)),
+        "gripper": curves(state[:, number : number + 1], ("opening",)),
         "gripper target": curves(action[:, -1:], ("target",)),
         "ee": curves(base_from_tcp[:, :3], ("x", "y", "z")),
     }

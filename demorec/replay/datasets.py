@@ -43,16 +43,16 @@ def dataset_demonstrations(
         kind = dataset.action_kind(info)
         if kind is None:
             raise ConfigError(f"The dataset's actions are none that demorec writes, so they cannot be replayed: {path}")
-        state = rows[STATE].astype(np.float64)
+        state, arm = rows[STATE].astype(np.float64), len(info.robot.arm_joints)
         yield Demonstration(
             name=f"{path.name}_episode_{number:06d}",
             info=info,
             fps=dataset.info.fps,
             actions=rows[ACTION].astype(np.float64),
             action_kind=kind,
-            joint_position=state[:, :-1],
+            joint_position=state[:, :arm],
             joint_velocity=None,
-            gripper_width=state[:, -1],
+            gripper_width=state[:, arm],
             object_poses={},
             recorded_success=bool(row["success"]),
             tolerance=1e-6,

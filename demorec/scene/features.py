@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +36,10 @@ IMAGE_PREFIX, DEPTH_SUFFIX = "observation.images.", "_depth"
 ActionKind = Literal["joint", "joint_increment", "ee", "ee_delta"]
 """What the action column holds; `action_vectors` defines each."""
 
+StateKind = Literal["joint", "joint_ee"]
+STATE_KINDS: tuple[StateKind, ...] = get_args(StateKind)
+"""What `observation.state` holds; `observation_vectors` defines both."""
+
 NOISE_DECAY = 0.3
 """Share of the exploration noise on the executed commands that goes away within 1/30 s, when none is added.
 
@@ -48,6 +52,7 @@ be, but is a twentieth of a standard deviation of the plain offset, which a poli
 
 _POSITION = ("x", "y", "z")
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
+_TCP_NAMES = tuple(f"tcp.{axis}" for axis in _POSE)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -83,13 +88,20 @@ class ObservationRows:
         )
 
 
-def observation_names(robot: RobotSpec, scene: Scene, *, privileged: bool = False) -> dict[str, tuple[str, ...]]:
+def state_names(robot: RobotSpec, kind: StateKind) -> tuple[str, ...]:
+    """Name of every component of `observation.state`."""
+    joints = (*(f"{joint}.pos" for joint in robot.arm_joints), "gripper.width")
+    return (*joints, *_TCP_NAMES) if kind == "joint_ee" else joints
+
+
+def observation_names(
+    robot: RobotSpec, scene: Scene, *, privileged: bool = False, state: StateKind = "joint"
+) -> dict[str, tuple[str, ...]]:
     """Feature name -> name of every component, in the order of `observation_vectors`."""
-    arm = robot.arm_joints
     names = {
-        STATE: (*(f"{joint}.pos" for joint in arm), "gripper.width"),
-        VELOCITY: (*(f"{joint}.vel" for joint in arm), "gripper.vel"),
-        EE_POSE: tuple(f"tcp.{axis}" for axis in _POSE),
+        STATE: state_names(robot, state),
+        VELOCITY: (*(f"{joint}.vel" for joint in robot.arm_joints), "gripper.vel"),
+        EE_POSE: _TCP_NAMES,
     }
     if privileged:
         names[ENVIRONMENT_STATE] = tuple(_environment_names(robot, scene))
@@ -97,21 +109,23 @@ def observation_names(robot: RobotSpec, scene: Scene, *, privileged: bool = Fals
 
 
 def observation_vectors(
-    rows: ObservationRows, robot: RobotSpec, scene: Scene, *, privileged: bool = False
+    rows: ObservationRows, robot: RobotSpec, scene: Scene, *, privileged: bool = False, state: StateKind = "joint"
 ) -> dict[str, Vectors]:
     """Feature name -> (T, D) float32.
 
-    - `observation.state`: arm joint positions (rad), gripper opening (m).
+    - `observation.state`: arm joint positions (rad), gripper opening (m); with `state` "joint_ee" the seven numbers of
+      `observation.ee_pose` behind them, for policies that take no second vector (LeRobot's ACT).
     - `observation.velocity`: arm joint velocities (rad/s), speed of the gripper's opening (m/s).
     - `observation.ee_pose`: base_from_tcp, xyz (m) and quaternion xyzw. Of the two signs of the quaternion the one
       with x >= 0: it does not jump for a hand that points down within 180 degrees of yaw.
     - `observation.environment_state` (only if `privileged`): see `_environment_columns`.
     """
     arm = len(robot.arm_joints)
+    tcp = _continuous(rows.base_from_tcp)
     features = {
-        STATE: _float32([rows.joint_position[:, :arm], rows.gripper_width]),
+        STATE: _float32([rows.joint_position[:, :arm], rows.gripper_width, *([tcp] if state == "joint_ee" else [])]),
         VELOCITY: _float32([rows.joint_velocity[:, :arm], _gripper_velocity(rows, robot)]),
-        EE_POSE: _float32([_continuous(rows.base_from_tcp)]),
+        EE_POSE: _float32([tcp]),
     }
     if privileged:
         features[ENVIRONMENT_STATE] = _float32(_environment_columns(rows, robot, scene))

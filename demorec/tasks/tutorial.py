@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 
 from demorec.geometry import Pose
-from demorec.render.cameras import FRONT, TOP, CameraPreset
+from demorec.render.cameras import FRONT, TOP, WORKSPACE, CameraPreset
 from demorec.scene.episode import SuccessCheck
 from demorec.scene.robot import RobotSpec
 from demorec.scene.scene import Body, Goal, RobotPlacement, Scene, Shape
@@ -67,6 +67,13 @@ class Tutorial(Task):
     camera_presets: ClassVar[Mapping[str, CameraPreset]] = {
         "front": replace(FRONT, eye=(-1.35, 1.75, 1.55), target=(0.66, 0.38, 0.42), fov_y=math.radians(36.0)),
         "top": replace(TOP, eye=(0.5, 0.45, 2.6), target=(0.5, 0.45, 0.0), up=(0.0, 1.0, 0.0)),
+        "workspace": replace(
+            WORKSPACE,
+            eye=(-0.75, 1.75, 2.0),
+            target=(0.42, 0.44, 0.30),
+            fov_y=math.radians(33.0),
+            fov_x=math.radians(45.0),
+        ),
     }
 
     def sample_scene(self, robot: RobotSpec, sampler: Sampler) -> Scene:

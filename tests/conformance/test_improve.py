@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from support.check import edit_json
 from support.export import data_table, info
 
 from demorec.cli import generate_dataset_main, main
@@ -103,6 +104,23 @@ def test_a_training_that_fails_is_told_and_begun_anew(
     monkeypatch.setattr(improvement, "start_program", failing)
     assert ends(words_for(place, out)) == 1
     assert {f"--config_path={checkpoint}", "--resume=true"} <= set(failing.commands[0])
+
+
+def test_the_kind_of_state_decides_the_datasets_and_older_rounds_had_one(
+    place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(improvement, "start_program", Failing())
+    assert ends(words_for(place, tmp_path / "ee", "--state", "joint_ee")) == 1
+    assert info(tmp_path / "ee" / "round_00" / "dataset")["features"]["observation.state"]["shape"] == [15]
+    assert ends(words_for(place, tmp_path / "old")) == 1
+    assert info(tmp_path / "old" / "round_00" / "dataset")["features"]["observation.state"]["shape"] == [8]
+    capsys.readouterr()
+
+    edit_json(tmp_path / "old" / "improve.json", lambda data: data.pop("state"))
+    assert ends(words_for(place, tmp_path / "old")) == 1
+    assert "The training failed" in capsys.readouterr().err  # it went on
+    assert ends(words_for(place, tmp_path / "old", "--state", "joint_ee")) != 0
+    assert "state is joint there and joint_ee here" in capsys.readouterr().err
 
 
 def test_what_is_not_its_own_is_refused(

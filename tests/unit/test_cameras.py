@@ -15,6 +15,7 @@ from demorec.loop import make_world
 from demorec.scene.scene import Camera
 from demorec.sim.world import World
 from demorec.tables import CAMERAS, ROBOTS
+from demorec.tasks.sampling import WORKSPACE
 
 
 def pixel(camera: Camera, world_from_camera: Pose, point: tuple[float, float, float]) -> tuple[float, float]:
@@ -57,6 +58,20 @@ def test_top_sees_every_place_where_objects_go_with_the_base_below(world: World)
     assert near[1] > far[1]
     right = pixel(camera, camera.mount_from_camera, (0.5, -0.2, 0.0))
     assert right[0] > pixel(camera, camera.mount_from_camera, (0.5, 0.2, 0.0))[0]  # no mirror: y is to the left
+
+
+@pytest.mark.parametrize("size", [(56, 40), (224, 224), (640, 480), (640, 360)])
+def test_workspace_sees_every_place_where_objects_go_in_pictures_of_any_shape(
+    world: World, size: tuple[int, int]
+) -> None:
+    camera = CAMERAS.load("workspace").camera("workspace", world.robot, width=size[0], height=size[1])
+    pixels = [
+        pixel(camera, camera.mount_from_camera, (*place, z))
+        for place in itertools.product(WORKSPACE.x, WORKSPACE.y)
+        for z in (0.0, 0.06)
+    ]
+    assert all(inside(camera, place) for place in pixels)
+    assert (np.ptp(pixels, axis=0) / size).max() > 0.65  # and it sees little else
 
 
 def test_wrist_sees_the_space_between_the_fingers(world: World) -> None:

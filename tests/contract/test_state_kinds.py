@@ -1,0 +1,166 @@
+"""`--state joint_ee`: the TCP's pose behind the joints in observation.state, wherever such a dataset or policy goes."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.check import checked, edit_column, level_of, simulate_run
+from support.collected import make_collected, write_collected
+from support.commands import exit_code
+from support.export import data_table, info
+
+from demorec.config import GenerateConfig
+from demorec.errors import ConfigError
+from demorec.evaluate.policy import CONFIG_NAME
+from demorec.evaluate.rollouts import settings_for
+from demorec.generate.reproduce import read_original
+from demorec.gym_env import DemorecEnv
+from demorec.lerobot.export import export_lerobot
+from demorec.lerobot.options import ExportOptions
+from demorec.playback.episode import PlayedEpisode
+from demorec.playback.from_dataset import open_dataset_episode
+from demorec.recording import Recording
+from demorec.replay.demonstration import ReplayOptions
+from demorec.scene.features import Vectors
+
+STATE = "observation.state"
+SMALL = ExportOptions(verify=False, action="ee_delta", state="joint_ee", features=(STATE,))
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two episodes without exploration noise, so that actions are what was executed."""
+    return simulate_run(tmp_path_factory.mktemp("states") / "run", 2, seed=3, variation="none")
+
+
+@pytest.fixture(scope="module")
+def dataset(run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("states") / "ds"
+    export_lerobot([run], folder, ExportOptions(verify=False, state="joint_ee"))
+    return folder
+
+
+@pytest.fixture
+def small(run: Path, tmp_path: Path) -> Path:
+    """The state is the only place of the TCP's pose."""
+    export_lerobot([run], tmp_path / "small", SMALL)
+    return tmp_path / "small"
+
+
+def states(dataset: Path) -> Vectors:
+    return np.array(data_table(dataset).column(STATE).to_pylist(), dtype=np.float32)
+
+
+def test_the_state_is_joints_gripper_and_the_recorded_pose(run: Path, dataset: Path) -> None:
+    first, *_ = sorted((run / "episodes").glob("*.mcap"))
+    with Recording(first) as recording:
+        columns = recording.columns()
+    found = states(dataset)[: columns.num_frames]
+    assert found.shape == (columns.num_frames, 15)
+    assert info(dataset)["features"][STATE]["names"][6:10] == ["panda_joint7.pos", "gripper.width", "tcp.x", "tcp.y"]
+    assert np.array_equal(found[:, :7], columns.joint_position[:, :7].astype(np.float32))
+    assert np.array_equal(found[:, 7], columns.gripper_width.astype(np.float32))
+    assert np.array_equal(found[:, 8:11], columns.base_from_tcp[:, :3].astype(np.float32))
+    # A quaternion and its negative are one rotation.
+    np.testing.assert_allclose(np.abs((found[:, 11:] * columns.base_from_tcp[:, 3:]).sum(axis=1)), 1.0, atol=1e-6)
+    assert (found[:, 11] >= 0).all()
+    assert "tool centre point" in (dataset / "README.md").read_text().partition(f"`{STATE}`")[2].partition("\n")[0]
+
+
+def test_such_a_dataset_passes_every_check(dataset: Path, small: Path) -> None:
+    for path in (dataset, small):
+        report = checked(path, "dataset", pictures=False)
+        assert [r for r in report.results if r.level in ("warn", "fail")] == []
+    for check in ("dataset_action_lag", "dataset_forward_kinematics", "dataset_description", "dataset_joint_limits"):
+        assert level_of(small, check, "dataset") == "pass"
+
+
+def test_a_wrong_pose_in_the_state_is_found(small: Path) -> None:
+    before = states(small)
+    edit_column(small, STATE, lambda rows: rows[:, [*range(11), 14, 11, 12, 13]])  # scalar first
+    assert not np.array_equal(states(small), before)
+    assert level_of(small, "dataset_forward_kinematics", "dataset") == "fail"
+
+
+def test_late_actions_are_found_by_the_pose_in_the_state(small: Path) -> None:
+    edit_column(small, "action", lambda rows: np.concatenate([np.zeros_like(rows[:6]), rows[:-6]]))
+    assert level_of(small, "dataset_action_lag", "dataset") == "fail"
+
+
+def test_it_is_shown_as_one_with_joints_alone(run: Path, dataset: Path, tmp_path: Path) -> None:
+    export_lerobot([run], tmp_path / "plain", ExportOptions(verify=False))
+    with open_dataset_episode(dataset, 1) as shown, open_dataset_episode(tmp_path / "plain", 1) as plain:
+        assert isinstance(shown, PlayedEpisode)
+        assert isinstance(plain, PlayedEpisode)
+        assert np.array_equal(shown.joint_position, plain.joint_position)
+        assert np.array_equal(shown.base_from_tcp, plain.base_from_tcp)
+        assert shown.curves.keys() == plain.curves.keys()
+        assert all(np.array_equal(shown.curves[name].values, plain.curves[name].values) for name in plain.curves)
+        for name, poses in plain.object_poses.items():
+            assert np.array_equal(shown.object_poses[name], poses)
+
+
+def test_it_replays(dataset: Path) -> None:
+    from demorec.cli.replay import demonstrations
+
+    options = ReplayOptions()
+    joints = [each.joint_position.shape[1] for each in demonstrations([dataset], options)]
+    assert joints == [7, 7]
+    assert exit_code("replay", dataset, "--episodes", "1") == 0
+
+
+def test_the_environment_gives_the_dataset_to_the_bit(run: Path, tmp_path: Path) -> None:
+    first, *_ = sorted((run / "episodes").glob("*.mcap"))
+    export_lerobot([first], tmp_path / "one", SMALL)
+    with Recording(first) as recording:
+        columns = recording.columns()
+    config = GenerateConfig(cameras=(), seed=3, variation="none")
+    env = DemorecEnv(config=config, state="joint_ee", privileged=False)
+    assert env.observation_space["agent_pos"].shape == (15,)
+    observation, _ = env.reset(seed=0)
+    for row, command in zip(states(tmp_path / "one"), columns.command_joint_target, strict=True):
+        assert np.array_equal(observation["agent_pos"], row)
+        frame = env.situation.frame_index
+        observation, *_ = env.step(np.append(command, columns.command_gripper[frame]))
+    env.close()
+
+
+@pytest.mark.parametrize(("length", "kind"), [(8, "joint"), (15, "joint_ee")])
+def test_a_policy_tells_which_state_it_takes(length: int, kind: str, tmp_path: Path) -> None:
+    plain = {"type": "act", "input_features": {STATE: {"type": "STATE", "shape": [length]}}}
+    (tmp_path / CONFIG_NAME).write_text(json.dumps(plain))
+    assert settings_for(tmp_path, GenerateConfig(cameras=()), action="ee_delta").state == kind
+
+
+def test_lerobot_is_told_of_the_state() -> None:
+    from demorec.lerobot_env import DemorecEnvConfig
+
+    assert DemorecEnvConfig(state="joint_ee").features["agent_pos"].shape == (15,)
+    assert DemorecEnvConfig().features["agent_pos"].shape == (8,)
+    with pytest.raises(ConfigError, match="Unknown state 'joint_e'"):
+        DemorecEnvConfig(state="joint_e")
+
+
+def test_states_of_two_kinds_do_not_go_into_one_dataset(run: Path, dataset: Path) -> None:
+    before = states(dataset)
+    with pytest.raises(ConfigError, match=STATE):
+        export_lerobot([run], dataset, ExportOptions(verify=False, append=True, allow_duplicates=True))
+    assert np.array_equal(states(dataset), before)
+
+
+def test_the_dataset_tells_how_to_make_it_again(dataset: Path) -> None:
+    original = read_original(dataset)
+    assert original.export is not None
+    assert original.export.state == "joint_ee"
+    assert "--state joint_ee" in (dataset / "README.md").read_text()
+
+
+def test_the_state_of_a_collected_episode_stays_as_it_came(tmp_path: Path) -> None:
+    write_collected(tmp_path / "e.mcap", make_collected(cameras=()))
+    with pytest.raises(ConfigError, match="as it came"):
+        export_lerobot([tmp_path / "e.mcap"], tmp_path / "ds", replace(SMALL, action="joint"))
+    assert not (tmp_path / "ds").exists()
