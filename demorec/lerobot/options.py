@@ -10,7 +10,7 @@ from demorec.config import VideoConfig
 from demorec.errors import ConfigError, OptionError
 from demorec.export.options import CommonOptions
 from demorec.language.kinds import KINDS, LanguageKind
-from demorec.scene.features import StateKind
+from demorec.scene.features import STATE_KINDS, StateKind
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,7 +19,7 @@ class ExportOptions(CommonOptions):
 
     state: StateKind = "joint"
     """What observation.state holds: joint (joint positions, gripper opening), joint_ee (behind them the TCP's pose, for
-    policies that look at one vector alone: LeRobot's ACT and Diffusion learn faster with it)."""
+    policies that look at this vector alone, such as LeRobot's ACT)."""
     language: tuple[str, ...] | None = None
     """Add LeRobot's language columns: say in words what the robot does, from what was recorded. Named kinds alone
     (subtask plan memory motion task_aug vqa trace interjection), or all that the recordings support."""
@@ -80,6 +80,8 @@ class ExportOptions(CommonOptions):
             raise ConfigError("--boxes are written for a whole dataset: leave --append out and export all of it anew.")
         if self.workers < 0:
             raise OptionError("workers", f"is {self.workers}, it must be 0 (as many as pay) or more.")
+        if self.state not in STATE_KINDS:
+            raise OptionError("state", f"is {self.state!r}, allowed are {', '.join(STATE_KINDS)}.")
         if unknown := [kind for kind in self.language or () if kind not in KINDS]:
             raise OptionError("language", f"names {unknown[0]!r}, its kinds are {', '.join(KINDS)}.")
         check_repo_id(self.repo_id)

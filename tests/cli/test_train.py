@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import subprocess
 import sys
@@ -111,7 +112,7 @@ def test_lerobots_parser_takes_the_configs(path: Path, monkeypatch: pytest.Monke
     config.output_dir = None
     config.validate()
     assert config.policy.type == path.stem.split("_")[0]
-    assert config.batch_size == 64
+    assert config.batch_size == json.loads(path.read_text())["batch_size"]
     assert config.policy.push_to_hub is False
 
 

@@ -498,6 +498,7 @@ def test_a_single_frame(tmp_path: Path) -> None:
         ({"fps": 0}, "at least 1"),
         ({"repo_id": "a b"}, "OWNER/NAME"),
         ({"workers": -1}, "workers"),
+        ({"state": "velocity"}, "joint_ee"),
     ],
 )
 def test_impossible_options(options: dict[str, object], message: str) -> None:
