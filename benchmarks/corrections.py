@@ -7,8 +7,9 @@ A policy learns from --episodes plain demonstrations. Then, in --rounds, it acts
 table, the expert takes over where it strays, and the policy is trained anew on everything, until --corrected episodes
 have been corrected; only the expert's frames are learned from. Beside it a policy learns from as many plain
 demonstrations in all. Every training seed has its own policies, and so its own corrections. Trainings are those of
-benchmarks/learning.py: LeRobot's ACT from numbers in memory, one thread. Scenes are held out. What is in --out already
-(runs, corrections, datasets, policies, evaluations) is used again, so that the same command goes on.
+benchmarks/learning.py: LeRobot's ACT from numbers in memory, one thread; --steps updates for --episodes episodes, in
+proportion more for more of them. Scenes are held out. What is in --out already (runs, corrections, datasets, policies,
+evaluations) is used again, so that the same command goes on.
 """
 
 from __future__ import annotations
@@ -51,6 +52,7 @@ class Stage:
         corrected: Episodes that the expert has corrected so far.
         demonstrations: Plain ones.
         frames: Learned from.
+        updates: Of the training.
         evaluation: On the held-out scenes.
         cpu_seconds: Of the training.
         losses: Of the training, as (update, L1 of the normalised actions).
@@ -60,6 +62,7 @@ class Stage:
     corrected: int
     demonstrations: int
     frames: int
+    updates: int
     evaluation: Evaluation
     cpu_seconds: float
     losses: tuple[tuple[int, float], ...]
@@ -75,7 +78,7 @@ def demonstrations(args: argparse.Namespace, count: int) -> Path:
     run = args.out / "run"
     command(
         *("generate-dataset", "--out", run, "--task", args.task, "--num-episodes", str(count), "--split", "train"),
-        *("--workers", "1", "--no-export", "--cameras", "none"),
+        *("--workers", str(args.workers), "--no-export", "--cameras", "none"),
     )
     dataset = Path(args.out / "datasets" / f"plain_{count}_{args.action}")
     if not dataset.exists():
@@ -104,7 +107,7 @@ def correct(policy: Path, wanted: int, first_scene_seed: int, args: argparse.Nam
     tried, corrected = 0, list[int]()
     while len(corrected) < wanted:
         tried += max(5, wanted - len(corrected))
-        rollouts = evaluate(settings, out, num_episodes=tried, workers=1).rollouts
+        rollouts = evaluate(settings, out, num_episodes=tried, workers=args.workers).rollouts
         corrected = [r.episode_index for r in rollouts if r.success and read_takeover(out / r.file) is not None]
     export(out, dataset, args, ",".join(map(str, corrected[:wanted])))
     return dataset
@@ -138,24 +141,26 @@ def load(datasets: list[Path], *, relative: bool) -> Data:
 def stage(arm: str, datasets: list[Path], corrected: int, seed: int, args: argparse.Namespace) -> tuple[Stage, Path]:
     """Train on datasets and try what came out; the policy's folder, too."""
     count = args.episodes + (args.corrected if arm == "plain" else 0)
+    updates = round(args.steps * (count + corrected) / args.episodes)
     label = f"{args.label}_{args.rules}" if arm == "corrected" else args.label
     out = args.out / "policies" / f"{arm}_{count}_{corrected}_{label}_{seed}"
     data = load(datasets, relative=args.relative)
     if not (out / "training.json").exists():
         print(f"training {out.name} on {len(data.end)} frames", flush=True)
-        train(data, args.variant, args, seed=seed, out=out)
+        train(data, args.variant, argparse.Namespace(**vars(args) | {"steps": updates}), seed=seed, out=out)
     training = json.loads((out / "training.json").read_text())
     config = GenerateConfig(task=args.task, split="eval", seed=0, cameras=())
     settings = settings_for(out, config, action=args.action)
     where = args.out / "evaluations" / out.name
     where.parent.mkdir(parents=True, exist_ok=True)
-    found = evaluate(settings, where, num_episodes=args.scenes, workers=1)
+    found = evaluate(settings, where, num_episodes=args.scenes, workers=args.workers)
     print(f"{out.name:<40} {found.rate}", flush=True)
     made = Stage(
         arm=arm,
         corrected=corrected,
         demonstrations=count,
         frames=len(data.end),
+        updates=updates,
         evaluation=found,
         cpu_seconds=training["cpu_seconds"],
         losses=tuple((point["step"], point["loss"]) for point in training["curve"]),
@@ -251,11 +256,13 @@ def main() -> None:
     parser.add_argument("--corrected", type=int, default=100, help="corrected episodes in all")
     parser.add_argument("--rounds", type=int, default=2)
     parser.add_argument("--seeds", type=int, default=3, help="trainings, each with corrections of its own")
+    parser.add_argument("--first-seed", type=int, default=0, help="number of the first training")
+    parser.add_argument("--workers", type=int, default=1, help="processes that run episodes")
     parser.add_argument("--scenes", type=int, default=150, help="held-out scenes of each policy")
     parser.add_argument("--action", default="ee_delta")
     parser.add_argument("--execute", type=int, default=16, help="actions of the chunk of 16 that are executed")
     parser.add_argument("--relative", action="store_true", help="hide where on the table things are")
-    parser.add_argument("--steps", type=int, default=3000)
+    parser.add_argument("--steps", type=int, default=3000, help="updates for --episodes, in proportion for more")
     parser.add_argument("--batch-size", type=int, default=128)
     parser.add_argument("--learning-rate", type=float, default=5e-4)
     parser.add_argument("--stray-metres", type=float, default=TakeOver.stray_metres)
@@ -273,14 +280,15 @@ def main() -> None:
     args.out.mkdir(parents=True, exist_ok=True)
     rows: dict[tuple[str, int, int], list[Stage]] = defaultdict(list)
     started = time.process_time()
-    for seed in range(args.seeds):
+    for seed in range(args.first_seed, args.first_seed + args.seeds):
         for made in stages(seed, args):
             rows[made.row].append(made)
-    print(f"\n{'arm':<10} {'plain':>6} {'corrected':>9} {'frames':>8} {'by training':>16} {'train CPU s':>11}  success")
+    heads = f"{'arm':<10} {'plain':>6} {'corrected':>9} {'frames':>8} {'updates':>8} {'by training':>16}"
+    print(f"\n{heads} {'train CPU s':>11}  success")
     for (arm, plain, corrected), found in rows.items():
         print(
             f"{arm:<10} {plain:>6} {corrected:>9} {np.mean([s.frames for s in found]):>8.0f} "
-            f"{' '.join(str(s.evaluation.rate.successes) for s in found):>16} "
+            f"{found[0].updates:>8} {' '.join(str(s.evaluation.rate.successes) for s in found):>16} "
             f"{np.mean([s.cpu_seconds for s in found]):>11.0f}  {rate(found)}"
         )
     print(f"CPU seconds of this process, workers not counted: {time.process_time() - started:.0f}")

@@ -3,14 +3,14 @@
     python benchmarks/learning.py --variants base clean plain_increments --out outputs/learning
     python benchmarks/learning.py --episodes 1000 --steps 8000 --scenes 100 --seeds 3
     python benchmarks/learning.py --variants joint_state joint_ee_state --episodes 300 --steps 3000 --scenes 60
-    python benchmarks/learning.py --variants pictures --episodes 700 --batch-size 32 --learning-rate 3e-4 --steps 8400
     python benchmarks/learning.py --variants base clean --plot outputs/learning/learning.png
 
 Every variant is made with the product's own commands (generate-dataset, demorec export lerobot, demorec evaluate).
 Training is LeRobot's ACT class with the numbers of a dataset held in memory: lerobot-train reads them row by row and
 spends five sixths of its CPU time there; the network, the loss and the optimizer are the same. One thread, no
 download. Each variant is one row: strict success in closed loop with its 95 % interval, and CPU seconds of training.
-What is there already (runs, datasets, policies, evaluations in --out) is used again.
+What is there already (runs, datasets, policies, evaluations in --out) is used again. benchmarks/checkpoints.py measures
+trainings of lerobot-train, such as those with pictures.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import re
 import subprocess
 import sys
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -52,8 +52,6 @@ class Variant:
         hide: Components of the environment state whose names contain one of these are hidden.
         see: Pattern of the components that are not hidden; "" for all.
         chunk, execute: Actions predicted at once, and executed before looking again.
-        pictures: From two 56 x 40 cameras in place of the environment state, the TCP's pose in observation.state, and a
-            network of 256 instead of 128.
     """
 
     about: str
@@ -65,7 +63,6 @@ class Variant:
     see: str = ""
     chunk: int = 16
     execute: int = 16
-    pictures: bool = False
 
 
 RELATIVE = ("from_", ".yaw.", "tcp.")
@@ -95,9 +92,6 @@ VARIANTS = {
     "execute_1": Variant(about="one action at a time", execute=1),
     "execute_8": Variant(about="half of the chunk of 16", execute=8),
     "chunk_32": Variant(about="chunk of 32, 16 executed", chunk=32, execute=16),
-    "pictures": Variant(
-        about="TCP deltas; two 56 x 40 cameras, no environment state", action="ee_delta", pictures=True
-    ),
 }
 
 
@@ -108,7 +102,6 @@ class Data:
     columns: dict[str, torch.Tensor]
     end: torch.Tensor  # (N,) index after the last frame of each frame's episode
     stats: dict[str, dict[str, torch.Tensor]]
-    pictures: dict[str, torch.Tensor] = field(default_factory=dict)  # (N, 3, H, W) uint8
 
 
 def command(*words: str | Path) -> None:
@@ -121,44 +114,38 @@ def command(*words: str | Path) -> None:
 
 def make_dataset(variant: Variant, args: argparse.Namespace) -> Path:
     """Generate and export, where that was not done yet."""
-    cameras = ("workspace", "wrist", "--width", "56", "--height", "40") if variant.pictures else ("none",)
     label = "_".join(word.strip("-").replace(".", "") for word in variant.generate) or "base"
-    run = args.out / f"run_{label}{'_pictures' if variant.pictures else ''}_{args.episodes}"
+    run = args.out / f"run_{label}_{args.episodes}"
     command(
         *("generate-dataset", "--out", run, "--task", args.task, "--num-episodes", str(args.episodes)),
-        *("--split", "train", "--workers", str(args.workers), "--no-export", "--cameras", *cameras, *variant.generate),
+        *("--split", "train", "--workers", str(args.workers), "--no-export", "--cameras", "none", *variant.generate),
     )
     count = max(1, round(args.episodes * variant.share))
     dataset = run / f"dataset_{variant.action}_{count}"
     if not dataset.exists():
         command(
             *("demorec", "export", "lerobot", run, "--out", dataset, "--action", variant.action),
-            *("--episodes", f"0:{count}", *(("--state", "joint_ee") if variant.pictures else ("--privileged",))),
+            *("--episodes", f"0:{count}", "--privileged"),
         )
     return Path(dataset)
 
 
 def load(dataset: Path, variant: Variant) -> Data:
-    """Read a dataset's numbers (and its pictures, through LeRobot) and hide what the variant hides."""
+    """Read a dataset's numbers and hide what the variant hides."""
     info = json.loads((dataset / "meta" / "info.json").read_text())
     tables = [pq.read_table(path) for path in sorted((dataset / "data").rglob("*.parquet"))]
-    names = [STATE, ACTION, *([] if variant.pictures else [ENVIRONMENT])]
     columns = {
         name: torch.from_numpy(np.concatenate([np.stack(t[name].to_numpy()) for t in tables]).astype(np.float32))
-        for name in names
+        for name in (STATE, ACTION, ENVIRONMENT)
     }
     episode = np.concatenate([t["episode_index"].to_numpy() for t in tables])
     if variant.plain:
         columns[ACTION] = torch.from_numpy(plain_increments(dataset))
     stats = {name: statistics(values) for name, values in columns.items()}
-    if ENVIRONMENT in columns:
-        for i, component in enumerate(info["features"][ENVIRONMENT]["names"]):
-            if any(part in component for part in variant.hide) or not re.fullmatch(variant.see or ".*", component):
-                stats[ENVIRONMENT]["std"][i] = SWITCHED_OFF
-    data = Data(columns=columns, end=torch.from_numpy(np.searchsorted(episode, episode, side="right")), stats=stats)
-    if variant.pictures:
-        add_pictures(data, dataset)
-    return data
+    for i, component in enumerate(info["features"][ENVIRONMENT]["names"]):
+        if any(part in component for part in variant.hide) or not re.fullmatch(variant.see or ".*", component):
+            stats[ENVIRONMENT]["std"][i] = SWITCHED_OFF
+    return Data(columns=columns, end=torch.from_numpy(np.searchsorted(episode, episode, side="right")), stats=stats)
 
 
 def statistics(values: torch.Tensor) -> dict[str, torch.Tensor]:
@@ -181,22 +168,6 @@ def plain_increments(dataset: Path) -> NDArray[np.float32]:
     return np.asarray(np.concatenate(rows), dtype=np.float32)
 
 
-def add_pictures(data: Data, dataset: Path) -> None:
-    """Decode every picture once."""
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-    frames = LeRobotDataset("local/learning", root=dataset, return_uint8=True)
-    keys = frames.meta.camera_keys
-    items = [frames[i] for i in range(len(frames))]
-    for key in keys:
-        data.pictures[key] = torch.stack([item[key] for item in items])
-        scaled = data.pictures[key][:: max(1, len(items) // 500)].double() / 255
-        data.stats[key] = {
-            "mean": scaled.mean((0, 2, 3)).float()[:, None, None],
-            "std": scaled.std((0, 2, 3)).float()[:, None, None],
-        }
-
-
 def train(data: Data, variant: Variant, args: argparse.Namespace, *, seed: int, out: Path) -> float:
     """Train LeRobot's ACT and save it as lerobot-train does; returns CPU seconds."""
     from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature
@@ -210,23 +181,21 @@ def train(data: Data, variant: Variant, args: argparse.Namespace, *, seed: int, 
         for name, values in data.columns.items()
         if name != ACTION
     }
-    inputs |= {key: PolicyFeature(FeatureType.VISUAL, tuple(p.shape[1:])) for key, p in data.pictures.items()}
     torch.manual_seed(seed)
     policy = ACTPolicy(
         ACTConfig(
             use_vae=False,
             dropout=0.0,
-            dim_model=256 if variant.pictures else 128,
-            n_heads=8 if variant.pictures else 4,
-            dim_feedforward=1024 if variant.pictures else 512,
+            dim_model=128,
+            n_heads=4,
+            dim_feedforward=512,
             n_encoder_layers=2,
             chunk_size=variant.chunk,
             n_action_steps=variant.execute,
             pretrained_backbone_weights=None,
-            optimizer_lr_backbone=args.learning_rate,
             device=args.device,
             push_to_hub=False,
-            normalization_mapping=dict.fromkeys(("STATE", "ENV", "ACTION", "VISUAL"), NormalizationMode.MEAN_STD),
+            normalization_mapping=dict.fromkeys(("STATE", "ENV", "ACTION"), NormalizationMode.MEAN_STD),
             input_features=inputs,
             output_features={ACTION: PolicyFeature(FeatureType.ACTION, tuple(data.columns[ACTION].shape[1:]))},
         )
@@ -246,7 +215,6 @@ def train(data: Data, variant: Variant, args: argparse.Namespace, *, seed: int, 
         last = data.end[rows][:, None] - 1
         batch = {name: values[rows] for name, values in data.columns.items()}
         batch[ACTION] = data.columns[ACTION][torch.minimum(ahead, last)]
-        batch |= {key: pictures[rows].float() / 255 for key, pictures in data.pictures.items()}
         batch = before(batch)
         batch["action_is_pad"] = (ahead > last).to(args.device)
         loss, _ = policy(batch)

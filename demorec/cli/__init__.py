@@ -45,6 +45,7 @@ COMMANDS: Registry[type[Command]] = Registry(
         "report": "demorec.cli.report:Report",
         "replay": "demorec.cli.replay:Replay",
         "render": "demorec.cli.render:Render",
+        "pretrain": "demorec.cli.pretrain:Pretrain",
         "train": "demorec.cli.train:Train",
         "evaluate": "demorec.cli.evaluate:Evaluate",
         "correct": "demorec.cli.correct:Correct",

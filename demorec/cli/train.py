@@ -16,7 +16,7 @@ class Train:
 
     Examples:
       demorec train --config_path=examples/act_numbers.json
-      demorec train --config_path=examples/act_pictures.json --policy.device=cuda
+      demorec train --config_path=examples/act_pictures.json --policy.path=outputs/eye --freeze-encoder
       demorec train --dataset.repo_id=lerobot/pusht --policy.type=diffusion
     """
 
@@ -24,6 +24,8 @@ class Train:
     """Decoded frames that each process keeps, in MB of 2^20 bytes; a small dataset is then decoded only once."""
     expert_only: bool = False
     """Of corrected episodes (demorec correct, export --intervention) learn from the expert's frames alone."""
+    freeze_encoder: bool = False
+    """Do not train the encoder of an ACT policy's pictures (demorec pretrain): each picture goes through it once."""
     others: tuple[str, ...] = ()
     """What goes to lerobot-train."""
 
@@ -39,5 +41,6 @@ class Train:
             frame_cache_bytes=self.frame_cache_mb << 20,
             on_replaced=say_what_is_replaced,
             expert_only=self.expert_only,
+            freeze_encoder=self.freeze_encoder,
         )
         return 0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -23,33 +23,36 @@ def train(
     frame_cache_bytes: int,
     on_replaced: Callable[[], None],
     expert_only: bool = False,
+    freeze_encoder: bool = False,
 ) -> None:
     """Run lerobot-train in this process.
 
     Args:
         arguments: As for lerobot-train.
-        frame_cache_bytes: Limit of the decoded frames that each process keeps.
+        frame_cache_bytes: Limit of the decoded frames that each process keeps; of a frozen encoder's maps as well.
         expert_only: As of `FastDataset`.
+        freeze_encoder: Do not train an ACT policy's encoder of pictures (`freeze_encoder`).
         on_replaced: Called when the first dataset is opened by `FastDataset`: streamed ones are not.
 
     Raises:
-        ConfigError: The limit is negative, or the file of --config_path is missing.
+        ConfigError: The limit is negative, the file of --config_path is missing, or there is no encoder to freeze.
         TrainingError: lerobot-train ended with an error.
         MissingDependencyError: LeRobot, or what it needs for training, is not installed.
         SystemExit: lerobot-train refused its arguments (2), and said why, or told its help (0).
     """
     if frame_cache_bytes < 0:
         raise ConfigError(f"frame-cache-mb is {frame_cache_bytes / (1 << 20):g}, at least 0 is needed.")
-    for argument in arguments:
-        flag, _, path = argument.partition("=")
-        if flag == "--config_path" and path.endswith(".json") and not Path(path).exists():
-            raise ConfigError(f"There is no such file of settings: {path}")
+    check_settings_file(arguments)
     try:
         import accelerate  # noqa: F401  # which lerobot-train asks for late
         from lerobot.scripts import lerobot_train
     except ImportError as error:
         raise MissingDependencyError("Training", error.name or "lerobot", "pip install 'demorec[train]'") from error
-    with _reading_fast(frame_cache_bytes, on_replaced, expert_only=expert_only), _called_as(PROGRAM, arguments):
+    with (
+        _reading_fast(frame_cache_bytes, on_replaced, expert_only=expert_only, is_frozen=freeze_encoder),
+        _freezing(frame_cache_bytes) if freeze_encoder else nullcontext(),
+        _called_as(PROGRAM, arguments),
+    ):
         try:
             lerobot_train.main()
         except SystemExit as ended:  # its parser exits with 1 for some wrong requests and with 2 for others
@@ -62,8 +65,42 @@ def train(
             ) from error
 
 
+def check_settings_file(arguments: Sequence[str]) -> None:
+    """Raise ConfigError if the file of --config_path is missing."""
+    for argument in arguments:
+        flag, _, path = argument.partition("=")
+        if flag == "--config_path" and path.endswith(".json") and not Path(path).exists():
+            raise ConfigError(f"There is no such file of settings: {path}")
+
+
+def training_config(arguments: Sequence[str]) -> Any:
+    """lerobot-train's settings (TrainPipelineConfig), as its parser reads them from its arguments.
+
+    Raises:
+        ConfigError: The file of --config_path is missing.
+        MissingDependencyError: LeRobot, or what it needs for training, is not installed.
+        SystemExit: The parser refused the arguments (2), and said why.
+    """
+    check_settings_file(arguments)
+    try:
+        import draccus
+        from lerobot.configs.train import TrainPipelineConfig
+        from lerobot.policies import factory  # noqa: F401  # which registers the policies' types
+    except ImportError as error:
+        raise MissingDependencyError("Training", error.name or "lerobot", "pip install 'demorec[train]'") from error
+    with _called_as(PROGRAM, arguments):
+        try:
+            return draccus.parse(TrainPipelineConfig, args=list(arguments))
+        except SystemExit as ended:
+            raise SystemExit(2 if ended.code else 0) from None
+        except Exception as error:  # whatever a foreign parser raises
+            raise ConfigError(f"{PROGRAM} does not take these settings ({type(error).__name__}: {error}).") from error
+
+
 @contextmanager
-def _reading_fast(frame_cache_bytes: int, on_replaced: Callable[[], None], *, expert_only: bool) -> Iterator[None]:
+def _reading_fast(
+    frame_cache_bytes: int, on_replaced: Callable[[], None], *, expert_only: bool, is_frozen: bool
+) -> Iterator[None]:
     """LeRobot's factory of datasets makes `FastDataset`s meanwhile."""
     from lerobot.datasets import factory
 
@@ -74,6 +111,11 @@ def _reading_fast(frame_cache_bytes: int, on_replaced: Callable[[], None], *, ex
 
     def open_dataset(*args: Any, **kwargs: Any) -> FastDataset:
         nonlocal is_told
+        if is_frozen and kwargs.get("image_transforms") is not None:
+            raise ConfigError(
+                "--freeze-encoder keeps what the encoder made of each picture, so pictures must not change: leave out "
+                "--dataset.image_transforms.enable."
+            )
         if not is_told:
             on_replaced()
             is_told = True
@@ -84,6 +126,27 @@ def _reading_fast(frame_cache_bytes: int, on_replaced: Callable[[], None], *, ex
         yield
     finally:
         factory.LeRobotDataset = original
+
+
+@contextmanager
+def _freezing(limit_bytes: int) -> Iterator[None]:
+    """Policies that lerobot-train makes have a frozen encoder meanwhile."""
+    from lerobot.scripts import lerobot_train
+
+    from demorec.training.frozen import freeze_encoder
+
+    make_policy = lerobot_train.make_policy
+
+    def frozen(*args: Any, **kwargs: Any) -> Any:
+        policy = make_policy(*args, **kwargs)
+        freeze_encoder(policy, num_frames=kwargs["ds_meta"].total_frames, limit_bytes=limit_bytes)
+        return policy
+
+    lerobot_train.make_policy = frozen
+    try:
+        yield
+    finally:
+        lerobot_train.make_policy = make_policy
 
 
 @contextmanager

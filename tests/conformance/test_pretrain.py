@@ -1,0 +1,265 @@
+"""demorec pretrain and demorec train --freeze-encoder, with LeRobot's own ACT and its own training."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.export import info
+
+from demorec.cli import generate_dataset_main, main
+
+pytestmark = pytest.mark.usefixtures("hf_datasets_cache")
+
+POLICY: dict[str, Any] = {
+    "type": "act",
+    "device": "cpu",
+    "push_to_hub": False,
+    "dim_model": 16,
+    "n_heads": 2,
+    "dim_feedforward": 32,
+    "n_encoder_layers": 1,
+    "use_vae": False,
+    "dropout": 0.0,
+    "chunk_size": 8,
+    "n_action_steps": 4,
+    "pretrained_backbone_weights": None,
+    "normalization_mapping": {"VISUAL": "MEAN_STD", "STATE": "MEAN_STD", "ACTION": "MEAN_STD"},
+}
+
+
+@pytest.fixture(scope="module")
+def settings(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Settings of a training on three demonstrations with two small cameras."""
+    folder = tmp_path_factory.mktemp("pretrain")
+    words = ["--num-episodes", "3", "--split", "train", "--cameras", "workspace", "wrist", "--width", "32"]
+    with pytest.raises(SystemExit) as ended:
+        generate_dataset_main([*words, "--height", "24", "--no-export", "--workers", "1", "--out", str(folder / "run")])
+    assert ended.value.code == 0
+    run, dataset = str(folder / "run"), folder / "dataset"
+    assert ends("export", "lerobot", run, "--out", str(dataset), "--action", "ee_delta", "--state", "joint_ee") == 0
+    plain = {
+        "dataset": {"repo_id": "local/test", "root": str(dataset), "video_backend": "pyav"},
+        "policy": POLICY,
+        "batch_size": 4,
+        "steps": 6,
+        "save_freq": 3,
+        "num_workers": 0,
+        "log_freq": 1,
+    }
+    path = folder / "settings.json"
+    path.write_text(json.dumps(plain))
+    return path
+
+
+def ends(*words: str) -> int:
+    with pytest.raises(SystemExit) as ended:
+        main(list(words))
+    assert isinstance(ended.value.code, int)
+    return ended.value.code
+
+
+def pretrain(settings: Path, out: Path, *more: str) -> int:
+    words = [f"--config_path={settings}", "--out", str(out), "--num-updates", "6", "--frames-per-update", "4"]
+    return ends("pretrain", *words, *more)
+
+
+def weights(folder: Path) -> dict[str, np.ndarray[Any, Any]]:
+    from safetensors.numpy import load_file
+
+    return load_file(folder / "model.safetensors")
+
+
+@pytest.fixture(scope="module")
+def taught(settings: Path) -> Path:
+    out = settings.parent / "taught"
+    assert pretrain(settings, out) == 0
+    return out
+
+
+def test_what_it_tells_is_what_the_left_out_episode_shows(
+    settings: Path, taught: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The figure of an encoder that knows nothing, from the table itself; a second call does nothing and tells it."""
+    import pyarrow.parquet as pq
+
+    table = pq.read_table(next((settings.parent / "dataset" / "data").rglob("*.parquet")))
+    episode, pose = table["episode_index"].to_numpy(), np.stack(table["observation.ee_pose"].to_numpy())[:, :3]
+    is_open = np.stack(table["action"].to_numpy())[:, -1] > 0.04
+    ahead = [
+        next((k for k in range(i + 1, len(pose)) if episode[k] == episode[i] and is_open[k] != is_open[k - 1]), None)
+        for i in range(len(pose))
+    ]
+    last = {number: np.flatnonzero(episode == number)[-1] for number in (0, 1, 2)}
+    then = np.array([last[episode[i]] if k is None else k for i, k in enumerate(ahead)])
+    offset = pose[then] - pose
+    blind = np.median(np.linalg.norm(offset[episode == 2] - offset[episode < 2].mean(0), axis=1))
+    found = json.loads((taught / "pretraining.json").read_text())["taught"]
+    assert found["blind_m"] == pytest.approx(blind, abs=2e-5)
+    assert found["episodes"] == 1
+    assert 0 < found["median_m"] <= found["most_m"] < 2
+    before = {path: path.stat().st_mtime_ns for path in taught.glob("[!.]*")}
+    assert pretrain(settings, taught) == 0
+    assert f"next keyframe {1000 * found['median_m']:.1f} mm off" in capsys.readouterr().out
+    assert {path: path.stat().st_mtime_ns for path in taught.glob("[!.]*")} == before
+    assert "unfinished.pt" not in {path.name for path in before}
+
+
+def test_lerobot_loads_the_policy_and_its_encoder_sees_as_taught(settings: Path, taught: Path) -> None:
+    """ACT's own encoder with frozen normalisation makes of pictures what the taught one makes of them."""
+    import torch
+    from lerobot.policies.act.modeling_act import ACTPolicy
+
+    from demorec.training.encoder import KeyframeEncoder
+
+    policy = ACTPolicy.from_pretrained(taught)
+    network = KeyframeEncoder(policy.config, num_cameras=2, state_dim=15, num_targets=5)
+    pictures = torch.randn(3, 3, 24, 32, generator=torch.Generator().manual_seed(0))
+    for _ in range(3):
+        network.backbone(pictures * 2 + 1)  # so that the statistics are not those of the start
+    network.eval()
+    with torch.no_grad():
+        expected = network.backbone(pictures)["feature_map"]
+        before = policy.model.backbone(pictures)["feature_map"]
+        policy.model.backbone.load_state_dict(network.weights())
+        found = policy.model.backbone(pictures)["feature_map"]
+    assert not torch.allclose(before, expected, atol=1e-2)
+    torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-4)
+
+
+def test_a_killed_call_goes_on_to_the_same_weights(settings: Path, taught: Path, tmp_path: Path) -> None:
+    out = tmp_path / "killed"
+    program = (
+        "import sys; from demorec.training import pretrain as p; from demorec.training.command import training_config; "
+        "from pathlib import Path; "
+        "p.pretrain(training_config([sys.argv[1]]), p.Teaching(updates=6, batch_size=4, seed=1000), Path(sys.argv[2]), "
+        "frame_cache_bytes=1 << 28, on_progress=lambda done, loss: print(done, flush=True), save_every=2)"
+    )
+    command = [sys.executable, "-c", program, f"--config_path={settings}", str(out)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline().strip() == "2"
+        os.kill(process.pid, signal.SIGKILL)
+    assert (out / "unfinished.pt").exists()
+    assert not (out / "model.safetensors").exists()
+    told = subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
+    assert told in (["4", "6"], ["6"])
+    one, other = weights(taught), weights(out)
+    assert one.keys() == other.keys()
+    for name in one:
+        np.testing.assert_array_equal(one[name], other[name], err_msg=name)
+
+
+def test_another_teaching_in_the_folder_is_refused(
+    settings: Path, taught: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert pretrain(settings, taught, "--learning-rate", "0.01") == 2
+    assert "Another encoder is taught in this folder (another learning_rate), choose another --out" in (
+        capsys.readouterr().err
+    )
+    (tmp_path / "mine.txt").write_text("keep")
+    assert pretrain(settings, tmp_path) == 2
+    assert "holds something else (mine.txt)" in capsys.readouterr().err
+    assert {path.name for path in tmp_path.iterdir()} == {"mine.txt", ".lock"}
+
+
+def test_damage_is_told(settings: Path, tmp_path: Path, taught: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    plain = json.loads((taught / "pretraining.json").read_text())
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "pretraining.json").write_text(json.dumps({"settings": plain["settings"]}))
+    (out / "unfinished.pt").write_bytes(b"PK\x03\x04 nothing of torch")
+    assert pretrain(settings, out) == 1
+    assert "is damaged, delete it to begin anew" in capsys.readouterr().err
+    (out / "pretraining.json").write_text('{"settings": 3}')
+    assert pretrain(settings, out) == 1
+    assert "pretraining.json is damaged" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["--policy.type=diffusion"], "Only the encoder of an ACT policy can be taught"),
+        (["--num-updates=0"], "--num-updates is 0"),
+        (["--config_path=nothing.json"], "There is no such file of settings: nothing.json"),
+    ],
+)
+def test_wrong_requests(
+    settings: Path, tmp_path: Path, words: list[str], sentence: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = [f"--config_path={settings}"] if not any("config_path" in word for word in words) else []
+    if "--policy.type=diffusion" in words:
+        plain = json.loads(settings.read_text())
+        plain["policy"] = {"type": "diffusion", "device": "cpu", "push_to_hub": False}
+        given, words = [f"--config_path={tmp_path / 'other.json'}"], []
+        (tmp_path / "other.json").write_text(json.dumps(plain))
+    assert ends("pretrain", *given, "--out", str(tmp_path / "out"), *words) == 2
+    assert sentence in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_dataset_that_does_not_tell_where_the_hand_is(
+    settings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, dataset = str(settings.parent / "run"), tmp_path / "joints"
+    features = ["observation.images.workspace", "observation.images.wrist"]
+    assert ends("export", "lerobot", run, "--out", str(dataset), "--features", *features) == 0
+    assert "observation.ee_pose" not in info(dataset)["features"]
+    capsys.readouterr()
+    assert pretrain(settings, tmp_path / "out", f"--dataset.root={dataset}") == 2
+    assert "lacks tcp.x to tcp.qw in observation.ee_pose or observation.state: demorec export lerobot --state" in (
+        capsys.readouterr().err
+    )
+
+
+def train(settings: Path, out: Path, *more: str) -> tuple[list[float], Path]:
+    """Losses, and the last checkpoint, of `demorec train` in a process of its own."""
+    command = [
+        str(Path(sys.executable).parent / "demorec"),
+        "train",
+        f"--config_path={settings}",
+        f"--output_dir={out}",
+    ]
+    done = subprocess.run([*command, *more], capture_output=True, text=True, check=False)
+    text = done.stdout + done.stderr
+    assert done.returncode == 0, text[-3000:]
+    return [float(loss) for loss in re.findall(r"step:\S+ .*?loss:(\S+)", text)], (
+        out / "checkpoints" / "last" / "pretrained_model"
+    )
+
+
+@pytest.mark.slow
+def test_a_frozen_encoder_stays_as_it_was_taught(settings: Path, taught: Path, tmp_path: Path) -> None:
+    """With and without keeping its maps the losses are the same; without freezing, the encoder is trained."""
+    path = f"--policy.path={taught}"
+    kept, one = train(settings, tmp_path / "kept", path, "--freeze-encoder")
+    afresh, _ = train(settings, tmp_path / "afresh", path, "--freeze-encoder", "--frame-cache-mb=0")
+    _, trained = train(settings, tmp_path / "trained", path)
+    assert len(kept) >= 6
+    assert kept == pytest.approx(afresh, abs=2e-3)
+    before, after, other = weights(taught), weights(one), weights(trained)
+    assert before.keys() == after.keys() == other.keys()
+    encoder = [name for name in before if name.startswith("model.backbone.")]
+    assert len(encoder) > 80
+    for name in encoder:
+        np.testing.assert_array_equal(before[name], after[name], err_msg=name)
+    assert not np.array_equal(before["model.backbone.conv1.weight"], other["model.backbone.conv1.weight"])
+    assert not np.array_equal(before["model.action_head.weight"], after["model.action_head.weight"])
+
+
+def test_there_must_be_an_encoder_to_freeze(settings: Path, tmp_path: Path) -> None:
+    augmented = "--dataset.image_transforms.enable=true"
+    command = [str(Path(sys.executable).parent / "demorec"), "train", f"--config_path={settings}", augmented]
+    done = subprocess.run(
+        [*command, f"--output_dir={tmp_path / 'out'}", "--freeze-encoder"], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 2
+    assert "so pictures must not change: leave out --dataset.image_transforms.enable." in done.stderr
