@@ -21,7 +21,8 @@ class Pretrain:
 
     Examples:
       demorec pretrain --config_path=examples/act_pictures.json --out outputs/eye
-      demorec train --config_path=examples/act_pictures.json --policy.path=outputs/eye --freeze-encoder
+      demorec train --config_path=examples/act_pictures.json \\
+          --policy.path=outputs/eye --freeze-encoder
     """
 
     out: Path

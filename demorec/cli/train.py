@@ -16,7 +16,8 @@ class Train:
 
     Examples:
       demorec train --config_path=examples/act_numbers.json
-      demorec train --config_path=examples/act_pictures.json --policy.path=outputs/eye --freeze-encoder
+      demorec train --config_path=examples/act_pictures.json \\
+          --policy.path=outputs/eye --freeze-encoder
       demorec train --dataset.repo_id=lerobot/pusht --policy.type=diffusion
     """
 

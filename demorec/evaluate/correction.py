@@ -18,14 +18,14 @@ from demorec.loop import Episode
 from demorec.loop.agents import Decision
 from demorec.loop.noise import ActionNoise
 from demorec.recording import Recording
-from demorec.scene.episode import POLICY_PHASE
+from demorec.scene.episode import HALT_PHASE, POLICY_PHASE
 from demorec.tasks.recovery import TAKE_OVER
 from demorec.tasks.script import Behaviour, Step
 from demorec.tasks.skills import Expert, GaveUp
 
 TAKE_OVER_EVENT, _MESSAGE = "take_over", "the expert takes over: "
 HAND_BACK_EVENT = "hand_back"
-_RECOVERY = (TAKE_OVER, "recover", "perceive")
+_RECOVERY = (HALT_PHASE, TAKE_OVER, "recover", "perceive")
 """Phases in which the expert is not yet back where demonstrations go."""
 
 

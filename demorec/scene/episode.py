@@ -21,6 +21,9 @@ from demorec.scene.scene import Scene
 
 POLICY_PHASE = "policy"
 """Phase of the frames in which a policy acts, or somebody else who tells no phase; all others are the expert's."""
+HALT_PHASE = "halt"
+"""Phase in which an expert that has taken over does nothing yet but stop the arm. That is not to be learned: it stops
+in states in which a demonstration goes on."""
 MISTAKEN_PHASE, CORRECTED_PHASE = "mistake", "correct"
 """Phases of an episode with an interjection: the wrong thing is gone for; what was said is listened to."""
 INTERJECTION_EVENT = "interjection"

@@ -13,6 +13,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from demorec.geometry import wrap_angle
+from demorec.scene.episode import HALT_PHASE
 from demorec.scene.motion import PEAK_VELOCITY, quintic, slowdown
 from demorec.scene.scene import Goal
 from demorec.sim.world import World
@@ -22,7 +23,7 @@ from demorec.tasks.skills import Expert, GaveUp
 from demorec.tasks.success import placement_checks, resting_half_height
 
 TAKE_OVER = "take_over"
-"""Phase in which the arm is stopped and brought to where a script can begin."""
+"""Phase in which the arm, stopped, is brought to where a script can begin."""
 _STOP_SECONDS, _STOPPED = 0.3, 0.05
 """The arm is held for so long, or until no joint is faster (rad/s)."""
 _CLEARANCE = 0.03
@@ -49,15 +50,27 @@ def finish(expert: Expert, goals: Sequence[Goal]) -> Iterator[Step]:
     yield from _stop(expert, holding=bool(held))
     if held and expert.holds(held):
         yield from _place_held(expert, held, goals)
-    yield from _stand_clear(expert)
+    begun = _begun(expert, goals)
+    if begun is None:
+        yield from _stand_clear(expert)
     for _ in range(_ROUNDS):
         for goal in goals:
             if not is_served(expert.world, goal):
-                yield from _serve(expert, goal)
+                yield from _serve(expert, goal, is_begun=goal is begun)
+                begun = None
         if all(is_served(expert.world, goal) for goal in goals):
             return
     unserved = next(goal for goal in goals if not is_served(expert.world, goal))
     raise GaveUp(expert.phase, f"unserved_{unserved.object}")
+
+
+def _begun(expert: Expert, goals: Sequence[Goal]) -> Goal | None:
+    """The first goal to be served, if the open hand is above its object and needs but to descend.
+
+    Whoever halts there is shown the way on: to rise and to come again would contradict every demonstration.
+    """
+    goal = next((goal for goal in goals if not is_served(expert.world, goal)), None)
+    return goal if goal is not None and _is_open(expert) and expert.is_above_object(goal.object) else None
 
 
 def begin_again(expert: Expert) -> Iterator[Step]:
@@ -71,10 +84,10 @@ def _stand_clear(expert: Expert) -> Iterator[Step]:
         yield from _rise(expert)
 
 
-def _serve(expert: Expert, goal: Goal) -> Iterator[Step]:
+def _serve(expert: Expert, goal: Goal, *, is_begun: bool) -> Iterator[Step]:
     """Pick and place; once more from home where the arm stands so that no straight line leads on."""
     try:
-        yield from expert.pick_and_place(goal)
+        yield from expert.pick_and_place(goal, is_begun=is_begun)
     except GaveUp as error:
         if error.reason != "unreachable":
             raise
@@ -103,7 +116,7 @@ def _held(expert: Expert) -> str:
 def _stop(expert: Expert, *, holding: bool) -> Iterator[Step]:
     """Hold the arm where it is until it stands still, with the hand closed around what it holds."""
     world = expert.world
-    expert.phase = TAKE_OVER
+    expert.phase = HALT_PHASE
     if holding:
         expert.gripper_target = 0.0
     number = len(expert.joint_target)
@@ -112,7 +125,8 @@ def _stop(expert: Expert, *, holding: bool) -> Iterator[Step]:
         yield expert.step()
         _, velocity, _ = world.arm.joint_states()
         if float(np.abs(velocity[:number]).max()) < _STOPPED:
-            return
+            break
+    expert.phase = TAKE_OVER
 
 
 def _place_held(expert: Expert, name: str, goals: Sequence[Goal]) -> Iterator[Step]:
@@ -125,15 +139,18 @@ def _place_held(expert: Expert, name: str, goals: Sequence[Goal]) -> Iterator[St
         if not is_served(expert.world, wanted):
             break
     try:
-        yield from expert.place(goal)
+        yield from expert.place(goal, is_begun=True)
     except GaveUp:
         expert.phase = TAKE_OVER
 
 
 def _is_clear(expert: Expert) -> bool:
     """Whether the hand is open and so high that it may go anywhere."""
-    is_open = expert.world.arm.gripper_width() > expert.open_width - 0.01
-    return is_open and expert.tcp().position[2] >= _lowest_clear(expert)
+    return _is_open(expert) and expert.tcp().position[2] >= _lowest_clear(expert)
+
+
+def _is_open(expert: Expert) -> bool:
+    return expert.world.arm.gripper_width() > expert.open_width - 0.01
 
 
 def _lowest_clear(expert: Expert) -> float:

@@ -16,7 +16,7 @@ import numpy as np
 from demorec.geometry import Array, Pose, wrap_angle
 from demorec.scene.episode import Action, Event
 from demorec.scene.motion import MotionLimits, plan_straight
-from demorec.scene.scene import Body, Goal, yaw_of
+from demorec.scene.scene import Goal, yaw_of
 from demorec.sim.world import World
 from demorec.tasks.grasping import grasp_yaws, grasps_beside, hand_down, hand_yaw, raised, symmetric_yaws
 from demorec.tasks.script import Behaviour, Step
@@ -35,6 +35,8 @@ LOST_WIDTH = 0.012
 """Opening, metres, below which the hand holds nothing."""
 TRANSPORT_HEIGHT = 0.10
 """Above the goal, metres."""
+ABOVE_M, ABOVE_RAD = 0.01, 0.09
+"""How far the hand may be beside where it is going to be lowered to, so that it need not rise and come again."""
 
 
 class GaveUp(Exception):
@@ -190,8 +192,12 @@ class Expert:
             if done():
                 return
 
-    def pick_and_place(self, goal: Goal) -> Iterator[Step]:
+    def pick_and_place(self, goal: Goal, *, is_begun: bool = False) -> Iterator[Step]:
         """Bring one object to its goal, trying again after a miss, a drop or a bad placement.
+
+        Args:
+            goal: Of the object.
+            is_begun: As of `pick`, at the first try.
 
         Raises:
             GaveUp: Out of reach, or three tries were not enough.
@@ -200,7 +206,7 @@ class Expert:
             if attempt > 0:
                 self.num_retries += 1
             self._missing = self.behaviour.misses and not self._has_missed and attempt == 0
-            picked = yield from self.pick(goal.object)
+            picked = yield from self.pick(goal.object, is_begun=is_begun and attempt == 0)
             self._missing = False
             if not picked:
                 continue
@@ -215,18 +221,23 @@ class Expert:
         Raises:
             GaveUp: Out of reach at every yaw.
         """
-        pose = self.world.pose(name)
-        grasps = [self._perturbed(grasp) for grasp in self._grasps(self.world.body(name), pose)]
         found = None
         if self._missing:
+            grasps = self._grasps(name)
             found = self._first_reachable((m for grasp in grasps for m in self._grasps_beside(name, grasp)), above_by)
             self._missing = self._has_missed = found is not None
-        found = found or self._first_reachable(grasps, above_by)
+        found = found or self._first_reachable(self._grasps(name), above_by)
         if found is not None:
             self.note("grasp", f"grasp {name} at yaw {hand_yaw(found):.4f} rad")
             return found
-        self.note("unreachable", f"{name} at {np.round(pose.position, 3).tolist()} is out of reach", trouble=True)
+        place = np.round(self.world.pose(name).position, 3).tolist()
+        self.note("unreachable", f"{name} at {place} is out of reach", trouble=True)
         raise GaveUp(self.phase, "unreachable")
+
+    def is_above_object(self, name: str) -> bool:
+        """Whether the hand needs but to be lowered to grasp an object."""
+        grasp = self._first_reachable(self._grasps(name), self.behaviour.approach_height)
+        return grasp is not None and self.is_above(grasp)
 
     def reachable_place(self, position: tuple[float, float, float]) -> Pose:
         """`world_from_tcp` at a position, the hand pointing down at the reachable yaw nearest to the present one.
@@ -242,8 +253,13 @@ class Expert:
             raise GaveUp(self.phase, "unreachable")
         return place
 
-    def pick(self, name: str) -> Generator[Step, None, bool]:
-        """Grasp and lift an object; the generator returns whether it is held."""
+    def pick(self, name: str, *, is_begun: bool = False) -> Generator[Step, None, bool]:
+        """Grasp and lift an object; the generator returns whether it is held.
+
+        Args:
+            name: Of the object.
+            is_begun: Somebody else has brought the hand here: do not approach if it is above the object already.
+        """
         world, behaviour = self.world, self.behaviour
         self.phase = "perceive"
         above_by = behaviour.approach_height
@@ -253,7 +269,8 @@ class Expert:
         self.phase = "approach"
         self.gripper_target = self.open_width
         self._clear_height = -math.inf
-        yield from self.move(raised(grasp, above_by), speed=FREE_SPEED, free=True)
+        if not (is_begun and self.is_above(grasp)):
+            yield from self.move(raised(grasp, above_by), speed=FREE_SPEED, free=True)
         self.phase = "descend"
         yield from self.move(grasp, speed=DESCEND_SPEED, until=lambda: world.pressed_from_above(name))
 
@@ -276,20 +293,28 @@ class Expert:
         """Whether both fingers press on an object that keeps them apart."""
         return self.world.grip_force(name) > 0.5 and self.world.arm.gripper_width() > 0.01
 
-    def place(self, goal: Goal) -> Generator[Step, None, bool]:
-        """Carry the held object to its goal and let go; the generator returns whether it lies well."""
+    def is_above(self, wanted: Pose) -> bool:
+        """Whether the hand needs but to be lowered to get to `world_from_tcp`."""
+        here = self.tcp()
+        beside = math.dist(here.position[:2], wanted.position[:2])
+        turn = 2 * math.acos(min(1.0, abs(float(np.dot(here.quat_xyzw, wanted.quat_xyzw)))))
+        return bool(beside < ABOVE_M and turn < ABOVE_RAD and here.position[2] >= wanted.position[2])
+
+    def place(self, goal: Goal, *, is_begun: bool = False) -> Generator[Step, None, bool]:
+        """Carry the held object to its goal and let go; the generator returns whether it lies well.
+
+        Args:
+            goal: Of the object.
+            is_begun: Somebody else has brought the hand here: only lower it if it is above the goal already.
+        """
         world = self.world
         name = goal.object
         self.phase = "transport"
         wanted = self._place_pose(goal)
-        height = self._transport_height(wanted)
-        if self.tcp_target().position[2] < height - 1e-3:
-            here = self.tcp_target()
-            yield from self.move(raised(here, height - here.position[2]), speed=LIFT_SPEED)
-        self.note("place", f"place {name} at hand yaw {hand_yaw(wanted):.4f} rad")
-        yield from self.move(
-            raised(wanted, height - wanted.position[2]), speed=FREE_SPEED, free=True, until=lambda: not self._is_full()
-        )
+        if is_begun and self.is_above(wanted):
+            self._note_place(name, wanted)
+        else:
+            yield from self._carry(name, wanted)
         if self._is_full():
             self.phase = "lower"
             wanted = self._place_pose(goal, keep_yaw=True)
@@ -320,6 +345,20 @@ class Expert:
             self.note(f"misplaced_{failed[0]}", f"{name} lies badly: {', '.join(failed)}", trouble=True)
         return not failed
 
+    def _note_place(self, name: str, wanted: Pose) -> None:
+        self.note("place", f"place {name} at hand yaw {hand_yaw(wanted):.4f} rad")
+
+    def _carry(self, name: str, wanted: Pose) -> Iterator[Step]:
+        """Rise with what is held, and bring it above where `world_from_tcp` will put it."""
+        height = self._transport_height(wanted)
+        if self.tcp_target().position[2] < height - 1e-3:
+            here = self.tcp_target()
+            yield from self.move(raised(here, height - here.position[2]), speed=LIFT_SPEED)
+        self._note_place(name, wanted)
+        yield from self.move(
+            raised(wanted, height - wanted.position[2]), speed=FREE_SPEED, free=True, until=lambda: not self._is_full()
+        )
+
     def _transport_height(self, place: Pose) -> float:
         """Height of the TCP, m, on the way to a place: never lower than now."""
         return float(max(self.tcp_target().position[2], place.position[2] + TRANSPORT_HEIGHT))
@@ -339,8 +378,9 @@ class Expert:
         yield from self.move(world_from_tcp, speed=0.4, free=True)
         self._clear_height = -math.inf
 
-    def _grasps(self, body: Body, pose: Pose) -> list[Pose]:
-        """Grasp poses `world_from_tcp` of a body, the yaw nearest to the hand's present one first."""
+    def _grasps(self, name: str) -> list[Pose]:
+        """Grasp poses `world_from_tcp` with the behaviour's errors, the yaw nearest to the hand's present one first."""
+        body, pose = self.world.body(name), self.world.pose(name)
         gripper = self.world.robot.gripper
         half = resting_half_height(body, pose)
         top, bottom = pose.position[2] + half, pose.position[2] - half
@@ -348,7 +388,7 @@ class Expert:
         z = max(pose.position[2], top - (gripper.palm_clearance - 0.007), bottom + gripper.finger_depth + 0.005)
         now = hand_yaw(self.tcp())
         yaws = sorted(grasp_yaws(body, pose, now, self.open_width), key=lambda yaw: abs(wrap_angle(yaw - now)))
-        return [hand_down((pose.position[0], pose.position[1], z), yaw) for yaw in yaws]
+        return [self._perturbed(hand_down((pose.position[0], pose.position[1], z), yaw)) for yaw in yaws]
 
     def _grasps_beside(self, name: str, grasp: Pose) -> list[Pose]:
         """Where the hand misses an object as the behaviour wants it."""

@@ -91,7 +91,7 @@ def test_a_stuck_policy_is_corrected_and_the_episode_replays(rollout: tuple[Atte
         assert recording.outcome is not None
         assert recording.outcome.success
         (event,) = [event for _, event in recording.events() if event.name == "take_over"]
-    handover = phases.index("take_over")
+    handover = phases.index("halt")
     assert FPS < handover < 3 * FPS
     assert set(phases[:handover]) == {POLICY_PHASE}
     assert POLICY_PHASE not in phases[handover:]
@@ -119,7 +119,7 @@ def test_the_dataset_tells_who_acted(rollout: tuple[Attempt, Path], tmp_path: Pa
     export(rollout[1], tmp_path / "dataset", intervention=True)
     assert info(tmp_path / "dataset")["features"]["intervention"] == {"dtype": "bool", "shape": [1], "names": None}
     with Recording(rollout[1]) as recording:
-        acted = [frame.phase != "policy" for frame in recording]
+        acted = [frame.phase not in ("policy", "halt") for frame in recording]
     column = data_table(tmp_path / "dataset").column("intervention").to_pylist()
     assert column == acted
     assert set(column) == {False, True}
@@ -243,12 +243,12 @@ def test_who_strays_is_corrected(expert_poses: Array, hand_back: bool) -> None:
     turns, frames = act_in_turns(Wanderer(expert_poses, astray_from=20, drift=0.01), rules)
     assert turns.success
     phases = [frame.phase for frame in frames]
-    assert phases.index("take_over") in range(29, 34)
+    assert phases.index("halt") in range(29, 34)
     events = [event for frame in frames for event in frame.events if event.name in ("take_over", "hand_back")]
     assert events[0].message == "the expert takes over: the policy strays"
-    assert (POLICY_PHASE in phases[phases.index("take_over") :]) == hand_back
+    assert (POLICY_PHASE in phases[phases.index("halt") :]) == hand_back
     assert [event.name for event in events[:2]] == ["take_over", "hand_back"][: 1 + hand_back]
-    before = frames[phases.index("take_over") - 1]
+    before = frames[phases.index("halt") - 1]
     assert np.array_equal(before.action.joint_target, before.command.joint_target)  # what it did is what it said
 
 
@@ -270,7 +270,9 @@ def test_who_is_handed_back_to_is_told_and_the_episode_replays(expert_poses: Arr
     report, _ = next(iter(replay_all([open_file(path, options)], options)))
     assert report.is_identical, report
     export(path, tmp_path / "dataset", intervention=True)
-    assert data_table(tmp_path / "dataset").column("intervention").to_pylist() == (~by_policy).tolist()
+    assert data_table(tmp_path / "dataset").column("intervention").to_pylist() == [
+        phase not in (POLICY_PHASE, "halt") for phase in columns.phase
+    ]
     checked = check_subject(Subject(path=path, kind="recording"), CheckOptions())
     failed = [result.check for result in checked.results if result.level == "fail"]
     assert failed == ["action_acceleration"]  # the wanderer jumps to where it would be, once it is handed back to

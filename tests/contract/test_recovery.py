@@ -11,6 +11,7 @@ from support.tasks import tasks_with_slow_ones
 
 from demorec.geometry import Array, Pose, quat_multiply
 from demorec.loop import Episode, ScriptAgent, Session, make_world
+from demorec.scene.episode import HALT_PHASE
 from demorec.sim.world import World
 from demorec.tasks.grasping import hand_down, raised
 from demorec.tasks.recovery import TAKE_OVER, is_served
@@ -97,10 +98,35 @@ def test_the_expert_finishes_from_any_state(spoil: Spoil) -> None:
         moved = float(np.abs(world.pose(goal.object).position - start).max())
         assert (moved > 0.03) == (spoil in (push_away, carry_tilted)), "it is not the state that the test is about"
         steps = taken_over(world, prepared)
-        assert steps[0].phase == TAKE_OVER
+        assert steps[0].phase == HALT_PHASE
         assert failed_conditions(world, prepared) == []
         phases = {step.phase for step in steps}
         assert ("approach" in phases) == (spoil is not carry_tilted), "what is held is not let go first"
+
+
+@pytest.mark.parametrize(("phase", "after"), [("descend", "close"), ("lower", "release")])
+def test_who_halts_above_the_place_is_shown_the_way_down(phase: str, after: str) -> None:
+    """Rising and coming again would contradict every demonstration, which goes down from there."""
+    prepared = episode(2, variation="none")
+    with make_world(prepared.info) as world:
+        seen = 0
+        for frame in Session.of_episode(world, prepared).run(ScriptAgent(prepared)):
+            seen += frame.phase == phase
+            if seen == 7:
+                break
+        expert = Expert(world)
+        apply(world, (expert.step() for _ in range(20)))  # which holds the arm where it is
+        height = float(expert.tcp().position[2])
+        heights, phases = [], []
+        for step in prepared.task.resume(Expert(world, Behaviour(action_noise=0.0))):
+            world.apply(step.action)
+            heights.append(float(expert.tcp().position[2]))
+            phases.append(step.phase)
+        assert failed_conditions(world, prepared) == []
+        until = phases.index(after)
+        assert set(phases[:until]) <= {HALT_PHASE, "perceive", phase}
+        assert max(heights[:until]) < height + 0.003
+        assert min(heights[:until]) < height - 0.03, "it is not the state that the test is about"
 
 
 def test_what_is_served_is_left_alone() -> None:
@@ -111,7 +137,7 @@ def test_what_is_served_is_left_alone() -> None:
         assert is_served(world, goal)
         before = world.pose(goal.object).vector()
         steps = taken_over(world, prepared)
-        assert {step.phase for step in steps} == {TAKE_OVER}
+        assert {step.phase for step in steps} <= {HALT_PHASE, TAKE_OVER}
         np.testing.assert_allclose(world.pose(goal.object).vector(), before, atol=1e-4)
 
 
