@@ -38,7 +38,7 @@ from demorec.evaluate.statistics import Rate, cells
 INTERVENTION = "intervention"
 CORRECTION_SEED = 1
 """Root of the scenes that are corrected; those of the demonstrations have 0."""
-_ABSOLUTE = re.compile(r"tcp\.[xy]|\w+(\.goal)?\.[xy]|.*\.pose\..*|\w+\.pos|\w+\.vel")
+_ABSOLUTE = re.compile(r"tcp\.[xy]|\w+(\.goal)?\.[xy]|.*\.pose\..*|\w+\.pos")
 """Components that say where on the table something is, or how the arm stands. A hundred demonstrations are too few to
 learn that these do not matter, so that the policy is not shown them."""
 

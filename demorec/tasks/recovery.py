@@ -145,8 +145,8 @@ def _place_held(expert: Expert, name: str, goals: Sequence[Goal]) -> Iterator[St
 
 
 def _is_clear(expert: Expert) -> bool:
-    """Whether the hand is open and so high that it may go anywhere."""
-    return _is_open(expert) and expert.tcp().position[2] >= _lowest_clear(expert)
+    """Whether the hand is so high that it may go anywhere, and open, or empty: it then opens on its way."""
+    return (_is_open(expert) or not _held(expert)) and expert.tcp().position[2] >= _lowest_clear(expert)
 
 
 def _is_open(expert: Expert) -> bool:

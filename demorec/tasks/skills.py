@@ -35,8 +35,10 @@ LOST_WIDTH = 0.012
 """Opening, metres, below which the hand holds nothing."""
 TRANSPORT_HEIGHT = 0.10
 """Above the goal, metres."""
-ABOVE_M, ABOVE_RAD = 0.01, 0.09
+ABOVE_M, ABOVE_RAD = 0.01, 0.35
 """How far the hand may be beside where it is going to be lowered to, so that it need not rise and come again."""
+CARRIED_ABOVE_M = 0.04
+"""The same for what it holds: fingers must not come down on an object, but what is held may come down aslant."""
 
 
 class GaveUp(Exception):
@@ -293,12 +295,18 @@ class Expert:
         """Whether both fingers press on an object that keeps them apart."""
         return self.world.grip_force(name) > 0.5 and self.world.arm.gripper_width() > 0.01
 
-    def is_above(self, wanted: Pose) -> bool:
-        """Whether the hand needs but to be lowered to get to `world_from_tcp`."""
+    def is_above(self, wanted: Pose, *, beside: float = ABOVE_M) -> bool:
+        """Whether the hand needs but to be lowered to get to `world_from_tcp`.
+
+        Args:
+            wanted: Where to.
+            beside: So far aside it may be, metres; beyond a centimetre no farther than it is above.
+        """
         here = self.tcp()
-        beside = math.dist(here.position[:2], wanted.position[:2])
+        above = float(here.position[2] - wanted.position[2])
         turn = 2 * math.acos(min(1.0, abs(float(np.dot(here.quat_xyzw, wanted.quat_xyzw)))))
-        return bool(beside < ABOVE_M and turn < ABOVE_RAD and here.position[2] >= wanted.position[2])
+        aside = math.dist(here.position[:2], wanted.position[:2])
+        return above >= 0 and turn < ABOVE_RAD and aside < min(beside, max(ABOVE_M, above))
 
     def place(self, goal: Goal, *, is_begun: bool = False) -> Generator[Step, None, bool]:
         """Carry the held object to its goal and let go; the generator returns whether it lies well.
@@ -311,7 +319,7 @@ class Expert:
         name = goal.object
         self.phase = "transport"
         wanted = self._place_pose(goal)
-        if is_begun and self.is_above(wanted):
+        if is_begun and self.is_above(wanted, beside=CARRIED_ABOVE_M):
             self._note_place(name, wanted)
         else:
             yield from self._carry(name, wanted)
