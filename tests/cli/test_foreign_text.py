@@ -197,7 +197,7 @@ def test_an_unforeseen_error_leaves_a_report(capsys: pytest.CaptureFixture[str],
     assert len(err.splitlines()) == 1
 
 
-POLICIES = ("correct", "evaluate", "improve", "train")
+POLICIES = ("correct", "evaluate", "improve", "pretrain", "train")
 """Commands that read policies and the settings of trainings."""
 
 
