@@ -236,6 +236,11 @@ def _seen_from(tcp: Array, pose: Array) -> tuple[Array, Array]:
 def _near(pose: Array, origin: Array) -> Array:
     """(T, 3) offset d from another pose, base axes, each as d / (|d| + 2 cm): -1 .. 1, steep where it matters."""
     offset = pose[:, :3] - origin[:, :3]
+    return near_field(offset)
+
+
+def near_field(offset: Array) -> Array:
+    """Offsets (metres, any shape) as near-field components d / (|d| + NEAR), in -1..1 and steep around 0."""
     return np.asarray(offset / (np.abs(offset) + NEAR), dtype=np.float64)
 
 

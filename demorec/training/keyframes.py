@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from demorec.scene.features import near_field
+
 NUM_KEYFRAMES = 2
-_NEAR_M = 0.02
-"""Offsets are told as d / (|d| + 2 cm), too: steep where a centimetre decides."""
 
 Array = NDArray[np.float64]
 
@@ -83,26 +83,22 @@ def keyframe_targets(
         for axis, name in enumerate("xyz"):
             columns[f"keyframe_{k}.{name}"] = xyz[then, axis]
             columns[f"keyframe_{k}.from_tcp.{name}"] = offset[:, axis]
-            columns[f"keyframe_{k}.from_tcp.near_{name}"] = _near(offset[:, axis])
+            columns[f"keyframe_{k}.from_tcp.near_{name}"] = near_field(offset[:, axis])
         for axis, name in enumerate("xy"):
             columns[f"keyframe_{k}.from_tcp.hand_{name}"] = in_hand[:, axis]
-            columns[f"keyframe_{k}.from_tcp.near_hand_{name}"] = _near(in_hand[:, axis])
+            columns[f"keyframe_{k}.from_tcp.near_hand_{name}"] = near_field(in_hand[:, axis])
         for name, angle in (("yaw", yaw[then]), ("from_tcp.yaw", yaw[then] - yaw)):
             columns[f"keyframe_{k}.{name}.sin2"] = np.sin(2 * angle)  # two fingers: half a turn is the same
             columns[f"keyframe_{k}.{name}.cos2"] = np.cos(2 * angle)
     between = xyz[keyframes[:, 1]] - xyz[keyframes[:, 0]]
     for axis, name in enumerate("xyz"):
         columns[f"keyframe_1.from_keyframe_0.{name}"] = between[:, axis]
-        columns[f"keyframe_1.from_keyframe_0.near_{name}"] = _near(between[:, axis])
+        columns[f"keyframe_1.from_keyframe_0.near_{name}"] = near_field(between[:, axis])
     names = tuple(columns)
     x, y, z = (names.index(f"keyframe_0.from_tcp.{name}") for name in "xyz")
     return KeyframeTargets(
         values=np.stack(list(columns.values()), axis=1).astype(np.float32), names=names, offsets=(x, y, z)
     )
-
-
-def _near(offset: Array) -> Array:
-    return offset / (np.abs(offset) + _NEAR_M)
 
 
 def _yaw(quat_xyzw: Array) -> Array:

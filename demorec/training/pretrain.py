@@ -118,7 +118,12 @@ def pretrain(
     targets = read_targets(dataset)
     if not dataset.meta.camera_keys:
         raise ConfigError(f"The dataset has no pictures to learn from: {dataset.root}")
-    settings = {**asdict(teaching), "dataset": _digest(dataset), "policy": _deciding(config.policy)}
+    settings = {
+        **asdict(teaching),
+        "dataset": _digest(dataset),
+        "episodes": chosen.episodes,
+        "policy": _deciding(config.policy),
+    }
     out.mkdir(parents=True, exist_ok=True)
     with run_lock(out):
         done = _settle(out, settings)
@@ -310,7 +315,7 @@ def _deciding(policy: Any) -> dict[str, Any]:
 
 
 def _digest(dataset: FastDataset) -> str:
-    """Of the dataset's statistics, which no two datasets share."""
+    """Of the dataset's statistics, by which it is known again."""
     path = Path(dataset.root) / "meta" / "stats.json"
     return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
 

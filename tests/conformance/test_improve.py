@@ -15,25 +15,13 @@ from typing import Any
 import pytest
 from support.check import edit_json
 from support.export import data_table, info
+from support.training import SMALL_ACT
 
 from demorec.cli import generate_dataset_main, main
 from demorec.evaluate import improvement
 
 SETTINGS: dict[str, Any] = {
-    "policy": {
-        "type": "act",
-        "device": "cpu",
-        "push_to_hub": False,
-        "dim_model": 16,
-        "n_heads": 2,
-        "dim_feedforward": 32,
-        "n_encoder_layers": 1,
-        "use_vae": False,
-        "dropout": 0.0,  # LeRobot does not take its random numbers up again where they were
-        "chunk_size": 8,
-        "n_action_steps": 4,
-        "pretrained_backbone_weights": None,
-    },
+    "policy": SMALL_ACT,
     "batch_size": 4,
     "steps": 6,
     "save_freq": 2,

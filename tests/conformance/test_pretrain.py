@@ -14,24 +14,14 @@ from typing import Any
 import numpy as np
 import pytest
 from support.export import info
+from support.training import SMALL_ACT
 
 from demorec.cli import generate_dataset_main, main
 
 pytestmark = pytest.mark.usefixtures("hf_datasets_cache")
 
 POLICY: dict[str, Any] = {
-    "type": "act",
-    "device": "cpu",
-    "push_to_hub": False,
-    "dim_model": 16,
-    "n_heads": 2,
-    "dim_feedforward": 32,
-    "n_encoder_layers": 1,
-    "use_vae": False,
-    "dropout": 0.0,
-    "chunk_size": 8,
-    "n_action_steps": 4,
-    "pretrained_backbone_weights": None,
+    **SMALL_ACT,
     "normalization_mapping": {"VISUAL": "MEAN_STD", "STATE": "MEAN_STD", "ACTION": "MEAN_STD"},
 }
 

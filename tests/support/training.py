@@ -12,6 +12,21 @@ from numpy.typing import NDArray
 from demorec.recording.scheduling import ordinary_scheduling
 
 CAMERA, DEPTH = "observation.images.top", "observation.images.top_depth"
+SMALL_ACT: dict[str, Any] = {
+    "type": "act",
+    "device": "cpu",
+    "push_to_hub": False,
+    "dim_model": 16,
+    "n_heads": 2,
+    "dim_feedforward": 32,
+    "n_encoder_layers": 1,
+    "use_vae": False,
+    "dropout": 0.0,  # LeRobot does not take its random numbers up again where they were
+    "chunk_size": 8,
+    "n_action_steps": 4,
+    "pretrained_backbone_weights": None,
+}
+"""Settings of a policy whose training takes no time."""
 SIZE = 64
 """Of the pictures: the least that LeRobot's AV1 encoder takes."""
 
