@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
@@ -17,7 +18,7 @@ from demorec.export.options import ExportReport, ProgressCallback
 from demorec.export.sources import ExportSource, Intake, find_recordings, places_of
 from demorec.export.staging import CODED, staged_folder
 from demorec.lerobot.boxes import BoxWriter
-from demorec.lerobot.card import CardFacts, write_card
+from demorec.lerobot.card import CardFacts, has_own_card, write_card
 from demorec.lerobot.digest import combined_digest
 from demorec.lerobot.existing import Existing, features_to_append, link_files, open_existing
 from demorec.lerobot.hub import push_to_hub
@@ -25,6 +26,7 @@ from demorec.lerobot.inspect import episode_digests
 from demorec.lerobot.kind import DATASET, GROWING_DATASET
 from demorec.lerobot.layout import DatasetInfo
 from demorec.lerobot.options import ExportOptions
+from demorec.lerobot.paths import CARD_PATH
 from demorec.lerobot.progress import STAGE_COLUMNS, EpisodeProgress, read_progress, write_progress
 from demorec.lerobot.readings import Reading, readings
 from demorec.lerobot.sidecar import SidecarStart, SidecarWriter
@@ -62,6 +64,8 @@ def export_lerobot(
     ):
         if existing is not None:
             link_files(existing.root, folder)
+        elif options.overwrite and has_own_card(out):
+            shutil.copy2(out / CARD_PATH, folder / CARD_PATH)  # what somebody wrote outlives the dataset it was about
         export = _Export(folder, found, options, existing)
         report = export.run(progress)
         if verifier is not None:

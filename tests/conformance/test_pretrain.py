@@ -148,6 +148,22 @@ def test_a_killed_call_goes_on_to_the_same_weights(settings: Path, taught: Path,
         np.testing.assert_array_equal(one[name], other[name], err_msg=name)
 
 
+def test_bfloat16_teaches_nearly_the_same(settings: Path, taught: Path, tmp_path: Path) -> None:
+    """LeRobot's `use_amp`: the network computes with 8 bits of mantissa, its weights stay in float32."""
+    out = tmp_path / "bfloat16"
+    assert pretrain(settings, out, "--policy.use_amp=true") == 0
+    full, half = weights(taught), weights(out)
+    apart = []
+    for name in (name for name in full if name.startswith("model.backbone.")):
+        assert half[name].dtype == np.float32
+        apart.append(np.linalg.norm(full[name] - half[name]) / np.linalg.norm(full[name]))
+    assert 1e-4 < np.max(apart)
+    assert np.median(apart) < 0.05
+    told = [json.loads((folder / "pretraining.json").read_text())["taught"]["median_m"] for folder in (taught, out)]
+    assert told[0] != told[1]
+    assert told[0] == pytest.approx(told[1], rel=0.2)
+
+
 def test_another_teaching_in_the_folder_is_refused(
     settings: Path, taught: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -103,6 +103,19 @@ def test_an_edited_card_stays_when_the_dataset_is_appended_to(tmp_path: Path) ->
     assert "3 scripted demonstrations" in beside.read_text()
 
 
+def test_an_edited_card_stays_when_the_dataset_is_replaced(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "run", (6, 5), cameras=())
+    card, beside = tmp_path / "d" / "README.md", tmp_path / "d" / "demorec" / "README.md"
+    export(run, tmp_path / "d")
+    export(run, tmp_path / "d", episodes="0", overwrite=True)
+    assert "1 scripted demonstrations" in card.read_text()  # nobody has edited it, so it is replaced
+    assert not beside.exists()
+    card.write_text("what I found out about these")
+    export(run, tmp_path / "d", overwrite=True)
+    assert card.read_text() == "what I found out about these"
+    assert "2 scripted demonstrations" in beside.read_text()
+
+
 def test_thumbnails_are_labelled(tmp_path: Path) -> None:
     export(make_run(tmp_path / "run", (31, 16)), tmp_path / "d")
     sheet = np.asarray(Image.open(tmp_path / "d" / "demorec" / "thumbnails.jpg")).astype(int)
