@@ -1,4 +1,4 @@
-"""The command line: one file per command, exit codes, errors as one sentence.
+"""The command line: one file per command, `shared` for what they have in common, exit codes, errors as one sentence.
 
 Exit codes: 0 done; 1 it did not work, a check failed, or data are damaged; 2 the request was wrong (an impossible
 option, a missing path, a target that is in the way); 130 interrupted.
@@ -16,8 +16,8 @@ from collections.abc import Sequence
 from importlib.metadata import version
 from typing import Protocol
 
-from demorec.cli.flags import parse, terminal_width
-from demorec.cli.output import PrintableFormatter, say, tell
+from demorec.cli.shared.flags import parse, terminal_width
+from demorec.cli.shared.output import PrintableFormatter, say, tell
 from demorec.errors import DemorecError, OptionError, resource_error
 from demorec.registry import Registry, nearest_match
 

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 from tyro.conf import Positional
 
-from demorec.cli.allow import Allow, allowed_modules
-from demorec.cli.output import counted, say, say_json
-from demorec.cli.paths import places_read, refuse_inside
-from demorec.cli.progress import ProgressBar
+from demorec.cli.shared.allow import Allow, allowed_modules
+from demorec.cli.shared.output import counted, say, say_json
+from demorec.cli.shared.paths import places_read, refuse_inside
+from demorec.cli.shared.progress import ProgressBar
 from demorec.errors import ConfigError, OptionError
 from demorec.safety.replacing import PICTURE, check_replaceable
 
@@ -107,7 +107,7 @@ class Check:
         failed = [report for report in reports if report.is_bad(strict=self.strict)]
         diverged = [replayed for replayed in replays if not _as_recorded(replayed)]
         different = [report for report in remade if report.level == "fail" or (self.strict and report.level == "warn")]
-        from demorec.cli.deep import deep_summary, plain_deep
+        from demorec.cli.check_deep import deep_summary, plain_deep
 
         if self.json:
             plain = [_plain(report) for report in reports] + [_plain_replay(r) for r in replays]
@@ -118,7 +118,7 @@ class Check:
         return 1 if failed or diverged or different else 0
 
     def _remade(self, subjects: Sequence[Subject], options: CheckOptions) -> Iterator[DeepReport]:
-        from demorec.cli.deep import deep_lines
+        from demorec.cli.check_deep import deep_lines
         from demorec.replay.deep import deep_checks, deep_dataset_checks
 
         paths = [subject.path for subject in subjects if subject.kind == "recording"]

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from demorec.cli.output import say
-from demorec.cli.rollout_flags import RolloutFlags, Split
+from demorec.cli.shared.output import say
+from demorec.cli.shared.rollout_flags import RolloutFlags, Split
 from demorec.errors import ConfigError
 from demorec.evaluate.moments import TakeOver
 

@@ -6,8 +6,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from demorec.cli.output import say, say_json
-from demorec.cli.rollout_flags import RolloutFlags, Split
+from demorec.cli.shared.output import say, say_json
+from demorec.cli.shared.rollout_flags import RolloutFlags, Split
 from demorec.errors import ConfigError
 
 if TYPE_CHECKING:

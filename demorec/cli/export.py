@@ -10,9 +10,9 @@ from typing import Annotated, Any
 from tyro.conf import Positional, arg
 from tyro.constructors import MISSING_NONPROP
 
-from demorec.cli.output import counted, say
-from demorec.cli.paths import refuse_inside
-from demorec.cli.progress import ProgressBar
+from demorec.cli.shared.output import counted, say
+from demorec.cli.shared.paths import refuse_inside
+from demorec.cli.shared.progress import ProgressBar
 from demorec.errors import ConfigError
 from demorec.export.options import CommonOptions, ExportReport
 from demorec.tables import EXPORTERS

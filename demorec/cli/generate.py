@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import arg
 
-from demorec.cli.config_file import config_path, with_file_values
-from demorec.cli.output import tell
-from demorec.cli.paths import refuse_inside
+from demorec.cli.shared.config_file import config_path, with_file_values
+from demorec.cli.shared.output import tell
+from demorec.cli.shared.paths import refuse_inside
 from demorec.config import GenerateConfig
 from demorec.errors import ConfigError
 from demorec.generate.options import RunOptions, default_out, default_repo_id
@@ -81,7 +81,7 @@ class Generate:
             return 0
 
         from demorec.cli.generate_report import check_run, print_result
-        from demorec.cli.progress import RunProgress
+        from demorec.cli.shared.progress import RunProgress
         from demorec.generate.interrupts import terminate_as_interrupt
         from demorec.generate.run import generate
 

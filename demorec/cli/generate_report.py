@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
-from demorec.cli.output import counted, say, tell
-from demorec.cli.progress import duration
+from demorec.cli.shared.output import counted, say, tell
+from demorec.cli.shared.progress import duration
 from demorec.generate.contents import set_aside
 from demorec.generate.estimate import Estimate
 from demorec.generate.observer import RunResult

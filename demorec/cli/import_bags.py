@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from demorec.cli.output import counted, say, tell
+from demorec.cli.shared.output import counted, say, tell
 from demorec.config import VideoConfig
 from demorec.errors import ConfigError
 

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
-from demorec.cli.output import say, tell
-from demorec.cli.paths import refuse_inside
+from demorec.cli.shared.output import say, tell
+from demorec.cli.shared.paths import refuse_inside
 from demorec.errors import check_option
 from demorec.evaluate.moments import TakeOver
 

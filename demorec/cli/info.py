@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 from tyro.conf import Positional
 
-from demorec.cli.output import counted, say, say_json
-from demorec.cli.table import aligned, size_in_words
+from demorec.cli.shared.output import counted, say, say_json
+from demorec.cli.shared.table import aligned, size_in_words
 from demorec.errors import ConfigError, ExportError, RecordingError, in_words, resource_error, without_path
 from demorec.lerobot.paths import INFO_PATH
 from demorec.runs.find import Found, expect

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from demorec.cli.table import aligned, size_in_words
+from demorec.cli.shared.table import aligned, size_in_words
 
 if TYPE_CHECKING:
     from demorec.recording.collected.summary import CollectedCameraSummary, CollectedSummary, FeatureSummary

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
-from demorec.cli.output import say, say_json
+from demorec.cli.shared.output import say, say_json
 from demorec.errors import ConfigError
 
 if TYPE_CHECKING:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from demorec.cli.output import say, tell
-from demorec.cli.paths import refuse_inside
+from demorec.cli.shared.output import say, tell
+from demorec.cli.shared.paths import refuse_inside
 from demorec.errors import check_option
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
-from demorec.cli.output import say
+from demorec.cli.shared.output import say
 from demorec.runs.find import EVALUATION_NAME, expect
 from demorec.runs.run_file import EPISODES, FAILED, RUN_NAME
 

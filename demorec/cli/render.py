@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Literal
 
 from tyro.conf import Positional
 
-from demorec.cli.allow import Allow, allowed_modules
-from demorec.cli.output import say, tell
-from demorec.cli.paths import refuse_sources
-from demorec.cli.progress import ProgressBar
+from demorec.cli.shared.allow import Allow, allowed_modules
+from demorec.cli.shared.output import say, tell
+from demorec.cli.shared.paths import refuse_sources
+from demorec.cli.shared.progress import ProgressBar
 from demorec.config import VideoConfig
 from demorec.errors import ConfigError, check_option
 from demorec.processes import SPAWN, available_cores

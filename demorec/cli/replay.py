@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
-from demorec.cli.allow import Allow, allowed_modules
-from demorec.cli.output import say, say_json, tell
-from demorec.cli.paths import refuse_sources
-from demorec.cli.progress import ProgressBar
+from demorec.cli.shared.allow import Allow, allowed_modules
+from demorec.cli.shared.output import say, say_json, tell
+from demorec.cli.shared.paths import refuse_sources
+from demorec.cli.shared.progress import ProgressBar
 from demorec.errors import ConfigError, OptionError
 from demorec.runs.find import EPISODE_FOLDERS, Found, expect, expect_recordings
 

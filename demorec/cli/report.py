@@ -7,10 +7,10 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
-from demorec.cli.allow import Allow, allowed_modules
-from demorec.cli.output import counted, say
-from demorec.cli.paths import places_read, refuse_inside
-from demorec.cli.progress import ProgressBar
+from demorec.cli.shared.allow import Allow, allowed_modules
+from demorec.cli.shared.output import counted, say
+from demorec.cli.shared.paths import places_read, refuse_inside
+from demorec.cli.shared.progress import ProgressBar
 from demorec.errors import ConfigError, check_option
 from demorec.runs.find import EPISODE_FOLDERS, expect
 from demorec.safety.replacing import REPORT, check_replaceable

@@ -8,9 +8,9 @@ from typing import Literal
 
 from tyro.conf import Positional
 
-from demorec.cli.allow import Allow, allowed_modules
-from demorec.cli.output import say, tell
-from demorec.cli.paths import refuse_inside
+from demorec.cli.shared.allow import Allow, allowed_modules
+from demorec.cli.shared.output import say, tell
+from demorec.cli.shared.paths import refuse_inside
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +41,7 @@ class Reproduce:
 
     def run(self) -> int:
         """Generate again, compare, report."""
-        from demorec.cli.progress import RunProgress
+        from demorec.cli.shared.progress import RunProgress
         from demorec.generate.options import RunOptions
         from demorec.generate.reproduce import Reproduction, reproduce
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from demorec.cli.output import tell
+from demorec.cli.shared.output import tell
 
 
 @dataclass(frozen=True, kw_only=True)

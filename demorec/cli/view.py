@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
-from demorec.cli.allow import Allow, allowed_modules
-from demorec.cli.output import say, tell
-from demorec.cli.paths import places_read, refuse_inside
+from demorec.cli.shared.allow import Allow, allowed_modules
+from demorec.cli.shared.output import say, tell
+from demorec.cli.shared.paths import places_read, refuse_inside
 from demorec.errors import ConfigError, check_option
 from demorec.runs.find import expect
 from demorec.safety.replacing import PICTURE, RERUN_FILE, check_replaceable

@@ -14,7 +14,7 @@ name that are no UTF-8) and separators of lines and paragraphs."""
 def printable(text: str) -> str:
     r"""The same text with every control character spelt out (\x1b, \n, \u202e), so that it can do nothing but be read.
 
-    All foreign text goes through here before it reaches a terminal; `demorec.cli.output` sees to that.
+    All foreign text goes through here before it reaches a terminal; `demorec.cli.shared.output` sees to that.
     """
     if text.isprintable():  # nearly always; a plain space counts as printable
         return text

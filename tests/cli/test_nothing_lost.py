@@ -19,7 +19,7 @@ from support.export import export, files_of, make_run
 from support.generate import run_fake
 from support.recording import write_episode
 
-from demorec.cli.paths import refuse_inside
+from demorec.cli.shared.paths import refuse_inside
 from demorec.config import GenerateConfig
 from demorec.errors import ConfigError, DemorecError
 from demorec.evaluate.rollouts import Settings, _open

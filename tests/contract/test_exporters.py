@@ -11,7 +11,7 @@ import pytest
 from support.export import export, files_of, make_run
 from support.recording import make_episode
 
-from demorec.cli.flags import _field_texts
+from demorec.cli.shared.flags import _field_texts
 from demorec.config import VideoConfig
 from demorec.errors import ConfigError, DemorecError, RecordingError
 from demorec.export.options import CommonOptions

@@ -13,8 +13,8 @@ from support.export import export, make_run
 from support.recording import frame_number
 
 from demorec.cli.export import Export
-from demorec.cli.flags import parse
 from demorec.cli.generate import Generate
+from demorec.cli.shared.flags import parse
 from demorec.config import GenerateConfig, VideoConfig
 from demorec.lerobot.commands import flags
 from demorec.lerobot.options import ExportOptions

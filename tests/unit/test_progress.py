@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from demorec.cli.progress import ProgressBar, RunProgress
+from demorec.cli.shared.progress import ProgressBar, RunProgress
 
 
 class Clock:

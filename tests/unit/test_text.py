@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from demorec.cli.output import OutputError, say, tell
-from demorec.cli.table import aligned
+from demorec.cli.shared.output import OutputError, say, tell
+from demorec.cli.shared.table import aligned
 from demorec.safety.text import display_width, printable
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 from tqdm import tqdm
 
-from demorec.cli.output import counted, tell
+from demorec.cli.shared.output import counted, tell
 
 if TYPE_CHECKING:
     from demorec.runs.run_file import Attempt, RunFile

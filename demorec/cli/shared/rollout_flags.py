@@ -6,9 +6,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from demorec.cli.allow import Allow, allowed_modules
-from demorec.cli.paths import refuse_inside
-from demorec.cli.progress import ProgressBar
+from demorec.cli.shared.allow import Allow, allowed_modules
+from demorec.cli.shared.paths import refuse_inside
+from demorec.cli.shared.progress import ProgressBar
 from demorec.config import GenerateConfig, VideoConfig
 from demorec.errors import check_option
 

@@ -32,7 +32,7 @@ from tyro.constructors import (
     StructTypeInfo,
 )
 
-from demorec.cli.output import say, tell
+from demorec.cli.shared.output import say, tell
 from demorec.safety.text import printable
 
 FLAG_TYPES = tyro.constructors.ConstructorRegistry()
