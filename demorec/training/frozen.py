@@ -47,7 +47,7 @@ def freeze_encoder(policy: Any, *, num_frames: int, limit_bytes: int) -> None:
 
 
 class _Memory:
-    """What an encoder made of the frames of each camera, in its precision; ACT encodes one camera after the other."""
+    """What an encoder made of the frames of each camera, as ACT takes it; it encodes one camera after the other."""
 
     def __init__(self, encode: Any, num_frames: int, num_cameras: int, limit_bytes: int) -> None:
         self._encode_all = encode
@@ -100,6 +100,8 @@ class _Memory:
                 part = pictures[start : start + _TOGETHER]
                 empty = part.new_zeros((_TOGETHER - len(part), *part.shape[1:]))
                 together = torch.cat([part, empty]).contiguous(memory_format=torch.channels_last)
-                maps = self._encode_all(together)[_FEATURES]
-                parts.append(maps[: len(part)].cpu().contiguous())
+                maps = self._encode_all(together)[_FEATURES][: len(part)]
+                if torch.is_autocast_enabled(part.device.type):  # ACT goes on in that precision, so nothing is lost
+                    maps = maps.to(torch.get_autocast_dtype(part.device.type))
+                parts.append(maps.cpu().contiguous())
         return torch.cat(parts)

@@ -71,6 +71,17 @@ def test_what_does_not_fit_is_encoded_again() -> None:
     assert policy.model.backbone.given == 2 * (8 + 3)
 
 
+def test_with_autocast_half_as_much_is_kept_as_act_would_take() -> None:
+    """The room of ten maps of float32 holds twenty of bfloat16, the precision in which ACT goes on."""
+    policy, reference = frozen(20 * 16), Policy()
+    for _ in range(2):
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            found = policy(batch(*range(20)))
+        assert found.dtype == torch.bfloat16
+        torch.testing.assert_close(found, reference(batch(*range(20))).bfloat16(), rtol=0, atol=0)
+    assert policy.model.backbone.given == 2 * 20
+
+
 def test_without_room_nothing_is_kept_but_it_is_frozen() -> None:
     policy = frozen(0)
     for _ in range(2):
