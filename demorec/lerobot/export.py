@@ -64,7 +64,7 @@ def export_lerobot(
     ):
         if existing is not None:
             link_files(existing.root, folder)
-        elif options.overwrite and has_own_card(out):
+        elif options.overwrite and has_own_card(out) and (out / CARD_PATH).is_file():
             shutil.copy2(out / CARD_PATH, folder / CARD_PATH)  # what somebody wrote outlives the dataset it was about
         export = _Export(folder, found, options, existing)
         report = export.run(progress)

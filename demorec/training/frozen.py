@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import torch
 
 from demorec.errors import ConfigError
@@ -86,12 +87,12 @@ class _Memory:
         return {_FEATURES: maps.to(pictures.device)}
 
     def _keep(self, camera: int, kept: torch.Tensor, index: torch.Tensor, made: torch.Tensor) -> None:
-        first = {int(row): position for position, row in reversed(list(enumerate(index)))}  # one may be there twice
-        begin = self._num_kept[camera]
-        for place, (row, position) in enumerate(list(first.items())[: len(kept) - begin], start=begin):
-            kept[place] = made[position]
-            self._places[camera][row] = place
-            self._num_kept[camera] = place + 1
+        once, first = np.unique(index.numpy(), return_index=True)
+        room = min(len(once), len(kept) - self._num_kept[camera])
+        places = torch.arange(room) + self._num_kept[camera]
+        kept[places] = made[torch.from_numpy(first[:room])]
+        self._places[camera][torch.from_numpy(once[:room])] = places
+        self._num_kept[camera] += room
 
     def _encode(self, pictures: torch.Tensor) -> torch.Tensor:
         parts = []
