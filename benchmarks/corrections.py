@@ -41,6 +41,7 @@ CORRECTION_SEED = 1
 _ABSOLUTE = re.compile(r"tcp\.[xy]|\w+(\.goal)?\.[xy]|.*\.pose\..*|\w+\.pos")
 """Components that say where on the table something is, or how the arm stands. A hundred demonstrations are too few to
 learn that these do not matter, so that the policy is not shown them."""
+_VELOCITIES = re.compile(r"\w+\.vel")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,7 +114,7 @@ def correct(policy: Path, wanted: int, first_scene_seed: int, args: argparse.Nam
     return dataset
 
 
-def load(datasets: list[Path], *, relative: bool) -> Data:
+def load(datasets: list[Path], *, hidden: tuple[re.Pattern[str], ...]) -> Data:
     """All frames in which the expert acts; a stretch of them ends where it hands back."""
     parts: dict[str, list[np.ndarray[Any, Any]]] = defaultdict(list)
     for number, dataset in enumerate(datasets):
@@ -131,9 +132,9 @@ def load(datasets: list[Path], *, relative: bool) -> Data:
     columns = {name: torch.from_numpy(np.concatenate(values)) for name, values in parts.items()}
     stats = {name: statistics(values) for name, values in columns.items()}
     features = json.loads((datasets[0] / "meta" / "info.json").read_text())["features"]
-    for name in (STATE, ENVIRONMENT) if relative else ():
+    for name in (STATE, ENVIRONMENT):
         for i, component in enumerate(features[name]["names"]):
-            if _ABSOLUTE.fullmatch(component):
+            if any(pattern.fullmatch(component) for pattern in hidden):
                 stats[name]["std"][i] = SWITCHED_OFF
     return Data(columns=columns, end=torch.from_numpy(np.searchsorted(stretch, stretch, side="right")), stats=stats)
 
@@ -144,7 +145,7 @@ def stage(arm: str, datasets: list[Path], corrected: int, seed: int, args: argpa
     updates = round(args.steps * (count + corrected) / args.episodes)
     label = f"{args.label}_{args.rules}" if arm == "corrected" else args.label
     out = args.out / "policies" / f"{arm}_{count}_{corrected}_{label}_{seed}"
-    data = load(datasets, relative=args.relative)
+    data = load(datasets, hidden=args.hidden)
     if not (out / "training.json").exists():
         print(f"training {out.name} on {len(data.end)} frames", flush=True)
         train(data, args.variant, argparse.Namespace(**vars(args) | {"steps": updates}), seed=seed, out=out)
@@ -262,6 +263,7 @@ def main() -> None:
     parser.add_argument("--action", default="ee_delta")
     parser.add_argument("--execute", type=int, default=16, help="actions of the chunk of 16 that are executed")
     parser.add_argument("--relative", action="store_true", help="hide where on the table things are")
+    parser.add_argument("--no-velocities", dest="velocities", action="store_false", help="hide them: weaker policies")
     parser.add_argument("--steps", type=int, default=3000, help="updates for --episodes, in proportion for more")
     parser.add_argument("--batch-size", type=int, default=128)
     parser.add_argument("--learning-rate", type=float, default=5e-4)
@@ -275,7 +277,9 @@ def main() -> None:
     args.device = "cpu"
     args.variant = Variant(about="", action=args.action, execute=args.execute)
     handed = "back" if args.hand_back else "finished"
-    args.label = f"{args.action}_{args.execute}_{args.steps}{'_relative' if args.relative else ''}"
+    args.hidden = (_ABSOLUTE,) * args.relative + (_VELOCITIES,) * (not args.velocities)
+    args.label = f"{args.action}_{args.execute}_{args.steps}{'_relative' * args.relative}"
+    args.label += "_no_velocities" * (not args.velocities)
     args.rules = f"{args.stray_metres:g}_{handed}{'' if args.noise else '_clean'}"
     args.out.mkdir(parents=True, exist_ok=True)
     rows: dict[tuple[str, int, int], list[Stage]] = defaultdict(list)

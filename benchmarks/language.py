@@ -2,16 +2,21 @@
 
     python benchmarks/language.py                                    makes ten episodes first
     python benchmarks/language.py --run recordings/cubes --rounds 9
+    python benchmarks/language.py --commands 10 1000                 whole commands, of so many episodes
 
 Every round exports the same run with each choice one after the other; CPU time of the process, medians, and the ratio
 to the plain export of the same round. The same random items are read by LeRobot and by demorec, with pictures (by each
-decoder that works here) and without.
+decoder that works here) and without. --commands runs `demorec export lerobot` as it is, LeRobot's verification
+included, without --language and with it, on copies of the run's recordings.
 """
 
 from __future__ import annotations
 
 import argparse
+import resource
+import shutil
 import statistics
+import subprocess
 import sys
 import tempfile
 import time
@@ -108,10 +113,34 @@ def items(run: Path, work: Path, rounds: int, *, pictures: bool) -> None:
         print(f"  {reader_name:14} {decoder:10} {name:9} {1e3 * statistics.median(found):7.3f} {ratio:6.2f}")
 
 
+def commands(run: Path, work: Path, counts: list[int], rounds: int) -> None:
+    """Whole commands on so many episodes: copies of the run's, since no more than the number matters."""
+    recordings = sorted((run / "episodes").glob("*.mcap"))
+    for count in counts:
+        copies = work / f"copies-{count}"
+        copies.mkdir()
+        for index in range(count):
+            shutil.copyfile(recordings[index % len(recordings)], copies / f"{index:06d}.mcap")
+        seconds: dict[str, list[float]] = {"plain": [], "language": []}
+        for number in range(rounds):
+            for name, found in seconds.items():
+                out = work / f"command-{count}-{name}-{number}"
+                words = ["export", "lerobot", str(copies), "--out", str(out), "--workers", "1"]
+                before = resource.getrusage(resource.RUSAGE_CHILDREN)
+                words += ["--language"] if name == "language" else []
+                subprocess.run([sys.executable, "-m", "demorec", *words], check=True, capture_output=True)
+                after = resource.getrusage(resource.RUSAGE_CHILDREN)
+                found.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
+        ratio = statistics.median(a / b for a, b in zip(seconds["language"], seconds["plain"], strict=True))
+        cost = ", ".join(f"{name} {statistics.median(found):.1f} CPU s" for name, found in seconds.items())
+        print(f"demorec export lerobot, {count} episodes: {cost}, ratio {ratio:.2f}")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--run", type=Path, help="a run with cameras and segmentation")
     parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--commands", type=int, nargs="+", help="measure whole commands, on so many episodes")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         work, run = Path(folder), args.run
@@ -120,6 +149,9 @@ def main() -> None:
 
             size = {"width": 224, "height": 224}
             run = simulate_run(work / "run", 10, seed=1, cameras=("front", "wrist"), segmentation=True, **size)
+        if args.commands:
+            commands(run, work, args.commands, args.rounds)
+            return
         exports(run, work, args.rounds)
         for pictures in (False, True):
             items(run, work, args.rounds, pictures=pictures)

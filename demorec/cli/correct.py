@@ -29,7 +29,7 @@ class Correct(RolloutFlags):
     Examples:
       demorec correct --policy outputs/train --num-episodes 100 --seed 1 --out fix1
       demorec correct --policy outputs/train --stray-metres 0.1 --hand-back
-      demorec export lerobot fix1 --out datasets/fix1 --intervention
+      demorec export lerobot fix1 --out data/fix1 --intervention --corrected-only
     """
 
     split: Split = "train"

@@ -218,9 +218,8 @@ class Improvement:
         )
         export_lerobot((self._plan.demonstrations,), part, replace(options, overwrite=True))
         for k in range(1, number + 1):
-            if chosen := self._corrected(k):
-                episodes = ",".join(map(str, chosen))
-                more = replace(options, append=True, episodes=episodes)
+            if self._corrected(k):
+                more = replace(options, append=True, corrected_only=True)
                 export_lerobot((self._corrections(k),), part, more)
         part.replace(dataset)
         return dataset

@@ -12,7 +12,7 @@ from demorec.plain import digest
 from demorec.recording import AnyRecording, CollectedRecording, open_recording
 from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings
 from demorec.scene.collected import CollectedOutcome
-from demorec.scene.episode import Outcome
+from demorec.scene.episode import HALT_PHASE, POLICY_PHASE, Outcome
 from demorec.scene.features import ENVIRONMENT_STATE, IMAGE_PREFIX, observation_names
 
 
@@ -51,9 +51,18 @@ def find_recordings(paths: Sequence[Path], *, include_failures: bool) -> list[Ex
     return found
 
 
-def is_among_episodes(recording: AnyRecording, options: CommonOptions) -> bool:
-    """Whether the number of its episode is wanted (`--episodes`)."""
-    return parse_episodes(options.episodes)(recording.info.episode_index)
+def is_wanted(recording: AnyRecording, options: CommonOptions) -> bool:
+    """Whether its episode is one of those that the options ask for (`--episodes`, `--corrected-only`).
+
+    Raises:
+        RecordingError: It is damaged.
+    """
+    if not parse_episodes(options.episodes)(recording.info.episode_index):
+        return False
+    if not options.corrected_only or isinstance(recording, CollectedRecording):
+        return True
+    phases = set(recording.columns().phase)
+    return POLICY_PHASE not in phases or not phases <= {POLICY_PHASE, HALT_PHASE}
 
 
 def goes_in(source: ExportSource, recording: AnyRecording, options: CommonOptions) -> bool:
@@ -201,13 +210,18 @@ class Intake:
         else:
             self.skipped_failures += 1
 
+    @property
+    def num_unwanted(self) -> int:
+        """Recordings that the options do not ask for; known once all have been read."""
+        return len(self._found) - self.num_taken - self.skipped_failures - self.skipped_unknown
+
     def check(self) -> None:
         """Raise ConfigError when not one recording has gone in."""
         if self._first is None:
             raise ConfigError(
                 f"Nothing to export. Recordings: {len(self._found)}, of failed attempts: {self.skipped_failures}, "
                 f"of unknown outcome: {self.skipped_unknown} (--include-failures takes both); the others are not among "
-                "the wanted --episodes."
+                f"the wanted --episodes{' or were not corrected' * self._options.corrected_only}."
             )
 
 

@@ -13,7 +13,7 @@ from demorec.export.sources import (
     Profile,
     find_recordings,
     goes_in,
-    is_among_episodes,
+    is_wanted,
     places_of,
 )
 from demorec.hdf5.file import DATASET, UNFINISHED, NewFile
@@ -65,7 +65,7 @@ def _write(
     intake = Intake(found, options)
     for done, source in enumerate(found, start=1):
         with open_recording(source.path) as recording:
-            if is_among_episodes(recording, options):
+            if is_wanted(recording, options):
                 if goes_in(source, recording, options):
                     intake.take(source.path, Profile.of(recording, options))
                     writer.add(recording)
@@ -83,5 +83,6 @@ def _write(
         new_frames=writer.num_frames,
         skipped_failures=intake.skipped_failures,
         skipped_unknown=intake.skipped_unknown,
+        unwanted=intake.num_unwanted,
         depth_left_out=intake.depth_left_out,
     )

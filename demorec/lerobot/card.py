@@ -116,10 +116,11 @@ def _card(root: Path, info: DatasetInfo, about: CardFacts, has_sheet: bool) -> I
     yield from ("tags:", "- LeRobot", "- demorec", *([] if about.is_collected else ["- simulation"]))
     yield from ("configs:", "- config_name: default", "  data_files: data/*/*.parquet", "---", "")
     yield from (f"# {options.repo_id}", "")
+    plural = "" if info.total_episodes == 1 else "s"
     whose = (
-        f"demonstrations of {info.robot_type}, collected"
+        f"demonstration{plural} of {info.robot_type}, collected"
         if about.is_collected
-        else f"scripted demonstrations by a simulated {info.robot_type} arm in PyBullet"
+        else f"scripted demonstration{plural} by a simulated {info.robot_type} arm in PyBullet"
     )
     yield (
         f"{info.total_episodes} {whose}, "

@@ -121,14 +121,16 @@ def language_feature(name: str) -> dict[str, Any]:
 
 def language_arrays(language: EpisodeLanguage, frames: int) -> dict[str, pa.Array]:
     """Column -> array of so many rows."""
-    own = [language.events.get(row, ()) for row in range(frames)]
-    ends = np.cumsum([0, *(len(rows) for rows in own)], dtype=np.int32)
+    counts = np.zeros(frames + 1, dtype=np.int32)
+    for row, told in language.events.items():
+        counts[row + 1] = len(told)
+    said = [entry for _, told in sorted(language.events.items()) for entry in told]
     state = _structs(language.persistent, _STATE)
     often = state.take(pa.array(np.tile(np.arange(len(state)), frames)))
     steps = pa.array(np.arange(frames + 1, dtype=np.int32) * np.int32(len(state)))
     return {
         PERSISTENT: pa.ListArray.from_arrays(steps, often),
-        EVENTS: pa.ListArray.from_arrays(pa.array(ends), _structs([row for rows in own for row in rows], _EVENT)),
+        EVENTS: pa.ListArray.from_arrays(pa.array(np.cumsum(counts, dtype=np.int32)), _structs(said, _EVENT)),
     }
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from demorec.export.columns import frame_stride
 from demorec.export.options import ProgressCallback
-from demorec.export.sources import ExportSource, Profile, goes_in, is_among_episodes
+from demorec.export.sources import ExportSource, Profile, goes_in, is_wanted
 from demorec.lerobot.attempts import AttemptRecord
 from demorec.lerobot.layout import Feature
 from demorec.lerobot.options import ExportOptions
@@ -54,7 +54,7 @@ class Reading:
 
 
 def read(source: ExportSource, options: ExportOptions) -> Reading | None:
-    """Read one recording; None if its episode is not wanted (`--episodes`).
+    """Read one recording; None if its episode is not wanted (`is_wanted`).
 
     Raises:
         RecordingError: It is damaged.
@@ -62,7 +62,7 @@ def read(source: ExportSource, options: ExportOptions) -> Reading | None:
     """
     with open_recording(source.path) as recording:
         info = recording.info
-        if not is_among_episodes(recording, options):
+        if not is_wanted(recording, options):
             return None
         attempt = AttemptRecord.of(recording)
         features = dataset_features(recording, options)

@@ -14,12 +14,15 @@ from support.recording import write_episode
 
 from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.config import EpisodePlan, GenerateConfig
+from demorec.errors import ConfigError
 from demorec.evaluate import rollouts
 from demorec.evaluate.correction import read_takeover
 from demorec.evaluate.moments import TakeOver
 from demorec.evaluate.rollouts import Evaluation, Settings, make_rollout
 from demorec.evaluate.turns import Turns
 from demorec.evaluate.watch import Watch
+from demorec.generate.options import RunOptions
+from demorec.generate.run import generate
 from demorec.geometry import Array, Pose
 from demorec.gym_env import DemorecEnv, Situation
 from demorec.loop import ScriptAgent, Session, make_world, prepare
@@ -130,6 +133,28 @@ def test_the_dataset_tells_who_acted(rollout: tuple[Attempt, Path], tmp_path: Pa
 def test_a_demonstration_has_no_interventions(tmp_path: Path) -> None:
     export(write_episode(tmp_path / "plain.mcap", num_frames=5, cameras=()), tmp_path / "dataset", intervention=True)
     assert data_table(tmp_path / "dataset").column("intervention").to_pylist() == [False] * 5
+
+
+@pytest.mark.parametrize("exporter", ["lerobot", "hdf5"])
+def test_what_a_policy_did_alone_can_be_left_out(
+    rollout: tuple[Attempt, Path], expert_poses: Array, tmp_path: Path, exporter: str
+) -> None:
+    alone, uncorrected = roll_out(
+        tmp_path, Wanderer(expert_poses, astray_from=10_000, drift=0.0), TakeOver(stray_metres=0.0), action="ee"
+    )
+    assert alone.success
+    options = RunOptions(out=tmp_path / "run", num_episodes=1, workers=1, export=False)
+    generate(GenerateConfig(cameras=(), split="train"), options)
+    (demonstration,) = (tmp_path / "run" / "episodes").glob("*.mcap")
+    sources = [demonstration, uncorrected, rollout[1]]
+    everything = export(sources, tmp_path / "all.hdf5", exporter)
+    assert (everything.num_episodes, everything.unwanted) == (3, 0)
+    report = export(sources, tmp_path / "corrected.hdf5", exporter, corrected_only=True)
+    assert (report.num_episodes, report.unwanted) == (2, 1)
+    with Recording(demonstration) as plain, Recording(rollout[1]) as corrected:
+        assert report.num_frames == plain.num_frames + corrected.num_frames
+    with pytest.raises(ConfigError, match="or were not corrected"):
+        export(uncorrected, tmp_path / "none.hdf5", exporter, corrected_only=True)
 
 
 @dataclass

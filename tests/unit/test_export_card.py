@@ -108,7 +108,7 @@ def test_an_edited_card_stays_when_the_dataset_is_replaced(tmp_path: Path) -> No
     card, beside = tmp_path / "d" / "README.md", tmp_path / "d" / "demorec" / "README.md"
     export(run, tmp_path / "d")
     export(run, tmp_path / "d", episodes="0", overwrite=True)
-    assert "1 scripted demonstrations" in card.read_text()  # nobody has edited it, so it is replaced
+    assert "1 scripted demonstration by" in card.read_text()  # nobody has edited it, so it is replaced
     assert not beside.exists()
     card.write_text("what I found out about these")
     export(run, tmp_path / "d", overwrite=True)
