@@ -18,7 +18,7 @@ from demorec.loop import Episode
 from demorec.loop.agents import Decision
 from demorec.loop.noise import ActionNoise
 from demorec.recording import Recording
-from demorec.scene.episode import HALT_PHASE, POLICY_PHASE
+from demorec.scene.episode import HALT_PHASE, POLICY_PHASE, interventions
 from demorec.tasks.recovery import TAKE_OVER
 from demorec.tasks.script import Behaviour, Step
 from demorec.tasks.skills import Expert, GaveUp
@@ -90,10 +90,12 @@ class TakenOver:
     Attributes:
         reasons: Why the expert took over, each time.
         num_frames: How many the expert acted in.
+        is_lesson: Whether it did more than stop the arm.
     """
 
     reasons: tuple[str, ...]
     num_frames: int
+    is_lesson: bool
 
 
 def read_takeover(path: Path) -> TakenOver | None:
@@ -106,5 +108,9 @@ def read_takeover(path: Path) -> TakenOver | None:
         messages = [event.message for _, event in recording.events() if event.name == TAKE_OVER_EVENT]
         if not messages:
             return None
-        acted = sum(phase != POLICY_PHASE for phase in recording.columns().phase)
-    return TakenOver(reasons=tuple(message.removeprefix(_MESSAGE) for message in messages), num_frames=acted)
+        phases = recording.columns().phase
+    return TakenOver(
+        reasons=tuple(message.removeprefix(_MESSAGE) for message in messages),
+        num_frames=sum(phase != POLICY_PHASE for phase in phases),
+        is_lesson=bool(interventions(phases).any()),
+    )

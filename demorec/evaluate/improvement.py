@@ -196,10 +196,10 @@ class Improvement:
         return self._folder(number) / "corrections"
 
     def _corrected(self, number: int) -> list[int]:
-        """Episodes of a round's corrections in which the expert took over and succeeded."""
+        """Episodes of a round's corrections that are learned from: the expert took over and succeeded."""
         out = self._corrections(number)
-        rollouts = load_evaluation(out).rollouts
-        return [r.episode_index for r in rollouts if r.success and read_takeover(out / r.file) is not None]
+        found = ((r, read_takeover(out / r.file)) for r in load_evaluation(out).rollouts if r.success)
+        return [r.episode_index for r, taken in found if taken is not None and taken.is_lesson]
 
     def _dataset(self, number: int) -> Path:
         """All that a round learns from."""

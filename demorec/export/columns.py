@@ -12,7 +12,7 @@ from demorec.errors import ConfigError, ExportError
 from demorec.export.options import CommonOptions
 from demorec.recording import Recording
 from demorec.registry import nearest_match
-from demorec.scene.episode import HALT_PHASE, POLICY_PHASE, EpisodeColumns
+from demorec.scene.episode import EpisodeColumns, interventions
 from demorec.scene.features import (
     ACTION,
     DEPTH_SUFFIX,
@@ -117,6 +117,5 @@ def feature_columns(recording: Recording, options: CommonOptions, *, state: Stat
     features[REWARD] = (is_last & success).astype(np.float32)
     features[DONE] = is_last
     features[SUCCESS] = is_last & success
-    by_expert = np.array([phase not in (POLICY_PHASE, HALT_PHASE) for phase in columns.phase])
-    features[INTERVENTION] = (POLICY_PHASE in columns.phase) & by_expert[rows]
+    features[INTERVENTION] = interventions(columns.phase)[rows]
     return FeatureColumns(recorded=columns, rows=rows, features=features)

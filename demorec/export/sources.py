@@ -12,7 +12,7 @@ from demorec.plain import digest
 from demorec.recording import AnyRecording, CollectedRecording, open_recording
 from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings
 from demorec.scene.collected import CollectedOutcome
-from demorec.scene.episode import HALT_PHASE, POLICY_PHASE, Outcome
+from demorec.scene.episode import POLICY_PHASE, Outcome, interventions
 from demorec.scene.features import ENVIRONMENT_STATE, IMAGE_PREFIX, observation_names
 
 
@@ -61,8 +61,8 @@ def is_wanted(recording: AnyRecording, options: CommonOptions) -> bool:
         return False
     if not options.corrected_only or isinstance(recording, CollectedRecording):
         return True
-    phases = set(recording.columns().phase)
-    return POLICY_PHASE not in phases or not phases <= {POLICY_PHASE, HALT_PHASE}
+    phases = recording.columns().phase
+    return POLICY_PHASE not in phases or bool(interventions(phases).any())
 
 
 def goes_in(source: ExportSource, recording: AnyRecording, options: CommonOptions) -> bool:

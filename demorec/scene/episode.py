@@ -8,7 +8,7 @@ episode to the bit.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -258,3 +258,12 @@ class EpisodeColumns:
 def frame_time_ns(frame_index: int, fps: int) -> int:
     """Nanoseconds of a frame since the episode's start: exact integer arithmetic, rounded half up."""
     return (frame_index * 2_000_000_000 + fps) // (2 * fps)
+
+
+def interventions(phases: Sequence[str]) -> NDArray[np.bool_]:
+    """(T,) where an expert acts that has taken over from a policy, and does more than stop the arm.
+
+    False in all frames of a demonstration, which nobody took over.
+    """
+    acts = np.array([phase not in (POLICY_PHASE, HALT_PHASE) for phase in phases], dtype=np.bool_)
+    return acts & (POLICY_PHASE in phases)

@@ -31,7 +31,7 @@ from demorec.recording import Recording
 from demorec.replay import ReplayOptions, open_file, replay_all
 from demorec.runs.find import EVALUATION_NAME
 from demorec.runs.run_file import Attempt
-from demorec.scene.episode import POLICY_PHASE, Action, Frame, Observation
+from demorec.scene.episode import POLICY_PHASE, Action, Frame, Observation, interventions
 from demorec.scene.features import ActionKind
 
 FPS = 30
@@ -102,6 +102,7 @@ def test_a_stuck_policy_is_corrected_and_the_episode_replays(rollout: tuple[Atte
     taken = read_takeover(path)
     assert taken is not None
     assert (taken.reasons, taken.num_frames) == (("the policy is stuck",), len(phases) - handover)
+    assert taken.is_lesson
     options = ReplayOptions()
     report, _ = next(iter(replay_all([open_file(path, options)], options)))
     assert report.is_identical, report
@@ -133,6 +134,18 @@ def test_the_dataset_tells_who_acted(rollout: tuple[Attempt, Path], tmp_path: Pa
 def test_a_demonstration_has_no_interventions(tmp_path: Path) -> None:
     export(write_episode(tmp_path / "plain.mcap", num_frames=5, cameras=()), tmp_path / "dataset", intervention=True)
     assert data_table(tmp_path / "dataset").column("intervention").to_pylist() == [False] * 5
+
+
+@pytest.mark.parametrize(
+    ("phases", "expected"),
+    [
+        (("approach", "halt", "grasp"), [False, False, False]),  # nobody was taken over from
+        (("policy", "halt", "halt"), [False, False, False]),
+        (("policy", "halt", "approach", "policy"), [False, False, True, False]),
+    ],
+)
+def test_interventions(phases: tuple[str, ...], expected: list[bool]) -> None:
+    assert interventions(phases).tolist() == expected
 
 
 @pytest.mark.parametrize("exporter", ["lerobot", "hdf5"])
