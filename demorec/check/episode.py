@@ -197,7 +197,7 @@ class CheckedEpisode:
     @cached_property
     def events(self) -> tuple[tuple[int, Event], ...]:
         """(time_ns, event) in order of time, without changes of phase."""
-        return self.recording.events()
+        return tuple(self.recording.events())
 
     def kinematics(self, joint_position: Array) -> LinkMatrices:
         """Forward kinematics of (T, n_arm) or (T, n_joints) positions."""

@@ -43,7 +43,7 @@ def open_recording(path: Path, *, group: str) -> Iterator[PlayedEpisode]:
             object_poses=columns.object_poses,
             world_from_camera=columns.world_from_camera,
             phase=columns.phase,
-            events=recording.events(),
+            events=tuple(recording.events()),
             curves=_curves(recording, columns),
             videos={
                 name: Video(codec=recording.video_settings(name).codec, batches=partial(_batches, recording, name))

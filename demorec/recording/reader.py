@@ -5,8 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from functools import cached_property
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from types import MappingProxyType
 
 import numpy as np
@@ -147,18 +146,14 @@ class RecordingReader(EpisodeFile):
                 time_ns=message.time_ns, joint_position=position, joint_velocity=velocity, joint_effort=effort
             )
 
-    @cached_property
-    def _events(self) -> tuple[tuple[int, Event], ...]:
-        read: Iterable[tuple[int, bytes]] | None = self._said
-        if read is None:
-            read = ((message.time_ns, message.data) for message in self._container.messages((channels.EVENTS,)))
-        with damage_as_recording_error(self.path):
-            found = [(time_ns, messages.read_log(data)) for time_ns, data in read]
-        return tuple((time_ns, event) for time_ns, event in found if event.name != channels.PHASE_EVENT)
-
-    def events(self) -> tuple[tuple[int, Event], ...]:
+    def events(self) -> Iterator[tuple[int, Event]]:
         """(time_ns, event) in order of time; changes of phase are in `columns().phase`."""
-        return self._events
+        read = ((message.time_ns, message.data) for message in self._container.messages((channels.EVENTS,)))
+        for time_ns, data in read if self._said is None else self._said:
+            with damage_as_recording_error(self.path):
+                event = messages.read_log(data)
+            if event.name != channels.PHASE_EVENT:
+                yield time_ns, event
 
     def packets(self, camera: str) -> Iterator[VideoPacket]:
         """The coded pictures of a camera, one a frame, in order."""
