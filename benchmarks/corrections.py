@@ -30,7 +30,7 @@ import torch
 from learning import ACTION, ENVIRONMENT, STATE, SWITCHED_OFF, Data, Variant, command, statistics, train
 
 from demorec.config import GenerateConfig
-from demorec.evaluate.correction import read_takeover
+from demorec.evaluate.improvement import corrected_episodes
 from demorec.evaluate.moments import TakeOver
 from demorec.evaluate.rollouts import Evaluation, evaluate, settings_for
 from demorec.evaluate.statistics import Rate, cells
@@ -108,8 +108,8 @@ def correct(policy: Path, wanted: int, first_scene_seed: int, args: argparse.Nam
     tried, corrected = 0, list[int]()
     while len(corrected) < wanted:
         tried += max(5, wanted - len(corrected))
-        rollouts = evaluate(settings, out, num_episodes=tried, workers=args.workers).rollouts
-        corrected = [r.episode_index for r in rollouts if r.success and read_takeover(out / r.file) is not None]
+        evaluate(settings, out, num_episodes=tried, workers=args.workers)
+        corrected = corrected_episodes(out)
     export(out, dataset, args, ",".join(map(str, corrected[:wanted])))
     return dataset
 
@@ -277,9 +277,9 @@ def main() -> None:
     args.device = "cpu"
     args.variant = Variant(about="", action=args.action, execute=args.execute)
     handed = "back" if args.hand_back else "finished"
-    args.hidden = (_ABSOLUTE,) * args.relative + (_VELOCITIES,) * (not args.velocities)
-    args.label = f"{args.action}_{args.execute}_{args.steps}{'_relative' * args.relative}"
-    args.label += "_no_velocities" * (not args.velocities)
+    args.hidden = (*([_ABSOLUTE] if args.relative else []), *([] if args.velocities else [_VELOCITIES]))
+    args.label = f"{args.action}_{args.execute}_{args.steps}{'_relative' if args.relative else ''}"
+    args.label += "" if args.velocities else "_no_velocities"
     args.rules = f"{args.stray_metres:g}_{handed}{'' if args.noise else '_clean'}"
     args.out.mkdir(parents=True, exist_ok=True)
     rows: dict[tuple[str, int, int], list[Stage]] = defaultdict(list)

@@ -126,8 +126,8 @@ def commands(run: Path, work: Path, counts: list[int], rounds: int) -> None:
             for name, found in seconds.items():
                 out = work / f"command-{count}-{name}-{number}"
                 words = ["export", "lerobot", str(copies), "--out", str(out), "--workers", "1"]
-                before = resource.getrusage(resource.RUSAGE_CHILDREN)
                 words += ["--language"] if name == "language" else []
+                before = resource.getrusage(resource.RUSAGE_CHILDREN)
                 subprocess.run([sys.executable, "-m", "demorec", *words], check=True, capture_output=True)
                 after = resource.getrusage(resource.RUSAGE_CHILDREN)
                 found.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)

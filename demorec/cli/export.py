@@ -77,8 +77,8 @@ def _told(report: ExportReport) -> list[str]:
         lines.append(f"{counted(report.skipped_failures, 'failed attempt')} left out ({_TAKEN}).")
     if report.skipped_unknown:
         lines.append(f"{counted(report.skipped_unknown, 'recording')} of unknown outcome left out ({_TAKEN}).")
-    if report.unwanted:
-        lines.append(f"{counted(report.unwanted, 'recording')} left out by --episodes or --corrected-only.")
+    if report.skipped_unwanted:
+        lines.append(f"{counted(report.skipped_unwanted, 'recording')} left out by --episodes or --corrected-only.")
     if report.left_out:
         lines.append(f"Left out, since the dataset does not have them: {', '.join(report.left_out)}.")
     if report.depth_left_out:

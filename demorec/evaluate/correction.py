@@ -90,12 +90,12 @@ class TakenOver:
     Attributes:
         reasons: Why the expert took over, each time.
         num_frames: How many the expert acted in.
-        is_lesson: Whether it did more than stop the arm.
+        has_interventions: Whether it did more than stop the arm (`interventions`).
     """
 
     reasons: tuple[str, ...]
     num_frames: int
-    is_lesson: bool
+    has_interventions: bool
 
 
 def read_takeover(path: Path) -> TakenOver | None:
@@ -112,5 +112,5 @@ def read_takeover(path: Path) -> TakenOver | None:
     return TakenOver(
         reasons=tuple(message.removeprefix(_MESSAGE) for message in messages),
         num_frames=sum(phase != POLICY_PHASE for phase in phases),
-        is_lesson=bool(interventions(phases).any()),
+        has_interventions=bool(interventions(phases).any()),
     )

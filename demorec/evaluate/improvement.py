@@ -170,7 +170,7 @@ class Improvement:
         return Round(
             number=number,
             demonstrations=self._num_demonstrations,
-            corrections=sum(len(self._corrected(k)) for k in range(1, number + 1)),
+            corrections=sum(len(corrected_episodes(self._corrections(k))) for k in range(1, number + 1)),
             rate=tried.rate,
             cpu_seconds=seconds,
         )
@@ -195,12 +195,6 @@ class Improvement:
     def _corrections(self, number: int) -> Path:
         return self._folder(number) / "corrections"
 
-    def _corrected(self, number: int) -> list[int]:
-        """Episodes of a round's corrections that are learned from: the expert took over and succeeded."""
-        out = self._corrections(number)
-        found = ((r, read_takeover(out / r.file)) for r in load_evaluation(out).rollouts if r.success)
-        return [r.episode_index for r, taken in found if taken is not None and taken.is_lesson]
-
     def _dataset(self, number: int) -> Path:
         """All that a round learns from."""
         dataset = self._folder(number) / "dataset"
@@ -218,7 +212,7 @@ class Improvement:
         )
         export_lerobot((self._plan.demonstrations,), part, replace(options, overwrite=True))
         for k in range(1, number + 1):
-            if self._corrected(k):
+            if corrected_episodes(self._corrections(k)):
                 more = replace(options, append=True, corrected_only=True)
                 export_lerobot((self._corrections(k),), part, more)
         part.replace(dataset)
@@ -255,6 +249,17 @@ class Improvement:
         _, digest = policy_summary(find_checkpoint(train))
         replace_text(done, json.dumps({"policy_digest": digest, "cpu_seconds": round(seconds, 1)}, indent=1))
         return seconds
+
+
+def corrected_episodes(corrections: Path) -> list[int]:
+    """Episodes of a folder of corrections that are learned from: the expert took over and succeeded.
+
+    Raises:
+        RecordingError: One cannot be read.
+    """
+    rollouts = load_evaluation(corrections).rollouts
+    found = ((r.episode_index, read_takeover(corrections / r.file)) for r in rollouts if r.success)
+    return [index for index, taken in found if taken is not None and taken.has_interventions]
 
 
 def _run_training(words: Sequence[str], log: Path) -> None:

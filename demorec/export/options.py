@@ -65,7 +65,7 @@ class ExportReport:
         new_episodes, new_frames: Added by this export.
         skipped_failures: Failed episodes that were left out.
         skipped_unknown: Episodes that were left out since their recordings end before the outcome.
-        unwanted: Recordings that `episodes` and `corrected_only` left out.
+        skipped_unwanted: Recordings that `episodes` and `corrected_only` left out.
         transcoded: Cameras whose pictures had to be coded anew, with the reason.
         left_out: Features that the dataset appended to does not have.
         depth_left_out: Depth cameras of collected episodes that were not asked for.
@@ -83,7 +83,7 @@ class ExportReport:
     new_frames: int
     skipped_failures: int = 0
     skipped_unknown: int = 0
-    unwanted: int = 0
+    skipped_unwanted: int = 0
     transcoded: tuple[str, ...] = ()
     left_out: tuple[str, ...] = ()
     depth_left_out: tuple[str, ...] = ()

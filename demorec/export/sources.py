@@ -211,17 +211,18 @@ class Intake:
             self.skipped_failures += 1
 
     @property
-    def num_unwanted(self) -> int:
+    def skipped_unwanted(self) -> int:
         """Recordings that the options do not ask for; known once all have been read."""
         return len(self._found) - self.num_taken - self.skipped_failures - self.skipped_unknown
 
     def check(self) -> None:
         """Raise ConfigError when not one recording has gone in."""
         if self._first is None:
+            corrected = " or were not corrected" if self._options.corrected_only else ""
             raise ConfigError(
                 f"Nothing to export. Recordings: {len(self._found)}, of failed attempts: {self.skipped_failures}, "
                 f"of unknown outcome: {self.skipped_unknown} (--include-failures takes both); the others are not among "
-                f"the wanted --episodes{' or were not corrected' * self._options.corrected_only}."
+                f"the wanted --episodes{corrected}."
             )
 
 

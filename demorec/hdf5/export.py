@@ -83,6 +83,6 @@ def _write(
         new_frames=writer.num_frames,
         skipped_failures=intake.skipped_failures,
         skipped_unknown=intake.skipped_unknown,
-        unwanted=intake.num_unwanted,
+        skipped_unwanted=intake.skipped_unwanted,
         depth_left_out=intake.depth_left_out,
     )

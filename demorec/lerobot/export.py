@@ -143,7 +143,7 @@ class _Export:
             new_frames=finished.total_frames - start.num_frames,
             skipped_failures=self._intake.skipped_failures,
             skipped_unknown=self._intake.skipped_unknown,
-            unwanted=self._intake.num_unwanted,
+            skipped_unwanted=self._intake.skipped_unwanted,
             transcoded=tuple(self._transcoded),
             left_out=self._left_out,
             depth_left_out=self._intake.depth_left_out,

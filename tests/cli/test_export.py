@@ -28,6 +28,14 @@ def test_an_export(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert "# me/cubes" in (out / "README.md").read_text()
 
 
+def test_what_was_not_asked_for_is_counted(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ("export", "lerobot", run, "--out", tmp_path / "d", "--no-verify", "--corrected-only", "--episodes", "0")
+    assert exit_code(*words) == 0
+    printed = capsys.readouterr()
+    assert "1 episode, 8 frames" in printed.out  # nobody took over in a demonstration: it stays
+    assert "2 recordings left out by --episodes or --corrected-only." in printed.out
+
+
 def test_options_reach_the_export(run: Path, tmp_path: Path) -> None:
     out = tmp_path / "d"
     arguments = ("--include-failures", "--episodes", "1", "--action", "ee_delta", "--privileged", "--fps", "15")

@@ -102,7 +102,7 @@ def test_a_stuck_policy_is_corrected_and_the_episode_replays(rollout: tuple[Atte
     taken = read_takeover(path)
     assert taken is not None
     assert (taken.reasons, taken.num_frames) == (("the policy is stuck",), len(phases) - handover)
-    assert taken.is_lesson
+    assert taken.has_interventions
     options = ReplayOptions()
     report, _ = next(iter(replay_all([open_file(path, options)], options)))
     assert report.is_identical, report
@@ -161,9 +161,9 @@ def test_what_a_policy_did_alone_can_be_left_out(
     (demonstration,) = (tmp_path / "run" / "episodes").glob("*.mcap")
     sources = [demonstration, uncorrected, rollout[1]]
     everything = export(sources, tmp_path / "all.hdf5", exporter)
-    assert (everything.num_episodes, everything.unwanted) == (3, 0)
+    assert (everything.num_episodes, everything.skipped_unwanted) == (3, 0)
     report = export(sources, tmp_path / "corrected.hdf5", exporter, corrected_only=True)
-    assert (report.num_episodes, report.unwanted) == (2, 1)
+    assert (report.num_episodes, report.skipped_unwanted) == (2, 1)
     with Recording(demonstration) as plain, Recording(rollout[1]) as corrected:
         assert report.num_frames == plain.num_frames + corrected.num_frames
     with pytest.raises(ConfigError, match="or were not corrected"):
