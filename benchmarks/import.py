@@ -2,7 +2,8 @@
 
     python benchmarks/import.py                              a small sample
     python benchmarks/import.py --seconds 30 --rounds 5 --pictures h264 jpeg
-    python benchmarks/import.py --growth 1 5 20              peak memory for bags of that many gigabytes
+    python benchmarks/import.py --pictures h264 --gop 30     video with a keyframe a second
+    python benchmarks/import.py --growth 1 5 20              peak memory for so many gigabytes, as one bag and as many
     python benchmarks/import.py --forge /tmp/forge/bin/python    against forge-robotics, too
 
 forge-robotics is no dependency: it is run by the Python of an environment of its own that has
@@ -10,7 +11,7 @@ forge-robotics is no dependency: it is run by the Python of an environment of it
 place of figures.
 
 The bag is written by `mcap` and `rosbags`: two joint topics at 200 Hz and two 640x480 cameras. Each round runs the
-candidates one after the other in processes of their own; loading libraries is not counted.
+candidates one after the other in processes of their own; loading libraries is not counted, of none of them.
 LeRobot's writer is given frames that were decoded by the same reader as ours, aligned as ours. "decoding and coding" is
 what no import of JPEG pictures into videos can do without: each picture decoded by Pillow and coded by libx264, as our
 export codes it.
@@ -79,8 +80,8 @@ def scene(step: int, camera: int) -> NDArray[np.uint8]:
     return np.ascontiguousarray(large[shift // 2 : shift // 2 + HEIGHT, shift : shift + WIDTH])
 
 
-def make_bag(path: Path, seconds: float, pictures: str) -> Path:
-    """A bag with `pictures` (h264 or jpeg)."""
+def make_bag(path: Path, seconds: float, pictures: str, gop: int) -> Path:
+    """A bag with `pictures` (h264 with a keyframe in front of every `gop` pictures, or jpeg)."""
     bags.WIDTH, bags.HEIGHT = WIDTH, HEIGHT
     notes = bags.joints("/follower/joint_states", bags.SO101_JOINTS, bags.times(200, seconds, seed=1))
     notes += bags.joints("/leader/joint_states", bags.SO101_JOINTS, bags.times(200, seconds, seed=2), shift=0.1)
@@ -88,7 +89,7 @@ def make_bag(path: Path, seconds: float, pictures: str) -> Path:
         moments = bags.times(FPS, seconds, seed=3, jitter=0.01)
         loop = [scene(step, camera) for step in range(48)]
         if pictures == "h264":
-            packets = bags.video([loop[step % 48] for step in range(len(moments))], gop=2)
+            packets = bags.video([loop[step % 48] for step in range(len(moments))], gop=gop)
         else:
             coded = [bags.jpeg(picture) for picture in loop]
             packets = [coded[step % 48] for step in range(len(moments))]
@@ -105,11 +106,11 @@ def make_bag(path: Path, seconds: float, pictures: str) -> Path:
     return bags.write_mcap(bags.in_order(notes), path)
 
 
-def ours(bag: Path, out: Path, mapping: Path, *, exports: bool) -> None:
-    """The bag to a run, and with `exports` on to a LeRobot dataset."""
+def ours(bags_: list[Path], out: Path, mapping: Path, *, exports: bool) -> None:
+    """The bags to a run, and with `exports` on to a LeRobot dataset."""
     from demorec.ingest.import_run import import_bags
 
-    import_bags([bag], mapping, out / "run")
+    import_bags(bags_, mapping, out / "run")
     if exports:
         from demorec.lerobot import ExportOptions, export_lerobot
 
@@ -208,18 +209,25 @@ def forges(python: Path, bag: Path, out: Path) -> Cost | str:
     return Cost(cpu=told["cpu"], peak=told["peak"])
 
 
-def _child(candidate: str, bag: Path, out: Path, mapping: Path, answer: multiprocessing.queues.Queue[Cost]) -> None:
+def _child(
+    candidate: str, bags_: list[Path], out: Path, mapping: Path, answer: multiprocessing.queues.Queue[Cost]
+) -> None:
+    import numba  # noqa: F401, the export loads it, and pandas, when it first needs them
+    import pandas as pd  # noqa: F401
 
     import demorec.ingest.import_run
     import demorec.lerobot  # noqa: F401
 
+    if candidate == "lerobot":
+        import lerobot.datasets.lerobot_dataset  # noqa: F401
+
     begin = _used()
     if candidate == "lerobot":
-        lerobots(bag, out, mapping)
+        lerobots(bags_[0], out, mapping)
     elif candidate == "decoding and coding":
-        decoding_and_coding(bag)
+        decoding_and_coding(bags_[0])
     else:
-        ours(bag, out, mapping, exports=candidate == "import and export")
+        ours(bags_, out, mapping, exports=candidate == "import and export")
     answer.put(Cost(cpu=_used() - begin, peak=_peak()))
 
 
@@ -236,7 +244,7 @@ def _peak() -> int:
     return int(line.split()[1]) << 10
 
 
-def measure(candidate: str, bag: Path, folder: Path) -> Cost:
+def measure(candidate: str, bags_: list[Path], folder: Path) -> Cost:
     """One run of a candidate in a fresh process."""
     out = folder / candidate.replace(" ", "_")
     shutil.rmtree(out, ignore_errors=True)
@@ -245,7 +253,7 @@ def measure(candidate: str, bag: Path, folder: Path) -> Cost:
     mapping.write_text(MAPPING)
     context = multiprocessing.get_context("spawn")
     answer: multiprocessing.queues.Queue[Cost] = context.Queue()
-    process = context.Process(target=_child, args=(candidate, bag, out, mapping, answer))
+    process = context.Process(target=_child, args=(candidate, bags_, out, mapping, answer))
     process.start()
     cost = answer.get()
     process.join()
@@ -253,12 +261,12 @@ def measure(candidate: str, bag: Path, folder: Path) -> Cost:
     return cost
 
 
-def grow(path: Path, pictures: str, gigabytes: float) -> Path:
+def grow(path: Path, pictures: str, gop: int, gigabytes: float) -> Path:
     """A bag of that size: a piece of ten seconds again and again, each time ten seconds later."""
     from mcap.reader import make_reader
     from mcap.writer import CompressionType, Writer
 
-    piece = make_bag(path.with_suffix(".piece"), 10.0, pictures)
+    piece = make_bag(path.with_suffix(".piece"), 10.0, pictures, gop)
     with piece.open("rb") as source, path.open("wb") as target:
         writer = Writer(target, compression=CompressionType.NONE)
         writer.start()
@@ -293,7 +301,7 @@ def table(pictures: str, bag: Path, options: argparse.Namespace, folder: Path) -
     told = ""
     for _ in range(options.rounds):
         for candidate in candidates:
-            costs[candidate].append(measure(candidate, bag, folder))
+            costs[candidate].append(measure(candidate, [bag], folder))
         if options.forge is not None:
             cost = forges(options.forge, bag, folder / "forge")
             if isinstance(cost, str):
@@ -314,9 +322,17 @@ def table(pictures: str, bag: Path, options: argparse.Namespace, folder: Path) -
         print(f"  forge fails: {told}")
 
 
+def tell(bags_: list[Path], folder: Path) -> None:
+    """Print what their import takes."""
+    gigabytes, cost = sum(bag.stat().st_size for bag in bags_) / 1e9, measure("import", bags_, folder)
+    peak, cpu = cost.peak / 1e6, cost.cpu / gigabytes
+    print(f"{gigabytes:.1f} GB in {len(bags_)} bags: peak {peak:.0f} MB, {cpu:.1f} CPU s/GB", flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=4.0, help="of the bag")
+    parser.add_argument("--gop", type=int, default=2, help="pictures from a keyframe of H.264 video to the next")
     parser.add_argument("--rounds", type=int, default=2, help="0 for --growth alone")
     parser.add_argument("--pictures", nargs="+", choices=("h264", "jpeg"), default=["h264", "jpeg"])
     parser.add_argument(
@@ -329,14 +345,17 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="demorec-import-", dir=options.folder) as name:
         folder = Path(name)
         for pictures in options.pictures if options.rounds else ():
-            table(pictures, make_bag(folder / f"{pictures}.mcap", options.seconds, pictures), options, folder)
+            bag = make_bag(folder / f"{pictures}.mcap", options.seconds, pictures, options.gop)
+            table(pictures, bag, options, folder)
         for gigabytes in options.growth:
-            bag = grow(folder / "long.mcap", options.pictures[0], gigabytes)
-            cost = measure("import", bag, folder)
-            print(
-                f"{bag.stat().st_size / 1e9:.1f} GB: peak {cost.peak / 1e6:.0f} MB, "
-                f"{cost.cpu / bag.stat().st_size * 1e9:.1f} CPU s/GB"
-            )
+            one = grow(folder / "one.mcap", options.pictures[0], options.gop, 1)
+            many = [folder / f"part_{number:04d}.mcap" for number in range(round(gigabytes))]
+            for path in many:
+                path.hardlink_to(one)
+            tell(many, folder)
+            for path in many:
+                path.unlink()
+            tell([grow(one, options.pictures[0], options.gop, gigabytes)], folder)
 
 
 if __name__ == "__main__":

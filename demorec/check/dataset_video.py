@@ -51,13 +51,15 @@ def episode_pictures(root: Path, info: DatasetInfo, places: Sequence[EpisodePlac
         ExportError: A video cannot be decoded, or has too few pictures.
     """
     files: dict[Path, Iterator[NDArray[np.uint8]]] = {}
+    ends: dict[Path, int] = {}
     found = []
     for place in places:
-        position, _ = place.videos[key]
+        position, first = place.videos[key]
         path = root / position.path(info.video_path or VIDEO_PATH, key)
         if path not in files:
             files[path] = _decoded(path, info.features[key].shape)
-        pictures = list(islice(files[path], place.length))
+        lead, ends[path] = max(0, first - ends.get(path, 0)), first + place.length
+        pictures = list(islice(files[path], lead, lead + place.length))
         if len(pictures) < place.length or not pictures:
             raise ExportError(
                 f"Episode {place.episode_index} has {place.length} frames, {len(pictures)} pictures decode: {path}"

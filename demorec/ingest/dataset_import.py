@@ -87,6 +87,7 @@ def import_lerobot(root: Path, out: Path, *, video: VideoConfig | None = None) -
                     dataset.pictures(place),
                     success=rows.success,
                     video=video or VideoConfig(),
+                    leads={name: camera.lead(place) for name, camera in dataset.cameras.items()},
                 )
                 folder.add(target)
                 num_new += 1
@@ -201,7 +202,7 @@ class _Dataset:
         return info, _Rows(num_frames=place.length, features=features, success=success)
 
     def pictures(self, place: EpisodePlace) -> dict[str, Iterator[Picture]]:
-        """Camera -> its pictures in an episode, one a frame."""
+        """Camera -> its pictures in an episode, its lead and one a frame."""
         return {name: camera.pictures(place) for name, camera in self.cameras.items()}
 
     def _files(self, place: EpisodePlace) -> Iterator[SourceFile]:

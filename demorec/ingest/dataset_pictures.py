@@ -1,7 +1,7 @@
 """The pictures of a LeRobot dataset's camera, whoever wrote it: packets as they are where they can be, else pixels.
 
-A dataset's video holds many episodes. Its packets can be cut out where each episode begins with a keyframe and no
-picture is shown in another order than it was coded in.
+A dataset's video holds many episodes. Its packets can be cut out, from the keyframe on that an episode's first picture
+needs, where no picture is shown in another order than it was coded in.
 """
 
 from __future__ import annotations
@@ -47,9 +47,13 @@ class DatasetCamera(ABC):
     kept: Literal[""] | PacketCodec = ""
     told: str
 
+    def lead(self, place: EpisodePlace) -> int:
+        """How many of an episode's `pictures` come before its first frame: what that is decoded from."""
+        return 0
+
     @abstractmethod
     def pictures(self, place: EpisodePlace) -> Iterator[Picture]:
-        """One a frame of the episode: a packet where they are kept, else (H, W, 3) uint8 RGB.
+        """Its `lead`, then one a frame of the episode: a packet where they are kept, else (H, W, 3) uint8 RGB.
 
         Raises:
             BagError, ExportError: They cannot be read, are of another size, or end too early.
@@ -72,9 +76,15 @@ class VideoCamera(DatasetCamera):
         self._path: Path | None = None
         self._shown: Iterator[Picture] = iter(())
         self._next = 0
+        self._leads: dict[tuple[Path, int], int] = {}
+        self._since_keyframe: list[Picture] = []
         codec, reason = self._look(list(places))
         self.kept = "" if reason else codec
         self.told = f"{codec}, coded once, since {reason}" if reason else f"{codec} kept as it is"
+
+    def lead(self, place: EpisodePlace) -> int:
+        """As of `DatasetCamera`."""
+        return self._leads.get(self._place(place), 0) if self.kept else 0
 
     def pictures(self, place: EpisodePlace) -> Iterator[Picture]:
         """As of `DatasetCamera`."""
@@ -92,6 +102,8 @@ class VideoCamera(DatasetCamera):
                     f"{max(0, number - first)} of its pictures: {path}"
                 )
             self._next = number + 1
+            if number == first and self.kept:
+                yield from self._since_keyframe[:-1]
             if number >= first:
                 yield picture
 
@@ -101,23 +113,28 @@ class VideoCamera(DatasetCamera):
         return self._root / position.path(self._template, self.key), first
 
     def _look(self, places: list[EpisodePlace]) -> tuple[PacketCodec, str]:
-        """The codec, and why its packets cannot be kept, "" if they can; sets the size."""
-        firsts: dict[Path, set[int]] = {}
+        """The codec, and why its packets cannot be kept, "" if they can; sets the size and the leads."""
+        lengths: dict[Path, dict[int, int]] = {}
         for place in places:
             path, first = self._place(place)
-            firsts.setdefault(path, set()).add(first)
+            lengths.setdefault(path, {})[first] = place.length
         codecs, sizes, reason = set(), set(), ""
-        for path, beginnings in firsts.items():
+        for path, beginnings in lengths.items():
             with _opened(path) as (container, stream):
                 codec = _codec(stream, path)
                 convert = access_units(stream, codec)
                 codecs.add(codec)
                 sizes.add((stream.codec_context.width, stream.codec_context.height))
+                last, keyframe = -1, b""
                 for number, packet in enumerate(packet for packet in container.demux(stream) if packet.size):
                     if packet.pts != packet.dts:
                         reason = reason or "pictures are not shown in the order in which they were coded"
-                    elif number in beginnings and not is_keyframe(codec, convert(packet)):
-                        reason = reason or "an episode does not begin with a keyframe"
+                    if packet.is_keyframe:
+                        last, keyframe = number, convert(packet)
+                    if number in beginnings:
+                        self._leads[path, number] = number - last
+                        if last < 0 or number - last > beginnings[number] or not is_keyframe(codec, keyframe):
+                            reason = reason or "an episode begins far from the keyframe that it needs"
         if len(codecs) != 1 or len(sizes) != 1:
             raise BagError(f"The videos of {self.key} are of several codecs or sizes: {self._root}")
         self.width, self.height = sizes.pop()
@@ -129,7 +146,10 @@ class VideoCamera(DatasetCamera):
             convert = access_units(stream, _codec(stream, path))
             for packet in container.demux(stream):
                 if packet.size:
-                    yield convert(packet)
+                    if packet.is_keyframe:
+                        self._since_keyframe.clear()
+                    self._since_keyframe.append(data := convert(packet))
+                    yield data
 
     def _pixels(self, path: Path) -> Iterator[NDArray[np.uint8]]:
         with _opened(path) as (container, stream):

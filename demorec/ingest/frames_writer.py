@@ -25,6 +25,7 @@ def write_frames(
     *,
     success: bool | None,
     video: VideoConfig,
+    leads: Mapping[str, int] | None = None,
 ) -> None:
     """Record an episode at `info.fps`: whole, or not at all.
 
@@ -32,18 +33,24 @@ def write_frames(
         path: Of the recording.
         info: What is known of the episode.
         frames: Feature -> its vector, of each frame.
-        pictures: Camera -> its pictures, one a frame.
+        pictures: Camera -> its pictures, one a frame, its lead in front.
         success: How it ended; None when nobody said.
         video: How pixels are coded.
+        leads: Camera -> how many of its pictures come before the first frame; 0 where not given.
 
     Raises:
         RecordingError: A number is not finite, or the disk is full.
     """
     writer = CollectedWriter(path, info, video=video)
+    leads = leads or {}
+    begin = max(leads.values(), default=0)
     try:
+        for name, lead in leads.items():
+            for number in range(begin - lead, begin):
+                writer.picture(name, frame_time_ns(number, info.fps), next(pictures[name]))
         count = 0
         for vectors in frames:
-            time_ns = frame_time_ns(count, info.fps)
+            time_ns = frame_time_ns(begin + count, info.fps)
             shown = {name: writer.picture(name, time_ns, next(images)) for name, images in pictures.items()}
             samples = {name: Sample(stamp_ns=time_ns, vector=vector) for name, vector in vectors.items()}
             writer.write(CollectedFrame(time_ns=time_ns, samples=samples, pictures=shown))

@@ -106,7 +106,7 @@ class Timelines:
     def rows(self, window: Window) -> EpisodeRows:
         """The rows of an episode; NoRowsError where a stream has nothing fit for them."""
         begin, end = self._extent(window)
-        times = self._times(begin, end, window)
+        times = self._times(begin, end)
         if len(times) < 2:
             raise NoRowsError(f"only {len(times)} rows have all streams")
         chosen = {key: self.chosen(key, times) for key in self.lines}
@@ -176,22 +176,15 @@ class Timelines:
             age = min(age, line.period_ns if sample == "latest" else line.period_ns // 2)
         return int(line.times_ns[last]) + (0 if sample == "linear" else age)
 
-    def _times(self, begin: int, end: int, window: Window) -> Int:
+    def _times(self, begin: int, end: int) -> Int:
         clock = self.mapping.clock
         if clock.rows == "grid":
             return grid(begin, end, clock.fps)
         key = next((key for key, stream in self.streams.items() if stream.topic == clock.rows), None)
         if key is None:
             raise BagError(f"clock.rows is {clock.rows!r}, of which the mapping takes no feature or camera")
-        line, heads = self.lines[key], self.streams[key].heads
-        inside = np.flatnonzero((line.times_ns >= begin) & (line.times_ns <= end))
-        if heads:
-            # Video that begins with a keyframe goes into a dataset as it is.
-            keyframes = inside[heads.are_keyframes[line.order[inside]]]
-            limit = window.begin_ns + round(clock.max_trim_s * NS)
-            if len(keyframes) and line.times_ns[keyframes[0]] <= limit:
-                inside = inside[inside >= keyframes[0]]
-        return line.times_ns[inside]
+        times = self.lines[key].times_ns
+        return times[(times >= begin) & (times <= end)]
 
     def _label(self, key: Key) -> str:
         stream = self.streams[key]

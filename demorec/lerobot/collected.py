@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -74,15 +75,17 @@ def reasons_to_transcode(recording: CollectedRecording, options: ExportOptions) 
             reasons[camera] = "jpeg pictures are no video"
         elif len(numbers) and (np.diff(numbers) != 1).any():
             reasons[camera] = "frames show pictures again, or leave some out"
-        elif len(numbers) and not _is_keyframe(recording, camera, int(numbers[0])):
-            reasons[camera] = "the first frame's picture is no keyframe"
+        elif len(numbers) and _lead(recording, camera, int(numbers[0])) > len(numbers):
+            reasons[camera] = "the keyframe that the first frame needs is further away than the episode is long"
         else:
             reasons[camera] = ""
     return reasons
 
 
-def _is_keyframe(recording: CollectedRecording, camera: str, number: int) -> bool:
-    return next(packet.is_keyframe for packet in recording.packets(camera) if packet.frame_index == number)
+def _lead(recording: CollectedRecording, camera: str, number: int) -> int:
+    """How many pictures from the last keyframe on come before one: recordings of video begin with a keyframe."""
+    packets = islice(recording.packets(camera), number + 1)
+    return number - max((packet.frame_index for packet in packets if packet.is_keyframe), default=0)
 
 
 def _dataset_settings(recording: CollectedRecording, camera: str, video: VideoConfig, reason: str) -> VideoSettings:
@@ -144,9 +147,10 @@ def _language(recording: CollectedRecording, options: ExportOptions) -> EpisodeL
 
 def _kept(recording: CollectedRecording, camera: str, numbers: NDArray[np.int64]) -> CodedVideo:
     settings = recording.video_settings(camera)
-    block = recording.coded_pictures(camera).select(numbers.astype(np.intp))
+    lead = _lead(recording, camera, int(numbers[0]))
+    block = recording.coded_pictures(camera).select(np.arange(numbers[0] - lead, numbers[-1] + 1, dtype=np.intp))
     codec = _MP4_CODECS.get(settings.codec, settings.codec)
-    return CodedVideo.of_access_units(codec, settings.width, settings.height, block.joined(), block.lengths)
+    return CodedVideo.of_access_units(codec, settings.width, settings.height, block.joined(), block.lengths, lead)
 
 
 def _transcoded(

@@ -33,15 +33,16 @@ _DEMUXERS = {"h264": "h264", "hevc": "hevc", "av1": "obu"}
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CodedVideo:
-    """The T pictures of one camera in one episode.
+    """The T pictures of one camera in one episode, and those before them without which they cannot be decoded.
 
     Attributes:
         codec: "h264", "hevc" or "av1".
         first: The first picture as it was coded, a keyframe.
         samples: All pictures back to back, as an mp4 file stores them; or a file of them that is deleted once written.
-        sizes: (T,) int64, bytes of each in `samples`.
-        is_keyframe: (T,) bool, which ones can be decoded by themselves.
-        digest: SHA-256 of `samples`, hex.
+        sizes: (lead + T,) int64, bytes of each in `samples`.
+        is_keyframe: (lead + T,) bool, which ones can be decoded by themselves.
+        digest: SHA-256 of the samples of the T pictures, hex.
+        lead: How many pictures are in front that belong to no frame, from a keyframe on.
     """
 
     codec: str
@@ -52,10 +53,11 @@ class CodedVideo:
     sizes: NDArray[np.int64]
     is_keyframe: NDArray[np.bool_]
     digest: str
+    lead: int = 0
 
     @classmethod
     def of_access_units(
-        cls, codec: str, width: int, height: int, data: bytes, lengths: Sequence[int] | NDArray[np.int64]
+        cls, codec: str, width: int, height: int, data: bytes, lengths: Sequence[int] | NDArray[np.int64], lead: int = 0
     ) -> CodedVideo:
         """From pictures back to back, as they were coded, and the length of each; ExportError if that is none."""
         unit_lengths = np.asarray(lengths, dtype=np.int64)
@@ -69,8 +71,14 @@ class CodedVideo:
             samples=samples,
             sizes=sizes,
             is_keyframe=is_key,
-            digest=hashlib.sha256(samples).hexdigest(),
+            digest=hashlib.sha256(memoryview(samples)[int(sizes[:lead].sum()) :]).hexdigest(),
+            lead=lead,
         )
+
+    @property
+    def num_frames(self) -> int:
+        """T."""
+        return len(self.sizes) - self.lead
 
     @property
     def num_bytes(self) -> int:
@@ -105,7 +113,7 @@ class Mp4Writer:
 
     def __init__(self, path: Path, first: CodedVideo, *, fps: int) -> None:
         self.parameter_sets = first.parameter_sets()
-        self.num_frames = 0
+        self.num_pictures = 0
         self.num_bytes = 0
         self._path = path
         self._unfinished = path.with_suffix(".unfinished")
@@ -128,7 +136,7 @@ class Mp4Writer:
 
     def add(self, video: CodedVideo) -> None:
         """Append the pictures of an episode; if they are in a file, it is deleted."""
-        time = self.num_frames * self._ticks
+        time = self.num_pictures * self._ticks
         with video.opened() as samples, self._muxing():
             for size, is_keyframe in zip(video.sizes.tolist(), video.is_keyframe.tolist(), strict=True):
                 packet = av.Packet(samples.read(size))
@@ -140,7 +148,7 @@ class Mp4Writer:
                 time += self._ticks
         if isinstance(video.samples, Path):
             video.samples.unlink()
-        self.num_frames += len(video.sizes)
+        self.num_pictures += len(video.sizes)
         self.num_bytes += video.num_bytes
 
     def close(self) -> None:

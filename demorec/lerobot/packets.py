@@ -31,7 +31,10 @@ _TEMPORAL_DELIMITER = b"\x12\x00"
 
 @dataclass(frozen=True, kw_only=True)
 class Packet:
-    """A coded picture of an episode: its frame there, the access unit, and whether it can be decoded by itself."""
+    """A coded picture of an episode: its frame there, the access unit, and whether it can be decoded by itself.
+
+    Frames below 0 are pictures before the episode, from which its first ones are decoded.
+    """
 
     frame: int
     data: bytes
@@ -67,14 +70,21 @@ def episode_packets(root: Path, info: DatasetInfo, key: str, place: EpisodePlace
         if PACKET_CODECS.get(told, codec) != codec:
             raise ValueError(f"its codec is {codec}, and meta/info.json says {told}")
         convert, left = access_units(stream, codec), place.length
+        lead: list[Packet] = []
         for packet in container.demux(stream):
             if not packet.size or packet.pts is None:
                 continue
             # Read before the conversion, which empties the packet.
             frame, is_keyframe = round(packet.pts * rate) - place.videos[key][1], packet.is_keyframe
             data = convert(packet)
-            if 0 <= frame < place.length:
-                yield Packet(frame=frame, data=data, is_keyframe=is_keyframe)
+            read = Packet(frame=frame, data=data, is_keyframe=is_keyframe)
+            if is_keyframe:
+                lead.clear()
+            if frame < 0:
+                lead.append(read)
+            elif frame < place.length:
+                yield from (*lead, read)
+                lead.clear()
                 left -= 1
             if not left:
                 return

@@ -162,7 +162,11 @@ def _column(column: Any) -> NDArray[Any]:
 
 
 class PacketReader:
-    """Coded pictures of one camera feature, in order over all its files."""
+    """Coded pictures of one camera feature, in order over all its files.
+
+    Attributes:
+        keyframe: Number, in its file, of the keyframe from which on the picture read last can be decoded; -1 for none.
+    """
 
     def __init__(self, root: Path, info: DatasetInfo, key: str) -> None:
         self._root = root
@@ -170,8 +174,9 @@ class PacketReader:
         self._key = key
         self._position: FilePosition | None = None
         self._container: Any = None
-        self._packets: Iterator[bytes] = iter(())
+        self._packets: Iterator[av.Packet] = iter(())
         self._next = 0
+        self.keyframe = -1
 
     def close(self) -> None:
         """Close the open file; harmless when called twice."""
@@ -190,23 +195,19 @@ class PacketReader:
                 self._container = av.open(str(path), format="mp4")
             except (OSError, av.FFmpegError) as error:
                 raise ExportError(f"The video cannot be opened ({in_words(error)}): {path}") from error
-            self._packets = _samples(self._container)
-            self._position, self._next = position, 0
+            self._packets = (packet for packet in self._container.demux(video=0) if packet.size)
+            self._position, self._next, self.keyframe = position, 0, -1
         if first < self._next:
             raise ExportError(f"Episode {place.episode_index} overlaps the one before it: {path}")
-        for _ in range(first - self._next):  # pictures that belong to no episode
-            next(self._packets, None)
-        self._next = first + place.length
-        for number in range(place.length):
-            sample = next(self._packets, None)
-            if sample is None:
+        begin, self._next = self._next, first + place.length
+        for number in range(begin, self._next):  # those before the first belong to no episode
+            packet = next(self._packets, None)
+            if packet is None:
                 raise ExportError(
-                    f"Episode {place.episode_index} has {place.length} frames, but {number} pictures: {path}"
+                    f"Episode {place.episode_index} has {place.length} frames, but {max(0, number - first)} pictures: "
+                    f"{path}"
                 )
-            yield sample
-
-
-def _samples(container: Any) -> Iterator[bytes]:
-    for packet in container.demux(video=0):
-        if packet.size:
-            yield bytes(packet)
+            if packet.is_keyframe:
+                self.keyframe = number
+            if number >= first:
+                yield bytes(packet)

@@ -92,8 +92,12 @@ def _transcoded(
 
 
 def video_info(settings: VideoSettings) -> dict[str, Any]:
-    """The `info` of a camera feature: what LeRobot reads from a file, and how it was coded."""
-    preset: int | str = int(settings.preset) if settings.preset.isdigit() else settings.preset
+    """The `info` of a camera feature: what LeRobot reads from a file, and how it was coded, null where unknown.
+
+    LeRobot codes anew with these settings when it takes episodes out of a dataset, and takes its own for those that are
+    null; a GOP of 0 it refuses.
+    """
+    preset = int(settings.preset) if settings.preset.isdigit() else settings.preset or None
     return {
         "video.height": settings.height,
         "video.width": settings.width,
@@ -102,7 +106,7 @@ def video_info(settings: VideoSettings) -> dict[str, Any]:
         "video.fps": settings.fps,
         "video.channels": 3,
         "has_audio": False,
-        "video.g": settings.gop,
+        "video.g": settings.gop or None,
         "video.crf": settings.crf,
         "video.preset": preset,
         "video.fast_decode": 0,

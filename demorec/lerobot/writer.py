@@ -211,13 +211,13 @@ class DatasetWriter:
         )
 
     def _add_video(self, key: str, video: CodedVideo, frames: int) -> dict[str, int | float]:
-        if len(video.sizes) != frames:
-            raise ExportError(f"{key} has {len(video.sizes)} pictures for {frames} frames.")
+        if video.num_frames != frames:
+            raise ExportError(f"{key} has {video.num_frames} pictures for {frames} frames.")
         file = self._videos.get(key)
         fps = self._info.fps
         if file is not None and (
             file.num_bytes + video.num_bytes >= self._info.video_files_size_in_mb * MEBIBYTE
-            or (file.num_frames + frames) / fps > _MAX_SECONDS_PER_VIDEO
+            or (file.num_pictures + len(video.sizes)) / fps > _MAX_SECONDS_PER_VIDEO
             or file.parameter_sets != video.parameter_sets()
         ):
             file.close()
@@ -227,7 +227,7 @@ class DatasetWriter:
         if file is None:
             path = self._root / position.path(VIDEO_PATH, key)
             file = self._videos[key] = Mp4Writer(path, video, fps=fps)
-        start = file.num_frames
+        start = file.num_pictures + video.lead
         file.add(video)
         return {
             f"videos/{key}/chunk_index": position.chunk,

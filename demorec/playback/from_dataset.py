@@ -275,8 +275,10 @@ def _video_batches(
     root: Path, described: DatasetInfo, key: str, place: EpisodePlace, time_ns: NDArray[np.int64]
 ) -> Iterator[VideoBatch]:
     for packets in batched(episode_packets(root, described, key, place), _PICTURES_AT_ONCE):
+        frames = np.array([packet.frame for packet in packets])
+        before = np.array([frame_time_ns(-frame, described.fps) for frame in np.minimum(frames, 0).tolist()])
         yield VideoBatch(
-            time_ns=time_ns[[packet.frame for packet in packets]],
+            time_ns=time_ns[np.maximum(frames, 0)] - before,
             samples=[packet.data for packet in packets],
             is_keyframe=np.array([packet.is_keyframe for packet in packets]),
         )

@@ -1,0 +1,205 @@
+"""Video that stays as it is though episodes begin between its keyframes: every picture is that of the bag's stream.
+
+What the bag shows is decoded here by PyAV from the stream's beginning; the episodes are cut out of its middle.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+from pathlib import Path
+
+import av
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from numpy.typing import NDArray
+from support import bag_mappings, bags
+from support.check import level_of
+from support.export import episode_rows, export
+
+from demorec.ingest.dataset_import import import_lerobot
+from demorec.ingest.import_run import import_bags
+from demorec.lerobot import dataset_digest
+from demorec.lerobot.layout import DatasetInfo
+from demorec.lerobot.packets import episode_packets
+from demorec.lerobot.reader import episode_places
+from demorec.lerobot.stills import pictures_at
+from demorec.playback.from_dataset import open_dataset_episode
+from demorec.recording import CollectedRecording
+
+TOPIC, KEY = "/cameras/cam_high/image", "observation.images.high"
+GOP = 20
+CUTS = ((0.7, 1.9), (2.2, 4.2))
+"""Seconds; both between keyframes, which come every two thirds of a second."""
+
+pytestmark = pytest.mark.usefixtures("hf_datasets_cache")
+Pictures = list[NDArray[np.uint8]]
+
+
+def _pixels(frame: av.VideoFrame) -> NDArray[np.uint8]:
+    return np.asarray(frame.to_ndarray(format="rgb24"), dtype=np.uint8)
+
+
+@pytest.fixture(scope="module")
+def notes() -> bags.Notes:
+    return bags.trossen(4.5, gop=GOP)
+
+
+@pytest.fixture(scope="module")
+def run(notes: bags.Notes, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("kept")
+    text = bag_mappings.TROSSEN.split("[cameras.wrist]")[0].replace("fps = 30", f'fps = 30\nrows = "{TOPIC}"')
+    text += f'[episodes]\ncut = "times"\ntimes_s = {json.dumps(CUTS)}\n'
+    bag = bags.write_trossen(bags.in_order(notes), folder / "bag.mcap")
+    import_bags([bag], bag_mappings.write_mapping(text, folder / "robot.toml"), folder / "run")
+    return folder / "run"
+
+
+@pytest.fixture(scope="module")
+def dataset(run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("dataset") / "d"
+    assert export(run, out).transcoded == ()
+    return out
+
+
+@pytest.fixture(scope="module")
+def expected(notes: bags.Notes, run: Path) -> list[Pictures]:
+    """Episode -> the picture of each frame, out of the whole stream."""
+    of_topic = bags.of_topic(notes, TOPIC)
+    stream = io.BytesIO(b"".join(bytes(note.body["data"]) for note in of_topic))
+    with av.open(stream, "r", format="h264") as container:
+        shown = [_pixels(frame) for frame in container.decode(video=0)]
+    by_stamp = {note.header_ns: picture for note, picture in zip(of_topic, shown, strict=True)}
+    found = []
+    for path in sorted((run / "episodes").glob("*.mcap")):
+        with CollectedRecording(path) as recording:
+            found.append([by_stamp[time] for time in recording.columns().time_ns.tolist()])
+    return found
+
+
+def shown_by(dataset: Path) -> list[Pictures]:
+    """Episode -> its pictures, each found by its time in the file, which PyAV decodes as a whole."""
+    found = []
+    for row in episode_rows(dataset):
+        name = f"chunk-{row[f'videos/{KEY}/chunk_index']:03d}/file-{row[f'videos/{KEY}/file_index']:03d}.mp4"
+        with av.open(str(dataset / "videos" / KEY / name)) as container:
+            pictures = {round((frame.time or 0) * 30): _pixels(frame) for frame in container.decode(video=0)}
+        first, end = (round(row[f"videos/{KEY}/{edge}_timestamp"] * 30) for edge in ("from", "to"))
+        assert end - first == row["length"]
+        found.append([pictures[number] for number in range(first, end)])
+    return found
+
+
+def assert_equal(found: list[Pictures], expected: list[Pictures]) -> None:
+    assert [len(pictures) for pictures in found] == [len(pictures) for pictures in expected]
+    for one, other in zip(found, expected, strict=True):
+        assert all(np.array_equal(a, b) for a, b in zip(one, other, strict=True))
+
+
+def test_whole_episodes_between_keyframes(expected: list[Pictures], dataset: Path) -> None:
+    # No frame is left out to begin with a keyframe, and none is coded anew.
+    assert [len(pictures) for pictures in expected] == pytest.approx([30 * (end - begin) for begin, end in CUTS], abs=1)
+    assert_equal(shown_by(dataset), expected)
+    (first, second) = (row[f"videos/{KEY}/from_timestamp"] * 30 for row in episode_rows(dataset))
+    assert 0 < first < GOP
+    assert 0 < second - first - len(expected[0]) < GOP
+
+
+def test_single_pictures(expected: list[Pictures], dataset: Path) -> None:
+    info = DatasetInfo.load(dataset)
+    for place, pictures in zip(episode_places(dataset, info), expected, strict=True):
+        frames = [0, 1, GOP, place.length - 1]
+        for frame, found in zip(frames, pictures_at(dataset, info, KEY, place, frames), strict=True):
+            assert np.array_equal(found, pictures[frame])
+
+
+@pytest.mark.slow
+def test_lerobot_shows_them(expected: list[Pictures], dataset: Path) -> None:
+    from lerobot.datasets import LeRobotDataset
+
+    opened = LeRobotDataset("local/kept", root=dataset, video_backend="pyav", return_uint8=True)
+    pictures = [picture for episode in expected for picture in episode]
+    assert len(opened) == len(pictures)
+    for number in (0, 1, 17, len(expected[0]) - 1, len(expected[0]), len(expected[0]) + 5, len(pictures) - 1):
+        assert np.array_equal(opened[number][KEY].numpy().transpose(1, 2, 0), pictures[number])
+
+
+@pytest.mark.slow
+def test_lerobots_tools_keep_them(expected: list[Pictures], dataset: Path, run: Path, tmp_path: Path) -> None:
+    from lerobot.datasets import LeRobotDataset
+    from lerobot.datasets.aggregate import aggregate_datasets
+    from lerobot.datasets.dataset_tools import delete_episodes
+
+    roots = [dataset, tmp_path / "second"]
+    export(run, roots[1])
+    aggregate_datasets(["local/1", "local/2"], "local/all", roots=roots, aggr_root=tmp_path / "merged")
+    assert_equal(shown_by(tmp_path / "merged"), [*expected, *expected])
+    opened = LeRobotDataset("local/1", root=dataset)
+    delete_episodes(opened, [0], output_dir=tmp_path / "left", repo_id="local/left")  # which codes pictures anew
+    ((*left,),) = shown_by(tmp_path / "left")
+    assert len(left) == len(expected[1])
+    differences = [np.abs(a.astype(float) - b).mean() for a, b in zip(left, expected[1], strict=True)]
+    moved = [np.abs(a.astype(float) - b).mean() for a, b in zip(left[5:], expected[1], strict=False)]
+    assert max(differences) < 4 < np.median(moved)
+
+
+def test_appended_they_stay(expected: list[Pictures], run: Path, tmp_path: Path) -> None:
+    files = sorted((run / "episodes").glob("*.mcap"))
+    export(files[1], tmp_path / "d")
+    export(files[0], tmp_path / "d", append=True)
+    assert_equal(shown_by(tmp_path / "d"), expected[::-1])
+
+
+def test_imported_again_packets_and_digest_are_the_same(dataset: Path, run: Path, tmp_path: Path) -> None:
+    result = import_lerobot(dataset, tmp_path / "run")
+    assert result.cameras["high"] == "h264 kept as it is"
+    for path in sorted((run / "episodes").glob("*.mcap")):
+        with CollectedRecording(path) as given, CollectedRecording(tmp_path / "run/episodes" / path.name) as found:
+            ours, theirs = (list(recording.packets("high")) for recording in (found, given))
+            length = given.columns().num_frames
+            slices = [[packet.data[packet.data.rfind(b"\0\0\1") :] for packet in packets] for packets in (ours, theirs)]
+            assert slices[0] == slices[1][: len(ours)]
+            assert len(ours) - length == found.columns().pictures["high"][0] > 0
+            times = found.columns().time_ns
+            assert np.array_equal(found.columns().picture_stamps["high"][-length:], times)
+    export(tmp_path / "run", tmp_path / "d")
+    assert dataset_digest(tmp_path / "d") == dataset_digest(dataset)
+
+
+def test_playback_has_what_the_first_frames_are_decoded_from(expected: list[Pictures], dataset: Path) -> None:
+    info = DatasetInfo.load(dataset)
+    for place, pictures in zip(episode_places(dataset, info), expected, strict=True):
+        packets = list(episode_packets(dataset, info, KEY, place))
+        assert packets[0].is_keyframe
+        numbers = [packet.frame for packet in packets]
+        assert numbers == list(range(-numbers.count(0) * (len(packets) - place.length), place.length))
+        with av.open(io.BytesIO(b"".join(packet.data for packet in packets)), "r", format="h264") as container:
+            shown = [_pixels(frame) for frame in container.decode(video=0)]
+        assert_equal([shown[len(packets) - place.length :]], [pictures])
+        with open_dataset_episode(dataset, place.episode_index) as episode:
+            batches = list(episode.videos["high"].batches())
+        times = np.concatenate([batch.time_ns for batch in batches])
+        assert len(times) == len(packets)
+        assert (np.abs(np.diff(times) - 1e9 / 30) < 2).all()
+        assert times[len(packets) - place.length] == episode.time_ns[0]
+
+
+def test_checks_take_them_and_nothing_else(dataset: Path, tmp_path: Path) -> None:
+    for name in ("dataset_videos", "dataset_sidecar"):
+        assert level_of(dataset, name, "dataset") == "pass"
+    # An episode that is off by a picture has a gap of the right kind in front, but not the pictures of its digest.
+    for check, episode, shift in (("dataset_sidecar", 1, -1), ("dataset_sidecar", 1, 1), ("dataset_videos", 0, -GOP)):
+        spoilt = tmp_path / f"{check}{shift}"
+        shutil.copytree(dataset, spoilt)
+        (path,) = (spoilt / "meta" / "episodes").rglob("*.parquet")
+        table = pq.read_table(path)
+        for edge in ("from", "to"):
+            name = f"videos/{KEY}/{edge}_timestamp"
+            times = table.column(name).to_pylist()
+            times[episode] = max(0.0, times[episode] + shift / 30)
+            table = table.set_column(table.column_names.index(name), name, pa.array(times, pa.float64()))
+        pq.write_table(table, path)
+        assert level_of(spoilt, check, "dataset") == "fail"
