@@ -276,9 +276,8 @@ def _video_batches(
 ) -> Iterator[VideoBatch]:
     for packets in batched(episode_packets(root, described, key, place), _PICTURES_AT_ONCE):
         frames = np.array([packet.frame for packet in packets])
-        before = np.array([frame_time_ns(-frame, described.fps) for frame in np.minimum(frames, 0).tolist()])
         yield VideoBatch(
-            time_ns=time_ns[np.maximum(frames, 0)] - before,
+            time_ns=time_ns[np.maximum(frames, 0)],  # those before the episode are decoded with its first frame
             samples=[packet.data for packet in packets],
             is_keyframe=np.array([packet.is_keyframe for packet in packets]),
         )
