@@ -212,8 +212,7 @@ def forges(python: Path, bag: Path, out: Path) -> Cost | str:
 def _child(
     candidate: str, bags_: list[Path], out: Path, mapping: Path, answer: multiprocessing.queues.Queue[Cost]
 ) -> None:
-    import numba  # noqa: F401, the export loads it, and pandas, when it first needs them
-    import pandas as pd  # noqa: F401
+    import pandas as pd  # noqa: F401, the export loads it when it first needs it
 
     import demorec.ingest.import_run
     import demorec.lerobot  # noqa: F401

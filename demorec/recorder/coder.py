@@ -20,7 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.recording import CollectedWriter, WriteStats
-from demorec.recording.pixels import PixelCounter
 from demorec.scene.collected import CollectedCamera, CollectedFrame, CollectedOutcome, Sample
 
 WhenFull = Literal["error", "drop", "wait"]
@@ -35,11 +34,6 @@ _MIN_WAITING_FRAMES = 8
 
 WaitingPictures = Mapping[str, tuple[int, NDArray[np.uint8] | None]]
 """Camera -> stamp and pixels of a new picture, or its stamp and None for the same one again."""
-
-
-def warm_up() -> None:
-    """Load and compile what the first picture would have to wait for."""
-    PixelCounter().add(np.zeros((2, 2, 3), dtype=np.uint8))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

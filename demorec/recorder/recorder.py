@@ -12,7 +12,7 @@ from typing import Self, get_args
 
 from demorec.config import VideoConfig
 from demorec.errors import ConfigError, RecordingError
-from demorec.recorder.coder import Buffers, Coder, WhenFull, warm_up
+from demorec.recorder.coder import Buffers, Coder, WhenFull
 from demorec.recorder.episode import RecordedEpisode
 from demorec.recorder.robot import RobotLike, robot_facts
 from demorec.recorder.vectors import NamedVectors, features_of
@@ -72,8 +72,6 @@ class Recorder:
         self.clock, self.when_full = clock, when_full
         self._check_request()
         self._buffers = Buffers(self._cameras)
-        if self._cameras:
-            warm_up()
         self._stack = ExitStack()
         self._open: RecordedEpisode | None = None
         self._folder: CollectedFolder = self._stack.enter_context(open_collected_run(Path(folder)))

@@ -16,7 +16,7 @@ def count_values(
     picture: NDArray[np.uint8], first_row: int, row_step: int, column_step: int, counts: NDArray[np.int64]
 ) -> None:
     """Add the values of some of a picture's rows and columns to counts (3, 256)."""
-    # Four times as fast as numpy.bincount, twice as fast as Pillow.
+    # Six times as fast as numpy.bincount, four times as fast as Pillow.
     height, width, _ = picture.shape
     for row in range(first_row, height, row_step):
         for column in range(0, width, column_step):

@@ -67,7 +67,7 @@ class CameraRecorder:
         self.streams = CameraStreams(
             video=self._encoder.settings, depth=first.depth is not None, segmentation=first.segmentation is not None
         )
-        self._pixels = PixelCounter()
+        self._pixels = PixelCounter(compiled=True)
         frame_id = camera_frame(camera.name)
         self._color = ColorMessages(camera.name, video.codec)
         self._depth = messages.PictureMessages(frame_id, DEPTH_FORMAT)

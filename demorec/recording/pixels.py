@@ -28,10 +28,14 @@ class PixelCounter:
     known yet. Of a picture only every fourth row is counted, a different quarter in turn.
     """
 
-    def __init__(self) -> None:
-        from demorec.recording.kernels import count_values
+    def __init__(self, *, compiled: bool = False) -> None:
+        """Count by a compiled function: up to six times as fast as NumPy (0.01 against 0.06 ms for 224x224), but worth
+        it only for a process that draws pictures, since it takes 0.4 s to load Numba's compiled functions."""
+        self._count_values = _count_values
+        if compiled:
+            from demorec.recording.kernels import count_values
 
-        self._count_values = count_values
+            self._count_values = count_values
         self._counts = np.zeros((3, 256), dtype=np.int64)
         self._num_seen = 0
         self._num_images = 0
@@ -49,3 +53,10 @@ class PixelCounter:
     def statistics(self) -> PixelStatistics:
         """The counts so far."""
         return PixelStatistics(counts=self._counts.copy(), num_images=self._num_images)
+
+
+def _count_values(
+    picture: NDArray[np.uint8], first_row: int, row_step: int, column_step: int, counts: NDArray[np.int64]
+) -> None:
+    for row_of_counts, channel in zip(counts, np.moveaxis(picture, 2, 0), strict=True):
+        row_of_counts += np.bincount(channel[first_row::row_step, ::column_step].ravel(), minlength=256)
