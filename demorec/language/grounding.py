@@ -26,31 +26,31 @@ class Seen:
 
     Attributes:
         name: Of the body.
-        pixels: (N,) numbers of the pixels that show it, counted row by row from the upper left, in order.
-        width: Of the picture, px.
+        num_pixels: How many pixels show it.
     """
 
     name: str
-    pixels: NDArray[np.intp]
-    width: int
+    num_pixels: int
+    _label: int
+    _labels: NDArray[np.uint16]
 
-    @property
-    def num_pixels(self) -> int:
-        """How many pixels show it."""
-        return len(self.pixels)
+    @cached_property
+    def pixels(self) -> NDArray[np.intp]:
+        """(N,) numbers of the pixels that show it, counted row by row from the upper left, in order."""
+        shown = self._labels == self._label
+        _, y_min, _, y_max = self.box
+        return np.asarray(np.flatnonzero(shown[y_min : y_max + 1]) + y_min * shown.shape[1])
 
     @cached_property
     def box(self) -> tuple[int, int, int, int]:
         """(x_min, y_min, x_max, y_max), the outermost pixels that show it, both included."""
-        columns = self.pixels % self.width
-        y_min, y_max = int(self.pixels[0]) // self.width, int(self.pixels[-1]) // self.width
-        return int(columns.min()), y_min, int(columns.max()), y_max
+        shown = self._labels == self._label
+        (y_min, y_max), (x_min, x_max) = (np.flatnonzero(shown.any(axis=axis))[[0, -1]].tolist() for axis in (1, 0))
+        return x_min, y_min, x_max, y_max
 
     def is_at(self, x: int, y: int) -> bool:
         """Whether a pixel shows it."""
-        number = y * self.width + x
-        place = int(np.searchsorted(self.pixels, number))
-        return place < len(self.pixels) and int(self.pixels[place]) == number
+        return int(self._labels[y, x]) == self._label
 
 
 def spoken_bodies(recording: Recording) -> tuple[str, ...]:
@@ -65,13 +65,12 @@ def seen_things(labels: NDArray[np.uint16], numbers: dict[str, int]) -> dict[str
         labels: (H, W) as of `Recording.segmentation_at`.
         numbers: Name of a body -> its label.
     """
-    # Bodies that are spoken of have no links, and so one label each.
-    by_row = labels.ravel()
-    pixels = np.flatnonzero(by_row >= min(numbers.values(), default=1))
-    shown = by_row[pixels]
-    found = {name: pixels[shown == number] for name, number in numbers.items()}
-    width = labels.shape[1]
-    return {name: Seen(name=name, pixels=pixels, width=width) for name, pixels in found.items() if len(pixels)}
+    counts = {name: int(np.count_nonzero(labels == number)) for name, number in numbers.items()}
+    return {
+        name: Seen(name=name, num_pixels=count, _label=numbers[name], _labels=labels)
+        for name, count in counts.items()
+        if count
+    }
 
 
 def body_labels(recording: Recording) -> dict[str, int]:
@@ -115,9 +114,9 @@ def project_each(camera: Camera, world_from_camera: Array, points: Array) -> Arr
     return np.stack([k[0, 0] * seen[0] / depth + k[0, 2], k[1, 1] * seen[1] / depth + k[1, 2]], axis=-1)
 
 
-def pixel_of(camera: Camera, point: Array) -> tuple[int, int] | None:
-    """The pixel that contains a point (2,) px; None outside of the picture."""
-    x, y = point.tolist()
-    if not (0 <= x < camera.width and 0 <= y < camera.height):  # which NaN is not either
-        return None
-    return int(x), int(y)
+def pixels_of(camera: Camera, points: Array) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """The pixels that contain points (..., 2) px, and whether they are in the picture at all; (0, 0) where not."""
+    x, y = points[..., 0], points[..., 1]
+    # NaN is not inside either.
+    inside: NDArray[np.bool_] = (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+    return np.where(inside[..., np.newaxis], points, 0).astype(np.int64), inside

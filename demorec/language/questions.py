@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.geometry import Array
-from demorec.language.grounding import MIN_PIXELS, Seen, body_labels, pixel_of, project, project_each, seen_things
+from demorec.language.grounding import MIN_PIXELS, Seen, body_labels, pixels_of, project_each, seen_things
 from demorec.language.referring import each_phrase
 from demorec.language.situation import NamedThing, Situations, Surroundings
 from demorec.recording import Recording
 from demorec.scene.episode import EpisodeColumns
-from demorec.scene.scene import Camera, Scene
+from demorec.scene.scene import Camera
 
 ANSWERS = {
     "bbox": {"detections"},
@@ -67,9 +67,8 @@ class Trace:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Moment:
-    """Where all things are at one moment, and what they are called, whatever camera looks at them."""
+    """All things at one moment, and what they are called, whatever camera looks at them."""
 
-    positions: dict[str, Array]
     now: Surroundings
     _plainest: dict[str, str] = field(default_factory=dict)
 
@@ -86,12 +85,12 @@ class _Moment:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _View:
-    """One picture with all that is known of it."""
+    """One picture with all that is known of it; `middles` are where those of the things are in it, px."""
 
     camera: Camera
-    world_from_camera: Array
     seen: dict[str, Seen]
     moment: _Moment
+    middles: dict[str, Array]
 
     @property
     def now(self) -> Surroundings:
@@ -103,16 +102,6 @@ class _View:
         """Name -> phrase of each thing that is visible enough to be spoken of, in words that mean it alone."""
         large = (name for name, thing in self.seen.items() if thing.num_pixels >= MIN_PIXELS)
         return {name: phrase for name in large if (phrase := self.moment.phrase(name))}
-
-    @cached_property
-    def _middles(self) -> dict[str, Array]:
-        positions = self.moment.positions
-        pixels = project(self.camera, self.world_from_camera, np.array(list(positions.values())).reshape(-1, 3))
-        return dict(zip(positions, pixels, strict=True))
-
-    def middle(self, name: str) -> Array:
-        """(2,) where the middle of a thing is in the picture, px."""
-        return self._middles[name]
 
 
 def asked_rows(rows: NDArray[np.intp], fps: int) -> list[int]:
@@ -134,40 +123,38 @@ def questions(
     Raises:
         RecordingError: The recording is damaged.
     """
-    anchors = {int(rows[row]): row for row in asked_rows(rows, fps)}
+    scene, asked = recording.info.scene, asked_rows(rows, fps)
+    frames = rows[asked]
     chosen = {
         camera.name: (number, camera)
-        for number, camera in enumerate(recording.info.scene.cameras)
+        for number, camera in enumerate(scene.cameras)
         if camera.name in cameras and recording.has_segmentation(camera.name)
     }
     if not chosen:
         return
-    numbers, situations = body_labels(recording), Situations(recording.info.scene)
-    moments: dict[int, _Moment] = {}
-    found: dict[str, list[Question | None]] = {name: [] for name in chosen}
-    for name, frame, labels in recording.segmentation_at(list(chosen), anchors):
-        if frame not in moments:
-            moments[frame] = _moment(recording.info.scene, situations, columns, frame)
-        number, camera = chosen[name]
+    numbers, poses = body_labels(recording), {name: values[frames] for name, values in columns.object_poses.items()}
+    moments = [_Moment(now=now) for now in Situations(scene).at_each(poses, len(frames))]
+    places = np.empty((len(frames), len(numbers), 3))
+    for index, name in enumerate(numbers):
+        places[:, index] = poses[name][:, :3] if name in poses else scene.body(name).world_from_body.position
+    middles = {
+        name: project_each(camera, columns.world_from_camera[name][frames], places)
+        for name, (_, camera) in chosen.items()
+    }
+    turns = {int(frame): turn for turn, frame in enumerate(frames)}
+    found: dict[str, list[Question]] = {name: [] for name in chosen}
+    for name, frame, labels in recording.segmentation_at(list(chosen), turns):
+        (number, camera), turn = chosen[name], turns[frame]
         view = _View(
             camera=camera,
-            world_from_camera=columns.world_from_camera[name][frame],
             seen=seen_things(labels, numbers),
-            moment=moments[frame],
+            moment=moments[turn],
+            middles=dict(zip(numbers, middles[name][turn], strict=True)),
         )
-        asked = _ask(view, len(found[name]) + number)
-        found[name].append(
-            asked and Question(row=anchors[frame], camera=name, text=asked[0], answer=json.dumps(asked[1]))
-        )
-    for told in found.values():
-        yield from (question for question in told if question is not None)
-
-
-def _moment(scene: Scene, situations: Situations, columns: EpisodeColumns, frame: int) -> _Moment:
-    poses = {name: values[frame] for name, values in columns.object_poses.items()}
-    positions = {body.name: body.world_from_body.position for body in scene.bodies}
-    positions |= {name: np.asarray(pose[:3]) for name, pose in poses.items()}
-    return _Moment(positions=positions, now=situations.at(poses))
+        if (told := _ask(view, turn + number)) is not None:
+            found[name].append(Question(row=asked[turn], camera=name, text=told[0], answer=json.dumps(told[1])))
+    for of_camera in found.values():
+        yield from of_camera
 
 
 def _ask(view: _View, turn: int) -> tuple[str, dict[str, Any]] | None:
@@ -188,16 +175,17 @@ def _bbox(view: _View, turn: int) -> tuple[str, dict[str, Any]] | None:
 
 
 def _keypoint(view: _View, turn: int) -> tuple[str, dict[str, Any]] | None:
-    names = []
-    for name in view.clear:
-        pixel = pixel_of(view.camera, view.middle(name))
-        if pixel is not None and view.seen[name].is_at(*pixel):
-            names.append((name, pixel))
+    pixels, inside = pixels_of(view.camera, np.array([view.middles[name] for name in view.clear]).reshape(-1, 2))
+    names = [
+        (name, pixel)
+        for name, pixel, is_inside in zip(view.clear, pixels.tolist(), inside.tolist(), strict=True)
+        if is_inside and view.seen[name].is_at(*pixel)
+    ]
     if not names:
         return None
     name, pixel = names[turn % len(names)]
     phrase = view.clear[name]
-    return f"Point at the middle of {phrase}.", {"label": phrase, "point_format": "xy", "point": list(pixel)}
+    return f"Point at the middle of {phrase}.", {"label": phrase, "point_format": "xy", "point": pixel}
 
 
 def _count(view: _View, turn: int) -> tuple[str, dict[str, Any]] | None:
@@ -247,7 +235,7 @@ def _relation(view: _View, name: str, other: str) -> str:
         return "in" if lower.noun == "tray" else "on"
     if rests_on(lower, view.now.thing(name)):
         return ""
-    offset = float(view.middle(name)[0] - view.middle(other)[0]) / view.camera.width
+    offset = float(view.middles[name][0] - view.middles[other][0]) / view.camera.width
     if not abs(offset) >= _CLEARLY_BESIDE:
         return ""
     return "left_of" if offset < 0 else "right_of"
@@ -288,12 +276,14 @@ def traces(
         frames = rows[asked]
         tcp = world_from_tcp[np.minimum(frames[:, np.newaxis] + steps, columns.num_frames - 1)]
         projected = project_each(camera, columns.world_from_camera[camera.name][frames], tcp)
-        for row, points in zip(asked, projected, strict=True):
-            pixels: list[list[int]] = []
-            for point in points:
-                if (pixel := pixel_of(camera, point)) is None:
-                    break
-                pixels.append(list(pixel))
-            if pixels:
-                answer = {"label": "gripper", "point_format": "xy", "points": pixels, "seconds": _TRACE_SECONDS}
+        pixels, inside = pixels_of(camera, projected)
+        counts = np.logical_and.accumulate(inside, axis=1).sum(axis=1).tolist()
+        for row, points, count in zip(asked, pixels.tolist(), counts, strict=True):
+            if count:
+                answer = {
+                    "label": "gripper",
+                    "point_format": "xy",
+                    "points": points[:count],
+                    "seconds": _TRACE_SECONDS,
+                }
                 yield Trace(row=row, camera=camera.name, answer=json.dumps(answer))

@@ -99,11 +99,22 @@ class Situations:
         Args:
             world_from_object: Body -> (7,) pose (xyz, quaternion xyzw) at the moment; the scene's own where left out.
         """
-        moved = world_from_object or {}
-        places = [moved[b.name][:3] if b.name in moved else b.world_from_body.position for b in self._bodies]
-        positions = self._base_from_world.apply(np.array(places).reshape(-1, 3))
-        things = (NamedThing(position=place, **traits) for place, traits in zip(positions, self._traits, strict=True))
-        return Surroundings(things=tuple(things))
+        return self.at_each({name: pose[np.newaxis] for name, pose in (world_from_object or {}).items()}, 1)[0]
+
+    def at_each(self, world_from_object: Mapping[str, Array], moments: int) -> list[Surroundings]:
+        """The same of T moments at once: body -> (T, 7) poses."""
+        places = np.empty((moments, len(self._bodies), 3))
+        for index, body in enumerate(self._bodies):
+            moved = world_from_object.get(body.name)
+            places[:, index] = body.world_from_body.position if moved is None else moved[:, :3]
+        return [
+            Surroundings(
+                things=tuple(
+                    NamedThing(position=place, **traits) for place, traits in zip(there, self._traits, strict=True)
+                )
+            )
+            for there in self._base_from_world.apply(places)
+        ]
 
 
 def situation(scene: Scene, world_from_object: Mapping[str, Array] | None = None) -> Surroundings:

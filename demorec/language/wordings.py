@@ -76,7 +76,9 @@ def task_wordings(scene: Scene, instruction: str, rng: np.random.Generator, *, i
     clauses = [
         _Clause(object=goal.object, place=place_of(scene, goal), base=_base_of(goal, start)) for goal in scene.goals
     ]
-    sentences = list(dict.fromkeys([*_by_class(scene, clauses), *_one_by_one(scene, clauses, start, is_dropped, rng)]))
+    sentences = list(
+        dict.fromkeys([*_by_class(scene, clauses, start), *_one_by_one(scene, clauses, start, is_dropped, rng)])
+    )
     order = rng.permutation(len(sentences))
     wanted = WORDINGS - 1
     chosen = [sentences[index] for index in order[:wanted]]
@@ -155,12 +157,11 @@ def _sentences(scene: Scene, clause: _Clause, start: Surroundings, is_dropped: b
             yield f"stack {object_} on {place}"
 
 
-def _by_class(scene: Scene, clauses: Sequence[_Clause]) -> Iterator[str]:
+def _by_class(scene: Scene, clauses: Sequence[_Clause], start: Surroundings) -> Iterator[str]:
     """Sentences that speak of all things of a kind at once, where several goals share a place: "every red cube"."""
     places = list(dict.fromkeys(clause.place for clause in clauses))
     if len(places) == len(clauses) or not all(places):
         return
-    start = situation(scene)
     parts: list[list[str]] = []
     for place in places:
         members = frozenset(clause.object for clause in clauses if clause.place == place)

@@ -45,6 +45,10 @@ REPEATING += (f"{PERSISTENT}.list.element.timestamp",)
 """Parquet's names of the parts whose values come again and again."""
 
 
+_AT_ONCE = 16
+"""How many rows of an episode are made in one step."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class LanguageRow:
     """One entry of a language column.
@@ -70,8 +74,11 @@ class LanguageRow:
         row: dict[str, Any] = {"role": self.role, "content": self.content, "style": self.style}
         if self.timestamp is not None:
             row["timestamp"] = self.timestamp
-        call = {"type": "function", "function": {"name": "say", "arguments": {"text": self.spoken}}}
-        return {**row, "camera": self.camera, "tool_calls": [json.dumps(call)] if self.spoken else None}
+        row |= {"camera": self.camera, "tool_calls": None}
+        if self.spoken:
+            call = {"type": "function", "function": {"name": "say", "arguments": {"text": self.spoken}}}
+            row["tool_calls"] = [json.dumps(call)]
+        return row
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,7 +133,9 @@ def language_arrays(language: EpisodeLanguage, frames: int) -> dict[str, pa.Arra
         counts[row + 1] = len(told)
     said = [entry for _, told in sorted(language.events.items()) for entry in told]
     state = _structs(language.persistent, _STATE)
-    often = state.take(pa.array(np.tile(np.arange(len(state)), frames)))
+    # In two steps, since each costs by the number of its parts; `take` costs three times as much.
+    several = pa.concat_arrays([state] * _AT_ONCE)
+    often = pa.concat_arrays([several] * (frames // _AT_ONCE) + [state] * (frames % _AT_ONCE))
     steps = pa.array(np.arange(frames + 1, dtype=np.int32) * np.int32(len(state)))
     return {
         PERSISTENT: pa.ListArray.from_arrays(steps, often),

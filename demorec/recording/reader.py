@@ -45,7 +45,7 @@ class RecordingReader(EpisodeFile):
     _said: tuple[tuple[int, bytes], ...] | None = None
     """(time_ns, message) of all events, once `columns` has come by them: they lie among the numbers in the file."""
     _packed_labels: Mapping[str, Block] = MappingProxyType({})
-    """topic -> segmentation pictures, once `coded_pictures` has come by them: they lie among the other pictures."""
+    """topic -> segmentation pictures and the names in them, once `coded_pictures` has come by them."""
 
     def _read_metadata(self) -> None:
         found = self._container.metadata(metadata.EPISODE)
@@ -167,6 +167,7 @@ class RecordingReader(EpisodeFile):
         codecs = {camera: self.video_settings(camera).codec for camera in cameras}
         topics = {camera: channels.video_topic(camera, codec) for camera, codec in codecs.items()}
         labels = [self._segmentation_topic(camera) for camera in cameras if self.has_segmentation(camera)]
+        labels += [channels.LABELS] if labels else []
         found = self._container.blocks((*topics.values(), *labels))
         self._packed_labels = {topic: found[topic] for topic in labels}
         times = self._frame_times()
@@ -248,9 +249,10 @@ class RecordingReader(EpisodeFile):
 
     def segment_labels(self) -> dict[int, str]:
         """Label in the files -> name, as of `segment_names`."""
-        for message in self._container.messages((channels.LABELS,)):
+        packed = self._packed_labels.get(channels.LABELS) or self._container.blocks((channels.LABELS,))[channels.LABELS]
+        for message in packed.messages():
             with damage_as_recording_error(self.path):
-                return messages.read_label_info(message.data)
+                return messages.read_label_info(message)
         return {}
 
     def _pictures[P](self, topic: str, read: Callable[[bytes], P]) -> Iterator[tuple[int, P]]:
