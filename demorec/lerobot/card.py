@@ -79,6 +79,24 @@ _ACTION_MEANING: Mapping[ActionKind, str] = {
     "ee_delta": "change of the tool centre point's pose since the frame before, the first since the observed one: "
     "translation (m) and rotation vector (rad) in base axes, applied from the left; gripper opening (m), absolute",
 }
+_COLLECTED_ROWS = (
+    "Row t holds what was recorded at frame t, as it came. LeRobot's timestamps are multiples of the nominal "
+    "period; the frames' own stamps, and how old each sample was, are in the recordings."
+)
+_SIMULATED_ROWS = (
+    "Row t holds the observation at time t, taken before the action of row t is applied; the action is what the "
+    "expert wanted to be reached at the next frame. Where exploration noise was added to what the motors got, the "
+    "action is derived from the clean target. Frame times are multiples of the simulation's frame period, not of a "
+    "wall clock."
+)
+_BESIDE_COLLECTED = (
+    f"`{SIDECAR_DIR}/episodes/` says where each episode comes from, how it ended and what its cameras were."
+)
+_BESIDE_SIMULATED = (
+    f"`{SIDECAR_DIR}/` holds what LeRobot has no column for: `episodes/` (seed, outcome with every check, phases, "
+    "camera intrinsics and extrinsics, poses, the complete scene of every episode), `camera_poses/` (of moving "
+    "cameras, per frame, world_from_camera, OpenCV axes), `attempts/` (failed ones too), `configs.json`."
+)
 
 
 def write_card(root: Path, info: DatasetInfo, about: CardFacts) -> None:
@@ -139,35 +157,13 @@ def _card(root: Path, info: DatasetInfo, about: CardFacts, has_sheet: bool) -> I
     for key, item in info.features.items():
         yield f"| `{key}` | {item.dtype} | {list(item.shape)} | {_meaning(key, item, about)} |"
     yield from ("", "Names of all components are in `meta/info.json`.", "", "## Contract", "")
-    if about.is_collected:
-        yield (
-            "Row t holds what was recorded at frame t, as it came. LeRobot's timestamps are multiples of the nominal "
-            "period; the frames' own stamps, and how old each sample was, are in the recordings."
-        )
-        yield ""
-        yield from _success_section(_read_attempts(root))
-        yield from ("## What stands beside", "")
-        yield f"`{SIDECAR_DIR}/episodes/` says where each episode comes from, how it ended and what its cameras were."
-        yield from _robot_section(root)
-        yield ""
-        return
-    yield (
-        "Row t holds the observation at time t, taken before the action of row t is applied; the action is what the "
-        "expert wanted to be reached at the next frame. Where exploration noise was added to what the motors got, the "
-        "action is derived from the clean target. Frame times are multiples of the simulation's frame period, not of a "
-        "wall clock."
-    )
-    yield ""
+    yield from (_COLLECTED_ROWS if about.is_collected else _SIMULATED_ROWS, "")
     yield from _success_section(_read_attempts(root))
-    yield from ("## What stands beside", "")
-    yield (
-        f"`{SIDECAR_DIR}/` holds what LeRobot has no column for: `episodes/` (seed, outcome with every check, phases, "
-        "camera intrinsics and extrinsics, poses, the complete scene of every episode), `camera_poses/` (of moving "
-        "cameras, per frame, world_from_camera, OpenCV axes), `attempts/` (failed ones too), `configs.json`."
-    )
+    yield from ("## What stands beside", "", _BESIDE_COLLECTED if about.is_collected else _BESIDE_SIMULATED)
     yield from _robot_section(root)
     yield ""
-    yield from _origin_section(root, about)
+    if not about.is_collected:
+        yield from _origin_section(root, about)
 
 
 def _robot_section(root: Path) -> Iterable[str]:
