@@ -6,7 +6,6 @@ each call of `messages`, in the memory of a chunk.
 
 from __future__ import annotations
 
-import hashlib
 import os
 import stat
 import tempfile
@@ -24,6 +23,7 @@ from demorec.ingest.mcap_bag import read_mcap
 from demorec.ingest.sqlite_bag import SQLITE_MAGIC, read_sqlite
 from demorec.lerobot.paths import INFO_PATH
 from demorec.recording.limits import Limits
+from demorec.runs.run_file import sha256_of
 from demorec.safety.files import MCAP_MAGIC, open_regular, read_text_limited
 
 METADATA = "metadata.yaml"
@@ -60,14 +60,7 @@ class Bag:
 
     def sha256s(self) -> dict[str, str]:
         """Name of each of its files -> SHA-256 of its bytes, hex digits."""
-        found = {}
-        for path in self.files:
-            sha = hashlib.sha256()
-            with open_regular(path) as file:
-                while block := file.read(_COPY_BYTES):
-                    sha.update(block)
-            found[path.name] = sha.hexdigest()
-        return found
+        return {path.name: sha256_of(path) for path in self.files}
 
     def messages(self, problems: list[str], topics: Collection[str] | None = None) -> Iterator[BagMessage]:
         """Its messages in the order in which they were written.

@@ -45,7 +45,6 @@ def describe(
     *,
     bag: Bag,
     lines: Timelines,
-    streams: BagStreams,
     rows: EpisodeRows,
     plans: Mapping[str, PicturePlan],
     urdf: str,
@@ -56,7 +55,7 @@ def describe(
     """The description of an episode; BagError when the robot's model in the bag is none."""
     mapping = lines.mapping
     if mapping.robot.urdf_topic:
-        urdf = _urdf_of(bag, streams, mapping.robot.urdf_topic)
+        urdf = _urdf_of(bag, lines.streams, mapping.robot.urdf_topic)
     joints = frozenset[str]()
     if urdf:
         try:
@@ -70,7 +69,7 @@ def describe(
         urdf=urdf,
         fps=mapping.clock.fps,
         features=tuple(_feature(name, feature, lines, joints) for name, feature in rows.features.items()),
-        cameras=tuple(_camera(name, plan, lines, streams) for name, plan in plans.items()),
+        cameras=tuple(_camera(name, plan, lines) for name, plan in plans.items()),
         origin=origin,
         versions={"demorec": version("demorec"), "av": version("av")},
     )
@@ -104,9 +103,9 @@ def _feature(name: str, feature: FeatureRows, lines: Timelines, joints: frozense
     )
 
 
-def _camera(name: str, plan: PicturePlan, lines: Timelines, streams: BagStreams) -> CollectedCamera:
+def _camera(name: str, plan: PicturePlan, lines: Timelines) -> CollectedCamera:
     clock = "header" if lines.lines[name].is_header else "log"
-    info = streams.infos.get(name, {})
+    info = lines.streams.infos.get(name, {})
     matrix, distortion = _first(info, "k", "K"), _first(info, "d", "D")
     fits = (int(info.get("width") or plan.head.width), int(info.get("height") or plan.head.height)) == (
         plan.head.width,

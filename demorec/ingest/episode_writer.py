@@ -20,7 +20,6 @@ from demorec.ingest.fields import picture_bytes
 from demorec.ingest.picture_messages import KEPT_FORMATS, PictureHead, decode_picture
 from demorec.ingest.ros_types import Values
 from demorec.ingest.rows import CameraRows, EpisodeRows
-from demorec.ingest.streams import Stream
 from demorec.recording import CollectedWriter
 from demorec.scene.collected import DEPTH_UNITS, CollectedFrame, CollectedInfo, CollectedOutcome, Kept, Sample
 
@@ -64,9 +63,10 @@ def _name_of(head: PictureHead) -> str:
     return head.encoding if head.format == "raw" else head.format
 
 
-def picture_plan(rows: CameraRows, stream: Stream, line: Timeline) -> PicturePlan:
+def picture_plan(rows: CameraRows, line: Timeline) -> PicturePlan:
     """Of a camera in an episode: of stills those that rows show, of video all from the keyframe before on."""
-    place = np.searchsorted(line.times_ns, _times_of(stream, line, rows))
+    stream = line.stream
+    place = np.searchsorted(line.times_ns, line.stamps_ns[rows.index])
     head = stream.heads[int(line.order[place[0]])]
     taken = np.unique(place)
     if head.format in KEPT_FORMATS and head.format != "jpeg":
@@ -90,10 +90,6 @@ def _kept(head: PictureHead) -> Kept:
     if head.encoding in DEPTH_UNITS:
         return cast(Kept, head.encoding)
     return cast(Kept, head.format) if head.format in KEPT_FORMATS else ""
-
-
-def _times_of(stream: Stream, line: Timeline, rows: CameraRows) -> Int:
-    return np.asarray((stream.header_ns if line.is_header else stream.log_ns)[rows.index])
 
 
 @dataclass(kw_only=True, eq=False)

@@ -83,7 +83,7 @@ def _calls(bag: Bag, streams: BagStreams, episodes: Episodes) -> list[Text]:
 
 
 def _marker(call: ServiceCall, value: object) -> Text:
-    return Text(time_ns=call.time_ns, log_ns=call.time_ns, value=value)
+    return Text(time_ns=call.time_ns, value=value)
 
 
 def _between_gaps(timelines: list[Timeline], gap_s: float) -> list[Window]:

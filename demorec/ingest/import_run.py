@@ -25,7 +25,7 @@ from demorec.ingest.import_file import ImportFile, load_import_file, save_import
 from demorec.ingest.mapping import BagMapping, read_mapping
 from demorec.ingest.report import BagReport, EpisodeReport, all_findings, stream_reports
 from demorec.ingest.rows import EpisodeRows, NoRowsError, Timelines
-from demorec.ingest.streams import BagDecoder, BagStreams, read_streams
+from demorec.ingest.streams import BagDecoder, read_streams
 from demorec.runs.collected import CollectedFolder, differences, open_collected_run
 from demorec.scene.collected import CollectedInfo
 
@@ -119,7 +119,7 @@ class _Import:
         found = windows(
             self._bag, streams, [line for line in lines.lines.values() if len(line.times_ns)], self._mapping
         )
-        findings = all_findings(streams, lines, self._mapping)
+        findings = all_findings(lines)
         begin = min(window.begin_ns for window in found)
         episodes: list[_Episode] = []
         reports: list[EpisodeReport] = []
@@ -133,7 +133,7 @@ class _Import:
                     raise BagError(f"The bag gives no whole episode: {error}{told}: {self._bag.path}") from error
                 reports.append(_dropped(window, begin, str(error)))
                 continue
-            episode = self._episode(streams, lines, rows, first_index + len(episodes))
+            episode = self._episode(lines, rows, first_index + len(episodes))
             episodes.append(episode)
             reports.append(_made(episode, begin))
         self._check_alike(episodes)
@@ -147,22 +147,19 @@ class _Import:
             episodes=tuple(reports),
         )
 
-    def _episode(self, streams: BagStreams, lines: Timelines, rows: EpisodeRows, index: int) -> _Episode:
-        plans = {
-            name: picture_plan(camera, lines.streams[name], lines.lines[name]) for name, camera in rows.cameras.items()
-        }
+    def _episode(self, lines: Timelines, rows: EpisodeRows, index: int) -> _Episode:
+        plans = {name: picture_plan(camera, lines.lines[name]) for name, camera in rows.cameras.items()}
         info = describe(
             bag=self._bag,
             lines=lines,
-            streams=streams,
             rows=rows,
             plans=plans,
             urdf=self._urdf,
             episode_index=index,
-            instruction=task_text(self._bag, streams, rows.window, self._mapping),
+            instruction=task_text(self._bag, lines.streams, rows.window, self._mapping),
             origin=origin_of(self._files, self._mapping),
         )
-        subtasks = subtask_rows(self._bag, streams, rows.window, rows.times_ns, self._mapping)
+        subtasks = subtask_rows(self._bag, lines.streams, rows.window, rows.times_ns, self._mapping)
         return _Episode(info=info, rows=rows, plans=plans, subtasks=subtasks, path=self._folder.path_of(index))
 
     def _check_alike(self, episodes: Sequence[_Episode]) -> None:

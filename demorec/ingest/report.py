@@ -9,9 +9,7 @@ import numpy as np
 
 from demorec.ingest.clock import NS, Timeline
 from demorec.ingest.findings import Finding, bag_findings, stream_findings
-from demorec.ingest.mapping import BagMapping
 from demorec.ingest.rows import EpisodeRows, Timelines
-from demorec.ingest.streams import NO_STAMP, BagStreams, Stream
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,12 +94,12 @@ class BagReport:
 
 def stream_reports(lines: Timelines, episodes: Sequence[EpisodeRows]) -> Iterator[StreamReport]:
     """A line for each stream."""
-    for key, stream in lines.streams.items():
-        line = lines.lines[key]
+    for key, line in lines.lines.items():
+        stream = line.stream
         steps = np.diff(line.times_ns)
         ages = [lines.chosen(key, rows.times_ns).reach_ns.max() for rows in episodes]
         usual = steps[(steps > 0.4 * line.period_ns) & (steps < 1.6 * line.period_ns)]
-        skew, spread = _skew(stream)
+        skew, spread = _skew(line)
         lost = int((np.round(steps / line.period_ns) - 1).clip(min=0).sum()) if line.is_regular else 0
         yield StreamReport(
             label=stream.label,
@@ -116,36 +114,24 @@ def stream_reports(lines: Timelines, episodes: Sequence[EpisodeRows]) -> Iterato
             jitter_ms=float(np.std(usual)) / 1e6 if len(usual) else 0.0,
             longest_ms=float(steps.max()) / 1e6 if len(steps) else 0.0,
             lost=lost,
-            duplicates=_duplicates(stream, line),
+            duplicates=line.num_repeated,
             malformed=stream.num_malformed,
             max_age_ms=float(max(ages)) / 1e6 if ages else None,
         )
 
 
-def _skew(stream: Stream) -> tuple[float | None, float | None]:
-    stamped = (stream.header_ns != NO_STAMP) & (stream.header_ns > 0)
-    if not stamped.any():
+def _skew(line: Timeline) -> tuple[float | None, float | None]:
+    skew = line.skews_ns
+    if not len(skew):
         return None, None
-    skew = (stream.log_ns - stream.header_ns)[stamped]
     low, high = np.percentile(skew, [1, 99])
     return float(np.median(skew)) / 1e6, float(high - low) / 1e6
 
 
-def _duplicates(stream: Stream, line: Timeline) -> int:
-    times = stream.header_ns if line.is_header else stream.log_ns
-    known = times[(times != NO_STAMP) & (times > 0)]
-    return len(known) - len(np.unique(known))
-
-
-def all_findings(streams: BagStreams, lines: Timelines, mapping: BagMapping) -> tuple[Finding, ...]:
+def all_findings(lines: Timelines) -> tuple[Finding, ...]:
     """What is odd in a bag, each thing once."""
-    by_label = {f"{key}": (stream, lines.lines[key]) for key, stream in lines.streams.items()}
-    found = [
-        finding
-        for key, stream in lines.streams.items()
-        for finding in stream_findings(stream, lines.lines[key], is_camera=isinstance(key, str))
-    ]
-    found += bag_findings(streams, by_label, mapping)
+    found = [finding for line in lines.lines.values() for finding in stream_findings(line)]
+    found += bag_findings(lines.streams, list(lines.lines.values()), lines.mapping)
     once: dict[tuple[str, str], Finding] = {}
     for finding in found:
         once.setdefault((finding.kind, finding.text.partition(":")[0] if finding.stream else finding.text), finding)

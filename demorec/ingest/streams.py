@@ -87,12 +87,10 @@ class Text:
 
     Attributes:
         time_ns: Of its message, as the mapping's clock takes it.
-        log_ns: When it was recorded.
         value: The text, number or boolean.
     """
 
     time_ns: int
-    log_ns: int
     value: Any
 
 
@@ -320,9 +318,7 @@ class _Reading:
             self._refused[topic] = f"a text has {len(value):,} characters, at most {limit:,} are read"
             return
         stamp = stamp_of(values) if self._mapping.clock.stamp == "header" else None
-        self._texts[topic].append(
-            Text(time_ns=message.log_ns if stamp is None else stamp, log_ns=message.log_ns, value=value)
-        )
+        self._texts[topic].append(Text(time_ns=message.log_ns if stamp is None else stamp, value=value))
 
     def check(self, bag: Bag) -> None:
         """Raise BagError for all that the mapping names and the bag lacks."""

@@ -28,7 +28,7 @@ def notes() -> bags.Notes:
 def _findings(bag: Path, tmp_path: Path, text: str = MAPPING) -> set[str]:
     mapping = read_mapping(bag_mappings.write_mapping(text, tmp_path / "robot.toml"))
     streams = read_streams(open_bag(bag), mapping)
-    return {finding.kind for finding in all_findings(streams, Timelines(streams, mapping), mapping)}
+    return {finding.kind for finding in all_findings(Timelines(streams, mapping))}
 
 
 def test_there_are_enough() -> None:
