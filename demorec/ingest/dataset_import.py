@@ -5,7 +5,7 @@ The same command again goes on: episodes that are there are not written.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -16,7 +16,7 @@ from demorec.config import VideoConfig
 from demorec.errors import ConfigError
 from demorec.ingest.channel import BagError
 from demorec.ingest.dataset_pictures import DatasetCamera, ImageCamera, VideoCamera
-from demorec.ingest.frames_writer import Picture, write_frames
+from demorec.ingest.frames_writer import FramesImport, write_frames
 from demorec.lerobot.layout import AUTOMATIC_FEATURES, DatasetInfo, Feature
 from demorec.lerobot.paths import INFO_PATH
 from demorec.lerobot.reader import EpisodePlace, RowReader, episode_places, read_tasks
@@ -39,25 +39,7 @@ _TIME_TOLERANCE_S = 1e-4
 _UNNAMED_ROBOT = "unknown"
 
 
-@dataclass(frozen=True, kw_only=True)
-class DatasetImport:
-    """What an import made.
-
-    Attributes:
-        num_episodes, num_frames: In the run.
-        num_new: Episodes that were written now; the others were there.
-        cameras: Camera -> what became of its pictures, in words.
-        left_out: Feature -> why it is in no recording.
-    """
-
-    num_episodes: int
-    num_frames: int
-    num_new: int
-    cameras: Mapping[str, str]
-    left_out: Mapping[str, str]
-
-
-def import_lerobot(root: Path, out: Path, *, video: VideoConfig | None = None) -> DatasetImport:
+def import_lerobot(root: Path, out: Path, *, video: VideoConfig | None = None) -> FramesImport:
     """Import a LeRobot v3.0 dataset, whoever wrote it, into a run.
 
     Args:
@@ -75,43 +57,26 @@ def import_lerobot(root: Path, out: Path, *, video: VideoConfig | None = None) -
     num_new = num_frames = 0
     with open_collected_run(out, recovers=False) as folder:
         for place in dataset.places:
-            info, rows = dataset.episode(place)
+            info, features, success = dataset.episode(place)
             num_frames += place.length
             if not folder.has(info):
-                target = folder.path_of(place.episode_index)
-                folder.check_fits(info)
                 write_frames(
-                    target,
+                    folder,
                     info,
-                    rows.frames(),
-                    dataset.pictures(place),
-                    success=rows.success,
+                    ({name: rows[number] for name, rows in features.items()} for number in range(place.length)),
+                    {name: camera.pictures(place) for name, camera in dataset.cameras.items()},
+                    success=success,
                     video=video or VideoConfig(),
                     leads={name: camera.lead(place) for name, camera in dataset.cameras.items()},
                 )
-                folder.add(target)
                 num_new += 1
-    return DatasetImport(
+    return FramesImport(
         num_episodes=len(dataset.places),
         num_frames=num_frames,
         num_new=num_new,
         cameras={name: camera.told for name, camera in dataset.cameras.items()},
         left_out=dataset.left_out,
     )
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Rows:
-    """The numbers of an episode of T frames: feature -> (T, D), and how it ended."""
-
-    num_frames: int
-    features: Mapping[str, Vector]
-    success: bool | None
-
-    def frames(self) -> Iterator[dict[str, Vector]]:
-        """Feature -> (D,) of each frame."""
-        for number in range(self.num_frames):
-            yield {name: values[number] for name, values in self.features.items()}
 
 
 @dataclass(kw_only=True, eq=False)
@@ -145,7 +110,7 @@ class _Dataset:
                 camera = _camera_name(name)
                 if camera in cameras:
                     raise ConfigError(f"Two cameras of the dataset would be called {camera!r}: {root}")
-                cameras[camera] = _camera(root, info, name, places)
+                cameras[camera] = (VideoCamera if feature.is_video else ImageCamera)(root, info, name, places)
             elif name not in AUTOMATIC_FEATURES and name != _SUCCESS:
                 features.append(_feature(name, feature))
         columns = [*(feature.name for feature in features), "timestamp", "task_index"]
@@ -164,8 +129,8 @@ class _Dataset:
             reader=RowReader(root, replace(info, features=wanted)),
         )
 
-    def episode(self, place: EpisodePlace) -> tuple[CollectedInfo, _Rows]:
-        """What is known of an episode, and its numbers."""
+    def episode(self, place: EpisodePlace) -> tuple[CollectedInfo, dict[str, Vector], bool | None]:
+        """What is known of an episode of T frames, its numbers (feature -> (T, D)), and how it ended."""
         columns = self.reader.read(place)
         number, fps = place.episode_index, int(self.info.fps)
         off = np.abs(columns["timestamp"][:, 0].astype(np.float64) - np.arange(place.length) / fps)
@@ -198,12 +163,7 @@ class _Dataset:
                     f"The column {feature.name} holds {columns[feature.name].dtype}, not {feature.dtype}: {self.root}"
                 )
         success = bool(columns[_SUCCESS][-1, 0]) if _SUCCESS in columns and place.length else None
-        features = {feature.name: columns[feature.name] for feature in self.features}
-        return info, _Rows(num_frames=place.length, features=features, success=success)
-
-    def pictures(self, place: EpisodePlace) -> dict[str, Iterator[Picture]]:
-        """Camera -> its pictures in an episode, its lead and one a frame."""
-        return {name: camera.pictures(place) for name, camera in self.cameras.items()}
+        return info, {feature.name: columns[feature.name] for feature in self.features}, success
 
     def _files(self, place: EpisodePlace) -> Iterator[SourceFile]:
         """What an episode was read from, by its place in the dataset."""
@@ -248,11 +208,3 @@ def _feature(name: str, feature: Feature) -> CollectedFeature:
 def _camera_name(name: str) -> str:
     """ "top" for "observation.images.top", "image" for "observation.image"."""
     return name.removeprefix(IMAGE_PREFIX).removeprefix("observation.").replace(".", "_")
-
-
-def _camera(root: Path, info: DatasetInfo, name: str, places: list[EpisodePlace]) -> DatasetCamera:
-    if info.features[name].is_video:
-        return VideoCamera(root, info, name, places)
-    camera = ImageCamera(root=root, info=info, key=name)
-    camera.measure(places[0])
-    return camera

@@ -17,7 +17,7 @@ from demorec.config import VideoConfig
 from demorec.errors import ConfigError
 from demorec.hdf5.foreign import ForeignFile, Hdf5Error, StoredArray
 from demorec.ingest.description import urdf_text
-from demorec.ingest.frames_writer import write_frames
+from demorec.ingest.frames_writer import FramesImport, write_frames
 from demorec.ingest.hdf5_episodes import episode_places, found_attribute, rate_of, success_of, task_of
 from demorec.ingest.hdf5_features import Hdf5FitError, StoredFeature, stored_feature
 from demorec.ingest.hdf5_mapping import Hdf5Mapping
@@ -34,28 +34,10 @@ _LENGTHS = "compress_len"
 """Where ALOHA's recorders say how long the JPEG file in each row is, without what pads it."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Hdf5Import:
-    """What an import made.
-
-    Attributes:
-        num_episodes, num_frames: In the run.
-        num_new: Episodes that were written now; the others were there.
-        cameras: Camera -> what became of its pictures, in words.
-        left_out: Datasets of the first episode that the mapping does not name, or groups of them.
-    """
-
-    num_episodes: int
-    num_frames: int
-    num_new: int
-    cameras: Mapping[str, str]
-    left_out: tuple[str, ...]
-
-
 def import_hdf5(
     paths: Sequence[Path], mapping_path: Path, out: Path, *, video: VideoConfig | None = None
-) -> Hdf5Import:
-    """Import HDF5 files into a run, by a mapping.
+) -> FramesImport:
+    """Import HDF5 files into a run, by a mapping; datasets of the first episode that it does not name are left out.
 
     Args:
         paths: Of the files, in the order of their episodes.
@@ -75,7 +57,7 @@ def import_hdf5(
     if len({path.resolve() for path in paths}) < len(paths):
         raise ConfigError("A file is given twice: name each once.")
     plans: list[_Plan] = []
-    left_out: tuple[str, ...] = ()
+    left_out: dict[str, str] = {}
     for path in paths:
         with ForeignFile(path) as file:
             source = SourceFile(name=path.name, sha256=sha256_of(path))
@@ -84,7 +66,7 @@ def import_hdf5(
                 plan = _plan(file, place, mapping, urdf, source, len(plans))
                 plans.append(_alike(plan, plans[0]) if plans else plan)
             left_out = left_out or _unnamed(file, places[0], mapping)
-    return Hdf5Import(
+    return FramesImport(
         num_episodes=len(plans),
         num_frames=sum(plan.num_frames for plan in plans),
         num_new=_write(plans, mapping, out, video or VideoConfig()),
@@ -127,19 +109,14 @@ class _Stored:
 
 def _write(plans: Sequence[_Plan], mapping: Hdf5Mapping, out: Path, video: VideoConfig) -> int:
     """Record what is not there; how many episodes that were."""
-    num_new = 0
     with open_collected_run(out, recovers=False) as folder:
         missing = [plan for plan in plans if not folder.has(plan.info)]
         for plan in missing:
-            folder.check_fits(plan.info)
             with ForeignFile(plan.path) as file, _named(plan.path):
                 episode = _stored(file, plan.place, mapping)
-                target = folder.path_of(plan.info.episode_index)
                 pictures = {camera.name: camera.pictures() for camera in episode.cameras}
-                write_frames(target, plan.info, episode.frames(), pictures, success=plan.success, video=video)
-            folder.add(target)
-            num_new += 1
-    return num_new
+                write_frames(folder, plan.info, episode.frames(), pictures, success=plan.success, video=video)
+    return len(missing)
 
 
 def _plan(
@@ -234,16 +211,16 @@ def _check_lengths(file: ForeignFile, place: str, arrays: Sequence[StoredArray],
         )
 
 
-def _unnamed(file: ForeignFile, place: str, mapping: Hdf5Mapping) -> tuple[str, ...]:
+def _unnamed(file: ForeignFile, place: str, mapping: Hdf5Mapping) -> dict[str, str]:
     """Datasets that the mapping does not name; groups of which it names none, as one."""
     used = {name.partition("/")[0] for name in mapping.datasets}
-    found: dict[str, None] = {}
+    found: dict[str, str] = {}
     for dataset in file.datasets(place):
         name = dataset.removeprefix(place).lstrip("/")
         if name not in mapping.datasets and name != _LENGTHS:
             group = name.partition("/")[0]
-            found[name if group in used else group] = None
-    return tuple(found)
+            found[name if group in used else group] = ""
+    return found
 
 
 @contextmanager
