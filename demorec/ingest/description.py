@@ -13,7 +13,6 @@ from demorec.errors import ConfigError
 from demorec.ingest.bag import Bag
 from demorec.ingest.channel import BagError
 from demorec.ingest.episode_writer import PicturePlan
-from demorec.ingest.mapping import BagMapping
 from demorec.ingest.mapping_file import STATE, recorded_unit
 from demorec.ingest.rows import EpisodeRows, FeatureRows, Timelines
 from demorec.ingest.streams import BagStreams
@@ -35,12 +34,6 @@ def urdf_text(name: str, mapping_path: Path) -> str:
         raise ConfigError(f"The URDF cannot be read ({getattr(error, 'strerror', 'it is no text')}): {path}") from error
 
 
-def origin_of(files: Mapping[str, str], mapping: BagMapping) -> Origin:
-    """Of the episodes of a bag, given file name -> SHA-256."""
-    sources = tuple(SourceFile(name=name, sha256=sha256) for name, sha256 in files.items())
-    return Origin(kind="import", files=sources, mapping_digest=mapping.digest)
-
-
 def describe(
     *,
     bag: Bag,
@@ -50,10 +43,11 @@ def describe(
     urdf: str,
     episode_index: int,
     instruction: str,
-    origin: Origin,
+    files: Mapping[str, str],
 ) -> CollectedInfo:
-    """The description of an episode; BagError when the robot's model in the bag is none."""
+    """The description of an episode; `files` by name -> SHA-256. BagError when the robot's model in the bag is none."""
     mapping = lines.mapping
+    sources = tuple(SourceFile(name=name, sha256=sha256) for name, sha256 in files.items())
     if mapping.robot.urdf_topic:
         urdf = _urdf_of(bag, lines.streams, mapping.robot.urdf_topic)
     joints = frozenset[str]()
@@ -70,7 +64,7 @@ def describe(
         fps=mapping.clock.fps,
         features=tuple(_feature(name, feature, lines, joints) for name, feature in rows.features.items()),
         cameras=tuple(_camera(name, plan, lines) for name, plan in plans.items()),
-        origin=origin,
+        origin=Origin(kind="import", files=sources, mapping_digest=mapping.digest),
         versions={"demorec": version("demorec"), "av": version("av")},
     )
 

@@ -53,14 +53,11 @@ class PicturePlan:
         """What becomes of them, for people."""
         shown = len(np.unique(self.positions))
         what = f"{len(self.numbers)} pictures {self.head.width}x{self.head.height}, "
-        what += f"{self.kept} kept as it is" if self.kept else f"{_name_of(self.head)}, coded once"
+        kind = self.head.encoding if self.head.format == "raw" else self.head.format
+        what += f"{self.kept} kept as it is" if self.kept else f"{kind}, coded once"
         repeated = len(self.positions) - shown
         what += f", {repeated} rows show the picture of the row before" if repeated else ""
         return what + (f", {len(self.numbers) - shown} shown by no row" if len(self.numbers) > shown else "")
-
-
-def _name_of(head: PictureHead) -> str:
-    return head.encoding if head.format == "raw" else head.format
 
 
 def picture_plan(rows: CameraRows, line: Timeline) -> PicturePlan:

@@ -52,22 +52,16 @@ def windows(bag: Bag, streams: BagStreams, timelines: list[Timeline], mapping: B
         return _between_gaps(timelines, episodes.gap_s)
     is_service = episodes.cut == "service"
     found = _between_markers(_calls(bag, streams, episodes) if is_service else streams.texts[episodes.topic], mapping)
-    if not found and episodes.start_topic:
-        raise BagError(
-            f"No call of {episodes.start_topic} is followed by one of {episodes.stop_topic}, so there is no episode: "
-            f"{bag.path}"
-        )
-    if not found and is_service:
-        raise BagError(
-            f"No call of {episodes.topic} with true (or {episodes.start!r}) in {episodes.field!r} is followed by one "
-            f"with false (or {episodes.stop!r}), so there is no episode: {bag.path}"
-        )
-    if not found:
-        raise BagError(
-            f"No marker of {episodes.topic} says {episodes.start!r} and then {episodes.stop!r}, so there is no "
-            f"episode: {bag.path}"
-        )
-    return found
+    if found:
+        return found
+    if episodes.start_topic:
+        reason = f"No call of {episodes.start_topic} is followed by one of {episodes.stop_topic}"
+    elif is_service:
+        reason = f"No call of {episodes.topic} with true (or {episodes.start!r}) in {episodes.field!r} is followed by "
+        reason += f"one with false (or {episodes.stop!r})"
+    else:
+        reason = f"No marker of {episodes.topic} says {episodes.start!r} and then {episodes.stop!r}"
+    raise BagError(f"{reason}, so there is no episode: {bag.path}")
 
 
 def _calls(bag: Bag, streams: BagStreams, episodes: Episodes) -> list[Text]:

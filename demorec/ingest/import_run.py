@@ -17,7 +17,7 @@ from demorec.errors import ConfigError
 from demorec.ingest.bag import Bag, open_bag
 from demorec.ingest.channel import BagError
 from demorec.ingest.clock import NS, Int
-from demorec.ingest.description import describe, origin_of, urdf_text
+from demorec.ingest.description import describe, urdf_text
 from demorec.ingest.episode_writer import ImportedEpisodeWriter, PicturePlan, picture_plan
 from demorec.ingest.episodes import Window, subtask_rows, task_text, windows
 from demorec.ingest.fields import FieldError
@@ -78,7 +78,14 @@ def import_bags(
         with open_collected_run(out, recovers=False) as folder:
             for files, bag in new.items():
                 first = sum(episode.episode_index is not None for row in known.bags for episode in row.episodes)
-                report = _Import(bag, dict(files), mapping, urdf, folder, video or VideoConfig()).run(first)
+                report = _Import(
+                    bag=bag,
+                    files=dict(files),
+                    mapping=mapping,
+                    urdf=urdf,
+                    folder=folder,
+                    video=video or VideoConfig(),
+                ).run(first)
                 known = replace(known, bags=(*known.bags, report))
                 save_import_file(known, out)
                 reports[files] = report
@@ -94,31 +101,24 @@ class _Episode:
     rows: EpisodeRows
     plans: dict[str, PicturePlan]
     subtasks: dict[int, str]
-    path: Path
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
 class _Import:
-    """The import of one bag."""
+    """The import of one bag, whose files are given by name -> SHA-256."""
 
-    def __init__(
-        self,
-        bag: Bag,
-        files: dict[str, str],
-        mapping: BagMapping,
-        urdf: str,
-        folder: CollectedFolder,
-        video: VideoConfig,
-    ) -> None:
-        self._bag, self._files, self._mapping = bag, files, mapping
-        self._urdf, self._folder, self._video = urdf, folder, video
+    bag: Bag
+    files: dict[str, str]
+    mapping: BagMapping
+    urdf: str
+    folder: CollectedFolder
+    video: VideoConfig
 
     def run(self, first_index: int) -> BagReport:
         """Read, judge and write it."""
-        streams = read_streams(self._bag, self._mapping)
-        lines = Timelines(streams, self._mapping)
-        found = windows(
-            self._bag, streams, [line for line in lines.lines.values() if len(line.times_ns)], self._mapping
-        )
+        streams = read_streams(self.bag, self.mapping)
+        lines = Timelines(streams, self.mapping)
+        found = windows(self.bag, streams, list(lines.lines.values()), self.mapping)
         findings = all_findings(lines)
         begin = min(window.begin_ns for window in found)
         episodes: list[_Episode] = []
@@ -127,21 +127,21 @@ class _Import:
             try:
                 rows = lines.rows(window)
             except NoRowsError as error:
-                if self._mapping.clock.when_old == "error":
+                if self.mapping.clock.when_old == "error":
                     kinds = sorted({finding.kind for finding in findings})
                     told = f" (the bag's report: {', '.join(kinds)})" if kinds else ""
-                    raise BagError(f"The bag gives no whole episode: {error}{told}: {self._bag.path}") from error
+                    raise BagError(f"The bag gives no whole episode: {error}{told}: {self.bag.path}") from error
                 reports.append(_dropped(window, begin, str(error)))
                 continue
             episode = self._episode(lines, rows, first_index + len(episodes))
             episodes.append(episode)
             reports.append(_made(episode, begin))
         self._check_alike(episodes)
-        self._write([episode for episode in episodes if not self._folder.has(episode.info)])
+        self._write([episode for episode in episodes if not self.folder.has(episode.info)])
         return BagReport(
-            name=self._bag.path.name,
-            files=tuple(self._files.items()),
-            num_bytes=self._bag.num_bytes,
+            name=self.bag.path.name,
+            files=tuple(self.files.items()),
+            num_bytes=self.bag.num_bytes,
             streams=tuple(stream_reports(lines, [episode.rows for episode in episodes])),
             findings=findings,
             episodes=tuple(reports),
@@ -150,25 +150,25 @@ class _Import:
     def _episode(self, lines: Timelines, rows: EpisodeRows, index: int) -> _Episode:
         plans = {name: picture_plan(camera, lines.lines[name]) for name, camera in rows.cameras.items()}
         info = describe(
-            bag=self._bag,
+            bag=self.bag,
             lines=lines,
             rows=rows,
             plans=plans,
-            urdf=self._urdf,
+            urdf=self.urdf,
             episode_index=index,
-            instruction=task_text(self._bag, lines.streams, rows.window, self._mapping),
-            origin=origin_of(self._files, self._mapping),
+            instruction=task_text(self.bag, lines.streams, rows.window, self.mapping),
+            files=self.files,
         )
-        subtasks = subtask_rows(self._bag, lines.streams, rows.window, rows.times_ns, self._mapping)
-        return _Episode(info=info, rows=rows, plans=plans, subtasks=subtasks, path=self._folder.path_of(index))
+        subtasks = subtask_rows(self.bag, lines.streams, rows.window, rows.times_ns, self.mapping)
+        return _Episode(info=info, rows=rows, plans=plans, subtasks=subtasks)
 
     def _check_alike(self, episodes: Sequence[_Episode]) -> None:
         """ConfigError unless the episodes are of the kind that the run holds, and of one kind."""
         for episode in episodes[:1]:
-            self._folder.check_fits(episode.info)
+            self.folder.check_fits(episode.info)
         for episode in episodes[1:]:
             if different := differences(episodes[0].info, episode.info):
-                raise ConfigError(f"The bag's episodes differ ({'; '.join(different)}): {self._bag.path}")
+                raise ConfigError(f"The bag's episodes differ ({'; '.join(different)}): {self.bag.path}")
 
     def _write(self, episodes: list[_Episode]) -> None:
         """Read the bag's pictures once more, and write each episode while they pass."""
@@ -202,11 +202,12 @@ class _Import:
 
     def _finish(self, episode: _Episode, writer: ImportedEpisodeWriter) -> None:
         writer.finish(success=episode.rows.window.success)
-        self._folder.add(episode.path)
+        self.folder.add(self.folder.path_of(episode.info.episode_index))
 
     def _writer(self, episode: _Episode) -> ImportedEpisodeWriter:
+        path = self.folder.path_of(episode.info.episode_index)
         return ImportedEpisodeWriter(
-            episode.path, episode.info, episode.rows, episode.plans, subtasks=episode.subtasks, video=self._video
+            path, episode.info, episode.rows, episode.plans, subtasks=episode.subtasks, video=self.video
         )
 
     def _pictures(self, episodes: Sequence[_Episode]) -> Iterator[tuple[str, int, dict[str, object]]]:
@@ -217,7 +218,7 @@ class _Import:
                 taken.setdefault(plan.topic, []).append(plan.numbers)
         wanted = {topic: np.bincount(np.concatenate(numbers)) > 0 for topic, numbers in taken.items()}
         decoder, counts = BagDecoder(), dict.fromkeys(wanted, 0)
-        for message in self._bag.messages([], wanted.keys()):
+        for message in self.bag.messages([], wanted.keys()):
             topic = message.channel.topic
             number, counts[topic] = counts[topic], counts[topic] + 1
             if number < len(wanted[topic]) and wanted[topic][number]:
@@ -228,7 +229,7 @@ class _Import:
                 yield topic, number, values
 
     def _unusable(self, topic: str, error: ValueError) -> BagError:
-        return BagError(f"A picture of {topic} cannot be used, since {error}: {self._bag.path}")
+        return BagError(f"A picture of {topic} cannot be used, since {error}: {self.bag.path}")
 
 
 def _first_pictures(episodes: Iterable[_Episode]) -> dict[tuple[str, int], list[_Episode]]:

@@ -24,13 +24,11 @@ from demorec.ingest.mapping import Source
 from demorec.ingest.picture_messages import VIDEO_FORMATS, PictureHead, picture_head
 from demorec.ingest.ros_types import Values
 from demorec.ingest.streams import BagDecoder
-from demorec.ingest.words import quoted, unique_name
+from demorec.ingest.words import SHOWN, first_numbers, quoted, unique_name
 from demorec.scene.collected import DEPTH_UNITS
 
 _KEPT = 64
 """Messages of a topic that are looked into."""
-_SHOWN = 4
-_LONGEST = 40
 _ACTION = re.compile(r"leader|master|gello|command|cmd|target|desired|goal|teleop|/action")
 _STATE = re.compile(r"follower|puppet|measured|joint_states?$|joints/state$|robot_state")
 _TASK = re.compile(r"(?<!sub)(?<!sub[_/-])task|instruction|prompt")
@@ -76,7 +74,6 @@ class _Vector:
     topic: str
     field: str
     layout: SourceLayout
-    has_names: bool
     role: str
     rate_hz: float
 
@@ -131,12 +128,8 @@ def _look_into(topic: _Topic, message: BagMessage, decoder: BagDecoder) -> None:
     except (ValueError, RecursionError, OverflowError, TypeError):
         return
     topic.has_stamp = topic.has_stamp and bool(stamp_of(values))
-    if len(topic.values) < 2 or not _is_picture(values):
+    if len(topic.values) < 2 or _head(values) is None:
         topic.values.append(values)
-
-
-def _is_picture(values: Values) -> bool:
-    return _head(values) is not None
 
 
 def _head(values: Values) -> PictureHead | None:
@@ -158,24 +151,21 @@ def _listed(topics: Mapping[str, _Topic]) -> Iterator[str]:
 
 
 def _told(values: Values) -> str:
-    parts = []
-    for key, value in values.items():
-        if key in ("header", "ts", "timestamp", "stamp"):
-            continue
-        parts.append(f"{key}: {_short(value)}")
-    return "; ".join(parts)[:160] or "no fields"
+    times = ("header", "ts", "timestamp", "stamp")
+    return (
+        "; ".join(f"{key}: {_short(value)}" for key, value in values.items() if key not in times)[:160] or "no fields"
+    )
 
 
 def _short(value: Any) -> str:
     if isinstance(value, np.ndarray):
-        more = ", ..." if value.size > _SHOWN else ""
-        return f"[{', '.join(f'{number:.4g}' for number in value[:_SHOWN].tolist())}{more}]"
+        return first_numbers(value)
     if isinstance(value, bytes):
         return f"{len(value)} bytes"
     if isinstance(value, list):
-        return f"[{', '.join(_short(item) for item in value[:_SHOWN])}{', ...' if len(value) > _SHOWN else ''}]"
+        return f"[{', '.join(_short(item) for item in value[:SHOWN])}{', ...' if len(value) > SHOWN else ''}]"
     if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{key}: {_short(item)}" for key, item in list(value.items())[:_SHOWN]) + "}"
+        return "{" + ", ".join(f"{key}: {_short(item)}" for key, item in list(value.items())[:SHOWN]) + "}"
     return (
         json.dumps(value[:40]) if isinstance(value, str) else f"{value:.6g}" if isinstance(value, float) else str(value)
     )
@@ -183,7 +173,7 @@ def _short(value: Any) -> str:
 
 def _vectors(name: str, topic: _Topic) -> Iterator[_Vector]:
     """The joint positions, or other numbers, that a topic holds."""
-    if not topic.values or any(_is_picture(values) for values in topic.values[:1]):
+    if not topic.values or _head(topic.values[0]) is not None:
         return
     for path in _VECTOR_FIELDS:
         try:
@@ -195,14 +185,7 @@ def _vectors(name: str, topic: _Topic) -> Iterator[_Vector]:
             continue
         lower = name.lower()
         role = "action" if _ACTION.search(lower) else "state" if _STATE.search(lower) else ""
-        yield _Vector(
-            topic=name,
-            field=path,
-            layout=layout,
-            has_names=layout.names_steps is not None,
-            role=role,
-            rate_hz=topic.rate_hz,
-        )
+        yield _Vector(topic=name, field=path, layout=layout, role=role, rate_hz=topic.rate_hz)
         return
 
 
@@ -322,7 +305,7 @@ def _prefix(vector: _Vector, chosen: Sequence[_Vector]) -> str:
 def _source(feature: str, vector: _Vector, *, prefix: str) -> Iterator[str]:
     key = feature if "." not in feature else f'"{feature}"'
     yield from ("", f"[[features.{key}]]", f"topic = {quoted(vector.topic)}", f"field = {quoted(vector.field)}")
-    if vector.has_names:
+    if vector.layout.names_steps is not None:
         yield f"joints = [{', '.join(quoted(name) for name in vector.layout.names)}]"
     if prefix:
         yield f"prefix = {quoted(prefix)}"

@@ -37,26 +37,18 @@ EPISODE_FOLDERS: tuple[PathKind, ...] = ("run", "recordings", "evaluation")
 
 EVALUATION_NAME = "evaluation.json"
 
-_NAMES: dict[PathKind, str] = {
-    "recording": "a recording (.mcap)",
-    "unfinished": "an unfinished recording (.part)",
-    "rrd": "a Rerun file (.rrd)",
-    "hdf5": "an HDF5 file",
-    "rosbag": "a rosbag",
-    "run": "a run",
-    "evaluation": "an evaluation",
-    "dataset": "a LeRobot dataset",
-    "recordings": "a folder of recordings",
+_WORDS: dict[PathKind, tuple[str, str]] = {
+    "recording": ("a recording (.mcap)", ""),
+    "unfinished": ("an unfinished recording (.part)", "; demorec recover keeps what is whole in it"),
+    "rrd": ("a Rerun file (.rrd)", "; demorec view shows it by a name that ends in .rrd"),
+    "hdf5": ("an HDF5 file", "; name the run that it was made from, or make one of it (demorec import hdf5)"),
+    "rosbag": ("a rosbag", ""),
+    "run": ("a run", "; name one of its recordings"),
+    "evaluation": ("an evaluation", "; name one of its recordings"),
+    "dataset": ("a LeRobot dataset", "; name the run that it was made from"),
+    "recordings": ("a folder of recordings", "; name one of them"),
 }
-_ADVICE: dict[PathKind, str] = {
-    "unfinished": "; demorec recover keeps what is whole in it",
-    "rrd": "; demorec view shows it by a name that ends in .rrd",
-    "hdf5": "; name the run that it was made from, or make one of it (demorec import hdf5)",
-    "dataset": "; name the run that it was made from",
-    "run": "; name one of its recordings",
-    "evaluation": "; name one of its recordings",
-    "recordings": "; name one of them",
-}
+"""What each kind is called, and what to do where it was not expected."""
 _MAGICS: tuple[tuple[bytes, PathKind], ...] = (
     (MCAP_MAGIC, "recording"),
     *((magic, "rrd") for magic in RERUN_MAGICS),
@@ -130,9 +122,9 @@ def expect(path: Path, *kinds: PathKind) -> Found:
     if found.reason:
         raise ConfigError(f"{found.reason}: {path}")
     if found.kind not in kinds:
-        taken = [_NAMES[kind] for kind in kinds]
+        taken, (name, advice) = [_WORDS[kind][0] for kind in kinds], _WORDS[found.kind]
         allowed = " or ".join(filter(None, (", ".join(taken[:-1]), taken[-1])))
-        raise ConfigError(f"Expected {allowed}, found {_NAMES[found.kind]}{_ADVICE.get(found.kind, '')}: {path}")
+        raise ConfigError(f"Expected {allowed}, found {name}{advice}: {path}")
     return found
 
 
@@ -141,7 +133,7 @@ def expect_recordings(found: Found, files: Sequence[Path]) -> None:
     if files:
         return
     only = " but failed attempts, in failed/" if found.failed else ""
-    raise ConfigError(f"There is no finished recording in {_NAMES[found.kind]}{only}: {found.path}")
+    raise ConfigError(f"There is no finished recording in {_WORDS[found.kind][0]}{only}: {found.path}")
 
 
 def _file(path: Path) -> Found:

@@ -212,7 +212,7 @@ def load_run_file(folder: Path) -> RunFile:
             raise ConfigError(
                 f"run.json has format {str(plain['format'])[:40]}, this demorec knows up to {RUN_FORMAT}: {path}"
             )
-        attempts = [_attempt_line(line) for line in plain.pop("episodes") if line["state"] != "planned"]
+        attempts = [line for line in plain.pop("episodes") if line.pop("state") != "planned"]
         for derived in ("format", "config_digest", "digest", "complete"):
             plain.pop(derived)
         run = from_plain({**plain, "attempts": attempts}, RunFile)
@@ -288,7 +288,3 @@ def _episode_lines(run: RunFile, attempts: list[dict[str, Any]]) -> Iterable[dic
     for index in range(run.num_episodes):
         if index not in tried:
             yield {"state": "planned", "episode_index": index, "seed": run.config.seed}
-
-
-def _attempt_line(line: dict[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in line.items() if key != "state"}
