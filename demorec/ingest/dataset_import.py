@@ -5,8 +5,9 @@ The same command again goes on: episodes that are there are not written.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 
@@ -53,7 +54,7 @@ def import_lerobot(root: Path, out: Path, *, video: VideoConfig | None = None) -
         RecordingError: A number is not finite, or the disk is full.
     """
     expect(root, "dataset")
-    dataset = _Dataset.opened(root)
+    dataset = _Dataset(root)
     num_new = num_frames = 0
     with open_collected_run(out, recovers=False) as folder:
         for place in dataset.places:
@@ -79,59 +80,42 @@ def import_lerobot(root: Path, out: Path, *, video: VideoConfig | None = None) -
     )
 
 
-@dataclass(kw_only=True, eq=False)
 class _Dataset:
     """A dataset opened for import; episodes must be asked for in their order."""
 
-    root: Path
-    info: DatasetInfo
-    places: list[EpisodePlace]
-    tasks: list[str]
-    features: tuple[CollectedFeature, ...]
-    cameras: dict[str, DatasetCamera]
-    left_out: dict[str, str]
-    reader: RowReader
-    _digests: dict[Path, str] = field(default_factory=dict)
-
-    @classmethod
-    def opened(cls, root: Path) -> _Dataset:
-        info = DatasetInfo.load(root)
-        places = list(episode_places(root, info))
-        if not places:
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.info = info = DatasetInfo.load(root)
+        self.places = list(episode_places(root, info))
+        if not self.places:
             raise ConfigError(f"The dataset has no episodes: {root}")
-        if empty := [place.episode_index for place in places if place.length < 1]:
+        if empty := [place.episode_index for place in self.places if place.length < 1]:
             raise BagError(f"Episode {empty[0]} of the dataset has no frames: {root}")
-        features, cameras = list[CollectedFeature](), dict[str, DatasetCamera]()
-        left_out = dict[str, str]()
+        self.features: list[CollectedFeature] = []
+        self.cameras: dict[str, DatasetCamera] = {}
+        self.left_out: dict[str, str] = {}
         for name, feature in info.features.items():
             if reason := _why_left_out(name, feature):
-                left_out[name] = reason
+                self.left_out[name] = reason
             elif feature.dtype in ("video", "image"):
                 camera = _camera_name(name)
-                if camera in cameras:
+                if camera in self.cameras:
                     raise ConfigError(f"Two cameras of the dataset would be called {camera!r}: {root}")
-                cameras[camera] = (VideoCamera if feature.is_video else ImageCamera)(root, info, name, places)
+                kind = VideoCamera if feature.is_video else ImageCamera
+                self.cameras[camera] = kind(root, info, name, self.places)
             elif name not in AUTOMATIC_FEATURES and name != _SUCCESS:
-                features.append(_feature(name, feature))
-        columns = [*(feature.name for feature in features), "timestamp", "task_index"]
+                self.features.append(_feature(name, feature))
+        columns = [*(feature.name for feature in self.features), "timestamp", "task_index"]
         columns += [_SUCCESS] if _SUCCESS in info.features else []
         if missing := [name for name in columns if name not in info.features]:
             raise BagError(f"The dataset has no {', '.join(missing)}: {root}")
-        wanted = {name: info.features[name] for name in columns}
-        return cls(
-            root=root,
-            info=info,
-            places=places,
-            tasks=read_tasks(root),
-            features=tuple(features),
-            cameras=cameras,
-            left_out=left_out,
-            reader=RowReader(root, replace(info, features=wanted)),
-        )
+        self._tasks = read_tasks(root)
+        self._reader = RowReader(root, replace(info, features={name: info.features[name] for name in columns}))
+        self._digest = functools.cache(sha256_of)
 
     def episode(self, place: EpisodePlace) -> tuple[CollectedInfo, dict[str, Vector], bool | None]:
         """What is known of an episode of T frames, its numbers (feature -> (T, D)), and how it ended."""
-        columns = self.reader.read(place)
+        columns = self._reader.read(place)
         number, fps = place.episode_index, int(self.info.fps)
         off = np.abs(columns["timestamp"][:, 0].astype(np.float64) - np.arange(place.length) / fps)
         if len(wrong := np.flatnonzero(~(off <= _TIME_TOLERANCE_S))):
@@ -140,14 +124,14 @@ class _Dataset:
                 f"multiple of 1/{fps} s: {self.root}"
             )
         tasks = list(dict.fromkeys(columns["task_index"][:, 0].tolist()))
-        if any(not 0 <= task < len(self.tasks) for task in tasks):
+        if any(not 0 <= task < len(self._tasks) for task in tasks):
             raise BagError(f"Episode {number} names a task that is not in the table of tasks: {self.root}")
         info = CollectedInfo(
             episode_index=number,
-            instruction="; ".join(" ".join(self.tasks[task].split()) for task in tasks),
+            instruction="; ".join(" ".join(self._tasks[task].split()) for task in tasks),
             robot=self.info.robot_type or _UNNAMED_ROBOT,
             fps=fps,
-            features=self.features,
+            features=tuple(self.features),
             cameras=tuple(
                 CollectedCamera(
                     name=name, width=camera.width, height=camera.height, kept=camera.kept, source=camera.key
@@ -174,10 +158,7 @@ class _Dataset:
             if camera.key in place.videos
         ]
         for name in paths:
-            path = self.root / name
-            if path not in self._digests:
-                self._digests[path] = sha256_of(path)
-            yield SourceFile(name=name, sha256=self._digests[path])
+            yield SourceFile(name=name, sha256=self._digest(self.root / name))
 
 
 def _why_left_out(name: str, feature: Feature) -> str:

@@ -55,12 +55,10 @@ class StoredFeature:
 
     Attributes:
         name: Of it.
-        num_rows: That its datasets have.
         shift: By how many rows the frames are behind the datasets' rows: 1 for what another feature is next.
     """
 
     name: str
-    num_rows: int
     shift: int
     columns: tuple[_Column, ...]
 
@@ -114,7 +112,7 @@ def stored_feature(
     columns = tuple(
         _Column(part=part, array=array, names=_names(part, array)) for part, array in zip(parts, arrays, strict=True)
     )
-    return StoredFeature(name=name, num_rows=len(arrays[0]), shift=shift, columns=columns)
+    return StoredFeature(name=name, shift=shift, columns=columns)
 
 
 def _names(part: DatasetPart, array: StoredArray) -> tuple[str, ...]:

@@ -181,7 +181,7 @@ def _stored(file: ForeignFile, place: str, mapping: Hdf5Mapping) -> _Stored:
         used = mapping.features[following] if following else parts
         arrays = [array(part.dataset) for part in used]
         features.append(stored_feature(name, used, arrays, shift=1 if following else 0))
-    num_rows = features[0].num_rows
+    num_rows = len(features[0].columns[0].array)
     cameras = {name: (camera, array(camera.dataset)) for name, camera in mapping.cameras.items()}
     vectors = [column.array for feature in features for column in feature.columns]
     _check_lengths(file, place, [*vectors, *(pictures for _, pictures in cameras.values())], num_rows)

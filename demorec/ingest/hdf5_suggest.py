@@ -6,8 +6,7 @@ does. What the file does not say, and the layout does not either, is commented o
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -41,14 +40,18 @@ _PARTS = {
 """How an observation's name ends -> the feature that it is a part of; others are features of their own."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
 class _Contents:
     """An episode of a file: its datasets by their names below it, and why others cannot be used."""
 
-    file: ForeignFile
-    place: str
-    arrays: Mapping[str, StoredArray]
-    unusable: Mapping[str, str]
+    def __init__(self, file: ForeignFile, place: str) -> None:
+        self.file, self.place = file, place
+        self.arrays: dict[str, StoredArray] = {}
+        self.unusable: list[str] = []
+        for dataset in file.datasets(place):
+            try:
+                self.arrays[dataset.removeprefix(place).lstrip("/")] = file.array(dataset)
+            except Hdf5Error as error:
+                self.unusable.append(without_path(error, file.path))
 
     def is_camera(self, name: str) -> bool:
         """Whether a dataset holds pictures, JPEG files or, by its name, distances."""
@@ -82,7 +85,7 @@ def suggested_hdf5_mapping(path: Path) -> list[str]:
             )
         episodes = Hdf5Episodes(group="" if is_aloha else _ROBOMIMIC)
         places = episode_places(file, episodes)
-        contents = _contents(file, places[0])
+        contents = _Contents(file, places[0])
         lines = [f"# A mapping for {path.name}, suggested from what is in it; docs/import.md explains every key.", "#"]
         lines += [*_listed(contents, len(places)), ""]
         lines += ["[robot]", f"name = {quoted(_robot(contents, is_aloha))}", *_model(contents), ""]
@@ -93,17 +96,6 @@ def suggested_hdf5_mapping(path: Path) -> list[str]:
     return lines
 
 
-def _contents(file: ForeignFile, place: str) -> _Contents:
-    arrays, unusable = dict[str, StoredArray](), dict[str, str]()
-    for dataset in file.datasets(place):
-        name = dataset.removeprefix(place).lstrip("/")
-        try:
-            arrays[name] = file.array(dataset)
-        except Hdf5Error as error:
-            unusable[name] = without_path(error, file.path)
-    return _Contents(file=file, place=place, arrays=arrays, unusable=unusable)
-
-
 def _listed(contents: _Contents, count: int) -> Iterator[str]:
     """Every dataset of the first episode with its shape and first numbers."""
     where = f"{contents.place}, the first of {count} episodes" if contents.place else "the file, which is an episode"
@@ -112,7 +104,7 @@ def _listed(contents: _Contents, count: int) -> Iterator[str]:
         yield f"#   {name}  {array.dtype.name} {'x'.join(map(str, array.shape))}"
         if contents.is_vector(name) and array.shape[0]:
             yield f"#     {_first_row(contents, array)}"
-    for reason in contents.unusable.values():
+    for reason in contents.unusable:
         yield f"#   {reason}"
 
 

@@ -78,14 +78,7 @@ def import_bags(
         with open_collected_run(out, recovers=False) as folder:
             for files, bag in new.items():
                 first = sum(episode.episode_index is not None for row in known.bags for episode in row.episodes)
-                report = _Import(
-                    bag=bag,
-                    files=dict(files),
-                    mapping=mapping,
-                    urdf=urdf,
-                    folder=folder,
-                    video=video or VideoConfig(),
-                ).run(first)
+                report = _Import(bag, dict(files), mapping, urdf, folder, video or VideoConfig()).run(first)
                 known = replace(known, bags=(*known.bags, report))
                 save_import_file(known, out)
                 reports[files] = report
@@ -103,7 +96,7 @@ class _Episode:
     subtasks: dict[int, str]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class _Import:
     """The import of one bag, whose files are given by name -> SHA-256."""
 

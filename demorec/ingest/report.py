@@ -164,7 +164,6 @@ def _row(stream: StreamReport) -> tuple[str, ...]:
     def number(value: float | None) -> str:
         return "-" if value is None else f"{value:.1f}"
 
-    skew = "-" if stream.skew_ms is None else f"{stream.skew_ms:.1f}"
     rate = f"{stream.rate_hz:.1f}" if stream.is_regular else "on change"
     return (
         stream.label,
@@ -172,7 +171,7 @@ def _row(stream: StreamReport) -> tuple[str, ...]:
         str(stream.count),
         rate,
         stream.clock,
-        skew,
+        number(stream.skew_ms),
         number(stream.jitter_ms) if stream.is_regular else "-",
         number(stream.longest_ms),
         str(stream.lost),

@@ -95,7 +95,8 @@ def suggested_mapping(path: Path) -> list[str]:
     lines = [f"# A mapping for {path.name}, suggested from what is in it; docs/import.md explains every key.", "#"]
     lines += [f"# {problem}" for problem in problems[:5]]
     lines += list(_listed(topics))
-    lines += ["", "[robot]", f"name = {quoted(_robot_name(bag))}", *_robot_model(topics)]
+    robot = re.sub(r"[^A-Za-z0-9_]+", "_", bag.name).strip("_") or "robot"
+    lines += ["", "[robot]", f"name = {quoted(robot)}", *_robot_model(topics)]
     lines += ["", "[task]", *_task(topics, bag)]
     lines += ["", "[clock]", *_clock(topics, cameras, vectors)]
     lines += list(_services(topics))
@@ -214,10 +215,6 @@ def _info_topic(topic: str, topics: Mapping[str, _Topic]) -> list[str]:
     return [f"info_topic = {quoted(name)}"] if name in topics else []
 
 
-def _robot_name(bag: Bag) -> str:
-    return re.sub(r"[^A-Za-z0-9_]+", "_", bag.name).strip("_") or "robot"
-
-
 def _robot_model(topics: Mapping[str, _Topic]) -> list[str]:
     found = next((name for name in sorted(topics) if name.endswith("robot_description")), "")
     return [f"urdf_topic = {quoted(found)}"] if found else ['# urdf = "robot.urdf"']
@@ -279,12 +276,8 @@ def _features(vectors: Sequence[_Vector]) -> Iterator[str]:
         if not chosen and name == "observation.state":
             yield from ("", "# No topic says that it is the robot's state: take one of those above.")
         elif not chosen:
-            yield from (
-                "",
-                "# No topic says that it is a command, so the next state is the action.",
-                "[[features.action]]",
-            )
-            yield 'next = "observation.state"'
+            yield from ("", "# No topic says that it is a command, so the next state is the action.")
+            yield from ("[[features.action]]", 'next = "observation.state"')
     for vector in others:
         for line in _source("observation.extra", vector, prefix=""):
             yield f"# {line}" if line else ""
