@@ -89,6 +89,23 @@ def _kept(head: PictureHead) -> Kept:
     return cast(Kept, head.format) if head.format in KEPT_FORMATS else ""
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PlannedEpisode:
+    """An episode that shall be written.
+
+    Attributes:
+        info: What is known of it.
+        rows: Its rows.
+        plans: Camera -> its pictures.
+        subtasks: Row -> what is begun there, in words.
+    """
+
+    info: CollectedInfo
+    rows: EpisodeRows
+    plans: Mapping[str, PicturePlan]
+    subtasks: Mapping[int, str]
+
+
 @dataclass(kw_only=True, eq=False)
 class _Waiting:
     plan: PicturePlan
@@ -111,30 +128,18 @@ class ImportedEpisodeWriter:
 
     Args:
         path: Of the recording.
-        info: What is known of the episode.
-        rows: Its rows.
-        plans: Camera -> its pictures.
-        subtasks: Row -> what is begun there, in words.
+        episode: The episode.
         video: How pixels are coded.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        info: CollectedInfo,
-        rows: EpisodeRows,
-        plans: Mapping[str, PicturePlan],
-        *,
-        subtasks: Mapping[int, str],
-        video: VideoConfig,
-    ) -> None:
-        self._rows, self._subtasks = rows, subtasks
+    def __init__(self, path: Path, episode: PlannedEpisode, *, video: VideoConfig) -> None:
+        self._rows, self._subtasks = episode.rows, episode.subtasks
         self._waiting: dict[str, _Waiting] = {}
-        for name, plan in plans.items():
+        for name, plan in episode.plans.items():
             first = int(plan.numbers.min()) if len(plan.numbers) else 0
             self._waiting[name] = _Waiting(plan=plan, first=first, places=_places(plan.numbers, first))
         self._next_row = 0
-        self._writer = CollectedWriter(path, info, video=video)
+        self._writer = CollectedWriter(path, episode.info, video=video)
         self._is_finished = False
 
     def __enter__(self) -> Self:
@@ -193,11 +198,11 @@ class ImportedEpisodeWriter:
             self._writer.write(CollectedFrame(time_ns=time_ns, samples=samples, pictures=pictures, subtask=subtask))
             self._next_row += 1
 
-    def finish(self, *, success: bool | None) -> None:
+    def finish(self) -> None:
         """Write what is left and give the recording its name; BagError when pictures have not come."""
         self._write_rows()
         if self._next_row < len(self._rows.times_ns):
             missing = [w.plan.topic for w in self._waiting.values() if w.num_written < len(w.plan.numbers)]
             raise BagError(f"The bag has changed while it was read: pictures of {missing[0]} are missing.")
-        self._writer.finish(CollectedOutcome(success=success, num_frames=self._next_row))
+        self._writer.finish(CollectedOutcome(success=self._rows.window.success, num_frames=self._next_row))
         self._is_finished = True

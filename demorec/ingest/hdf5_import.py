@@ -86,10 +86,6 @@ class _Plan:
     success: bool | None
     told: Mapping[str, str]
 
-    @property
-    def name(self) -> str:
-        return f"{self.place} of {self.path}" if self.place else str(self.path)
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Stored:
@@ -156,7 +152,8 @@ def _plan(
 def _alike(plan: _Plan, first: _Plan) -> _Plan:
     """An episode that fits the first, with whose model, a long text, it shares memory; ConfigError when it differs."""
     if different := differences(first.info, plan.info):
-        raise ConfigError(f"The episodes differ ({'; '.join(different)}): import {plan.name} into another run.")
+        name = f"{plan.place} of {plan.path}" if plan.place else str(plan.path)
+        raise ConfigError(f"The episodes differ ({'; '.join(different)}): import {name} into another run.")
     return replace(plan, info=replace(plan.info, urdf=first.info.urdf))
 
 

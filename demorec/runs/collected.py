@@ -122,11 +122,9 @@ def load_collected_run(folder: Path) -> CollectedRun:
         for derived in ("format", "kind", "digest"):
             plain.pop(derived)
         return from_plain(plain, CollectedRun)
-    except OSError as error:
+    except (OSError, ValueError, KeyError, TypeError) as error:
         damaged = DamagedRunFileError(f"run.json is damaged ({in_words(error)}): {path}")
         raise resource_error(error, path) or damaged from error
-    except (ValueError, KeyError, TypeError) as error:
-        raise DamagedRunFileError(f"run.json is damaged ({in_words(error)}): {path}") from error
 
 
 class CollectedFolder:

@@ -220,11 +220,9 @@ def load_run_file(folder: Path) -> RunFile:
         return run.with_attempts(run.attempts)
     except FileNotFoundError as error:
         raise ConfigError(f"No run.json, so this is no run of generate-dataset: {folder}") from error
-    except OSError as error:
-        damaged = DamagedRunFileError(f"run.json is damaged ({error.strerror}): {path}")
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        damaged = DamagedRunFileError(f"run.json is damaged ({in_words(error)}): {path}")
         raise resource_error(error, path) or damaged from error
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise DamagedRunFileError(f"run.json is damaged ({in_words(error)}): {path}") from error
 
 
 def recording_name(episode_index: int, attempt: int, *, success: bool) -> str:
