@@ -169,21 +169,16 @@ def _unpacked(path: Path) -> Iterator[tuple[Path, bytes]]:
         return
     with tempfile.TemporaryDirectory(prefix="demorec-bag-") as folder:
         plain = Path(folder) / path.stem
+        limits, written = Limits.of_file(path.stat().st_size), 0
         try:
-            _unpack_file(path, plain)
+            with open_regular(path) as source, plain.open("wb") as file:
+                for block in zstandard.ZstdDecompressor().read_to_iter(source, write_size=_COPY_BYTES):
+                    written += len(block)
+                    limits.check_total(written)
+                    file.write(block)
             kind = _kind_of(plain)
         except (zstandard.ZstdError, ValueError) as error:
             raise BagError(f"The compressed bag cannot be unpacked ({error}): {path}") from error
         if kind == _ZSTD_MAGIC:
             raise BagError(f"The bag is compressed twice: {path}")
         yield plain, kind
-
-
-def _unpack_file(path: Path, target: Path) -> None:
-    limits = Limits.of_file(path.stat().st_size)
-    written = 0
-    with open_regular(path) as source, target.open("wb") as file:
-        for block in zstandard.ZstdDecompressor().read_to_iter(source, write_size=_COPY_BYTES):
-            written += len(block)
-            limits.check_total(written)
-            file.write(block)

@@ -60,22 +60,11 @@ def _protobuf_decoder(type_name: str, schema: bytes) -> Decoder:
     from google.protobuf.descriptor_pb2 import FileDescriptorSet
     from google.protobuf.descriptor_pool import DescriptorPool
     from google.protobuf.message import DecodeError
-    from google.protobuf.message_factory import GetMessageClass
+    from google.protobuf.message_factory import GetMessageClass, GetMessages
 
     try:
-        files = FileDescriptorSet.FromString(schema)
         pool = DescriptorPool()
-        waiting = {file.name: file for file in files.file}
-
-        def add(name: str) -> None:
-            file = waiting.pop(name, None)
-            if file is not None:
-                for needed in file.dependency:
-                    add(needed)
-                pool.Add(file)
-
-        for name in list(waiting):
-            add(name)
+        GetMessages(FileDescriptorSet.FromString(schema).file, pool)  # adds each file behind those that it needs
         message_class = GetMessageClass(pool.FindMessageTypeByName(type_name))
     except (DecodeError, TypeError, KeyError, RecursionError, ValueError) as error:
         raise ValueError("its protobuf definition cannot be read") from error

@@ -11,7 +11,6 @@ from demorec.ingest.channel import BagError
 from demorec.ingest.clock import NS, Int, Timeline
 from demorec.ingest.fields import FieldError
 from demorec.ingest.mapping import BagMapping, Episodes
-from demorec.ingest.service_calls import ServiceCall
 from demorec.ingest.streams import BagStreams, Text
 from demorec.ingest.words import task_in_name
 
@@ -69,15 +68,11 @@ def _calls(bag: Bag, streams: BagStreams, episodes: Episodes) -> list[Text]:
     try:
         if episodes.topic:
             calls = streams.calls[episodes.topic]
-            return [_marker(call, call.value(episodes.field)) for call in calls]
-        begins = [_marker(call, episodes.start) for call in streams.calls[episodes.start_topic]]
-        return [*begins, *(_marker(call, episodes.stop) for call in streams.calls[episodes.stop_topic])]
+            return [Text(time_ns=call.time_ns, value=call.value(episodes.field)) for call in calls]
+        ends = ((episodes.start_topic, episodes.start), (episodes.stop_topic, episodes.stop))
+        return [Text(time_ns=call.time_ns, value=word) for topic, word in ends for call in streams.calls[topic]]
     except FieldError as error:
         raise BagError(f"The calls of {episodes.topic} cannot be used, since {error}: {bag.path}") from error
-
-
-def _marker(call: ServiceCall, value: object) -> Text:
-    return Text(time_ns=call.time_ns, value=value)
 
 
 def _between_gaps(timelines: list[Timeline], gap_s: float) -> list[Window]:

@@ -49,18 +49,25 @@ class _Column:
         return converted(self.part, rows.astype(np.float32 if is_small else np.float64))
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
 class StoredFeature:
     """A feature of an episode.
 
     Attributes:
+        columns: Of each part the dataset.
+
+    Args:
         name: Of it.
+        parts, arrays: What it is made of, and where each is.
         shift: By how many rows the frames are behind the datasets' rows: 1 for what another feature is next.
+
+    Raises:
+        Hdf5FitError: They are no vectors.
     """
 
-    name: str
-    shift: int
-    columns: tuple[_Column, ...]
+    def __init__(self, name: str, parts: Sequence[DatasetPart], arrays: Sequence[StoredArray], *, shift: int) -> None:
+        self.name, self.shift = name, shift
+        pairs = zip(parts, arrays, strict=True)
+        self.columns = tuple(_Column(part=part, array=array, names=_names(part, array)) for part, array in pairs)
 
     @property
     def dtype(self) -> type[np.float32] | type[np.float64]:
@@ -103,16 +110,6 @@ class StoredFeature:
                         "numbers must be finite"
                     )
             yield from np.concatenate(parts, axis=1).astype(self.dtype)
-
-
-def stored_feature(
-    name: str, parts: Sequence[DatasetPart], arrays: Sequence[StoredArray], *, shift: int
-) -> StoredFeature:
-    """A feature of the datasets of its parts; Hdf5FitError when they are no vectors, or of several lengths."""
-    columns = tuple(
-        _Column(part=part, array=array, names=_names(part, array)) for part, array in zip(parts, arrays, strict=True)
-    )
-    return StoredFeature(name=name, shift=shift, columns=columns)
 
 
 def _names(part: DatasetPart, array: StoredArray) -> tuple[str, ...]:

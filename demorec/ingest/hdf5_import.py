@@ -19,7 +19,7 @@ from demorec.hdf5.foreign import ForeignFile, Hdf5Error, StoredArray
 from demorec.ingest.description import urdf_text
 from demorec.ingest.frames_writer import FramesImport, write_frames
 from demorec.ingest.hdf5_episodes import episode_places, found_attribute, rate_of, success_of, task_of
-from demorec.ingest.hdf5_features import Hdf5FitError, StoredFeature, stored_feature
+from demorec.ingest.hdf5_features import Hdf5FitError, StoredFeature
 from demorec.ingest.hdf5_mapping import Hdf5Mapping
 from demorec.ingest.hdf5_pictures import StoredCamera, picture_lengths
 from demorec.ingest.mapping_file import read_mapping_file
@@ -87,14 +87,31 @@ class _Plan:
     told: Mapping[str, str]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
 class _Stored:
-    """An episode in an opened file."""
+    """An episode in an opened file; Hdf5FitError when its datasets do not fit the mapping."""
 
-    features: tuple[StoredFeature, ...]
-    cameras: tuple[StoredCamera, ...]
-    num_rows: int
-    num_frames: int
+    def __init__(self, file: ForeignFile, place: str, mapping: Hdf5Mapping) -> None:
+        def array(name: str) -> StoredArray:
+            return file.array("/".join(filter(None, (place, name.strip("/")))))
+
+        self.features: list[StoredFeature] = []
+        for name, parts in mapping.features.items():
+            following = parts[0].next
+            used = mapping.features[following] if following else parts
+            arrays = [array(part.dataset) for part in used]
+            self.features.append(StoredFeature(name, used, arrays, shift=1 if following else 0))
+        vectors = [column.array for feature in self.features for column in feature.columns]
+        self.num_rows = num_rows = len(vectors[0])
+        cameras = {name: (camera, array(camera.dataset)) for name, camera in mapping.cameras.items()}
+        _check_lengths(file, place, [*vectors, *(pictures for _, pictures in cameras.values())], num_rows)
+        lengths = picture_lengths(array(_LENGTHS), num_rows) if file.has(f"{place}/{_LENGTHS}") else None
+        self.num_frames = num_rows - max(feature.shift for feature in self.features)
+        if self.num_frames < 1:
+            raise Hdf5FitError(f"{place or 'the episode'} has {num_rows} rows, too few for a frame")
+        self.cameras = [
+            StoredCamera(name, camera, pictures, lengths if len(pictures.shape) == 2 else None)
+            for name, (camera, pictures) in cameras.items()
+        ]
 
     def frames(self) -> Iterator[dict[str, Vector]]:
         """Feature -> (D,) of each frame."""
@@ -109,7 +126,7 @@ def _write(plans: Sequence[_Plan], mapping: Hdf5Mapping, out: Path, video: Video
         missing = [plan for plan in plans if not folder.has(plan.info)]
         for plan in missing:
             with ForeignFile(plan.path) as file, _named(plan.path):
-                episode = _stored(file, plan.place, mapping)
+                episode = _Stored(file, plan.place, mapping)
                 pictures = {camera.name: camera.pictures() for camera in episode.cameras}
                 write_frames(folder, plan.info, episode.frames(), pictures, success=plan.success, video=video)
     return len(missing)
@@ -120,7 +137,7 @@ def _plan(
 ) -> _Plan:
     """What an episode shall be; every number is looked at."""
     with _named(file.path):
-        episode = _stored(file, place, mapping)
+        episode = _Stored(file, place, mapping)
         for _ in episode.frames():
             pass
         if mapping.robot.urdf_attribute:
@@ -164,37 +181,6 @@ def _joints(urdf: str, attribute: str) -> frozenset[str]:
         return frozenset(joint.name for joint in Urdf.parse(urdf).joints)
     except ValueError as error:
         raise Hdf5FitError(f"the robot's model cannot be used ({error})") from error
-
-
-def _stored(file: ForeignFile, place: str, mapping: Hdf5Mapping) -> _Stored:
-    """The datasets of an episode; Hdf5FitError when they do not fit the mapping."""
-
-    def array(name: str) -> StoredArray:
-        return file.array("/".join(filter(None, (place, name.strip("/")))))
-
-    features = []
-    for name, parts in mapping.features.items():
-        following = parts[0].next
-        used = mapping.features[following] if following else parts
-        arrays = [array(part.dataset) for part in used]
-        features.append(stored_feature(name, used, arrays, shift=1 if following else 0))
-    num_rows = len(features[0].columns[0].array)
-    cameras = {name: (camera, array(camera.dataset)) for name, camera in mapping.cameras.items()}
-    vectors = [column.array for feature in features for column in feature.columns]
-    _check_lengths(file, place, [*vectors, *(pictures for _, pictures in cameras.values())], num_rows)
-    lengths = picture_lengths(array(_LENGTHS), num_rows) if file.has(f"{place}/{_LENGTHS}") else None
-    num_frames = num_rows - max(feature.shift for feature in features)
-    if num_frames < 1:
-        raise Hdf5FitError(f"{place or 'the episode'} has {num_rows} rows, too few for a frame")
-    return _Stored(
-        features=tuple(features),
-        cameras=tuple(
-            StoredCamera(name, camera, pictures, lengths if len(pictures.shape) == 2 else None)
-            for name, (camera, pictures) in cameras.items()
-        ),
-        num_rows=num_rows,
-        num_frames=num_frames,
-    )
 
 
 def _check_lengths(file: ForeignFile, place: str, arrays: Sequence[StoredArray], num_rows: int) -> None:

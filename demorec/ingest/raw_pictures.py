@@ -31,7 +31,13 @@ _YUV = {"uyvy": (1, 0, 2), "yuv422": (1, 0, 2), "yuyv": (0, 1, 3), "yuv422_yuy2"
 """Encoding -> where the first luma, U and V of a pair of pixels are, of its four bytes."""
 _DEPTH = {"16UC1": "u2", "32FC1": "f4"}
 """Encoding of distances -> type of one."""
-RAW_ENCODINGS = (*_CHANNELS, *_BAYER, *_YUV, *_DEPTH)
+_PIXEL_BYTES = (
+    {encoding: count for encoding, (count, _) in _CHANNELS.items()}
+    | dict.fromkeys(_BAYER, 1)
+    | dict.fromkeys(_YUV, 2)
+    | {encoding: np.dtype(kind).itemsize for encoding, kind in _DEPTH.items()}
+)
+RAW_ENCODINGS = tuple(_PIXEL_BYTES)
 
 
 def raw_picture(values: Values) -> NDArray[Any]:
@@ -63,14 +69,8 @@ def check_raw(values: Values) -> None:
 
 
 def _bytes_of_row(encoding: str, width: int) -> int:
-    if encoding in _CHANNELS:
-        return width * _CHANNELS[encoding][0]
-    if encoding in _BAYER:
-        return width
-    if encoding in _DEPTH:
-        return width * np.dtype(_DEPTH[encoding]).itemsize
-    if encoding in _YUV and width % 2 == 0:
-        return 2 * width
+    if encoding in _PIXEL_BYTES and not (encoding in _YUV and width % 2):
+        return width * _PIXEL_BYTES[encoding]
     raise FieldError(f"its encoding {encoding[:40]!r} is not read; {', '.join(RAW_ENCODINGS)} are")
 
 

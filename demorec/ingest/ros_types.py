@@ -46,7 +46,8 @@ def ros_decoder(type_name: str, schema_encoding: str, schema: bytes, *, is_cdr: 
     Raises:
         ValueError: The definition cannot be read; or, from the decoder, a message does not fit it.
     """
-    name = _full_name(type_name)
+    parts = type_name.split("/")
+    name = f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else type_name
     types = _types(name, schema_encoding, schema)
     if not is_cdr:
         read = _Builder(types, order="<", is_aligned=False).message(name)
@@ -70,11 +71,6 @@ def _whole(read: _Reader, data: memoryview) -> Values:
     except struct.error:
         raise ValueError("it ends within a value") from None
     return values
-
-
-def _full_name(name: str) -> str:
-    parts = name.split("/")
-    return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else name
 
 
 @lru_cache(maxsize=512)

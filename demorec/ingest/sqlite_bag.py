@@ -12,7 +12,6 @@ from demorec.ingest.channel import MAX_SCHEMA_BYTES, BagChannel, BagError, BagMe
 
 SQLITE_MAGIC = b"SQLite format 3\0"
 _MAX_MESSAGE_BYTES = 1 << 28
-_ENCODINGS = {"cdr": "cdr", "": "cdr"}
 
 
 def read_sqlite(path: Path, tell: Callable[[str], None]) -> Iterator[BagMessage]:
@@ -60,7 +59,7 @@ def _channels(database: sqlite3.Connection, path: Path) -> dict[int, BagChannel]
         channels[int(number)] = BagChannel(
             topic=str(topic),
             type=str(kind),
-            encoding=_ENCODINGS.get(str(serialisation), str(serialisation)),
+            encoding=str(serialisation) or "cdr",
             schema_encoding=encoding,
             schema=definition,
         )

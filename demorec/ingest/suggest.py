@@ -270,9 +270,10 @@ def _features(vectors: Sequence[_Vector]) -> Iterator[str]:
     if not states and len(others) == 1:
         states, others = others, []
     for name, chosen in (("observation.state", states), ("action", actions)):
-        double = _doubles(chosen)
+        labels = [label for vector in chosen for label in vector.layout.names]
+        are_double = len(set(labels)) < len(labels)
         for vector in chosen:
-            yield from _source(name, vector, prefix=_prefix(vector, chosen) if double else "")
+            yield from _source(name, vector, prefix=_prefix(vector, chosen) if are_double else "")
         if not chosen and name == "observation.state":
             yield from ("", "# No topic says that it is the robot's state: take one of those above.")
         elif not chosen:
@@ -281,11 +282,6 @@ def _features(vectors: Sequence[_Vector]) -> Iterator[str]:
     for vector in others:
         for line in _source("observation.extra", vector, prefix=""):
             yield f"# {line}" if line else ""
-
-
-def _doubles(chosen: Sequence[_Vector]) -> bool:
-    names = [name for vector in chosen for name in vector.layout.names]
-    return len(set(names)) < len(names)
 
 
 def _prefix(vector: _Vector, chosen: Sequence[_Vector]) -> str:

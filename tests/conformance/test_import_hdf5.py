@@ -31,7 +31,7 @@ from demorec.errors import ConfigError
 from demorec.hdf5.foreign import ForeignFile, Hdf5Error, StoredArray
 from demorec.ingest.frames_writer import FramesImport, Picture
 from demorec.ingest.hdf5_episodes import episode_places
-from demorec.ingest.hdf5_features import Hdf5FitError, stored_feature
+from demorec.ingest.hdf5_features import Hdf5FitError, StoredFeature
 from demorec.ingest.hdf5_import import import_hdf5
 from demorec.ingest.hdf5_mapping import DatasetPart, Hdf5Episodes
 from demorec.ingest.hdf5_pictures import StoredCamera
@@ -464,10 +464,10 @@ def test_whole_numbers_are_exact(edge: int, tmp_path: Path) -> None:
         file["other"] = np.array([[edge + (1 if edge > 0 else -1)]])
         file["unsigned"] = np.array([[2**64 - 1]], np.uint64)
     with ForeignFile(tmp_path / "a.hdf5") as opened:
-        held = stored_feature("a", [DatasetPart(dataset="held")], [array("held")], shift=0)
+        held = StoredFeature("a", [DatasetPart(dataset="held")], [array("held")], shift=0)
         assert [vector.tolist() for vector in held.vectors(1)] == [[edge]]
         for name in ("other", "unsigned"):
-            feature = stored_feature("a", [DatasetPart(dataset=name)], [array(name)], shift=0)
+            feature = StoredFeature("a", [DatasetPart(dataset=name)], [array(name)], shift=0)
             with pytest.raises(Hdf5FitError, match="whole numbers that float64 cannot hold"):
                 list(feature.vectors(1))
 
