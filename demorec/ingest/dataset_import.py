@@ -98,7 +98,8 @@ class _Dataset:
             if reason := _why_left_out(name, feature):
                 self.left_out[name] = reason
             elif feature.dtype in ("video", "image"):
-                camera = _camera_name(name)
+                # "top" for "observation.images.top", "image" for "observation.image".
+                camera = name.removeprefix(IMAGE_PREFIX).removeprefix("observation.").replace(".", "_")
                 if camera in self.cameras:
                     raise ConfigError(f"Two cameras of the dataset would be called {camera!r}: {root}")
                 kind = VideoCamera if feature.is_video else ImageCamera
@@ -184,8 +185,3 @@ def _feature(name: str, feature: Feature) -> CollectedFeature:
     return CollectedFeature(
         name=name, dtype="float32" if feature.dtype == "float32" else "float64", names=names, source=name
     )
-
-
-def _camera_name(name: str) -> str:
-    """ "top" for "observation.images.top", "image" for "observation.image"."""
-    return name.removeprefix(IMAGE_PREFIX).removeprefix("observation.").replace(".", "_")

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from demorec.ingest.clock import NS, Int, Numbers, Timeline
 from demorec.ingest.mapping import BagMapping, Clock
 from demorec.ingest.mapping_file import ACTION, STATE
+from demorec.ingest.rows import Timelines
 from demorec.ingest.streams import NO_STAMP, BagStreams, Stream
 
 _JITTER = 0.25
@@ -52,12 +53,28 @@ class Finding:
     text: str
 
 
-def stream_findings(line: Timeline) -> Iterator[Finding]:
-    """What is odd in one stream by itself."""
-    found = [*_message_findings(line.stream), *_time_findings(line), *_clock_findings(line.skews_ns)]
-    found += [*_picture_findings(line), *_value_findings(line)]
-    for kind, text in found:
-        yield _of(line.stream, kind, text)
+def all_findings(lines: Timelines) -> tuple[Finding, ...]:
+    """What is odd in a bag, each thing once."""
+    once: dict[tuple[str, str], Finding] = {}
+    for finding in _findings(lines, list(lines.lines.values())):
+        once.setdefault((finding.kind, finding.text.partition(":")[0] if finding.stream else finding.text), finding)
+    return tuple(once.values())
+
+
+def _findings(bag: Timelines, lines: Sequence[Timeline]) -> Iterator[Finding]:
+    for line in lines:
+        for kind, text in (*_message_findings(line.stream), *_time_findings(line), *_clock_findings(line.skews_ns)):
+            yield _of(line.stream, kind, text)
+        for kind, text in (*_picture_findings(line), *_value_findings(line)):
+            yield _of(line.stream, kind, text)
+    for problem in bag.streams.problems:
+        yield Finding(kind="cut_off", stream="", text=problem)
+    yield from _extent_findings([line for line in lines if line.is_regular])
+    yield from _offset_findings(lines)
+    yield from _camera_findings(bag.streams)
+    yield from _rate_findings(lines, bag.mapping.clock)
+    yield from _unit_findings(bag.streams, bag.mapping)
+    yield from _action_findings(bag.streams, bag.mapping)
 
 
 def _of(stream: Stream, kind: str, text: str) -> Finding:
@@ -231,18 +248,6 @@ def _picture_findings(line: Timeline) -> Iterator[tuple[str, str]]:
         keyframes = np.flatnonzero(stream.heads.are_keyframes)
         first = int(keyframes[0]) if len(keyframes) else len(stream.heads)
         yield "keyframe", f"its first {first} pictures cannot be decoded, since no keyframe is before them"
-
-
-def bag_findings(streams: BagStreams, lines: Sequence[Timeline], mapping: BagMapping) -> Iterator[Finding]:
-    """What is odd between streams; `lines` has every one of them."""
-    for problem in streams.problems:
-        yield Finding(kind="cut_off", stream="", text=problem)
-    yield from _extent_findings([line for line in lines if line.is_regular])
-    yield from _offset_findings(lines)
-    yield from _camera_findings(streams)
-    yield from _rate_findings(lines, mapping.clock)
-    yield from _unit_findings(streams, mapping)
-    yield from _action_findings(streams, mapping)
 
 
 def _extent_findings(regular: Sequence[Timeline]) -> Iterator[Finding]:

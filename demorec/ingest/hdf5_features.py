@@ -136,11 +136,8 @@ def _labels(array: StoredArray, count: int) -> list[str]:
         named = json.loads(str(array.attribute("names") or ""))
     except (ValueError, RecursionError, Hdf5Error):
         named = None
-    if isinstance(named, list) and len(named) == count and all(_is_name(name) for name in named):
+    is_list = isinstance(named, list) and len(named) == count and all(isinstance(name, str) for name in named)
+    if is_list and all(name and name.isprintable() and "," not in name for name in named):
         return named
     base = array.place.rpartition("/")[2].replace(",", " ")
     return [base] if len(array.shape) == 1 else [f"{base}_{number}" for number in range(count)]
-
-
-def _is_name(name: object) -> bool:
-    return isinstance(name, str) and bool(name) and name.isprintable() and "," not in name

@@ -7,9 +7,9 @@ goes on: episodes that are there are not written.
 from __future__ import annotations
 
 import reprlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 
@@ -63,8 +63,8 @@ def import_hdf5(
             source = SourceFile(name=path.name, sha256=sha256_of(path))
             places = episode_places(file, mapping.episodes)
             for place in places:
-                plan = _plan(file, place, mapping, urdf, source, len(plans))
-                plans.append(_alike(plan, plans[0]) if plans else plan)
+                plans.append(_Plan(file, place, mapping, urdf, source, len(plans)))
+                _make_alike(plans[-1], plans[0])
             left_out = left_out or _unnamed(file, places[0], mapping)
     return FramesImport(
         num_episodes=len(plans),
@@ -73,18 +73,6 @@ def import_hdf5(
         cameras=plans[0].told,
         left_out=left_out,
     )
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Plan:
-    """An episode that shall be in the run."""
-
-    path: Path
-    place: str
-    info: CollectedInfo
-    num_frames: int
-    success: bool | None
-    told: Mapping[str, str]
 
 
 class _Stored:
@@ -132,46 +120,44 @@ def _write(plans: Sequence[_Plan], mapping: Hdf5Mapping, out: Path, video: Video
     return len(missing)
 
 
-def _plan(
-    file: ForeignFile, place: str, mapping: Hdf5Mapping, urdf: str, source: SourceFile, episode_index: int
-) -> _Plan:
+class _Plan:
     """What an episode shall be; every number is looked at."""
-    with _named(file.path):
-        episode = _Stored(file, place, mapping)
-        for _ in episode.frames():
-            pass
-        if mapping.robot.urdf_attribute:
-            urdf = str(found_attribute(file, place, mapping.robot.urdf_attribute) or "")
-        joints = _joints(urdf, mapping.robot.urdf_attribute)
-        info = CollectedInfo(
-            episode_index=episode_index,
-            instruction=task_of(file, place, mapping),
-            robot=mapping.robot.name,
-            urdf=urdf,
-            fps=rate_of(file, place, mapping),
-            features=tuple(feature.described(joints) for feature in episode.features),
-            cameras=tuple(camera.described() for camera in episode.cameras),
-            origin=Origin(kind="import", files=(source,), mapping_digest=mapping.digest),
-            versions={"demorec": version("demorec"), "av": version("av")},
-        )
-        if wrong := what_is_wrong(info):
-            raise Hdf5FitError("; ".join(wrong))
-        return _Plan(
-            path=file.path,
-            place=place,
-            info=info,
-            num_frames=episode.num_frames,
-            success=success_of(file, place, mapping, episode.num_rows),
-            told={camera.name: f"{camera.width}x{camera.height}, {camera.told}" for camera in episode.cameras},
-        )
+
+    def __init__(
+        self, file: ForeignFile, place: str, mapping: Hdf5Mapping, urdf: str, source: SourceFile, episode_index: int
+    ) -> None:
+        self.path, self.place = file.path, place
+        with _named(file.path):
+            episode = _Stored(file, place, mapping)
+            for _ in episode.frames():
+                pass
+            if mapping.robot.urdf_attribute:
+                urdf = str(found_attribute(file, place, mapping.robot.urdf_attribute) or "")
+            joints = _joints(urdf, mapping.robot.urdf_attribute)
+            self.info = CollectedInfo(
+                episode_index=episode_index,
+                instruction=task_of(file, place, mapping),
+                robot=mapping.robot.name,
+                urdf=urdf,
+                fps=rate_of(file, place, mapping),
+                features=tuple(feature.described(joints) for feature in episode.features),
+                cameras=tuple(camera.described() for camera in episode.cameras),
+                origin=Origin(kind="import", files=(source,), mapping_digest=mapping.digest),
+                versions={"demorec": version("demorec"), "av": version("av")},
+            )
+            if wrong := what_is_wrong(self.info):
+                raise Hdf5FitError("; ".join(wrong))
+            self.num_frames = episode.num_frames
+            self.success = success_of(file, place, mapping, episode.num_rows)
+            self.told = {camera.name: f"{camera.width}x{camera.height}, {camera.told}" for camera in episode.cameras}
 
 
-def _alike(plan: _Plan, first: _Plan) -> _Plan:
-    """An episode that fits the first, with whose model, a long text, it shares memory; ConfigError when it differs."""
+def _make_alike(plan: _Plan, first: _Plan) -> None:
+    """Let an episode share the first one's model, a long text, in memory; ConfigError when it differs."""
     if different := differences(first.info, plan.info):
         name = f"{plan.place} of {plan.path}" if plan.place else str(plan.path)
         raise ConfigError(f"The episodes differ ({'; '.join(different)}): import {name} into another run.")
-    return replace(plan, info=replace(plan.info, urdf=first.info.urdf))
+    plan.info = replace(plan.info, urdf=first.info.urdf)
 
 
 def _joints(urdf: str, attribute: str) -> frozenset[str]:

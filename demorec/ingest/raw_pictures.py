@@ -58,14 +58,15 @@ def raw_picture(values: Values) -> NDArray[Any]:
     return _from_bayer(rows, *_BAYER[encoding]) if encoding in _BAYER else _from_yuv(rows, *_YUV[encoding])
 
 
-def check_raw(values: Values) -> None:
-    """Raise FieldError when a message's bytes are not those of its size and encoding."""
+def check_raw(values: Values) -> tuple[int, int]:
+    """Bytes of a row, with and without what pads it; FieldError when a message's are not those of its size."""
     encoding, width, height = str(values["encoding"]), int(values["width"]), int(values["height"])
     used = _bytes_of_row(encoding, width)
     step = int(values.get("step") or used)
     count = len(values["data"]) if not isinstance(values["data"], str) else len(picture_bytes(values))
     if step < used or count < step * (height - 1) + used:
         raise FieldError(f"its picture has {count:,} bytes, too few for {width}x{height} {encoding}")
+    return step, used
 
 
 def _bytes_of_row(encoding: str, width: int) -> int:
@@ -76,10 +77,8 @@ def _bytes_of_row(encoding: str, width: int) -> int:
 
 def _rows(values: Values) -> NDArray[np.uint8]:
     """(H, B) bytes, without what pads each row."""
-    check_raw(values)
-    height, used = int(values["height"]), _bytes_of_row(str(values["encoding"]), int(values["width"]))
-    data = np.frombuffer(picture_bytes(values), np.uint8)
-    step = int(values.get("step") or used)
+    step, used = check_raw(values)
+    height, data = int(values["height"]), np.frombuffer(picture_bytes(values), np.uint8)
     if step == used:
         return data[: used * height].reshape(height, used)
     padded = np.zeros(step * height, np.uint8)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from demorec.ingest.clock import NS, Timeline
-from demorec.ingest.findings import Finding, bag_findings, stream_findings
+from demorec.ingest.findings import Finding
 from demorec.ingest.rows import EpisodeRows, Timelines
 
 
@@ -126,16 +126,6 @@ def _skew(line: Timeline) -> tuple[float | None, float | None]:
         return None, None
     low, high = np.percentile(skew, [1, 99])
     return float(np.median(skew)) / 1e6, float(high - low) / 1e6
-
-
-def all_findings(lines: Timelines) -> tuple[Finding, ...]:
-    """What is odd in a bag, each thing once."""
-    found = [finding for line in lines.lines.values() for finding in stream_findings(line)]
-    found += bag_findings(lines.streams, list(lines.lines.values()), lines.mapping)
-    once: dict[tuple[str, str], Finding] = {}
-    for finding in found:
-        once.setdefault((finding.kind, finding.text.partition(":")[0] if finding.stream else finding.text), finding)
-    return tuple(once.values())
 
 
 _HEAD = ("stream", "topic", "messages", "rate Hz", "clock", "skew ms", "jitter ms", "longest ms", "lost", "age ms")

@@ -90,7 +90,7 @@ def suggested_mapping(path: Path) -> list[str]:
     topics = _topics(bag, problems)
     if not topics:
         raise BagError(f"The bag holds no messages: {path}")
-    cameras = dict(_cameras(topics))
+    cameras = _cameras(topics)
     vectors = [vector for name, topic in sorted(topics.items()) for vector in _vectors(name, topic)]
     lines = [f"# A mapping for {path.name}, suggested from what is in it; docs/import.md explains every key.", "#"]
     lines += [f"# {problem}" for problem in problems[:5]]
@@ -190,11 +190,11 @@ def _vectors(name: str, topic: _Topic) -> Iterator[_Vector]:
         return
 
 
-def _cameras(topics: Mapping[str, _Topic]) -> Iterator[tuple[str, str]]:
-    """(name, topic) of each camera: of several topics of the same one, the coded one."""
+def _cameras(topics: Mapping[str, _Topic]) -> dict[str, str]:
+    """Name of each camera -> topic: of several topics of the same one, the coded one."""
     heads = {name: _head(topic.values[0]) for name, topic in topics.items() if topic.values}
     pictures = [name for name, head in heads.items() if head is not None]
-    taken: set[str] = set()
+    cameras: dict[str, str] = {}
     for name in sorted(pictures):
         if any(other != name and other.startswith(f"{name}/") for other in pictures):
             continue  # image_raw beside image_raw/compressed: the same pictures
@@ -204,9 +204,8 @@ def _cameras(topics: Mapping[str, _Topic]) -> Iterator[tuple[str, str]]:
         words = [word for word in _CAMERA_WORD.split(name.lower()) if word and word not in ignored]
         camera = "_".join([*dict.fromkeys(words[-2:])] or ["camera"]) + ("_depth" if is_depth else "")
         camera = camera if camera[0].isalpha() else f"camera_{camera}"
-        camera = unique_name(camera, taken)
-        taken.add(camera)
-        yield camera, name
+        cameras[unique_name(camera, cameras)] = name
+    return cameras
 
 
 def _info_topic(topic: str, topics: Mapping[str, _Topic]) -> list[str]:

@@ -10,9 +10,9 @@ from support.bag_faults import FAULTS, hurt
 
 from demorec.ingest.bag import open_bag
 from demorec.ingest.channel import BagError
+from demorec.ingest.findings import all_findings
 from demorec.ingest.import_run import import_bags
 from demorec.ingest.mapping import read_mapping
-from demorec.ingest.report import all_findings
 from demorec.ingest.rows import Timelines
 from demorec.ingest.streams import read_streams
 from demorec.tables import CHECKS
