@@ -70,19 +70,15 @@ def timeline(stream: Stream, mapping: BagMapping) -> Timeline:
         order: Int = np.arange(len(times))
         ordered = times
     else:
-        ordered, order = _put_in_order(times, np.flatnonzero(stamped) if is_header else np.arange(len(times)))
+        usable = np.flatnonzero(stamped) if is_header else np.arange(len(times))
+        order = usable[np.argsort(times[usable], kind="stable")]
+        ordered = times[order]
+        is_first = np.diff(ordered, prepend=ordered[:1] - 1) > 0
+        ordered, order = ordered[is_first], order[is_first]
     period, is_regular = _period(ordered)
     return Timeline(
         stream=stream, times_ns=ordered, order=order, is_header=is_header, period_ns=period, is_regular=is_regular
     )
-
-
-def _put_in_order(times: Int, usable: Int) -> tuple[Int, Int]:
-    """The times of the usable messages, each once, and which messages they are."""
-    order = usable[np.argsort(times[usable], kind="stable")]
-    ordered = times[order]
-    first = np.concatenate(([True], np.diff(ordered) > 0)) if len(ordered) else np.zeros(0, bool)
-    return ordered[first], order[first]
 
 
 def _period(times: Int) -> tuple[int, bool]:

@@ -24,10 +24,9 @@ def decoder_of(channel: BagChannel) -> Decoder:
     """What reads the messages of a channel; UnknownEncodingError says why nothing does."""
     try:
         match channel.encoding:
-            case "cdr":
-                return ros_decoder(channel.type, channel.schema_encoding, channel.schema, is_cdr=True)
-            case "ros1":
-                return ros_decoder(channel.type, channel.schema_encoding, channel.schema, is_cdr=False)
+            case "cdr" | "ros1":
+                is_cdr = channel.encoding == "cdr"
+                return ros_decoder(channel.type, channel.schema_encoding, channel.schema, is_cdr=is_cdr)
             case "protobuf":
                 return _protobuf_decoder(channel.type, channel.schema)
             case "json":

@@ -109,10 +109,9 @@ def task_text(bag: Bag, streams: BagStreams, window: Window, mapping: BagMapping
     if task.text:
         return task.text.strip()
     if task.file_name:
-        text = task_in_name(bag.name)
-        if not text:
-            raise BagError(f"The bag's name says no task, which the mapping takes from it: {bag.path}")
-        return text
+        if text := task_in_name(bag.name):
+            return text
+        raise BagError(f"The bag's name says no task, which the mapping takes from it: {bag.path}")
     told = [text for text in streams.texts[task.topic] if text.time_ns <= window.end_ns]
     if not told:
         raise BagError(f"No text of {task.topic} is before the episode's end, so its task is unknown: {bag.path}")

@@ -63,9 +63,8 @@ def all_findings(lines: Timelines) -> tuple[Finding, ...]:
 
 def _findings(bag: Timelines, lines: Sequence[Timeline]) -> Iterator[Finding]:
     for line in lines:
-        for kind, text in (*_message_findings(line.stream), *_time_findings(line), *_clock_findings(line.skews_ns)):
-            yield _of(line.stream, kind, text)
-        for kind, text in (*_picture_findings(line), *_value_findings(line)):
+        found = (*_message_findings(line.stream), *_time_findings(line), *_clock_findings(line.skews_ns))
+        for kind, text in (*found, *_picture_findings(line), *_value_findings(line)):
             yield _of(line.stream, kind, text)
     for problem in bag.streams.problems:
         yield Finding(kind="cut_off", stream="", text=problem)

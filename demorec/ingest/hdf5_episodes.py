@@ -106,10 +106,9 @@ def task_of(file: ForeignFile, place: str, mapping: Hdf5Mapping) -> str:
     if task.text:
         return " ".join(task.text.split())
     if task.file_name:
-        text = task_in_name(file.path.stem)
-        if not text:
-            raise Hdf5Error(f"The file's name says no task, which the mapping takes from it: {file.path}")
-        return text
+        if text := task_in_name(file.path.stem):
+            return text
+        raise Hdf5Error(f"The file's name says no task, which the mapping takes from it: {file.path}")
     found = found_attribute(file, place, task.attribute)
     if not isinstance(found, str) or not found.strip():
         raise Hdf5Error(f"No attribute {task.attribute!r} says the task of {place or 'the episode'}: {file.path}")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -74,7 +74,7 @@ class StoredFeature:
         """float32 where that holds all numbers as they are."""
         return np.float32 if all(column.is_single for column in self.columns) else np.float64
 
-    def described(self, joints: frozenset[str]) -> CollectedFeature:
+    def described(self, joints: Container[str]) -> CollectedFeature:
         """The feature as recordings know it, given the joints of the robot's model."""
         names = tuple(name for column in self.columns for name in column.names)
         units = tuple(
@@ -138,6 +138,6 @@ def _labels(array: StoredArray, count: int) -> list[str]:
         named = None
     is_list = isinstance(named, list) and len(named) == count and all(isinstance(name, str) for name in named)
     if is_list and all(name and name.isprintable() and "," not in name for name in named):
-        return named
+        return list(named)
     base = array.place.rpartition("/")[2].replace(",", " ")
     return [base] if len(array.shape) == 1 else [f"{base}_{number}" for number in range(count)]

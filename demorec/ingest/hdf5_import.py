@@ -91,7 +91,16 @@ class _Stored:
         vectors = [column.array for feature in self.features for column in feature.columns]
         self.num_rows = num_rows = len(vectors[0])
         cameras = {name: (camera, array(camera.dataset)) for name, camera in mapping.cameras.items()}
-        _check_lengths(file, place, [*vectors, *(pictures for _, pictures in cameras.values())], num_rows)
+        for stored in (*vectors, *(pictures for _, pictures in cameras.values())):
+            if len(stored) != num_rows:
+                raise Hdf5FitError(
+                    f"{stored.place} has {len(stored)} rows, other datasets of the episode have {num_rows}"
+                )
+        told = file.attribute(place, "num_samples")
+        if told is not None and told != num_rows:
+            raise Hdf5FitError(
+                f"{place or 'the episode'} has {num_rows} rows, but its attribute num_samples says {reprlib.repr(told)}"
+            )
         lengths = picture_lengths(array(_LENGTHS), num_rows) if file.has(f"{place}/{_LENGTHS}") else None
         self.num_frames = num_rows - max(feature.shift for feature in self.features)
         if self.num_frames < 1:
@@ -131,9 +140,12 @@ class _Plan:
             episode = _Stored(file, place, mapping)
             for _ in episode.frames():
                 pass
-            if mapping.robot.urdf_attribute:
-                urdf = str(found_attribute(file, place, mapping.robot.urdf_attribute) or "")
-            joints = _joints(urdf, mapping.robot.urdf_attribute)
+            if attribute := mapping.robot.urdf_attribute:
+                urdf = str(found_attribute(file, place, attribute) or "")
+            try:
+                joints = {joint.name for joint in Urdf.parse(urdf).joints} if urdf or attribute else set()
+            except ValueError as error:
+                raise Hdf5FitError(f"the robot's model cannot be used ({error})") from error
             self.info = CollectedInfo(
                 episode_index=episode_index,
                 instruction=task_of(file, place, mapping),
@@ -158,26 +170,6 @@ def _make_alike(plan: _Plan, first: _Plan) -> None:
         name = f"{plan.place} of {plan.path}" if plan.place else str(plan.path)
         raise ConfigError(f"The episodes differ ({'; '.join(different)}): import {name} into another run.")
     plan.info = replace(plan.info, urdf=first.info.urdf)
-
-
-def _joints(urdf: str, attribute: str) -> frozenset[str]:
-    if not urdf and not attribute:
-        return frozenset()
-    try:
-        return frozenset(joint.name for joint in Urdf.parse(urdf).joints)
-    except ValueError as error:
-        raise Hdf5FitError(f"the robot's model cannot be used ({error})") from error
-
-
-def _check_lengths(file: ForeignFile, place: str, arrays: Sequence[StoredArray], num_rows: int) -> None:
-    for array in arrays:
-        if len(array) != num_rows:
-            raise Hdf5FitError(f"{array.place} has {len(array)} rows, other datasets of the episode have {num_rows}")
-    told = file.attribute(place, "num_samples")
-    if told is not None and told != num_rows:
-        raise Hdf5FitError(
-            f"{place or 'the episode'} has {num_rows} rows, but its attribute num_samples says {reprlib.repr(told)}"
-        )
 
 
 def _unnamed(file: ForeignFile, place: str, mapping: Hdf5Mapping) -> dict[str, str]:

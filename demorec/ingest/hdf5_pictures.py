@@ -86,8 +86,11 @@ class StoredCamera:
             Hdf5Error: They cannot be read.
         """
         for number, row in enumerate(self._array.rows()):
-            if self._form != "jpeg":
-                yield self._plain(row)
+            if self._form == "depth":
+                yield row.reshape(self.height, self.width).astype(row.dtype.newbyteorder("="), copy=False)
+                continue
+            if self._form == "pixels":
+                yield self._ordered(row.astype(np.uint8, copy=False))
                 continue
             data, head = self._head(row, number)
             if (head.width, head.height) != (self.width, self.height):
@@ -95,11 +98,6 @@ class StoredCamera:
                     f"{self._array.place} changes its size to {head.width}x{head.height} in row {number}"
                 )
             yield data if self.kept else self._ordered(self._used(decode_picture, data, number))
-
-    def _plain(self, row: NDArray[np.generic]) -> Picture:
-        if self._form == "depth":
-            return row.reshape(self.height, self.width).astype(row.dtype.newbyteorder("="), copy=False)
-        return self._ordered(row.astype(np.uint8, copy=False))
 
     def _ordered(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
         return picture if self._camera.colors == "rgb" else np.ascontiguousarray(picture[:, :, ::-1])

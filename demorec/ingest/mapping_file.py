@@ -133,8 +133,7 @@ def read_mapping_file[M: AnyMapping](path: Path, kind: type[M]) -> M:
         raise ConfigError(f"The mapping cannot be read ({error.strerror}): {path}") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ConfigError(f"The mapping is no valid TOML ({error}): {path}") from error
-    unknown = list(_unknown_keys(data, kind, ""))
-    if unknown:
+    if unknown := list(_unknown_keys(data, kind, "")):
         raise ConfigError(f"The mapping cannot be used: {'; '.join(unknown)}: {path}")
     try:
         mapping = from_plain(data, kind)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from demorec.ingest.clock import NS, Timeline
+from demorec.ingest.clock import NS
 from demorec.ingest.findings import Finding
 from demorec.ingest.rows import EpisodeRows, Timelines
 
@@ -99,7 +99,7 @@ def stream_reports(lines: Timelines, episodes: Sequence[EpisodeRows]) -> Iterato
         steps = np.diff(line.times_ns)
         ages = [lines.chosen(key, rows.times_ns).reach_ns.max() for rows in episodes]
         usual = steps[(steps > 0.4 * line.period_ns) & (steps < 1.6 * line.period_ns)]
-        skew, spread = _skew(line)
+        skews = line.skews_ns
         lost = int((np.round(steps / line.period_ns) - 1).clip(min=0).sum()) if line.is_regular else 0
         yield StreamReport(
             label=stream.label,
@@ -109,8 +109,8 @@ def stream_reports(lines: Timelines, episodes: Sequence[EpisodeRows]) -> Iterato
             count=len(stream),
             rate_hz=NS / line.period_ns if line.period_ns else 0.0,
             is_regular=line.is_regular,
-            skew_ms=skew,
-            skew_range_ms=spread,
+            skew_ms=float(np.median(skews)) / 1e6 if len(skews) else None,
+            skew_range_ms=float(np.ptp(np.percentile(skews, [1, 99]))) / 1e6 if len(skews) else None,
             jitter_ms=float(np.std(usual)) / 1e6 if len(usual) else 0.0,
             longest_ms=float(steps.max()) / 1e6 if len(steps) else 0.0,
             lost=lost,
@@ -118,14 +118,6 @@ def stream_reports(lines: Timelines, episodes: Sequence[EpisodeRows]) -> Iterato
             malformed=stream.num_malformed,
             max_age_ms=float(max(ages)) / 1e6 if ages else None,
         )
-
-
-def _skew(line: Timeline) -> tuple[float | None, float | None]:
-    skew = line.skews_ns
-    if not len(skew):
-        return None, None
-    low, high = np.percentile(skew, [1, 99])
-    return float(np.median(skew)) / 1e6, float(high - low) / 1e6
 
 
 _HEAD = ("stream", "topic", "messages", "rate Hz", "clock", "skew ms", "jitter ms", "longest ms", "lost", "age ms")

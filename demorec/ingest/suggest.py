@@ -96,7 +96,9 @@ def suggested_mapping(path: Path) -> list[str]:
     lines += [f"# {problem}" for problem in problems[:5]]
     lines += list(_listed(topics))
     robot = re.sub(r"[^A-Za-z0-9_]+", "_", bag.name).strip("_") or "robot"
-    lines += ["", "[robot]", f"name = {quoted(robot)}", *_robot_model(topics)]
+    model = next((name for name in sorted(topics) if name.endswith("robot_description")), "")
+    lines += ["", "[robot]", f"name = {quoted(robot)}"]
+    lines += [f"urdf_topic = {quoted(model)}" if model else '# urdf = "robot.urdf"']
     lines += ["", "[task]", *_task(topics, bag)]
     lines += ["", "[clock]", *_clock(topics, cameras, vectors)]
     lines += list(_services(topics))
@@ -212,11 +214,6 @@ def _info_topic(topic: str, topics: Mapping[str, _Topic]) -> list[str]:
     base = topic.removesuffix("/compressed").removesuffix("/compressedDepth").rpartition("/")[0]
     name = f"{base}/camera_info"
     return [f"info_topic = {quoted(name)}"] if name in topics else []
-
-
-def _robot_model(topics: Mapping[str, _Topic]) -> list[str]:
-    found = next((name for name in sorted(topics) if name.endswith("robot_description")), "")
-    return [f"urdf_topic = {quoted(found)}"] if found else ['# urdf = "robot.urdf"']
 
 
 def _task(topics: Mapping[str, _Topic], bag: Bag) -> list[str]:

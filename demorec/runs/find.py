@@ -16,6 +16,7 @@ from demorec.errors import ConfigError, resource_error
 from demorec.lerobot.paths import INFO_PATH
 from demorec.runs.run_file import EPISODES, FAILED, RUN_NAME
 from demorec.safety.files import HDF5_MAGIC, MCAP_MAGIC, RERUN_MAGICS, irregular_kind, open_regular
+from demorec.safety.replacing import shown
 
 PathKind = Literal[
     "recording",
@@ -64,8 +65,6 @@ _MARKS: tuple[tuple[str, PathKind], ...] = (
     ("metadata.yaml", "rosbag"),
 )
 """The file by whose presence a folder is known."""
-
-_SHOWN = 5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -184,5 +183,5 @@ def _nothing_in(path: Path, entries: Sequence[str]) -> str:
         return f"{reason}; it has unfinished recordings, of which demorec recover {parts[0]} reads one"
     below = sorted(name for name in entries if _is_there(path / name / RUN_NAME) or _is_there(path / name / EPISODES))
     if below:
-        return f"{reason}; it holds runs, name one ({', '.join(below[:_SHOWN])}{', ...' if below[_SHOWN:] else ''})"
+        return f"{reason}; it holds runs, name one ({shown(below)})"
     return reason
