@@ -92,14 +92,11 @@ def _protobuf_values(message: Any, depth: int) -> Values:
             else:
                 items = list(found)
                 is_number = all(isinstance(item, int | float) for item in items)
-                values[field.name] = np.array(items, dtype=_protobuf_dtype(field)) if is_number else items
+                dtype = {field.TYPE_FLOAT: "f4", field.TYPE_BOOL: "u1"}.get(field.type, "f8")
+                values[field.name] = np.array(items, dtype=dtype) if is_number else items
         elif is_message:
             if message.HasField(field.name):
                 values[field.name] = _protobuf_values(getattr(message, field.name), depth + 1)
         else:
             values[field.name] = getattr(message, field.name)
     return values
-
-
-def _protobuf_dtype(field: Any) -> str:
-    return {field.TYPE_FLOAT: "f4", field.TYPE_BOOL: "u1"}.get(field.type, "f8")

@@ -101,10 +101,7 @@ def suggested_mapping(path: Path) -> list[str]:
     lines += [f"urdf_topic = {quoted(model)}" if model else '# urdf = "robot.urdf"']
     lines += ["", "[task]", *_task(topics, bag)]
     lines += ["", "[clock]", *_clock(topics, cameras, vectors)]
-    lines += list(_services(topics))
-    lines += list(_subtasks(topics))
-    lines += list(_features(vectors))
-    lines += list(_poses(topics))
+    lines += [*_services(topics), *_subtasks(topics), *_features(vectors), *_poses(topics)]
     for camera, topic in cameras.items():
         lines += ["", f"[cameras.{camera}]", f"topic = {quoted(topic)}", *_info_topic(topic, topics)]
     return lines
