@@ -13,8 +13,7 @@ from demorec.config import VideoConfig
 from demorec.errors import ConfigError
 
 if TYPE_CHECKING:
-    from demorec.ingest.dataset_import import DatasetImport
-    from demorec.ingest.hdf5_import import Hdf5Import
+    from demorec.ingest.frames_writer import FramesImport
 
 _LEROBOT, _HDF5 = Path("lerobot"), Path("hdf5")
 """As the first word: what follows is a dataset, or HDF5 files."""
@@ -135,7 +134,7 @@ class Import:
         return 0
 
 
-def _say_made(result: DatasetImport | Hdf5Import, out: Path) -> None:
+def _say_made(result: FramesImport, out: Path) -> None:
     if there := result.num_episodes - result.num_new:
         tell(f"{there} of {counted(result.num_episodes, 'episode')} had been imported before.")
     say(f"{counted(result.num_episodes, 'episode')}, {result.num_frames} frames: {out}")

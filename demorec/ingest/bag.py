@@ -6,7 +6,6 @@ each call of `messages`, in the memory of a chunk.
 
 from __future__ import annotations
 
-import hashlib
 import os
 import stat
 import tempfile
@@ -24,6 +23,7 @@ from demorec.ingest.mcap_bag import read_mcap
 from demorec.ingest.sqlite_bag import SQLITE_MAGIC, read_sqlite
 from demorec.lerobot.paths import INFO_PATH
 from demorec.recording.limits import Limits
+from demorec.runs.run_file import sha256_of
 from demorec.safety.files import MCAP_MAGIC, open_regular, read_text_limited
 
 METADATA = "metadata.yaml"
@@ -60,14 +60,7 @@ class Bag:
 
     def sha256s(self) -> dict[str, str]:
         """Name of each of its files -> SHA-256 of its bytes, hex digits."""
-        found = {}
-        for path in self.files:
-            sha = hashlib.sha256()
-            with open_regular(path) as file:
-                while block := file.read(_COPY_BYTES):
-                    sha.update(block)
-            found[path.name] = sha.hexdigest()
-        return found
+        return {path.name: sha256_of(path) for path in self.files}
 
     def messages(self, problems: list[str], topics: Collection[str] | None = None) -> Iterator[BagMessage]:
         """Its messages in the order in which they were written.
@@ -176,21 +169,16 @@ def _unpacked(path: Path) -> Iterator[tuple[Path, bytes]]:
         return
     with tempfile.TemporaryDirectory(prefix="demorec-bag-") as folder:
         plain = Path(folder) / path.stem
+        limits, written = Limits.of_file(path.stat().st_size), 0
         try:
-            _unpack_file(path, plain)
+            with open_regular(path) as source, plain.open("wb") as file:
+                for block in zstandard.ZstdDecompressor().read_to_iter(source, write_size=_COPY_BYTES):
+                    written += len(block)
+                    limits.check_total(written)
+                    file.write(block)
             kind = _kind_of(plain)
         except (zstandard.ZstdError, ValueError) as error:
             raise BagError(f"The compressed bag cannot be unpacked ({error}): {path}") from error
         if kind == _ZSTD_MAGIC:
             raise BagError(f"The bag is compressed twice: {path}")
         yield plain, kind
-
-
-def _unpack_file(path: Path, target: Path) -> None:
-    limits = Limits.of_file(path.stat().st_size)
-    written = 0
-    with open_regular(path) as source, target.open("wb") as file:
-        for block in zstandard.ZstdDecompressor().read_to_iter(source, write_size=_COPY_BYTES):
-            written += len(block)
-            limits.check_total(written)
-            file.write(block)

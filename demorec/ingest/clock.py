@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.ingest.mapping import BagMapping, Sampling
-from demorec.ingest.streams import NO_STAMP, Stream
+from demorec.ingest.streams import Stream
 
 NS = 1_000_000_000
 MISSING = 2**62
@@ -28,6 +28,7 @@ class Timeline:
     """A stream's messages in the order of their times.
 
     Attributes:
+        stream: Whose it is.
         times_ns: (M,) int64, strictly increasing.
         order: (M,) which of the stream's messages they are. Those of equal times are left out but the first, and so
             are those whose header has no time where others have.
@@ -36,33 +37,48 @@ class Timeline:
         is_regular: Whether distances are alike; a stream that speaks only when something changes is not.
     """
 
+    stream: Stream
     times_ns: Int
     order: Int
     is_header: bool
     period_ns: int
     is_regular: bool
 
+    @property
+    def stamps_ns(self) -> Int:
+        """(N,) of the stream's messages; 0 or less where a header has no time."""
+        return self.stream.header_ns if self.is_header else self.stream.log_ns
+
+    @property
+    def skews_ns(self) -> Int:
+        """(K,) time of recording minus that of the header, of the messages whose header has a time."""
+        return (self.stream.log_ns - self.stream.header_ns)[self.stream.header_ns > 0]
+
+    @property
+    def num_repeated(self) -> int:
+        """Messages of the time of another one."""
+        known = self.stamps_ns[self.stamps_ns > 0]
+        return len(known) - len(np.unique(known))
+
 
 def timeline(stream: Stream, mapping: BagMapping) -> Timeline:
     """The timeline of a stream, by header stamps if the mapping wants them and most messages have one."""
-    stamped = (stream.header_ns != NO_STAMP) & (stream.header_ns > 0)
+    stamped = stream.header_ns > 0
     is_header = mapping.clock.stamp == "header" and bool(len(stamped)) and bool(np.mean(stamped) > 0.5)
     times = stream.header_ns if is_header else stream.log_ns
     if (not is_header or stamped.all()) and bool(np.all(times[1:] > times[:-1])):
         order: Int = np.arange(len(times))
         ordered = times
     else:
-        ordered, order = _put_in_order(times, np.flatnonzero(stamped) if is_header else np.arange(len(times)))
+        usable = np.flatnonzero(stamped) if is_header else np.arange(len(times))
+        order = usable[np.argsort(times[usable], kind="stable")]
+        ordered = times[order]
+        is_first = np.diff(ordered, prepend=ordered[:1] - 1) > 0
+        ordered, order = ordered[is_first], order[is_first]
     period, is_regular = _period(ordered)
-    return Timeline(times_ns=ordered, order=order, is_header=is_header, period_ns=period, is_regular=is_regular)
-
-
-def _put_in_order(times: Int, usable: Int) -> tuple[Int, Int]:
-    """The times of the usable messages, each once, and which messages they are."""
-    order = usable[np.argsort(times[usable], kind="stable")]
-    ordered = times[order]
-    first = np.concatenate(([True], np.diff(ordered) > 0)) if len(ordered) else np.zeros(0, bool)
-    return ordered[first], order[first]
+    return Timeline(
+        stream=stream, times_ns=ordered, order=order, is_header=is_header, period_ns=period, is_regular=is_regular
+    )
 
 
 def _period(times: Int) -> tuple[int, bool]:

@@ -5,8 +5,9 @@ The same command again goes on: episodes that are there are not written.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+import functools
+from collections.abc import Iterator
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from demorec.config import VideoConfig
 from demorec.errors import ConfigError
 from demorec.ingest.channel import BagError
 from demorec.ingest.dataset_pictures import DatasetCamera, ImageCamera, VideoCamera
-from demorec.ingest.frames_writer import Picture, write_frames
+from demorec.ingest.frames_writer import FramesImport, write_frames
 from demorec.lerobot.layout import AUTOMATIC_FEATURES, DatasetInfo, Feature
 from demorec.lerobot.paths import INFO_PATH
 from demorec.lerobot.reader import EpisodePlace, RowReader, episode_places, read_tasks
@@ -39,25 +40,7 @@ _TIME_TOLERANCE_S = 1e-4
 _UNNAMED_ROBOT = "unknown"
 
 
-@dataclass(frozen=True, kw_only=True)
-class DatasetImport:
-    """What an import made.
-
-    Attributes:
-        num_episodes, num_frames: In the run.
-        num_new: Episodes that were written now; the others were there.
-        cameras: Camera -> what became of its pictures, in words.
-        left_out: Feature -> why it is in no recording.
-    """
-
-    num_episodes: int
-    num_frames: int
-    num_new: int
-    cameras: Mapping[str, str]
-    left_out: Mapping[str, str]
-
-
-def import_lerobot(root: Path, out: Path, *, video: VideoConfig | None = None) -> DatasetImport:
+def import_lerobot(root: Path, out: Path, *, video: VideoConfig | None = None) -> FramesImport:
     """Import a LeRobot v3.0 dataset, whoever wrote it, into a run.
 
     Args:
@@ -71,27 +54,24 @@ def import_lerobot(root: Path, out: Path, *, video: VideoConfig | None = None) -
         RecordingError: A number is not finite, or the disk is full.
     """
     expect(root, "dataset")
-    dataset = _Dataset.opened(root)
+    dataset = _Dataset(root)
     num_new = num_frames = 0
     with open_collected_run(out, recovers=False) as folder:
         for place in dataset.places:
-            info, rows = dataset.episode(place)
+            info, features, success = dataset.episode(place)
             num_frames += place.length
             if not folder.has(info):
-                target = folder.path_of(place.episode_index)
-                folder.check_fits(info)
                 write_frames(
-                    target,
+                    folder,
                     info,
-                    rows.frames(),
-                    dataset.pictures(place),
-                    success=rows.success,
+                    ({name: rows[number] for name, rows in features.items()} for number in range(place.length)),
+                    {name: camera.pictures(place) for name, camera in dataset.cameras.items()},
+                    success=success,
                     video=video or VideoConfig(),
                     leads={name: camera.lead(place) for name, camera in dataset.cameras.items()},
                 )
-                folder.add(target)
                 num_new += 1
-    return DatasetImport(
+    return FramesImport(
         num_episodes=len(dataset.places),
         num_frames=num_frames,
         num_new=num_new,
@@ -100,73 +80,43 @@ def import_lerobot(root: Path, out: Path, *, video: VideoConfig | None = None) -
     )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Rows:
-    """The numbers of an episode of T frames: feature -> (T, D), and how it ended."""
-
-    num_frames: int
-    features: Mapping[str, Vector]
-    success: bool | None
-
-    def frames(self) -> Iterator[dict[str, Vector]]:
-        """Feature -> (D,) of each frame."""
-        for number in range(self.num_frames):
-            yield {name: values[number] for name, values in self.features.items()}
-
-
-@dataclass(kw_only=True, eq=False)
 class _Dataset:
     """A dataset opened for import; episodes must be asked for in their order."""
 
-    root: Path
-    info: DatasetInfo
-    places: list[EpisodePlace]
-    tasks: list[str]
-    features: tuple[CollectedFeature, ...]
-    cameras: dict[str, DatasetCamera]
-    left_out: dict[str, str]
-    reader: RowReader
-    _digests: dict[Path, str] = field(default_factory=dict)
-
-    @classmethod
-    def opened(cls, root: Path) -> _Dataset:
-        info = DatasetInfo.load(root)
-        places = list(episode_places(root, info))
-        if not places:
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.info = info = DatasetInfo.load(root)
+        self.places = list(episode_places(root, info))
+        if not self.places:
             raise ConfigError(f"The dataset has no episodes: {root}")
-        if empty := [place.episode_index for place in places if place.length < 1]:
+        if empty := [place.episode_index for place in self.places if place.length < 1]:
             raise BagError(f"Episode {empty[0]} of the dataset has no frames: {root}")
-        features, cameras = list[CollectedFeature](), dict[str, DatasetCamera]()
-        left_out = dict[str, str]()
+        self.features: list[CollectedFeature] = []
+        self.cameras: dict[str, DatasetCamera] = {}
+        self.left_out: dict[str, str] = {}
         for name, feature in info.features.items():
             if reason := _why_left_out(name, feature):
-                left_out[name] = reason
+                self.left_out[name] = reason
             elif feature.dtype in ("video", "image"):
-                camera = _camera_name(name)
-                if camera in cameras:
+                # "top" for "observation.images.top", "image" for "observation.image".
+                camera = name.removeprefix(IMAGE_PREFIX).removeprefix("observation.").replace(".", "_")
+                if camera in self.cameras:
                     raise ConfigError(f"Two cameras of the dataset would be called {camera!r}: {root}")
-                cameras[camera] = _camera(root, info, name, places)
+                kind = VideoCamera if feature.is_video else ImageCamera
+                self.cameras[camera] = kind(root, info, name, self.places)
             elif name not in AUTOMATIC_FEATURES and name != _SUCCESS:
-                features.append(_feature(name, feature))
-        columns = [*(feature.name for feature in features), "timestamp", "task_index"]
+                self.features.append(_feature(name, feature))
+        columns = [*(feature.name for feature in self.features), "timestamp", "task_index"]
         columns += [_SUCCESS] if _SUCCESS in info.features else []
         if missing := [name for name in columns if name not in info.features]:
             raise BagError(f"The dataset has no {', '.join(missing)}: {root}")
-        wanted = {name: info.features[name] for name in columns}
-        return cls(
-            root=root,
-            info=info,
-            places=places,
-            tasks=read_tasks(root),
-            features=tuple(features),
-            cameras=cameras,
-            left_out=left_out,
-            reader=RowReader(root, replace(info, features=wanted)),
-        )
+        self._tasks = read_tasks(root)
+        self._reader = RowReader(root, replace(info, features={name: info.features[name] for name in columns}))
+        self._digest = functools.cache(sha256_of)
 
-    def episode(self, place: EpisodePlace) -> tuple[CollectedInfo, _Rows]:
-        """What is known of an episode, and its numbers."""
-        columns = self.reader.read(place)
+    def episode(self, place: EpisodePlace) -> tuple[CollectedInfo, dict[str, Vector], bool | None]:
+        """What is known of an episode of T frames, its numbers (feature -> (T, D)), and how it ended."""
+        columns = self._reader.read(place)
         number, fps = place.episode_index, int(self.info.fps)
         off = np.abs(columns["timestamp"][:, 0].astype(np.float64) - np.arange(place.length) / fps)
         if len(wrong := np.flatnonzero(~(off <= _TIME_TOLERANCE_S))):
@@ -175,14 +125,14 @@ class _Dataset:
                 f"multiple of 1/{fps} s: {self.root}"
             )
         tasks = list(dict.fromkeys(columns["task_index"][:, 0].tolist()))
-        if any(not 0 <= task < len(self.tasks) for task in tasks):
+        if any(not 0 <= task < len(self._tasks) for task in tasks):
             raise BagError(f"Episode {number} names a task that is not in the table of tasks: {self.root}")
         info = CollectedInfo(
             episode_index=number,
-            instruction="; ".join(" ".join(self.tasks[task].split()) for task in tasks),
+            instruction="; ".join(" ".join(self._tasks[task].split()) for task in tasks),
             robot=self.info.robot_type or _UNNAMED_ROBOT,
             fps=fps,
-            features=self.features,
+            features=tuple(self.features),
             cameras=tuple(
                 CollectedCamera(
                     name=name, width=camera.width, height=camera.height, kept=camera.kept, source=camera.key
@@ -198,12 +148,7 @@ class _Dataset:
                     f"The column {feature.name} holds {columns[feature.name].dtype}, not {feature.dtype}: {self.root}"
                 )
         success = bool(columns[_SUCCESS][-1, 0]) if _SUCCESS in columns and place.length else None
-        features = {feature.name: columns[feature.name] for feature in self.features}
-        return info, _Rows(num_frames=place.length, features=features, success=success)
-
-    def pictures(self, place: EpisodePlace) -> dict[str, Iterator[Picture]]:
-        """Camera -> its pictures in an episode, its lead and one a frame."""
-        return {name: camera.pictures(place) for name, camera in self.cameras.items()}
+        return info, {feature.name: columns[feature.name] for feature in self.features}, success
 
     def _files(self, place: EpisodePlace) -> Iterator[SourceFile]:
         """What an episode was read from, by its place in the dataset."""
@@ -214,10 +159,7 @@ class _Dataset:
             if camera.key in place.videos
         ]
         for name in paths:
-            path = self.root / name
-            if path not in self._digests:
-                self._digests[path] = sha256_of(path)
-            yield SourceFile(name=name, sha256=self._digests[path])
+            yield SourceFile(name=name, sha256=self._digest(self.root / name))
 
 
 def _why_left_out(name: str, feature: Feature) -> str:
@@ -243,16 +185,3 @@ def _feature(name: str, feature: Feature) -> CollectedFeature:
     return CollectedFeature(
         name=name, dtype="float32" if feature.dtype == "float32" else "float64", names=names, source=name
     )
-
-
-def _camera_name(name: str) -> str:
-    """ "top" for "observation.images.top", "image" for "observation.image"."""
-    return name.removeprefix(IMAGE_PREFIX).removeprefix("observation.").replace(".", "_")
-
-
-def _camera(root: Path, info: DatasetInfo, name: str, places: list[EpisodePlace]) -> DatasetCamera:
-    if info.features[name].is_video:
-        return VideoCamera(root, info, name, places)
-    camera = ImageCamera(root=root, info=info, key=name)
-    camera.measure(places[0])
-    return camera

@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import io
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -32,7 +31,13 @@ from demorec.recording.video import is_keyframe
 
 
 class DatasetCamera(ABC):
-    """Pictures of one feature. Episodes must be asked for in their order.
+    """Pictures of one feature, in the files of its dataset. Episodes must be asked for in their order.
+
+    Args:
+        root: The dataset's folder.
+        info: Of it.
+        key: Of the feature.
+        places: All episodes: what becomes of the pictures is decided once for all of them.
 
     Attributes:
         key: Of the feature.
@@ -46,6 +51,9 @@ class DatasetCamera(ABC):
     height: int
     kept: Literal[""] | PacketCodec = ""
     told: str
+
+    @abstractmethod
+    def __init__(self, root: Path, info: DatasetInfo, key: str, places: Sequence[EpisodePlace]) -> None: ...
 
     def lead(self, place: EpisodePlace) -> int:
         """How many of an episode's `pictures` come before its first frame: what that is decoded from."""
@@ -61,16 +69,9 @@ class DatasetCamera(ABC):
 
 
 class VideoCamera(DatasetCamera):
-    """Pictures in mp4 files.
+    """Pictures in mp4 files."""
 
-    Args:
-        root: The dataset's folder.
-        info: Of it.
-        key: Of the feature.
-        places: All episodes: whether packets can be kept is decided once for all of them.
-    """
-
-    def __init__(self, root: Path, info: DatasetInfo, key: str, places: Iterable[EpisodePlace]) -> None:
+    def __init__(self, root: Path, info: DatasetInfo, key: str, places: Sequence[EpisodePlace]) -> None:
         self.key = key
         self._root, self._template = root, info.video_path or VIDEO_PATH
         self._path: Path | None = None
@@ -78,7 +79,7 @@ class VideoCamera(DatasetCamera):
         self._next = 0
         self._leads: dict[tuple[Path, int], int] = {}
         self._since_keyframe: list[Picture] = []
-        codec, reason = self._look(list(places))
+        codec, reason = self._look(places)
         self.kept = "" if reason else codec
         self.told = f"{codec}, coded once, since {reason}" if reason else f"{codec} kept as it is"
 
@@ -112,7 +113,7 @@ class VideoCamera(DatasetCamera):
         position, first = place.videos[self.key]
         return self._root / position.path(self._template, self.key), first
 
-    def _look(self, places: list[EpisodePlace]) -> tuple[PacketCodec, str]:
+    def _look(self, places: Sequence[EpisodePlace]) -> tuple[PacketCodec, str]:
         """The codec, and why its packets cannot be kept, "" if they can; sets the size and the leads."""
         lengths: dict[Path, dict[int, int]] = {}
         for place in places:
@@ -181,31 +182,24 @@ def _opened(path: Path) -> Iterator[tuple[av.container.InputContainer, av.video.
         raise BagError(f"The video cannot be read ({in_words(error)}): {path}") from error
 
 
-@dataclass(kw_only=True, eq=False)
 class ImageCamera(DatasetCamera):
     """Pictures in the rows of the data files, PNG or JPEG."""
 
-    root: Path
-    info: DatasetInfo
-    key: str
-    width: int = 0
-    height: int = 0
-    told: str = "pictures of their own, coded once"
+    width = height = 0
+    told = "pictures of their own, coded once"
 
-    def __post_init__(self) -> None:
+    def __init__(self, root: Path, info: DatasetInfo, key: str, places: Sequence[EpisodePlace]) -> None:
+        self.key = key
+        self._root, self._template = root, info.data_path
         self._path: Path | None = None
         self._rows: Iterator[tuple[int, Any]] = iter(())
-
-    def measure(self, place: EpisodePlace) -> None:
-        """Take the size from the first picture of an episode."""
-        first = next(self.pictures(place), None)
-        if isinstance(first, np.ndarray):
-            self.height, self.width = first.shape[:2]
+        first = next(self.pictures(places[0]))
+        self.height, self.width = first.shape[:2]
         self._path = None
 
-    def pictures(self, place: EpisodePlace) -> Iterator[Picture]:
+    def pictures(self, place: EpisodePlace) -> Iterator[NDArray[np.uint8]]:
         """As of `DatasetCamera`."""
-        path = self.root / place.data.path(self.info.data_path)
+        path = self._root / place.data.path(self._template)
         if path != self._path:
             self._path, self._rows = path, _image_rows(path, self.key)
         found = 0

@@ -24,10 +24,9 @@ def decoder_of(channel: BagChannel) -> Decoder:
     """What reads the messages of a channel; UnknownEncodingError says why nothing does."""
     try:
         match channel.encoding:
-            case "cdr":
-                return ros_decoder(channel.type, channel.schema_encoding, channel.schema, is_cdr=True)
-            case "ros1":
-                return ros_decoder(channel.type, channel.schema_encoding, channel.schema, is_cdr=False)
+            case "cdr" | "ros1":
+                is_cdr = channel.encoding == "cdr"
+                return ros_decoder(channel.type, channel.schema_encoding, channel.schema, is_cdr=is_cdr)
             case "protobuf":
                 return _protobuf_decoder(channel.type, channel.schema)
             case "json":
@@ -60,22 +59,11 @@ def _protobuf_decoder(type_name: str, schema: bytes) -> Decoder:
     from google.protobuf.descriptor_pb2 import FileDescriptorSet
     from google.protobuf.descriptor_pool import DescriptorPool
     from google.protobuf.message import DecodeError
-    from google.protobuf.message_factory import GetMessageClass
+    from google.protobuf.message_factory import GetMessageClass, GetMessages
 
     try:
-        files = FileDescriptorSet.FromString(schema)
         pool = DescriptorPool()
-        waiting = {file.name: file for file in files.file}
-
-        def add(name: str) -> None:
-            file = waiting.pop(name, None)
-            if file is not None:
-                for needed in file.dependency:
-                    add(needed)
-                pool.Add(file)
-
-        for name in list(waiting):
-            add(name)
+        GetMessages(FileDescriptorSet.FromString(schema).file, pool)  # adds each file behind those that it needs
         message_class = GetMessageClass(pool.FindMessageTypeByName(type_name))
     except (DecodeError, TypeError, KeyError, RecursionError, ValueError) as error:
         raise ValueError("its protobuf definition cannot be read") from error
@@ -104,14 +92,11 @@ def _protobuf_values(message: Any, depth: int) -> Values:
             else:
                 items = list(found)
                 is_number = all(isinstance(item, int | float) for item in items)
-                values[field.name] = np.array(items, dtype=_protobuf_dtype(field)) if is_number else items
+                dtype = {field.TYPE_FLOAT: "f4", field.TYPE_BOOL: "u1"}.get(field.type, "f8")
+                values[field.name] = np.array(items, dtype=dtype) if is_number else items
         elif is_message:
             if message.HasField(field.name):
                 values[field.name] = _protobuf_values(getattr(message, field.name), depth + 1)
         else:
             values[field.name] = getattr(message, field.name)
     return values
-
-
-def _protobuf_dtype(field: Any) -> str:
-    return {field.TYPE_FLOAT: "f4", field.TYPE_BOOL: "u1"}.get(field.type, "f8")

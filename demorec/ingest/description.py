@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from importlib.metadata import version
+from collections.abc import Container, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +12,11 @@ from demorec.errors import ConfigError
 from demorec.ingest.bag import Bag
 from demorec.ingest.channel import BagError
 from demorec.ingest.episode_writer import PicturePlan
-from demorec.ingest.mapping import BagMapping
 from demorec.ingest.mapping_file import STATE, recorded_unit
-from demorec.ingest.rows import EpisodeRows, FeatureRows, Timelines
+from demorec.ingest.rows import FeatureRows, Timelines
 from demorec.ingest.streams import BagStreams
 from demorec.safety.files import read_text_limited
-from demorec.scene.collected import CollectedCamera, CollectedFeature, CollectedInfo, Origin, SourceFile
-from demorec.scene.urdf import Urdf
+from demorec.scene.collected import CollectedCamera, CollectedFeature
 
 _MAX_URDF_BYTES = 4 << 20
 
@@ -35,55 +32,16 @@ def urdf_text(name: str, mapping_path: Path) -> str:
         raise ConfigError(f"The URDF cannot be read ({getattr(error, 'strerror', 'it is no text')}): {path}") from error
 
 
-def origin_of(files: Mapping[str, str], mapping: BagMapping) -> Origin:
-    """Of the episodes of a bag, given file name -> SHA-256."""
-    sources = tuple(SourceFile(name=name, sha256=sha256) for name, sha256 in files.items())
-    return Origin(kind="import", files=sources, mapping_digest=mapping.digest)
-
-
-def describe(
-    *,
-    bag: Bag,
-    lines: Timelines,
-    streams: BagStreams,
-    rows: EpisodeRows,
-    plans: Mapping[str, PicturePlan],
-    urdf: str,
-    episode_index: int,
-    instruction: str,
-    origin: Origin,
-) -> CollectedInfo:
-    """The description of an episode; BagError when the robot's model in the bag is none."""
-    mapping = lines.mapping
-    if mapping.robot.urdf_topic:
-        urdf = _urdf_of(bag, streams, mapping.robot.urdf_topic)
-    joints = frozenset[str]()
-    if urdf:
-        try:
-            joints = frozenset(joint.name for joint in Urdf.parse(urdf).joints)
-        except ValueError as error:
-            raise BagError(f"The robot's model cannot be used ({error}): {bag.path}") from error
-    return CollectedInfo(
-        episode_index=episode_index,
-        instruction=" ".join(instruction.split()),
-        robot=mapping.robot.name,
-        urdf=urdf,
-        fps=mapping.clock.fps,
-        features=tuple(_feature(name, feature, lines, joints) for name, feature in rows.features.items()),
-        cameras=tuple(_camera(name, plan, lines, streams) for name, plan in plans.items()),
-        origin=origin,
-        versions={"demorec": version("demorec"), "av": version("av")},
-    )
-
-
-def _urdf_of(bag: Bag, streams: BagStreams, topic: str) -> str:
+def urdf_in_bag(bag: Bag, streams: BagStreams, topic: str) -> str:
+    """The URDF that a topic of the bag holds; BagError when it holds none."""
     text = streams.texts[topic][0].value if streams.texts[topic] else ""
     if not isinstance(text, str) or not text.strip():
         raise BagError(f"{topic} holds no robot description: {bag.path}")
     return text
 
 
-def _feature(name: str, feature: FeatureRows, lines: Timelines, joints: frozenset[str]) -> CollectedFeature:
+def described_feature(name: str, feature: FeatureRows, lines: Timelines, joints: Container[str]) -> CollectedFeature:
+    """A feature as recordings know it, given the joints of the robot's model."""
     units = tuple(map(recorded_unit, feature.units))
     sources = lines.mapping.features[name]
     told = []
@@ -104,9 +62,10 @@ def _feature(name: str, feature: FeatureRows, lines: Timelines, joints: frozense
     )
 
 
-def _camera(name: str, plan: PicturePlan, lines: Timelines, streams: BagStreams) -> CollectedCamera:
+def described_camera(name: str, plan: PicturePlan, lines: Timelines) -> CollectedCamera:
+    """A camera as recordings know it."""
     clock = "header" if lines.lines[name].is_header else "log"
-    info = streams.infos.get(name, {})
+    info = lines.streams.infos.get(name, {})
     matrix, distortion = _first(info, "k", "K"), _first(info, "d", "D")
     fits = (int(info.get("width") or plan.head.width), int(info.get("height") or plan.head.height)) == (
         plan.head.width,

@@ -20,7 +20,6 @@ from demorec.ingest.fields import picture_bytes
 from demorec.ingest.picture_messages import KEPT_FORMATS, PictureHead, decode_picture
 from demorec.ingest.ros_types import Values
 from demorec.ingest.rows import CameraRows, EpisodeRows
-from demorec.ingest.streams import Stream
 from demorec.recording import CollectedWriter
 from demorec.scene.collected import DEPTH_UNITS, CollectedFrame, CollectedInfo, CollectedOutcome, Kept, Sample
 
@@ -54,19 +53,17 @@ class PicturePlan:
         """What becomes of them, for people."""
         shown = len(np.unique(self.positions))
         what = f"{len(self.numbers)} pictures {self.head.width}x{self.head.height}, "
-        what += f"{self.kept} kept as it is" if self.kept else f"{_name_of(self.head)}, coded once"
+        kind = self.head.encoding if self.head.format == "raw" else self.head.format
+        what += f"{self.kept} kept as it is" if self.kept else f"{kind}, coded once"
         repeated = len(self.positions) - shown
         what += f", {repeated} rows show the picture of the row before" if repeated else ""
         return what + (f", {len(self.numbers) - shown} shown by no row" if len(self.numbers) > shown else "")
 
 
-def _name_of(head: PictureHead) -> str:
-    return head.encoding if head.format == "raw" else head.format
-
-
-def picture_plan(rows: CameraRows, stream: Stream, line: Timeline) -> PicturePlan:
+def picture_plan(rows: CameraRows, line: Timeline) -> PicturePlan:
     """Of a camera in an episode: of stills those that rows show, of video all from the keyframe before on."""
-    place = np.searchsorted(line.times_ns, _times_of(stream, line, rows))
+    stream = line.stream
+    place = np.searchsorted(line.times_ns, line.stamps_ns[rows.index])
     head = stream.heads[int(line.order[place[0]])]
     taken = np.unique(place)
     if head.format in KEPT_FORMATS and head.format != "jpeg":
@@ -92,8 +89,21 @@ def _kept(head: PictureHead) -> Kept:
     return cast(Kept, head.format) if head.format in KEPT_FORMATS else ""
 
 
-def _times_of(stream: Stream, line: Timeline, rows: CameraRows) -> Int:
-    return np.asarray((stream.header_ns if line.is_header else stream.log_ns)[rows.index])
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PlannedEpisode:
+    """An episode that shall be written.
+
+    Attributes:
+        info: What is known of it.
+        rows: Its rows.
+        plans: Camera -> its pictures.
+        subtasks: Row -> what is begun there, in words.
+    """
+
+    info: CollectedInfo
+    rows: EpisodeRows
+    plans: Mapping[str, PicturePlan]
+    subtasks: Mapping[int, str]
 
 
 @dataclass(kw_only=True, eq=False)
@@ -118,30 +128,18 @@ class ImportedEpisodeWriter:
 
     Args:
         path: Of the recording.
-        info: What is known of the episode.
-        rows: Its rows.
-        plans: Camera -> its pictures.
-        subtasks: Row -> what is begun there, in words.
+        episode: The episode.
         video: How pixels are coded.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        info: CollectedInfo,
-        rows: EpisodeRows,
-        plans: Mapping[str, PicturePlan],
-        *,
-        subtasks: Mapping[int, str],
-        video: VideoConfig,
-    ) -> None:
-        self._rows, self._subtasks = rows, subtasks
+    def __init__(self, path: Path, episode: PlannedEpisode, *, video: VideoConfig) -> None:
+        self._rows, self._subtasks = episode.rows, episode.subtasks
         self._waiting: dict[str, _Waiting] = {}
-        for name, plan in plans.items():
+        for name, plan in episode.plans.items():
             first = int(plan.numbers.min()) if len(plan.numbers) else 0
             self._waiting[name] = _Waiting(plan=plan, first=first, places=_places(plan.numbers, first))
         self._next_row = 0
-        self._writer = CollectedWriter(path, info, video=video)
+        self._writer = CollectedWriter(path, episode.info, video=video)
         self._is_finished = False
 
     def __enter__(self) -> Self:
@@ -200,11 +198,11 @@ class ImportedEpisodeWriter:
             self._writer.write(CollectedFrame(time_ns=time_ns, samples=samples, pictures=pictures, subtask=subtask))
             self._next_row += 1
 
-    def finish(self, *, success: bool | None) -> None:
+    def finish(self) -> None:
         """Write what is left and give the recording its name; BagError when pictures have not come."""
         self._write_rows()
         if self._next_row < len(self._rows.times_ns):
             missing = [w.plan.topic for w in self._waiting.values() if w.num_written < len(w.plan.numbers)]
             raise BagError(f"The bag has changed while it was read: pictures of {missing[0]} are missing.")
-        self._writer.finish(CollectedOutcome(success=success, num_frames=self._next_row))
+        self._writer.finish(CollectedOutcome(success=self._rows.window.success, num_frames=self._next_row))
         self._is_finished = True

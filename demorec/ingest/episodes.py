@@ -11,7 +11,6 @@ from demorec.ingest.channel import BagError
 from demorec.ingest.clock import NS, Int, Timeline
 from demorec.ingest.fields import FieldError
 from demorec.ingest.mapping import BagMapping, Episodes
-from demorec.ingest.service_calls import ServiceCall
 from demorec.ingest.streams import BagStreams, Text
 from demorec.ingest.words import task_in_name
 
@@ -52,22 +51,16 @@ def windows(bag: Bag, streams: BagStreams, timelines: list[Timeline], mapping: B
         return _between_gaps(timelines, episodes.gap_s)
     is_service = episodes.cut == "service"
     found = _between_markers(_calls(bag, streams, episodes) if is_service else streams.texts[episodes.topic], mapping)
-    if not found and episodes.start_topic:
-        raise BagError(
-            f"No call of {episodes.start_topic} is followed by one of {episodes.stop_topic}, so there is no episode: "
-            f"{bag.path}"
-        )
-    if not found and is_service:
-        raise BagError(
-            f"No call of {episodes.topic} with true (or {episodes.start!r}) in {episodes.field!r} is followed by one "
-            f"with false (or {episodes.stop!r}), so there is no episode: {bag.path}"
-        )
-    if not found:
-        raise BagError(
-            f"No marker of {episodes.topic} says {episodes.start!r} and then {episodes.stop!r}, so there is no "
-            f"episode: {bag.path}"
-        )
-    return found
+    if found:
+        return found
+    if episodes.start_topic:
+        reason = f"No call of {episodes.start_topic} is followed by one of {episodes.stop_topic}"
+    elif is_service:
+        reason = f"No call of {episodes.topic} with true (or {episodes.start!r}) in {episodes.field!r} is followed by "
+        reason += f"one with false (or {episodes.stop!r})"
+    else:
+        reason = f"No marker of {episodes.topic} says {episodes.start!r} and then {episodes.stop!r}"
+    raise BagError(f"{reason}, so there is no episode: {bag.path}")
 
 
 def _calls(bag: Bag, streams: BagStreams, episodes: Episodes) -> list[Text]:
@@ -75,15 +68,11 @@ def _calls(bag: Bag, streams: BagStreams, episodes: Episodes) -> list[Text]:
     try:
         if episodes.topic:
             calls = streams.calls[episodes.topic]
-            return [_marker(call, call.value(episodes.field)) for call in calls]
-        begins = [_marker(call, episodes.start) for call in streams.calls[episodes.start_topic]]
-        return [*begins, *(_marker(call, episodes.stop) for call in streams.calls[episodes.stop_topic])]
+            return [Text(time_ns=call.time_ns, value=call.value(episodes.field)) for call in calls]
+        ends = ((episodes.start_topic, episodes.start), (episodes.stop_topic, episodes.stop))
+        return [Text(time_ns=call.time_ns, value=word) for topic, word in ends for call in streams.calls[topic]]
     except FieldError as error:
         raise BagError(f"The calls of {episodes.topic} cannot be used, since {error}: {bag.path}") from error
-
-
-def _marker(call: ServiceCall, value: object) -> Text:
-    return Text(time_ns=call.time_ns, log_ns=call.time_ns, value=value)
 
 
 def _between_gaps(timelines: list[Timeline], gap_s: float) -> list[Window]:
@@ -120,10 +109,9 @@ def task_text(bag: Bag, streams: BagStreams, window: Window, mapping: BagMapping
     if task.text:
         return task.text.strip()
     if task.file_name:
-        text = task_in_name(bag.name)
-        if not text:
-            raise BagError(f"The bag's name says no task, which the mapping takes from it: {bag.path}")
-        return text
+        if text := task_in_name(bag.name):
+            return text
+        raise BagError(f"The bag's name says no task, which the mapping takes from it: {bag.path}")
     told = [text for text in streams.texts[task.topic] if text.time_ns <= window.end_ns]
     if not told:
         raise BagError(f"No text of {task.topic} is before the episode's end, so its task is unknown: {bag.path}")

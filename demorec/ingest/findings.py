@@ -6,7 +6,7 @@ Nothing is repaired: a finding tells what the rows hold.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.ingest.clock import NS, Int, Numbers, Timeline
-from demorec.ingest.mapping import BagMapping
+from demorec.ingest.mapping import BagMapping, Clock
 from demorec.ingest.mapping_file import ACTION, STATE
+from demorec.ingest.rows import Timelines
 from demorec.ingest.streams import NO_STAMP, BagStreams, Stream
 
 _JITTER = 0.25
@@ -52,34 +53,53 @@ class Finding:
     text: str
 
 
-def stream_findings(stream: Stream, line: Timeline, *, is_camera: bool) -> Iterator[Finding]:
-    """What is odd in one stream by itself."""
-    found = [*_message_findings(stream), *_time_findings(stream, line), *_clock_findings(stream)]
-    found += _picture_findings(stream, line) if is_camera else _value_findings(stream, line)
-    for kind, text in found:
-        yield Finding(kind=kind, stream=stream.label, text=f"{stream.topic}: {text}")
+def all_findings(lines: Timelines) -> tuple[Finding, ...]:
+    """What is odd in a bag, each thing once."""
+    once: dict[tuple[str, str], Finding] = {}
+    for finding in _findings(lines, list(lines.lines.values())):
+        once.setdefault((finding.kind, finding.text.partition(":")[0] if finding.stream else finding.text), finding)
+    return tuple(once.values())
+
+
+def _findings(bag: Timelines, lines: Sequence[Timeline]) -> Iterator[Finding]:
+    for line in lines:
+        found = (*_message_findings(line.stream), *_time_findings(line), *_clock_findings(line.skews_ns))
+        for kind, text in (*found, *_picture_findings(line), *_value_findings(line)):
+            yield _of(line.stream, kind, text)
+    for problem in bag.streams.problems:
+        yield Finding(kind="cut_off", stream="", text=problem)
+    yield from _extent_findings([line for line in lines if line.is_regular])
+    yield from _offset_findings(lines)
+    yield from _camera_findings(bag.streams)
+    yield from _rate_findings(lines, bag.mapping.clock)
+    yield from _unit_findings(bag.streams, bag.mapping)
+    yield from _action_findings(bag.streams, bag.mapping)
+
+
+def _of(stream: Stream, kind: str, text: str) -> Finding:
+    return Finding(kind=kind, stream=stream.label, text=f"{stream.topic}: {text}")
 
 
 def _message_findings(stream: Stream) -> Iterator[tuple[str, str]]:
     if stream.num_malformed:
         yield "malformed", f"{stream.num_malformed} messages cannot be used, the first since {stream.first_problem}"
-    unstamped = int(np.sum((stream.header_ns == 0) | ((stream.header_ns < 0) & (stream.header_ns != NO_STAMP))))
+    unstamped = int(np.sum((stream.header_ns <= 0) & (stream.header_ns != NO_STAMP)))
     if unstamped:
         yield "unstamped", f"{unstamped} of {len(stream)} headers have no time"
     if len(stream.frame_ids) > 1:
         yield "frame_id", f"its messages name several coordinate frames ({', '.join(stream.frame_ids[:4])})"
 
 
-def _time_findings(stream: Stream, line: Timeline) -> Iterator[tuple[str, str]]:
-    late = int(np.sum(np.diff(stream.log_ns) < 0))
-    times = stream.header_ns if line.is_header else stream.log_ns
-    known = times[(times != NO_STAMP) & (times > 0)]
+def _time_findings(line: Timeline) -> Iterator[tuple[str, str]]:
+    late = int(np.sum(np.diff(line.stream.log_ns) < 0))
+    known = line.stamps_ns[line.stamps_ns > 0]
     backwards = int(np.sum(np.diff(known) < 0))
     if late or backwards:
         yield "order", f"{max(late, backwards)} messages come before earlier ones"
-    repeated = len(known) - len(np.unique(known))
-    if repeated:
-        same = int(np.sum((np.diff(known) == 0) & (np.diff(stream.checksums.astype(np.int64)[-len(known) :]) == 0)))
+    if repeated := line.num_repeated:
+        same = int(
+            np.sum((np.diff(known) == 0) & (np.diff(line.stream.checksums.astype(np.int64)[-len(known) :]) == 0))
+        )
         yield "duplicates", f"{repeated} messages have the time of another one, {same} of them the same bytes as well"
     if not line.is_regular:
         return
@@ -99,10 +119,8 @@ def _time_findings(stream: Stream, line: Timeline) -> Iterator[tuple[str, str]]:
         yield "jitter", f"its steps of {line.period_ns / 1e6:.1f} ms are off by {off / 1e6:.1f} ms (one of ten by more)"
 
 
-def _clock_findings(stream: Stream) -> Iterator[tuple[str, str]]:
+def _clock_findings(skew: Int) -> Iterator[tuple[str, str]]:
     """Of the difference between the times of recording and of headers."""
-    stamped = (stream.header_ns != NO_STAMP) & (stream.header_ns > 0)
-    skew = (stream.log_ns - stream.header_ns)[stamped]
     if len(skew) < 8:
         return
     median = float(np.median(skew)) / NS
@@ -120,7 +138,8 @@ def _clock_findings(stream: Stream) -> Iterator[tuple[str, str]]:
         yield "clock_drift", f"its clock drifts by {-total:+.3f} s in the bag"
 
 
-def _value_findings(stream: Stream, line: Timeline) -> Iterator[tuple[str, str]]:
+def _value_findings(line: Timeline) -> Iterator[tuple[str, str]]:
+    stream = line.stream
     if stream.values is None or stream.layout is None or len(line.order) < 2:
         return
     elements, names = _Elements(stream.values, line.order), stream.layout.names
@@ -208,7 +227,10 @@ def _longest_run(numbers: NDArray[Any]) -> tuple[int, int]:
     return int(edges[longest]), int(edges[longest + 1]) - 1
 
 
-def _picture_findings(stream: Stream, line: Timeline) -> Iterator[tuple[str, str]]:
+def _picture_findings(line: Timeline) -> Iterator[tuple[str, str]]:
+    stream = line.stream
+    if not stream.heads:
+        return
     formats = {(head.format, head.encoding) for head in stream.heads.kinds()}
     if len(formats) > 1:
         told = ", ".join(sorted(f"{name} {encoding}".strip() for name, encoding in formats))
@@ -221,47 +243,28 @@ def _picture_findings(stream: Stream, line: Timeline) -> Iterator[tuple[str, str
     if end - begin + 1 >= _FROZEN:
         at = (line.times_ns[begin] - line.times_ns[0]) / NS
         yield "frozen", f"{end - begin + 1} pictures from {at:.2f} s on have the very same bytes"
-    if stream.heads and stream.heads[0].format in ("h264", "h265", "av1") and not stream.heads[0].is_keyframe:
+    if stream.heads[0].format in ("h264", "h265", "av1") and not stream.heads[0].is_keyframe:
         keyframes = np.flatnonzero(stream.heads.are_keyframes)
         first = int(keyframes[0]) if len(keyframes) else len(stream.heads)
         yield "keyframe", f"its first {first} pictures cannot be decoded, since no keyframe is before them"
 
 
-def bag_findings(
-    streams: BagStreams, lines: dict[str, tuple[Stream, Timeline]], mapping: BagMapping
-) -> Iterator[Finding]:
-    """What is odd between streams; `lines` has every stream by its label and topic."""
-    for problem in streams.problems:
-        yield Finding(kind="cut_off", stream="", text=problem)
-    yield from _extent_findings(list(lines.values()))
-    yield from _offset_findings(list(lines.values()))
-    yield from _camera_findings(streams)
-    yield from _rate_findings(streams, lines, mapping)
-    yield from _unit_findings(streams, mapping)
-    yield from _action_findings(streams, mapping)
-
-
-def _extent_findings(lines: list[tuple[Stream, Timeline]]) -> Iterator[Finding]:
-    regular = [(stream, line) for stream, line in lines if line.is_regular]
+def _extent_findings(regular: Sequence[Timeline]) -> Iterator[Finding]:
     if len(regular) < 2:
         return
-    begin = float(np.median([line.times_ns[0] for _, line in regular]))
-    end = float(np.median([line.times_ns[-1] for _, line in regular]))
-    for stream, line in regular:
+    begin = float(np.median([line.times_ns[0] for line in regular]))
+    end = float(np.median([line.times_ns[-1] for line in regular]))
+    for line in regular:
         late, early = (line.times_ns[0] - begin) / NS, (end - line.times_ns[-1]) / NS
         if late > _STILL_S:
-            yield Finding(kind="late_start", stream=stream.label, text=f"{stream.topic}: begins {late:.2f} s late")
+            yield _of(line.stream, "late_start", f"begins {late:.2f} s late")
         if early > _STILL_S:
-            yield Finding(kind="early_end", stream=stream.label, text=f"{stream.topic}: ends {early:.2f} s early")
+            yield _of(line.stream, "early_end", f"ends {early:.2f} s early")
 
 
-def _offset_findings(lines: list[tuple[Stream, Timeline]]) -> Iterator[Finding]:
+def _offset_findings(lines: Sequence[Timeline]) -> Iterator[Finding]:
     """Streams whose headers are on another clock than those of most."""
-    skews = {}
-    for stream, _ in lines:
-        stamped = (stream.header_ns != NO_STAMP) & (stream.header_ns > 0)
-        if stamped.any():
-            skews[stream.label] = float(np.median((stream.log_ns - stream.header_ns)[stamped])) / NS
+    skews = {line.stream.label: float(np.median(line.skews_ns)) / NS for line in lines if len(line.skews_ns)}
     if len(skews) < 2:
         return
     usual = float(np.median(list(skews.values())))
@@ -274,14 +277,13 @@ def _offset_findings(lines: list[tuple[Stream, Timeline]]) -> Iterator[Finding]:
 def _camera_findings(streams: BagStreams) -> Iterator[Finding]:
     """Cameras whose messages are those of another one, by coordinate frame or picture."""
     for name, stream in streams.cameras.items():
-        info = streams.infos.get(name)
-        frame = str((info or {}).get("header", {}).get("frame_id", "")) if info else ""
+        frame = str(streams.infos.get(name, {}).get("header", {}).get("frame_id", ""))
         if frame and stream.frame_ids and stream.frame_ids[0] and frame != stream.frame_ids[0]:
-            text = f"{stream.topic}: its pictures are of {stream.frame_ids[0]!r}, its calibration is of {frame!r}"
-            yield Finding(kind="swapped", stream=stream.label, text=text)
+            text = f"its pictures are of {stream.frame_ids[0]!r}, its calibration is of {frame!r}"
+            yield _of(stream, "swapped", text)
         elif other := _claimed_by(name, streams):
-            text = f"{stream.topic}: its coordinate frame {stream.frame_ids[0]!r} is named like the topic of {other}"
-            yield Finding(kind="swapped", stream=stream.label, text=text)
+            text = f"its coordinate frame {stream.frame_ids[0]!r} is named like the topic of {other}"
+            yield _of(stream, "swapped", text)
     for (name, stream), (other_name, other_stream) in pairwise(sorted(streams.cameras.items())):
         shared = min(len(stream), len(other_stream))
         if shared >= _FROZEN and np.mean(np.isin(stream.picture_sums, other_stream.picture_sums)) > 0.9:
@@ -308,20 +310,17 @@ def _claimed_by(name: str, streams: BagStreams) -> str:
 _COMMON = {"camera", "cam", "color", "image", "raw", "rect", "compressed", "optical", "frame", "link", "rgb", "depth"}
 
 
-def _rate_findings(
-    streams: BagStreams, lines: dict[str, tuple[Stream, Timeline]], mapping: BagMapping
-) -> Iterator[Finding]:
-    period = NS / mapping.clock.fps
-    for stream, line in lines.values():
+def _rate_findings(lines: Sequence[Timeline], clock: Clock) -> Iterator[Finding]:
+    period = NS / clock.fps
+    for line in lines:
         if line.is_regular and line.period_ns > 1.15 * period:
-            text = f"{stream.topic}: comes {NS / line.period_ns:.1f} times a second, rows {mapping.clock.fps} times"
-            yield Finding(kind="slow", stream=stream.label, text=text)
-    if mapping.clock.rows != "grid":
-        for stream, line in lines.values():
-            if stream.topic == mapping.clock.rows and abs(line.period_ns - period) > 0.05 * period:
-                text = f"rows follow {stream.topic} at {NS / line.period_ns:.1f} a second, fps says {mapping.clock.fps}"
-                yield Finding(kind="fps", stream=stream.label, text=text)
-                break
+            text = f"comes {NS / line.period_ns:.1f} times a second, rows {clock.fps} times"
+            yield _of(line.stream, "slow", text)
+    for line in lines:
+        if line.stream.topic == clock.rows != "grid" and abs(line.period_ns - period) > 0.05 * period:
+            text = f"rows follow {clock.rows} at {NS / line.period_ns:.1f} a second, fps says {clock.fps}"
+            yield Finding(kind="fps", stream=line.stream.label, text=text)
+            break
 
 
 def _unit_findings(streams: BagStreams, mapping: BagMapping) -> Iterator[Finding]:
@@ -331,8 +330,7 @@ def _unit_findings(streams: BagStreams, mapping: BagMapping) -> Iterator[Finding
             continue
         largest = float(np.nanmax(np.abs(stream.values), initial=0.0))
         if largest > _FULL_TURNS:
-            text = f"{stream.topic}: angles reach {largest:.4g}, which is hardly rad"
-            yield Finding(kind="unit", stream=stream.label, text=text)
+            yield _of(stream, "unit", f"angles reach {largest:.4g}, which is hardly rad")
 
 
 def _action_findings(streams: BagStreams, mapping: BagMapping) -> Iterator[Finding]:
@@ -348,8 +346,7 @@ def _action_findings(streams: BagStreams, mapping: BagMapping) -> Iterator[Findi
     dead = [pair for pair in moving if _spread(state.values[:, pair[0]]) == 0.0]
     if dead:
         name = state.layout.names[dead[0][0]]
-        text = f"{state.topic}: {name!r} never changes while the action of the same name does"
-        yield Finding(kind="stuck", stream=state.label, text=text)
+        yield _of(state, "stuck", f"{name!r} never changes while the action of the same name does")
 
 
 def _spread(numbers: NDArray[Any]) -> float:

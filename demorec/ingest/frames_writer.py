@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 from numpy.typing import NDArray
 
 from demorec.config import VideoConfig
 from demorec.recording import CollectedWriter
+from demorec.runs.collected import CollectedFolder
 from demorec.scene.collected import CollectedFrame, CollectedInfo, CollectedOutcome, Sample, Vector
 from demorec.scene.episode import frame_time_ns
 
@@ -17,8 +18,26 @@ Picture = bytes | NDArray[Any]
 """A packet that stays as it is, (H, W, 3) uint8 RGB, or (H, W) distances as `CollectedWriter.picture` takes them."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class FramesImport:
+    """What an import of such episodes made.
+
+    Attributes:
+        num_episodes, num_frames: In the run.
+        num_new: Episodes that were written now; the others were there.
+        cameras: Camera -> what became of its pictures, in words.
+        left_out: What the run does not have, by its name in the source -> why; "" for what the mapping does not name.
+    """
+
+    num_episodes: int
+    num_frames: int
+    num_new: int
+    cameras: Mapping[str, str]
+    left_out: Mapping[str, str]
+
+
 def write_frames(
-    path: Path,
+    folder: CollectedFolder,
     info: CollectedInfo,
     frames: Iterable[Mapping[str, Vector]],
     pictures: Mapping[str, Iterator[Picture]],
@@ -27,10 +46,10 @@ def write_frames(
     video: VideoConfig,
     leads: Mapping[str, int] | None = None,
 ) -> None:
-    """Record an episode at `info.fps`: whole, or not at all.
+    """Record an episode of a run at `info.fps`: whole, or not at all.
 
     Args:
-        path: Of the recording.
+        folder: The run.
         info: What is known of the episode.
         frames: Feature -> its vector, of each frame.
         pictures: Camera -> its pictures, one a frame, its lead in front.
@@ -39,8 +58,11 @@ def write_frames(
         leads: Camera -> how many of its pictures come before the first frame; 0 where not given.
 
     Raises:
+        ConfigError: The run holds episodes of another kind.
         RecordingError: A number is not finite, or the disk is full.
     """
+    folder.check_fits(info)
+    path = folder.path_of(info.episode_index)
     writer = CollectedWriter(path, info, video=video)
     leads = leads or {}
     begin = max(leads.values(), default=0)
@@ -59,3 +81,4 @@ def write_frames(
     except BaseException:
         writer.discard()
         raise
+    folder.add(path)

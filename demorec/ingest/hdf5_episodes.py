@@ -7,7 +7,6 @@ import math
 import re
 import reprlib
 import sys
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -51,7 +50,8 @@ def _natural(name: str) -> list[Any]:
 
 def found_attribute(file: ForeignFile, place: str, name: str) -> Scalar | None:
     """An attribute of an episode, or of a group above it; a name with dots goes on into the JSON of one."""
-    for level in _levels(place):
+    groups = place.split("/")
+    for level in ("/".join(groups[:depth]) for depth in range(len(groups), -1, -1)):
         if (found := file.attribute(level, name)) is not None:
             return found
         first, _, keys = name.partition(".")
@@ -59,13 +59,6 @@ def found_attribute(file: ForeignFile, place: str, name: str) -> Scalar | None:
         if isinstance(text, str) and (inside := _in_json(text, keys.split("."))) is not None:
             return inside
     return None
-
-
-def _levels(place: str) -> Iterator[str]:
-    while place:
-        yield place
-        place = place.rpartition("/")[0]
-    yield ""
 
 
 def _in_json(text: str, keys: list[str]) -> Scalar | None:
@@ -113,10 +106,9 @@ def task_of(file: ForeignFile, place: str, mapping: Hdf5Mapping) -> str:
     if task.text:
         return " ".join(task.text.split())
     if task.file_name:
-        text = task_in_name(file.path.stem)
-        if not text:
-            raise Hdf5Error(f"The file's name says no task, which the mapping takes from it: {file.path}")
-        return text
+        if text := task_in_name(file.path.stem):
+            return text
+        raise Hdf5Error(f"The file's name says no task, which the mapping takes from it: {file.path}")
     found = found_attribute(file, place, task.attribute)
     if not isinstance(found, str) or not found.strip():
         raise Hdf5Error(f"No attribute {task.attribute!r} says the task of {place or 'the episode'}: {file.path}")

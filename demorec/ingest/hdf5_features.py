@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -49,27 +49,32 @@ class _Column:
         return converted(self.part, rows.astype(np.float32 if is_small else np.float64))
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
 class StoredFeature:
     """A feature of an episode.
 
     Attributes:
+        columns: Of each part the dataset.
+
+    Args:
         name: Of it.
-        num_rows: That its datasets have.
+        parts, arrays: What it is made of, and where each is.
         shift: By how many rows the frames are behind the datasets' rows: 1 for what another feature is next.
+
+    Raises:
+        Hdf5FitError: They are no vectors.
     """
 
-    name: str
-    num_rows: int
-    shift: int
-    columns: tuple[_Column, ...]
+    def __init__(self, name: str, parts: Sequence[DatasetPart], arrays: Sequence[StoredArray], *, shift: int) -> None:
+        self.name, self.shift = name, shift
+        pairs = zip(parts, arrays, strict=True)
+        self.columns = tuple(_Column(part=part, array=array, names=_names(part, array)) for part, array in pairs)
 
     @property
     def dtype(self) -> type[np.float32] | type[np.float64]:
         """float32 where that holds all numbers as they are."""
         return np.float32 if all(column.is_single for column in self.columns) else np.float64
 
-    def described(self, joints: frozenset[str]) -> CollectedFeature:
+    def described(self, joints: Container[str]) -> CollectedFeature:
         """The feature as recordings know it, given the joints of the robot's model."""
         names = tuple(name for column in self.columns for name in column.names)
         units = tuple(
@@ -107,16 +112,6 @@ class StoredFeature:
             yield from np.concatenate(parts, axis=1).astype(self.dtype)
 
 
-def stored_feature(
-    name: str, parts: Sequence[DatasetPart], arrays: Sequence[StoredArray], *, shift: int
-) -> StoredFeature:
-    """A feature of the datasets of its parts; Hdf5FitError when they are no vectors, or of several lengths."""
-    columns = tuple(
-        _Column(part=part, array=array, names=_names(part, array)) for part, array in zip(parts, arrays, strict=True)
-    )
-    return StoredFeature(name=name, num_rows=len(arrays[0]), shift=shift, columns=columns)
-
-
 def _names(part: DatasetPart, array: StoredArray) -> tuple[str, ...]:
     """Of the elements that are taken."""
     if len(array.shape) > 2:
@@ -141,11 +136,8 @@ def _labels(array: StoredArray, count: int) -> list[str]:
         named = json.loads(str(array.attribute("names") or ""))
     except (ValueError, RecursionError, Hdf5Error):
         named = None
-    if isinstance(named, list) and len(named) == count and all(_is_name(name) for name in named):
-        return named
+    is_list = isinstance(named, list) and len(named) == count and all(isinstance(name, str) for name in named)
+    if is_list and all(name and name.isprintable() and "," not in name for name in named):
+        return list(named)
     base = array.place.rpartition("/")[2].replace(",", " ")
     return [base] if len(array.shape) == 1 else [f"{base}_{number}" for number in range(count)]
-
-
-def _is_name(name: object) -> bool:
-    return isinstance(name, str) and bool(name) and name.isprintable() and "," not in name

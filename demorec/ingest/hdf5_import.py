@@ -7,9 +7,9 @@ goes on: episodes that are there are not written.
 from __future__ import annotations
 
 import reprlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 
@@ -17,9 +17,9 @@ from demorec.config import VideoConfig
 from demorec.errors import ConfigError
 from demorec.hdf5.foreign import ForeignFile, Hdf5Error, StoredArray
 from demorec.ingest.description import urdf_text
-from demorec.ingest.frames_writer import write_frames
+from demorec.ingest.frames_writer import FramesImport, write_frames
 from demorec.ingest.hdf5_episodes import episode_places, found_attribute, rate_of, success_of, task_of
-from demorec.ingest.hdf5_features import Hdf5FitError, StoredFeature, stored_feature
+from demorec.ingest.hdf5_features import Hdf5FitError, StoredFeature
 from demorec.ingest.hdf5_mapping import Hdf5Mapping
 from demorec.ingest.hdf5_pictures import StoredCamera, picture_lengths
 from demorec.ingest.mapping_file import read_mapping_file
@@ -34,28 +34,10 @@ _LENGTHS = "compress_len"
 """Where ALOHA's recorders say how long the JPEG file in each row is, without what pads it."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Hdf5Import:
-    """What an import made.
-
-    Attributes:
-        num_episodes, num_frames: In the run.
-        num_new: Episodes that were written now; the others were there.
-        cameras: Camera -> what became of its pictures, in words.
-        left_out: Datasets of the first episode that the mapping does not name, or groups of them.
-    """
-
-    num_episodes: int
-    num_frames: int
-    num_new: int
-    cameras: Mapping[str, str]
-    left_out: tuple[str, ...]
-
-
 def import_hdf5(
     paths: Sequence[Path], mapping_path: Path, out: Path, *, video: VideoConfig | None = None
-) -> Hdf5Import:
-    """Import HDF5 files into a run, by a mapping.
+) -> FramesImport:
+    """Import HDF5 files into a run, by a mapping; datasets of the first episode that it does not name are left out.
 
     Args:
         paths: Of the files, in the order of their episodes.
@@ -75,16 +57,16 @@ def import_hdf5(
     if len({path.resolve() for path in paths}) < len(paths):
         raise ConfigError("A file is given twice: name each once.")
     plans: list[_Plan] = []
-    left_out: tuple[str, ...] = ()
+    left_out: dict[str, str] = {}
     for path in paths:
         with ForeignFile(path) as file:
             source = SourceFile(name=path.name, sha256=sha256_of(path))
             places = episode_places(file, mapping.episodes)
             for place in places:
-                plan = _plan(file, place, mapping, urdf, source, len(plans))
-                plans.append(_alike(plan, plans[0]) if plans else plan)
+                plans.append(_Plan(file, place, mapping, urdf, source, len(plans)))
+                _make_alike(plans[-1], plans[0])
             left_out = left_out or _unnamed(file, places[0], mapping)
-    return Hdf5Import(
+    return FramesImport(
         num_episodes=len(plans),
         num_frames=sum(plan.num_frames for plan in plans),
         num_new=_write(plans, mapping, out, video or VideoConfig()),
@@ -93,30 +75,40 @@ def import_hdf5(
     )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Plan:
-    """An episode that shall be in the run."""
-
-    path: Path
-    place: str
-    info: CollectedInfo
-    num_frames: int
-    success: bool | None
-    told: Mapping[str, str]
-
-    @property
-    def name(self) -> str:
-        return f"{self.place} of {self.path}" if self.place else str(self.path)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
 class _Stored:
-    """An episode in an opened file."""
+    """An episode in an opened file; Hdf5FitError when its datasets do not fit the mapping."""
 
-    features: tuple[StoredFeature, ...]
-    cameras: tuple[StoredCamera, ...]
-    num_rows: int
-    num_frames: int
+    def __init__(self, file: ForeignFile, place: str, mapping: Hdf5Mapping) -> None:
+        def array(name: str) -> StoredArray:
+            return file.array("/".join(filter(None, (place, name.strip("/")))))
+
+        self.features: list[StoredFeature] = []
+        for name, parts in mapping.features.items():
+            following = parts[0].next
+            used = mapping.features[following] if following else parts
+            arrays = [array(part.dataset) for part in used]
+            self.features.append(StoredFeature(name, used, arrays, shift=1 if following else 0))
+        vectors = [column.array for feature in self.features for column in feature.columns]
+        self.num_rows = num_rows = len(vectors[0])
+        cameras = {name: (camera, array(camera.dataset)) for name, camera in mapping.cameras.items()}
+        for stored in (*vectors, *(pictures for _, pictures in cameras.values())):
+            if len(stored) != num_rows:
+                raise Hdf5FitError(
+                    f"{stored.place} has {len(stored)} rows, other datasets of the episode have {num_rows}"
+                )
+        told = file.attribute(place, "num_samples")
+        if told is not None and told != num_rows:
+            raise Hdf5FitError(
+                f"{place or 'the episode'} has {num_rows} rows, but its attribute num_samples says {reprlib.repr(told)}"
+            )
+        lengths = picture_lengths(array(_LENGTHS), num_rows) if file.has(f"{place}/{_LENGTHS}") else None
+        self.num_frames = num_rows - max(feature.shift for feature in self.features)
+        if self.num_frames < 1:
+            raise Hdf5FitError(f"{place or 'the episode'} has {num_rows} rows, too few for a frame")
+        self.cameras = [
+            StoredCamera(name, camera, pictures, lengths if len(pictures.shape) == 2 else None)
+            for name, (camera, pictures) in cameras.items()
+        ]
 
     def frames(self) -> Iterator[dict[str, Vector]]:
         """Feature -> (D,) of each frame."""
@@ -127,123 +119,69 @@ class _Stored:
 
 def _write(plans: Sequence[_Plan], mapping: Hdf5Mapping, out: Path, video: VideoConfig) -> int:
     """Record what is not there; how many episodes that were."""
-    num_new = 0
     with open_collected_run(out, recovers=False) as folder:
         missing = [plan for plan in plans if not folder.has(plan.info)]
         for plan in missing:
-            folder.check_fits(plan.info)
             with ForeignFile(plan.path) as file, _named(plan.path):
-                episode = _stored(file, plan.place, mapping)
-                target = folder.path_of(plan.info.episode_index)
+                episode = _Stored(file, plan.place, mapping)
                 pictures = {camera.name: camera.pictures() for camera in episode.cameras}
-                write_frames(target, plan.info, episode.frames(), pictures, success=plan.success, video=video)
-            folder.add(target)
-            num_new += 1
-    return num_new
+                write_frames(folder, plan.info, episode.frames(), pictures, success=plan.success, video=video)
+    return len(missing)
 
 
-def _plan(
-    file: ForeignFile, place: str, mapping: Hdf5Mapping, urdf: str, source: SourceFile, episode_index: int
-) -> _Plan:
+class _Plan:
     """What an episode shall be; every number is looked at."""
-    with _named(file.path):
-        episode = _stored(file, place, mapping)
-        for _ in episode.frames():
-            pass
-        if mapping.robot.urdf_attribute:
-            urdf = str(found_attribute(file, place, mapping.robot.urdf_attribute) or "")
-        joints = _joints(urdf, mapping.robot.urdf_attribute)
-        info = CollectedInfo(
-            episode_index=episode_index,
-            instruction=task_of(file, place, mapping),
-            robot=mapping.robot.name,
-            urdf=urdf,
-            fps=rate_of(file, place, mapping),
-            features=tuple(feature.described(joints) for feature in episode.features),
-            cameras=tuple(camera.described() for camera in episode.cameras),
-            origin=Origin(kind="import", files=(source,), mapping_digest=mapping.digest),
-            versions={"demorec": version("demorec"), "av": version("av")},
-        )
-        if wrong := what_is_wrong(info):
-            raise Hdf5FitError("; ".join(wrong))
-        return _Plan(
-            path=file.path,
-            place=place,
-            info=info,
-            num_frames=episode.num_frames,
-            success=success_of(file, place, mapping, episode.num_rows),
-            told={camera.name: f"{camera.width}x{camera.height}, {camera.told}" for camera in episode.cameras},
-        )
+
+    def __init__(
+        self, file: ForeignFile, place: str, mapping: Hdf5Mapping, urdf: str, source: SourceFile, episode_index: int
+    ) -> None:
+        self.path, self.place = file.path, place
+        with _named(file.path):
+            episode = _Stored(file, place, mapping)
+            for _ in episode.frames():
+                pass
+            if attribute := mapping.robot.urdf_attribute:
+                urdf = str(found_attribute(file, place, attribute) or "")
+            try:
+                joints = {joint.name for joint in Urdf.parse(urdf).joints} if urdf or attribute else set()
+            except ValueError as error:
+                raise Hdf5FitError(f"the robot's model cannot be used ({error})") from error
+            self.info = CollectedInfo(
+                episode_index=episode_index,
+                instruction=task_of(file, place, mapping),
+                robot=mapping.robot.name,
+                urdf=urdf,
+                fps=rate_of(file, place, mapping),
+                features=tuple(feature.described(joints) for feature in episode.features),
+                cameras=tuple(camera.described() for camera in episode.cameras),
+                origin=Origin(kind="import", files=(source,), mapping_digest=mapping.digest),
+                versions={"demorec": version("demorec"), "av": version("av")},
+            )
+            if wrong := what_is_wrong(self.info):
+                raise Hdf5FitError("; ".join(wrong))
+            self.num_frames = episode.num_frames
+            self.success = success_of(file, place, mapping, episode.num_rows)
+            self.told = {camera.name: f"{camera.width}x{camera.height}, {camera.told}" for camera in episode.cameras}
 
 
-def _alike(plan: _Plan, first: _Plan) -> _Plan:
-    """An episode that fits the first, with whose model, a long text, it shares memory; ConfigError when it differs."""
+def _make_alike(plan: _Plan, first: _Plan) -> None:
+    """Let an episode share the first one's model, a long text, in memory; ConfigError when it differs."""
     if different := differences(first.info, plan.info):
-        raise ConfigError(f"The episodes differ ({'; '.join(different)}): import {plan.name} into another run.")
-    return replace(plan, info=replace(plan.info, urdf=first.info.urdf))
+        name = f"{plan.place} of {plan.path}" if plan.place else str(plan.path)
+        raise ConfigError(f"The episodes differ ({'; '.join(different)}): import {name} into another run.")
+    plan.info = replace(plan.info, urdf=first.info.urdf)
 
 
-def _joints(urdf: str, attribute: str) -> frozenset[str]:
-    if not urdf and not attribute:
-        return frozenset()
-    try:
-        return frozenset(joint.name for joint in Urdf.parse(urdf).joints)
-    except ValueError as error:
-        raise Hdf5FitError(f"the robot's model cannot be used ({error})") from error
-
-
-def _stored(file: ForeignFile, place: str, mapping: Hdf5Mapping) -> _Stored:
-    """The datasets of an episode; Hdf5FitError when they do not fit the mapping."""
-
-    def array(name: str) -> StoredArray:
-        return file.array("/".join(filter(None, (place, name.strip("/")))))
-
-    features = []
-    for name, parts in mapping.features.items():
-        following = parts[0].next
-        used = mapping.features[following] if following else parts
-        arrays = [array(part.dataset) for part in used]
-        features.append(stored_feature(name, used, arrays, shift=1 if following else 0))
-    num_rows = features[0].num_rows
-    cameras = {name: (camera, array(camera.dataset)) for name, camera in mapping.cameras.items()}
-    vectors = [column.array for feature in features for column in feature.columns]
-    _check_lengths(file, place, [*vectors, *(pictures for _, pictures in cameras.values())], num_rows)
-    lengths = picture_lengths(array(_LENGTHS), num_rows) if file.has(f"{place}/{_LENGTHS}") else None
-    num_frames = num_rows - max(feature.shift for feature in features)
-    if num_frames < 1:
-        raise Hdf5FitError(f"{place or 'the episode'} has {num_rows} rows, too few for a frame")
-    return _Stored(
-        features=tuple(features),
-        cameras=tuple(
-            StoredCamera(name, camera, pictures, lengths if len(pictures.shape) == 2 else None)
-            for name, (camera, pictures) in cameras.items()
-        ),
-        num_rows=num_rows,
-        num_frames=num_frames,
-    )
-
-
-def _check_lengths(file: ForeignFile, place: str, arrays: Sequence[StoredArray], num_rows: int) -> None:
-    for array in arrays:
-        if len(array) != num_rows:
-            raise Hdf5FitError(f"{array.place} has {len(array)} rows, other datasets of the episode have {num_rows}")
-    told = file.attribute(place, "num_samples")
-    if told is not None and told != num_rows:
-        raise Hdf5FitError(
-            f"{place or 'the episode'} has {num_rows} rows, but its attribute num_samples says {reprlib.repr(told)}"
-        )
-
-
-def _unnamed(file: ForeignFile, place: str, mapping: Hdf5Mapping) -> tuple[str, ...]:
+def _unnamed(file: ForeignFile, place: str, mapping: Hdf5Mapping) -> dict[str, str]:
     """Datasets that the mapping does not name; groups of which it names none, as one."""
     used = {name.partition("/")[0] for name in mapping.datasets}
-    found: dict[str, None] = {}
+    found: dict[str, str] = {}
     for dataset in file.datasets(place):
         name = dataset.removeprefix(place).lstrip("/")
         if name not in mapping.datasets and name != _LENGTHS:
             group = name.partition("/")[0]
-            found[name if group in used else group] = None
-    return tuple(found)
+            found[name if group in used else group] = ""
+    return found
 
 
 @contextmanager

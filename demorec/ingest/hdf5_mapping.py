@@ -13,8 +13,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
-from demorec.ingest.mapping_file import ACTION, MAX_FPS, Part, camera_name_problems, feature_problems
-from demorec.plain import digest
+from demorec.ingest.mapping_file import ACTION, MAX_FPS, AnyMapping, Part, camera_name_problems, feature_problems
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,7 +100,7 @@ class Hdf5Episodes:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Hdf5Mapping:
+class Hdf5Mapping(AnyMapping):
     """A whole mapping.
 
     Attributes:
@@ -116,11 +115,6 @@ class Hdf5Mapping:
     episodes: Hdf5Episodes = field(default_factory=Hdf5Episodes)
     features: Mapping[str, tuple[DatasetPart, ...]]
     cameras: Mapping[str, CameraDataset] = field(default_factory=dict)
-
-    @property
-    def digest(self) -> str:
-        """16 hex digits of all it says."""
-        return digest(self)
 
     @property
     def datasets(self) -> frozenset[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Literal
 
 import numpy as np
@@ -15,6 +15,7 @@ from demorec.ingest.frames_writer import Picture
 from demorec.ingest.hdf5_features import Hdf5FitError
 from demorec.ingest.hdf5_mapping import CameraDataset
 from demorec.ingest.picture_messages import PictureHead, decode_picture, picture_head
+from demorec.ingest.ros_types import Values
 from demorec.scene.collected import CollectedCamera, Kept
 
 _JPEG_END = b"\xff\xd9"
@@ -57,7 +58,7 @@ class StoredCamera:
             )
         self._form = form
         if form == "jpeg":
-            head = self._head(self._jpeg(array.read(0, 1)[0], 0), 0)
+            head = self._head(array.read(0, 1)[0], 0)[1]
             self.width, self.height = head.width, head.height
             self.kept = "jpeg" if camera.colors == "rgb" else ""
             self.told = "jpeg kept as it is" if self.kept else "jpeg with red and blue exchanged, coded once"
@@ -85,27 +86,24 @@ class StoredCamera:
             Hdf5Error: They cannot be read.
         """
         for number, row in enumerate(self._array.rows()):
-            if self._form != "jpeg":
-                yield self._plain(row)
+            if self._form == "depth":
+                yield row.reshape(self.height, self.width).astype(row.dtype.newbyteorder("="), copy=False)
                 continue
-            data = self._jpeg(row, number)
-            head = self._head(data, number)
+            if self._form == "pixels":
+                yield self._ordered(row.astype(np.uint8, copy=False))
+                continue
+            data, head = self._head(row, number)
             if (head.width, head.height) != (self.width, self.height):
                 raise Hdf5FitError(
                     f"{self._array.place} changes its size to {head.width}x{head.height} in row {number}"
                 )
-            yield data if self.kept else self._ordered(self._decoded(data, number))
-
-    def _plain(self, row: NDArray[np.generic]) -> Picture:
-        if self._form == "depth":
-            return row.reshape(self.height, self.width).astype(row.dtype.newbyteorder("="), copy=False)
-        return self._ordered(row.astype(np.uint8, copy=False))
+            yield data if self.kept else self._ordered(self._used(decode_picture, data, number))
 
     def _ordered(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
         return picture if self._camera.colors == "rgb" else np.ascontiguousarray(picture[:, :, ::-1])
 
-    def _jpeg(self, row: NDArray[np.generic], number: int) -> bytes:
-        """The JPEG file of a row, without what pads it: it ends with its own mark, and never with a zero."""
+    def _head(self, row: NDArray[np.generic], number: int) -> tuple[bytes, PictureHead]:
+        """The JPEG file of a row and its head, without what pads it: it ends with its own mark, never with a zero."""
         data = row.tobytes().rstrip(b"\0")
         if not data.endswith(_JPEG_END):
             raise Hdf5FitError(f"{self._array.place} holds no whole JPEG file in row {number}")
@@ -114,20 +112,15 @@ class StoredCamera:
                 f"{self._array.place} holds {len(data):,} bytes of JPEG in row {number}, which is none of the lengths "
                 "that compress_len tells"
             )
-        return data
-
-    def _head(self, data: bytes, number: int) -> PictureHead:
-        try:
-            head = picture_head({"format": "jpeg", "data": data})
-        except FieldError as error:
-            raise Hdf5FitError(f"{self._array.place} cannot be used in row {number}, since {error}") from error
+        head = self._used(picture_head, data, number)
         if head.format != "jpeg":
             raise Hdf5FitError(f"{self._array.place} holds {head.format} in row {number}, no JPEG file")
-        return head
+        return data, head
 
-    def _decoded(self, data: bytes, number: int) -> NDArray[np.uint8]:
+    def _used[T](self, read: Callable[[Values], T], data: bytes, number: int) -> T:
+        """What is read of the JPEG file in a row."""
         try:
-            return decode_picture({"format": "jpeg", "data": data})
+            return read({"format": "jpeg", "data": data})
         except FieldError as error:
             raise Hdf5FitError(f"{self._array.place} cannot be used in row {number}, since {error}") from error
 

@@ -6,17 +6,17 @@ does. What the file does not say, and the layout does not either, is commented o
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
+from demorec.errors import without_path
 from demorec.hdf5.foreign import ForeignFile, Hdf5Error, StoredArray
 from demorec.ingest.hdf5_episodes import episode_places, found_attribute, told_rate
 from demorec.ingest.hdf5_mapping import Hdf5Episodes
 from demorec.ingest.hdf5_pictures import picture_form
-from demorec.ingest.words import quoted, task_in_name, unique_name
+from demorec.ingest.words import SHOWN, first_numbers, quoted, task_in_name, unique_name
 from demorec.runs.find import expect
 from demorec.scene.features import EE_POSE, ENVIRONMENT_STATE, STATE, VELOCITY
 
@@ -38,17 +38,20 @@ _PARTS = {
     "qvel": VELOCITY,
 }
 """How an observation's name ends -> the feature that it is a part of; others are features of their own."""
-_SHOWN = 4
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
 class _Contents:
     """An episode of a file: its datasets by their names below it, and why others cannot be used."""
 
-    file: ForeignFile
-    place: str
-    arrays: Mapping[str, StoredArray]
-    unusable: Mapping[str, str]
+    def __init__(self, file: ForeignFile, place: str) -> None:
+        self.file, self.place = file, place
+        self.arrays: dict[str, StoredArray] = {}
+        self.unusable: list[str] = []
+        for dataset in file.datasets(place):
+            try:
+                self.arrays[dataset.removeprefix(place).lstrip("/")] = file.array(dataset)
+            except Hdf5Error as error:
+                self.unusable.append(without_path(error, file.path))
 
     def is_camera(self, name: str) -> bool:
         """Whether a dataset holds pictures, JPEG files or, by its name, distances."""
@@ -75,14 +78,14 @@ def suggested_hdf5_mapping(path: Path) -> list[str]:
     with ForeignFile(path) as file:
         is_aloha = file.has("action") and file.is_group("observations")
         if not is_aloha and not file.is_group(_ROBOMIMIC):
-            held = ", ".join(list(file.children(""))[:_SHOWN]) or "nothing"
+            held = ", ".join(list(file.children(""))[:SHOWN]) or "nothing"
             raise Hdf5Error(
                 "This is neither robomimic's layout (data/demo_0/actions) nor ALOHA's (action, observations/qpos), it "
                 f"holds {held}: write the mapping by hand (docs/import.md): {path}"
             )
         episodes = Hdf5Episodes(group="" if is_aloha else _ROBOMIMIC)
         places = episode_places(file, episodes)
-        contents = _contents(file, places[0])
+        contents = _Contents(file, places[0])
         lines = [f"# A mapping for {path.name}, suggested from what is in it; docs/import.md explains every key.", "#"]
         lines += [*_listed(contents, len(places)), ""]
         lines += ["[robot]", f"name = {quoted(_robot(contents, is_aloha))}", *_model(contents), ""]
@@ -93,17 +96,6 @@ def suggested_hdf5_mapping(path: Path) -> list[str]:
     return lines
 
 
-def _contents(file: ForeignFile, place: str) -> _Contents:
-    arrays, unusable = dict[str, StoredArray](), dict[str, str]()
-    for dataset in file.datasets(place):
-        name = dataset.removeprefix(place).lstrip("/")
-        try:
-            arrays[name] = file.array(dataset)
-        except Hdf5Error as error:
-            unusable[name] = str(error).removesuffix(f": {file.path}")
-    return _Contents(file=file, place=place, arrays=arrays, unusable=unusable)
-
-
 def _listed(contents: _Contents, count: int) -> Iterator[str]:
     """Every dataset of the first episode with its shape and first numbers."""
     where = f"{contents.place}, the first of {count} episodes" if contents.place else "the file, which is an episode"
@@ -111,19 +103,17 @@ def _listed(contents: _Contents, count: int) -> Iterator[str]:
     for name, array in contents.arrays.items():
         yield f"#   {name}  {array.dtype.name} {'x'.join(map(str, array.shape))}"
         if contents.is_vector(name) and array.shape[0]:
-            yield f"#     {_first_numbers(contents, array)}"
-    for reason in contents.unusable.values():
+            yield f"#     {_first_row(contents, array)}"
+    for reason in contents.unusable:
         yield f"#   {reason}"
 
 
-def _first_numbers(contents: _Contents, array: StoredArray) -> str:
-    """Of its first row; why they cannot be read, where that is so."""
+def _first_row(contents: _Contents, array: StoredArray) -> str:
+    """Its numbers; why they cannot be read, where that is so."""
     try:
-        numbers = np.ravel(array.read(0, 1))
+        return first_numbers(np.ravel(array.read(0, 1)))
     except Hdf5Error as error:
-        return str(error).removesuffix(f": {contents.file.path}")
-    more = ", ..." if len(numbers) > _SHOWN else ""
-    return f"[{', '.join(f'{number:.4g}' for number in numbers[:_SHOWN].tolist())}{more}]"
+        return without_path(error, contents.file.path)
 
 
 def _robot(contents: _Contents, is_aloha: bool) -> str:

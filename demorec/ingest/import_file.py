@@ -41,6 +41,7 @@ def load_import_file(folder: Path) -> ImportFile | None:
         found = from_json(read_text_limited(path, _MAX_BYTES), ImportFile)
         if found.format != FORMAT:
             raise ConfigError(f"import.json has format {found.format}, this demorec knows up to {FORMAT}: {path}")
+        return found
     except (FileNotFoundError, NotADirectoryError):
         return None
     except OSError as error:
@@ -49,7 +50,6 @@ def load_import_file(folder: Path) -> ImportFile | None:
         ) from error
     except ValueError as error:
         raise BagError(f"import.json is damaged ({in_words(error)}): {path}") from error
-    return found
 
 
 def save_import_file(content: ImportFile, folder: Path) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -17,17 +18,19 @@ from demorec.errors import ConfigError
 from demorec.ingest.bag import Bag, open_bag
 from demorec.ingest.channel import BagError
 from demorec.ingest.clock import NS, Int
-from demorec.ingest.description import describe, origin_of, urdf_text
-from demorec.ingest.episode_writer import ImportedEpisodeWriter, PicturePlan, picture_plan
+from demorec.ingest.description import described_camera, described_feature, urdf_in_bag, urdf_text
+from demorec.ingest.episode_writer import ImportedEpisodeWriter, PlannedEpisode, picture_plan
 from demorec.ingest.episodes import Window, subtask_rows, task_text, windows
 from demorec.ingest.fields import FieldError
+from demorec.ingest.findings import all_findings
 from demorec.ingest.import_file import ImportFile, load_import_file, save_import_file
 from demorec.ingest.mapping import BagMapping, read_mapping
-from demorec.ingest.report import BagReport, EpisodeReport, all_findings, stream_reports
+from demorec.ingest.report import BagReport, EpisodeReport, stream_reports
 from demorec.ingest.rows import EpisodeRows, NoRowsError, Timelines
-from demorec.ingest.streams import BagDecoder, BagStreams, read_streams
+from demorec.ingest.streams import BagDecoder, read_streams
 from demorec.runs.collected import CollectedFolder, differences, open_collected_run
-from demorec.scene.collected import CollectedInfo
+from demorec.scene.collected import CollectedInfo, Origin, SourceFile
+from demorec.scene.urdf import Urdf
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,94 +89,82 @@ def import_bags(
     return ImportResult(reports=tuple(reports[files] for files in dict.fromkeys(hashes)), num_new=len(new))
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Episode:
-    """An episode that shall be written."""
-
-    info: CollectedInfo
-    rows: EpisodeRows
-    plans: dict[str, PicturePlan]
-    subtasks: dict[int, str]
-    path: Path
-
-
+@dataclass(frozen=True, eq=False)
 class _Import:
-    """The import of one bag."""
+    """The import of one bag, whose files are given by name -> SHA-256."""
 
-    def __init__(
-        self,
-        bag: Bag,
-        files: dict[str, str],
-        mapping: BagMapping,
-        urdf: str,
-        folder: CollectedFolder,
-        video: VideoConfig,
-    ) -> None:
-        self._bag, self._files, self._mapping = bag, files, mapping
-        self._urdf, self._folder, self._video = urdf, folder, video
+    bag: Bag
+    files: dict[str, str]
+    mapping: BagMapping
+    urdf: str
+    folder: CollectedFolder
+    video: VideoConfig
 
     def run(self, first_index: int) -> BagReport:
         """Read, judge and write it."""
-        streams = read_streams(self._bag, self._mapping)
-        lines = Timelines(streams, self._mapping)
-        found = windows(
-            self._bag, streams, [line for line in lines.lines.values() if len(line.times_ns)], self._mapping
-        )
-        findings = all_findings(streams, lines, self._mapping)
+        streams = read_streams(self.bag, self.mapping)
+        lines = Timelines(streams, self.mapping)
+        found = windows(self.bag, streams, list(lines.lines.values()), self.mapping)
+        findings = all_findings(lines)
         begin = min(window.begin_ns for window in found)
-        episodes: list[_Episode] = []
+        episodes: list[PlannedEpisode] = []
         reports: list[EpisodeReport] = []
         for window in found:
             try:
                 rows = lines.rows(window)
             except NoRowsError as error:
-                if self._mapping.clock.when_old == "error":
+                if self.mapping.clock.when_old == "error":
                     kinds = sorted({finding.kind for finding in findings})
                     told = f" (the bag's report: {', '.join(kinds)})" if kinds else ""
-                    raise BagError(f"The bag gives no whole episode: {error}{told}: {self._bag.path}") from error
-                reports.append(_dropped(window, begin, str(error)))
+                    raise BagError(f"The bag gives no whole episode: {error}{told}: {self.bag.path}") from error
+                reports.append(_report(window, begin, None, str(error)))
                 continue
-            episode = self._episode(streams, lines, rows, first_index + len(episodes))
+            episode = self._episode(lines, rows, first_index + len(episodes))
             episodes.append(episode)
-            reports.append(_made(episode, begin))
+            reports.append(_report(window, begin, episode))
         self._check_alike(episodes)
-        self._write([episode for episode in episodes if not self._folder.has(episode.info)])
+        self._write([episode for episode in episodes if not self.folder.has(episode.info)])
         return BagReport(
-            name=self._bag.path.name,
-            files=tuple(self._files.items()),
-            num_bytes=self._bag.num_bytes,
+            name=self.bag.path.name,
+            files=tuple(self.files.items()),
+            num_bytes=self.bag.num_bytes,
             streams=tuple(stream_reports(lines, [episode.rows for episode in episodes])),
             findings=findings,
             episodes=tuple(reports),
         )
 
-    def _episode(self, streams: BagStreams, lines: Timelines, rows: EpisodeRows, index: int) -> _Episode:
-        plans = {
-            name: picture_plan(camera, lines.streams[name], lines.lines[name]) for name, camera in rows.cameras.items()
-        }
-        info = describe(
-            bag=self._bag,
-            lines=lines,
-            streams=streams,
-            rows=rows,
-            plans=plans,
-            urdf=self._urdf,
+    def _episode(self, lines: Timelines, rows: EpisodeRows, index: int) -> PlannedEpisode:
+        plans = {name: picture_plan(camera, lines.lines[name]) for name, camera in rows.cameras.items()}
+        topic = self.mapping.robot.urdf_topic
+        urdf = urdf_in_bag(self.bag, lines.streams, topic) if topic else self.urdf
+        try:
+            joints = {joint.name for joint in Urdf.parse(urdf).joints} if urdf else set()
+        except ValueError as error:
+            raise BagError(f"The robot's model cannot be used ({error}): {self.bag.path}") from error
+        files = tuple(SourceFile(name=name, sha256=sha256) for name, sha256 in self.files.items())
+        info = CollectedInfo(
             episode_index=index,
-            instruction=task_text(self._bag, streams, rows.window, self._mapping),
-            origin=origin_of(self._files, self._mapping),
+            instruction=" ".join(task_text(self.bag, lines.streams, rows.window, self.mapping).split()),
+            robot=self.mapping.robot.name,
+            urdf=urdf,
+            fps=self.mapping.clock.fps,
+            features=tuple(described_feature(name, feature, lines, joints) for name, feature in rows.features.items()),
+            cameras=tuple(described_camera(name, plan, lines) for name, plan in plans.items()),
+            origin=Origin(kind="import", files=files, mapping_digest=self.mapping.digest),
+            versions={"demorec": version("demorec"), "av": version("av")},
         )
-        subtasks = subtask_rows(self._bag, streams, rows.window, rows.times_ns, self._mapping)
-        return _Episode(info=info, rows=rows, plans=plans, subtasks=subtasks, path=self._folder.path_of(index))
+        subtasks = subtask_rows(self.bag, lines.streams, rows.window, rows.times_ns, self.mapping)
+        return PlannedEpisode(info=info, rows=rows, plans=plans, subtasks=subtasks)
 
-    def _check_alike(self, episodes: Sequence[_Episode]) -> None:
+    def _check_alike(self, episodes: Sequence[PlannedEpisode]) -> None:
         """ConfigError unless the episodes are of the kind that the run holds, and of one kind."""
         for episode in episodes[:1]:
-            self._folder.check_fits(episode.info)
+            self.folder.check_fits(episode.info)
         for episode in episodes[1:]:
             if different := differences(episodes[0].info, episode.info):
-                raise ConfigError(f"The bag's episodes differ ({'; '.join(different)}): {self._bag.path}")
+                raise ConfigError(f"The bag's episodes differ ({'; '.join(different)}): {self.bag.path}")
 
-    def _write(self, episodes: list[_Episode]) -> None:
+    def _write(self, episodes: list[PlannedEpisode]) -> None:
         """Read the bag's pictures once more, and write each episode while they pass."""
         waiting = sorted(episodes, key=lambda episode: int(episode.rows.times_ns[0]))
         for episode in (episode for episode in waiting if not episode.plans):
@@ -185,7 +176,7 @@ class _Import:
         beginning = _first_pictures(filmed)
         begun: set[int] = set()
         with ExitStack() as stack:
-            under_way: list[tuple[_Episode, ImportedEpisodeWriter]] = []
+            under_way: list[tuple[PlannedEpisode, ImportedEpisodeWriter]] = []
             for topic, number, values in self._pictures(filmed):
                 for episode in beginning.get((topic, number), []):
                     if episode.info.episode_index not in begun:
@@ -203,16 +194,15 @@ class _Import:
             for episode, writer in under_way:
                 self._finish(episode, writer)
 
-    def _finish(self, episode: _Episode, writer: ImportedEpisodeWriter) -> None:
-        writer.finish(success=episode.rows.window.success)
-        self._folder.add(episode.path)
+    def _finish(self, episode: PlannedEpisode, writer: ImportedEpisodeWriter) -> None:
+        writer.finish()
+        self.folder.add(self.folder.path_of(episode.info.episode_index))
 
-    def _writer(self, episode: _Episode) -> ImportedEpisodeWriter:
-        return ImportedEpisodeWriter(
-            episode.path, episode.info, episode.rows, episode.plans, subtasks=episode.subtasks, video=self._video
-        )
+    def _writer(self, episode: PlannedEpisode) -> ImportedEpisodeWriter:
+        path = self.folder.path_of(episode.info.episode_index)
+        return ImportedEpisodeWriter(path, episode, video=self.video)
 
-    def _pictures(self, episodes: Sequence[_Episode]) -> Iterator[tuple[str, int, dict[str, object]]]:
+    def _pictures(self, episodes: Sequence[PlannedEpisode]) -> Iterator[tuple[str, int, dict[str, object]]]:
         """(topic, number, values) of the pictures that any episode takes."""
         taken: dict[str, list[Int]] = {}
         for episode in episodes:
@@ -220,7 +210,7 @@ class _Import:
                 taken.setdefault(plan.topic, []).append(plan.numbers)
         wanted = {topic: np.bincount(np.concatenate(numbers)) > 0 for topic, numbers in taken.items()}
         decoder, counts = BagDecoder(), dict.fromkeys(wanted, 0)
-        for message in self._bag.messages([], wanted.keys()):
+        for message in self.bag.messages([], wanted.keys()):
             topic = message.channel.topic
             number, counts[topic] = counts[topic], counts[topic] + 1
             if number < len(wanted[topic]) and wanted[topic][number]:
@@ -231,39 +221,31 @@ class _Import:
                 yield topic, number, values
 
     def _unusable(self, topic: str, error: ValueError) -> BagError:
-        return BagError(f"A picture of {topic} cannot be used, since {error}: {self._bag.path}")
+        return BagError(f"A picture of {topic} cannot be used, since {error}: {self.bag.path}")
 
 
-def _first_pictures(episodes: Iterable[_Episode]) -> dict[tuple[str, int], list[_Episode]]:
+def _first_pictures(episodes: Iterable[PlannedEpisode]) -> dict[tuple[str, int], list[PlannedEpisode]]:
     """(topic, number) -> the episodes whose first picture of that topic it is; a topic's messages come in order."""
-    found: dict[tuple[str, int], list[_Episode]] = {}
+    found: dict[tuple[str, int], list[PlannedEpisode]] = {}
     for episode in episodes:
         for plan in episode.plans.values():
             found.setdefault((plan.topic, int(plan.numbers.min())), []).append(episode)
     return found
 
 
-def _made(episode: _Episode, begin_ns: int) -> EpisodeReport:
-    rows = episode.rows
+def _report(window: Window, zero_ns: int, episode: PlannedEpisode | None, reason: str = "") -> EpisodeReport:
+    """Of a window of a bag that begins at `zero_ns`, and the episode that comes of it, or why none does."""
+    begin_ns, end_ns, count, trimmed_ns = window.begin_ns, window.end_ns, 0, (0, 0)
+    if episode is not None:
+        times = episode.rows.times_ns
+        begin_ns, end_ns, count, trimmed_ns = int(times[0]), int(times[-1]), len(times), episode.rows.trimmed_ns
     return EpisodeReport(
-        episode_index=episode.info.episode_index,
-        begin_s=(int(rows.times_ns[0]) - begin_ns) / NS,
-        end_s=(int(rows.times_ns[-1]) - begin_ns) / NS,
-        num_frames=len(rows.times_ns),
-        success=rows.window.success,
-        trimmed_s=(rows.trimmed_ns[0] / NS, rows.trimmed_ns[1] / NS),
-        pictures={name: plan.told for name, plan in episode.plans.items()},
-    )
-
-
-def _dropped(window: Window, begin_ns: int, reason: str) -> EpisodeReport:
-    return EpisodeReport(
-        episode_index=None,
-        begin_s=(window.begin_ns - begin_ns) / NS,
-        end_s=(window.end_ns - begin_ns) / NS,
-        num_frames=0,
+        episode_index=None if episode is None else episode.info.episode_index,
+        begin_s=(begin_ns - zero_ns) / NS,
+        end_s=(end_ns - zero_ns) / NS,
+        num_frames=count,
         success=window.success,
-        trimmed_s=(0.0, 0.0),
-        pictures={},
+        trimmed_s=(trimmed_ns[0] / NS, trimmed_ns[1] / NS),
+        pictures={} if episode is None else {name: plan.told for name, plan in episode.plans.items()},
         reason=reason,
     )

@@ -16,12 +16,12 @@ from typing import Literal
 from demorec.ingest.mapping_file import (
     ACTION,
     MAX_FPS,
+    AnyMapping,
     Part,
     camera_name_problems,
     feature_problems,
     read_mapping_file,
 )
-from demorec.plain import digest
 
 Sampling = Literal["latest", "nearest", "linear"]
 
@@ -168,7 +168,7 @@ class Episodes:
 
 
 @dataclass(frozen=True, kw_only=True)
-class BagMapping:
+class BagMapping(AnyMapping):
     """A whole mapping.
 
     Attributes:
@@ -184,11 +184,6 @@ class BagMapping:
     episodes: Episodes = field(default_factory=Episodes)
     features: Mapping[str, tuple[Source, ...]]
     cameras: Mapping[str, CameraSource] = field(default_factory=dict)
-
-    @property
-    def digest(self) -> str:
-        """16 hex digits of all it says."""
-        return digest(self)
 
     @property
     def topics(self) -> frozenset[str]:

@@ -9,10 +9,10 @@ import typing
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 from demorec.errors import ConfigError
-from demorec.plain import from_plain
+from demorec.plain import digest, from_plain
 from demorec.registry import nearest_match
 from demorec.safety.files import read_text_limited
 
@@ -48,11 +48,17 @@ class Part:
     next: str = ""
 
 
-class AnyMapping(Protocol):
+class AnyMapping:
     """A mapping, of whatever kind of file."""
+
+    @property
+    def digest(self) -> str:
+        """16 hex digits of all it says."""
+        return digest(self)
 
     def problems(self) -> Iterator[str]:
         """What is impossible in it, whatever the file."""
+        raise NotImplementedError
 
 
 def feature_problems(features: Mapping[str, Sequence[Part]]) -> Iterator[str]:
@@ -127,52 +133,30 @@ def read_mapping_file[M: AnyMapping](path: Path, kind: type[M]) -> M:
         raise ConfigError(f"The mapping cannot be read ({error.strerror}): {path}") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ConfigError(f"The mapping is no valid TOML ({error}): {path}") from error
-    unknown = list(_unknown_keys(data, kind, ""))
-    if unknown:
+    if unknown := list(_unknown_keys(data, kind, "")):
         raise ConfigError(f"The mapping cannot be used: {'; '.join(unknown)}: {path}")
     try:
-        mapping = from_plain(_whole_numbers_as_floats(data, kind), kind)
-    except (ValueError, OverflowError) as error:
+        mapping = from_plain(data, kind)
+    except ValueError as error:
         raise ConfigError(f"The mapping cannot be used: {error}: {path}") from error
     if problems := list(mapping.problems()):
         raise ConfigError(f"The mapping cannot be used: {'; '.join(problems)}: {path}")
     return mapping
 
 
-def _children(value: Any, kind: Any) -> Iterator[tuple[str, Any, Any]]:
-    """(key, value, type) of what is in a table or list that a type describes."""
-    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
-    if dataclasses.is_dataclass(kind) and isinstance(value, dict):
-        hints = typing.get_type_hints(kind)
-        for key, item in value.items():
-            if key in hints:
-                yield key, item, hints[key]
-    elif origin is not None and isinstance(value, dict) and len(arguments) == 2:
-        for key, item in value.items():
-            yield key, item, arguments[1]
-    elif origin is tuple and isinstance(value, list):
-        for item in value:
-            yield "", item, arguments[0]
-
-
 def _unknown_keys(value: Any, kind: Any, place: str) -> Iterator[str]:
-    if dataclasses.is_dataclass(kind) and isinstance(value, dict):
-        known = [row.name for row in dataclasses.fields(kind)]
-        where = f" in {place}" if place else ""
-        for key in value:
-            if key not in known:
-                yield f"unknown key {key!r}{where}.{nearest_match(key, known)}".rstrip(".")
-    for key, item, child in _children(value, kind):
-        yield from _unknown_keys(item, child, f"{place}.{key}".strip("."))
-
-
-def _whole_numbers_as_floats(value: Any, kind: Any) -> Any:
-    """The same, with `max_age_s = 1` as 1.0, which people write and the strict reader of dataclasses refuses."""
-    if isinstance(value, int) and not isinstance(value, bool) and float in (kind, *typing.get_args(kind)):
-        return float(value)
+    arguments = typing.get_args(kind)
     if isinstance(value, list) and typing.get_origin(kind) is tuple:
-        arguments = typing.get_args(kind)
-        return [_whole_numbers_as_floats(item, arguments[0]) for item in value]
-    if isinstance(value, dict):
-        return value | {key: _whole_numbers_as_floats(item, child) for key, item, child in _children(value, kind)}
-    return value
+        for item in value:
+            yield from _unknown_keys(item, arguments[0], place)
+    children: dict[str, Any] = {}
+    if isinstance(value, dict) and dataclasses.is_dataclass(kind):
+        children = typing.get_type_hints(kind)
+        where = f" in {place}" if place else ""
+        for key in (key for key in value if key not in children):
+            yield f"unknown key {key!r}{where}.{nearest_match(key, children)}".rstrip(".")
+    elif isinstance(value, dict) and len(arguments) == 2:
+        children = dict.fromkeys(value, arguments[1])
+    for key, item in value.items() if children else ():
+        if key in children:
+            yield from _unknown_keys(item, children[key], f"{place}.{key}".strip("."))

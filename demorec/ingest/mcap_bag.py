@@ -26,11 +26,11 @@ def read_mcap(path: Path, tell: Callable[[str], None]) -> Iterator[BagMessage]:
     """The messages of an MCAP file in the order of the file.
 
     Args:
-        path: Of the file.
+        path: Of a file that begins with `MCAP_MAGIC`.
         tell: Called with the reason, for the inside of a sentence, when the file ends or is damaged before its end.
 
     Raises:
-        BagError: It is no MCAP file, or cannot be read at all.
+        BagError: It cannot be read at all.
     """
     try:
         file = open_regular(path)
@@ -38,9 +38,7 @@ def read_mcap(path: Path, tell: Callable[[str], None]) -> Iterator[BagMessage]:
         raise resource_error(error, path) or BagError(f"The bag cannot be read ({error.strerror}): {path}") from error
     with file:
         size = os.fstat(file.fileno()).st_size
-        if file.read(len(MCAP_MAGIC)) != MCAP_MAGIC:
-            what = "is empty" if size == 0 else "is no MCAP file"
-            raise BagError(f"The bag {what}: {path}")
+        file.seek(len(MCAP_MAGIC))
         records = _Records(Limits.of_file(size))
         while True:
             head = file.read(RECORD_HEAD.size)

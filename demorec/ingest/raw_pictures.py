@@ -31,7 +31,13 @@ _YUV = {"uyvy": (1, 0, 2), "yuv422": (1, 0, 2), "yuyv": (0, 1, 3), "yuv422_yuy2"
 """Encoding -> where the first luma, U and V of a pair of pixels are, of its four bytes."""
 _DEPTH = {"16UC1": "u2", "32FC1": "f4"}
 """Encoding of distances -> type of one."""
-RAW_ENCODINGS = (*_CHANNELS, *_BAYER, *_YUV, *_DEPTH)
+_PIXEL_BYTES = (
+    {encoding: count for encoding, (count, _) in _CHANNELS.items()}
+    | dict.fromkeys(_BAYER, 1)
+    | dict.fromkeys(_YUV, 2)
+    | {encoding: np.dtype(kind).itemsize for encoding, kind in _DEPTH.items()}
+)
+RAW_ENCODINGS = tuple(_PIXEL_BYTES)
 
 
 def raw_picture(values: Values) -> NDArray[Any]:
@@ -52,34 +58,27 @@ def raw_picture(values: Values) -> NDArray[Any]:
     return _from_bayer(rows, *_BAYER[encoding]) if encoding in _BAYER else _from_yuv(rows, *_YUV[encoding])
 
 
-def check_raw(values: Values) -> None:
-    """Raise FieldError when a message's bytes are not those of its size and encoding."""
+def check_raw(values: Values) -> tuple[int, int]:
+    """Bytes of a row, with and without what pads it; FieldError when a message's are not those of its size."""
     encoding, width, height = str(values["encoding"]), int(values["width"]), int(values["height"])
     used = _bytes_of_row(encoding, width)
     step = int(values.get("step") or used)
     count = len(values["data"]) if not isinstance(values["data"], str) else len(picture_bytes(values))
     if step < used or count < step * (height - 1) + used:
         raise FieldError(f"its picture has {count:,} bytes, too few for {width}x{height} {encoding}")
+    return step, used
 
 
 def _bytes_of_row(encoding: str, width: int) -> int:
-    if encoding in _CHANNELS:
-        return width * _CHANNELS[encoding][0]
-    if encoding in _BAYER:
-        return width
-    if encoding in _DEPTH:
-        return width * np.dtype(_DEPTH[encoding]).itemsize
-    if encoding in _YUV and width % 2 == 0:
-        return 2 * width
+    if encoding in _PIXEL_BYTES and not (encoding in _YUV and width % 2):
+        return width * _PIXEL_BYTES[encoding]
     raise FieldError(f"its encoding {encoding[:40]!r} is not read; {', '.join(RAW_ENCODINGS)} are")
 
 
 def _rows(values: Values) -> NDArray[np.uint8]:
     """(H, B) bytes, without what pads each row."""
-    check_raw(values)
-    height, used = int(values["height"]), _bytes_of_row(str(values["encoding"]), int(values["width"]))
-    data = np.frombuffer(picture_bytes(values), np.uint8)
-    step = int(values.get("step") or used)
+    step, used = check_raw(values)
+    height, data = int(values["height"]), np.frombuffer(picture_bytes(values), np.uint8)
     if step == used:
         return data[: used * height].reshape(height, used)
     padded = np.zeros(step * height, np.uint8)

@@ -7,11 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from demorec.ingest.clock import NS, Timeline
-from demorec.ingest.findings import Finding, bag_findings, stream_findings
-from demorec.ingest.mapping import BagMapping
+from demorec.ingest.clock import NS
+from demorec.ingest.findings import Finding
 from demorec.ingest.rows import EpisodeRows, Timelines
-from demorec.ingest.streams import NO_STAMP, BagStreams, Stream
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,12 +94,12 @@ class BagReport:
 
 def stream_reports(lines: Timelines, episodes: Sequence[EpisodeRows]) -> Iterator[StreamReport]:
     """A line for each stream."""
-    for key, stream in lines.streams.items():
-        line = lines.lines[key]
+    for key, line in lines.lines.items():
+        stream = line.stream
         steps = np.diff(line.times_ns)
         ages = [lines.chosen(key, rows.times_ns).reach_ns.max() for rows in episodes]
         usual = steps[(steps > 0.4 * line.period_ns) & (steps < 1.6 * line.period_ns)]
-        skew, spread = _skew(stream)
+        skews = line.skews_ns
         lost = int((np.round(steps / line.period_ns) - 1).clip(min=0).sum()) if line.is_regular else 0
         yield StreamReport(
             label=stream.label,
@@ -111,45 +109,15 @@ def stream_reports(lines: Timelines, episodes: Sequence[EpisodeRows]) -> Iterato
             count=len(stream),
             rate_hz=NS / line.period_ns if line.period_ns else 0.0,
             is_regular=line.is_regular,
-            skew_ms=skew,
-            skew_range_ms=spread,
+            skew_ms=float(np.median(skews)) / 1e6 if len(skews) else None,
+            skew_range_ms=float(np.ptp(np.percentile(skews, [1, 99]))) / 1e6 if len(skews) else None,
             jitter_ms=float(np.std(usual)) / 1e6 if len(usual) else 0.0,
             longest_ms=float(steps.max()) / 1e6 if len(steps) else 0.0,
             lost=lost,
-            duplicates=_duplicates(stream, line),
+            duplicates=line.num_repeated,
             malformed=stream.num_malformed,
             max_age_ms=float(max(ages)) / 1e6 if ages else None,
         )
-
-
-def _skew(stream: Stream) -> tuple[float | None, float | None]:
-    stamped = (stream.header_ns != NO_STAMP) & (stream.header_ns > 0)
-    if not stamped.any():
-        return None, None
-    skew = (stream.log_ns - stream.header_ns)[stamped]
-    low, high = np.percentile(skew, [1, 99])
-    return float(np.median(skew)) / 1e6, float(high - low) / 1e6
-
-
-def _duplicates(stream: Stream, line: Timeline) -> int:
-    times = stream.header_ns if line.is_header else stream.log_ns
-    known = times[(times != NO_STAMP) & (times > 0)]
-    return len(known) - len(np.unique(known))
-
-
-def all_findings(streams: BagStreams, lines: Timelines, mapping: BagMapping) -> tuple[Finding, ...]:
-    """What is odd in a bag, each thing once."""
-    by_label = {f"{key}": (stream, lines.lines[key]) for key, stream in lines.streams.items()}
-    found = [
-        finding
-        for key, stream in lines.streams.items()
-        for finding in stream_findings(stream, lines.lines[key], is_camera=isinstance(key, str))
-    ]
-    found += bag_findings(streams, by_label, mapping)
-    once: dict[tuple[str, str], Finding] = {}
-    for finding in found:
-        once.setdefault((finding.kind, finding.text.partition(":")[0] if finding.stream else finding.text), finding)
-    return tuple(once.values())
 
 
 _HEAD = ("stream", "topic", "messages", "rate Hz", "clock", "skew ms", "jitter ms", "longest ms", "lost", "age ms")
@@ -178,7 +146,6 @@ def _row(stream: StreamReport) -> tuple[str, ...]:
     def number(value: float | None) -> str:
         return "-" if value is None else f"{value:.1f}"
 
-    skew = "-" if stream.skew_ms is None else f"{stream.skew_ms:.1f}"
     rate = f"{stream.rate_hz:.1f}" if stream.is_regular else "on change"
     return (
         stream.label,
@@ -186,7 +153,7 @@ def _row(stream: StreamReport) -> tuple[str, ...]:
         str(stream.count),
         rate,
         stream.clock,
-        skew,
+        number(stream.skew_ms),
         number(stream.jitter_ms) if stream.is_regular else "-",
         number(stream.longest_ms),
         str(stream.lost),

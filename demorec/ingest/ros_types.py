@@ -25,10 +25,6 @@ _CODES = {
     "bool": "?", "byte": "B", "char": "B", "int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i",
     "uint32": "I", "int64": "q", "uint64": "Q", "float32": "f", "float64": "d",
 }  # fmt: skip
-_DTYPES = {
-    "bool": "u1", "byte": "u1", "char": "u1", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2",
-    "int32": "i4", "uint32": "u4", "int64": "i8", "uint64": "u8", "float32": "f4", "float64": "f8",
-}  # fmt: skip
 _TIME: _Fields = [
     ("sec", (Nodetype.BASE, ("int32", 0))),
     ("nanosec", (Nodetype.BASE, ("uint32", 0))),
@@ -50,7 +46,8 @@ def ros_decoder(type_name: str, schema_encoding: str, schema: bytes, *, is_cdr: 
     Raises:
         ValueError: The definition cannot be read; or, from the decoder, a message does not fit it.
     """
-    name = _full_name(type_name)
+    parts = type_name.split("/")
+    name = f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else type_name
     types = _types(name, schema_encoding, schema)
     if not is_cdr:
         read = _Builder(types, order="<", is_aligned=False).message(name)
@@ -74,11 +71,6 @@ def _whole(read: _Reader, data: memoryview) -> Values:
     except struct.error:
         raise ValueError("it ends within a value") from None
     return values
-
-
-def _full_name(name: str) -> str:
-    parts = name.split("/")
-    return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else name
 
 
 @lru_cache(maxsize=512)
@@ -171,7 +163,7 @@ class _Builder:
             return self.message(rest, depth + 1)
         element, length = rest
         count = None if kind == Nodetype.SEQUENCE else length
-        if element[0] == Nodetype.BASE and element[1][0] in _DTYPES:
+        if element[0] == Nodetype.BASE and element[1][0] in _CODES:
             return self._numbers(element[1][0], count)
         return self._list(self._field(element, depth + 1), count)
 
@@ -206,7 +198,7 @@ class _Builder:
         return read
 
     def _numbers(self, name: str, count: int | None) -> _Reader:
-        dtype = np.dtype(self._order + _DTYPES[name])
+        dtype = np.dtype(self._order + ("B" if name == "bool" else _CODES[name]))
         size = dtype.itemsize
         mask = size - 1 if self._is_aligned else 0
         length_of = self._scalar("uint32")

@@ -78,16 +78,14 @@ class Timelines:
     """All streams of a bag on the mapping's clock.
 
     Attributes:
+        streams, mapping: As given.
         lines: Stream -> timeline.
     """
 
     def __init__(self, streams: BagStreams, mapping: BagMapping) -> None:
-        self.mapping = mapping
+        self.streams, self.mapping = streams, mapping
         pairs: tuple[tuple[Key, Stream], ...] = (*streams.sources.items(), *streams.cameras.items())
-        self.streams = dict(pairs)
-        self.lines: dict[Key, Timeline] = {
-            key: _from_keyframe(stream, timeline(stream, mapping)) for key, stream in self.streams.items()
-        }
+        self.lines = {key: _from_keyframe(timeline(stream, mapping)) for key, stream in pairs}
 
     def rule(self, key: Key) -> tuple[Sampling, int]:
         """How a stream is sampled, and how old what it gives may be, nanoseconds."""
@@ -125,7 +123,7 @@ class Timelines:
                 count = len(times) - 1
         cameras = {
             name: CameraRows(
-                numbers=self.streams[name].numbers[self.lines[name].order[chosen[name].index]][:count],
+                numbers=self.lines[name].stream.numbers[self.lines[name].order[chosen[name].index]][:count],
                 index=self.lines[name].order[chosen[name].index][:count],
                 ages_ns=chosen[name].age_ns[:count],
             )
@@ -180,14 +178,13 @@ class Timelines:
         clock = self.mapping.clock
         if clock.rows == "grid":
             return grid(begin, end, clock.fps)
-        key = next((key for key, stream in self.streams.items() if stream.topic == clock.rows), None)
-        if key is None:
+        times = next((line.times_ns for line in self.lines.values() if line.stream.topic == clock.rows), None)
+        if times is None:
             raise BagError(f"clock.rows is {clock.rows!r}, of which the mapping takes no feature or camera")
-        times = self.lines[key].times_ns
         return times[(times >= begin) & (times <= end)]
 
     def _label(self, key: Key) -> str:
-        stream = self.streams[key]
+        stream = self.lines[key].stream
         return f"{stream.label} ({stream.topic})"
 
     def _too_old(self, key: Key, chosen: Chosen, times: Int) -> str:
@@ -206,7 +203,8 @@ class Timelines:
 
     def _unfit(self, key: Key, chosen: Chosen, times: Int) -> str:
         """Why what the rows take cannot be recorded; "" when it can."""
-        stream, line = self.streams[key], self.lines[key]
+        line = self.lines[key]
+        stream = line.stream
         if stream.values is not None:
             used = stream.values[line.order[chosen.index]]
             if chosen.fraction is not None:
@@ -231,7 +229,8 @@ class Timelines:
         units: list[str] = []
         for index, source in enumerate(sources):
             key = (name, index)
-            stream, line, rows = self.streams[key], self.lines[key], chosen[key]
+            line, rows = self.lines[key], chosen[key]
+            stream = line.stream
             assert stream.values is not None
             assert stream.layout is not None
             unit = source.to or source.unit
@@ -249,26 +248,19 @@ class Timelines:
         )
 
 
-def _from_keyframe(stream: Stream, line: Timeline) -> Timeline:
+def _from_keyframe(line: Timeline) -> Timeline:
     """Of video only what can be decoded: from the first keyframe on."""
-    if not stream.heads:
+    if not line.stream.heads:
         return line
-    keyframes = np.flatnonzero(stream.heads.are_keyframes[line.order])
+    keyframes = np.flatnonzero(line.stream.heads.are_keyframes[line.order])
     first = int(keyframes[0]) if len(keyframes) else len(line.order)
     return replace(line, times_ns=line.times_ns[first:], order=line.order[first:]) if first else line
 
 
 def _first_rows(feature: FeatureRows, count: int) -> FeatureRows:
-    return FeatureRows(
-        values=feature.values[:count], names=feature.names, units=feature.units, ages_ns=feature.ages_ns[:count]
-    )
+    return replace(feature, values=feature.values[:count], ages_ns=feature.ages_ns[:count])
 
 
 def _next_of(feature: FeatureRows, times: Int) -> FeatureRows:
     """What a feature is one row later; its age is told from the row that has it, and so is below 0."""
-    return FeatureRows(
-        values=feature.values[1:],
-        names=feature.names,
-        units=feature.units,
-        ages_ns=feature.ages_ns[1:] - np.diff(times),
-    )
+    return replace(feature, values=feature.values[1:], ages_ns=feature.ages_ns[1:] - np.diff(times))

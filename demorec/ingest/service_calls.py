@@ -18,23 +18,18 @@ _IS_REQUEST = {0: True, 1: True, 2: False, 3: False}
 
 
 @dataclass(kw_only=True)
-class _Call:
-    time_ns: int
-    request: Values | None = None
-    is_refused: bool = False
-
-
-@dataclass(frozen=True, kw_only=True)
 class ServiceCall:
-    """A call that was not refused.
+    """A call.
 
     Attributes:
         time_ns: Of the first event of its request, as the mapping's clock takes it.
         request: What was asked for; None where the bag does not hold it.
+        is_refused: Whether the service refused it (`success` of its response).
     """
 
     time_ns: int
-    request: Values | None
+    request: Values | None = None
+    is_refused: bool = False
 
     def value(self, field: str) -> Any:
         """A field of the request; FieldError when it is not there."""
@@ -52,7 +47,7 @@ class CallReader:
 
     def __init__(self, *, by_header: bool) -> None:
         self._by_header = by_header
-        self._found: dict[tuple[bytes, int], _Call] = {}
+        self._found: dict[tuple[bytes, int], ServiceCall] = {}
 
     def add(self, values: Values, log_ns: int) -> None:
         """Take an event; FieldError for another message."""
@@ -73,19 +68,15 @@ class CallReader:
         key = bytes(memoryview(info.get("client_gid", b""))), int(info["sequence_number"])
         if is_request:
             stamp = stamp_of({"stamp": info.get("stamp")}) if self._by_header else None
-            call = self._found.setdefault(key, _Call(time_ns=log_ns if stamp is None else stamp))
+            call = self._found.setdefault(key, ServiceCall(time_ns=log_ns if stamp is None else stamp))
             call.request = call.request or _first(values.get("request"))
         elif key in self._found:
             response = _first(values.get("response")) or {}
             self._found[key].is_refused |= response.get("success") in (False, 0)
 
     def calls(self) -> list[ServiceCall]:
-        """Those that the service did not refuse (`success` of its response)."""
-        return [
-            ServiceCall(time_ns=call.time_ns, request=call.request)
-            for call in self._found.values()
-            if not call.is_refused
-        ]
+        """Those that the service did not refuse."""
+        return [call for call in self._found.values() if not call.is_refused]
 
 
 def _first(items: Any) -> Values | None:

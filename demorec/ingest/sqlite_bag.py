@@ -8,24 +8,14 @@ from contextlib import closing
 from pathlib import Path
 from urllib.parse import quote
 
-from demorec.errors import resource_error
 from demorec.ingest.channel import MAX_SCHEMA_BYTES, BagChannel, BagError, BagMessage
-from demorec.safety.files import open_regular
 
 SQLITE_MAGIC = b"SQLite format 3\0"
 _MAX_MESSAGE_BYTES = 1 << 28
-_ENCODINGS = {"cdr": "cdr", "": "cdr"}
 
 
 def read_sqlite(path: Path, tell: Callable[[str], None]) -> Iterator[BagMessage]:
     """The messages of a .db3 file in the order in which they were written; arguments and errors as `read_mcap`."""
-    try:
-        with open_regular(path) as file:
-            head = file.read(len(SQLITE_MAGIC))
-    except OSError as error:
-        raise resource_error(error, path) or BagError(f"The bag cannot be read ({error.strerror}): {path}") from error
-    if head != SQLITE_MAGIC:
-        raise BagError(f"The bag {'is no SQLite database' if head else 'is empty'}: {path}")
     started = False
     try:
         address = f"file:{quote(str(path.resolve()))}?mode=ro&immutable=1"
@@ -69,7 +59,7 @@ def _channels(database: sqlite3.Connection, path: Path) -> dict[int, BagChannel]
         channels[int(number)] = BagChannel(
             topic=str(topic),
             type=str(kind),
-            encoding=_ENCODINGS.get(str(serialisation), str(serialisation)),
+            encoding=str(serialisation) or "cdr",
             schema_encoding=encoding,
             schema=definition,
         )

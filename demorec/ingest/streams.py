@@ -31,7 +31,7 @@ from demorec.ingest.fields import (
     picture_bytes,
     stamp_of,
 )
-from demorec.ingest.mapping import BagMapping, CameraSource, Source
+from demorec.ingest.mapping import BagMapping, Source
 from demorec.ingest.picture_messages import PictureHeads, picture_head
 from demorec.ingest.ros_types import Values
 from demorec.ingest.service_calls import CallReader, ServiceCall
@@ -87,12 +87,10 @@ class Text:
 
     Attributes:
         time_ns: Of its message, as the mapping's clock takes it.
-        log_ns: When it was recorded.
         value: The text, number or boolean.
     """
 
     time_ns: int
-    log_ns: int
     value: Any
 
 
@@ -107,7 +105,6 @@ class BagStreams:
         texts: Topic -> its texts.
         calls: Topic of a service's events -> its calls.
         problems: Why parts of the bag could not be read.
-        first_ns, last_ns: When the first and last message of the bag was recorded.
     """
 
     sources: dict[tuple[str, int], Stream]
@@ -116,8 +113,6 @@ class BagStreams:
     texts: dict[str, list[Text]]
     calls: dict[str, list[ServiceCall]]
     problems: list[str]
-    first_ns: int
-    last_ns: int
 
 
 @dataclass(kw_only=True, eq=False)
@@ -127,7 +122,6 @@ class _Growing:
     label: str
     topic: str
     source: Source | None = None
-    camera: CameraSource | None = None
     type: str = ""
     layout: SourceLayout | None = None
     reader: SourceReader | None = None
@@ -252,8 +246,7 @@ class _Reading:
             if source.topic
         }
         self._cameras = {
-            name: _Growing(label=f"camera {name}", topic=camera.topic, camera=camera)
-            for name, camera in mapping.cameras.items()
+            name: _Growing(label=f"camera {name}", topic=camera.topic) for name, camera in mapping.cameras.items()
         }
         self._streams: dict[str, list[_Growing]] = {}
         for stream in (*self._sources.values(), *self._cameras.values()):
@@ -272,14 +265,12 @@ class _Reading:
         self._counts: dict[str, int] = {}
         self._types: dict[str, set[str]] = {}
         self._refused: dict[str, str] = {}
-        self._first_ns, self._last_ns = 2**63 - 1, 0
 
     def add(self, message: BagMessage) -> None:
         """Take a message."""
         topic = message.channel.topic
         number = self._counts.get(topic, 0)
         self._counts[topic] = number + 1
-        self._first_ns, self._last_ns = min(self._first_ns, message.log_ns), max(self._last_ns, message.log_ns)
         if number == 0 or message.channel.type not in self._types[topic]:
             self._types.setdefault(topic, set()).add(message.channel.type)
         if topic not in self._wanted or topic in self._refused:
@@ -320,9 +311,7 @@ class _Reading:
             self._refused[topic] = f"a text has {len(value):,} characters, at most {limit:,} are read"
             return
         stamp = stamp_of(values) if self._mapping.clock.stamp == "header" else None
-        self._texts[topic].append(
-            Text(time_ns=message.log_ns if stamp is None else stamp, log_ns=message.log_ns, value=value)
-        )
+        self._texts[topic].append(Text(time_ns=message.log_ns if stamp is None else stamp, value=value))
 
     def check(self, bag: Bag) -> None:
         """Raise BagError for all that the mapping names and the bag lacks."""
@@ -371,6 +360,4 @@ class _Reading:
             texts=self._texts,
             calls={topic: reader.calls() for topic, reader in self._calls.items()},
             problems=problems,
-            first_ns=self._first_ns,
-            last_ns=self._last_ns,
         )

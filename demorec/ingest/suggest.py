@@ -24,13 +24,11 @@ from demorec.ingest.mapping import Source
 from demorec.ingest.picture_messages import VIDEO_FORMATS, PictureHead, picture_head
 from demorec.ingest.ros_types import Values
 from demorec.ingest.streams import BagDecoder
-from demorec.ingest.words import quoted, unique_name
+from demorec.ingest.words import SHOWN, first_numbers, quoted, unique_name
 from demorec.scene.collected import DEPTH_UNITS
 
 _KEPT = 64
 """Messages of a topic that are looked into."""
-_SHOWN = 4
-_LONGEST = 40
 _ACTION = re.compile(r"leader|master|gello|command|cmd|target|desired|goal|teleop|/action")
 _STATE = re.compile(r"follower|puppet|measured|joint_states?$|joints/state$|robot_state")
 _TASK = re.compile(r"(?<!sub)(?<!sub[_/-])task|instruction|prompt")
@@ -76,7 +74,6 @@ class _Vector:
     topic: str
     field: str
     layout: SourceLayout
-    has_names: bool
     role: str
     rate_hz: float
 
@@ -93,18 +90,18 @@ def suggested_mapping(path: Path) -> list[str]:
     topics = _topics(bag, problems)
     if not topics:
         raise BagError(f"The bag holds no messages: {path}")
-    cameras = dict(_cameras(topics))
+    cameras = _cameras(topics)
     vectors = [vector for name, topic in sorted(topics.items()) for vector in _vectors(name, topic)]
     lines = [f"# A mapping for {path.name}, suggested from what is in it; docs/import.md explains every key.", "#"]
     lines += [f"# {problem}" for problem in problems[:5]]
     lines += list(_listed(topics))
-    lines += ["", "[robot]", f"name = {quoted(_robot_name(bag))}", *_robot_model(topics)]
+    robot = re.sub(r"[^A-Za-z0-9_]+", "_", bag.name).strip("_") or "robot"
+    model = next((name for name in sorted(topics) if name.endswith("robot_description")), "")
+    lines += ["", "[robot]", f"name = {quoted(robot)}"]
+    lines += [f"urdf_topic = {quoted(model)}" if model else '# urdf = "robot.urdf"']
     lines += ["", "[task]", *_task(topics, bag)]
     lines += ["", "[clock]", *_clock(topics, cameras, vectors)]
-    lines += list(_services(topics))
-    lines += list(_subtasks(topics))
-    lines += list(_features(vectors))
-    lines += list(_poses(topics))
+    lines += [*_services(topics), *_subtasks(topics), *_features(vectors), *_poses(topics)]
     for camera, topic in cameras.items():
         lines += ["", f"[cameras.{camera}]", f"topic = {quoted(topic)}", *_info_topic(topic, topics)]
     return lines
@@ -131,12 +128,8 @@ def _look_into(topic: _Topic, message: BagMessage, decoder: BagDecoder) -> None:
     except (ValueError, RecursionError, OverflowError, TypeError):
         return
     topic.has_stamp = topic.has_stamp and bool(stamp_of(values))
-    if len(topic.values) < 2 or not _is_picture(values):
+    if len(topic.values) < 2 or _head(values) is None:
         topic.values.append(values)
-
-
-def _is_picture(values: Values) -> bool:
-    return _head(values) is not None
 
 
 def _head(values: Values) -> PictureHead | None:
@@ -158,24 +151,21 @@ def _listed(topics: Mapping[str, _Topic]) -> Iterator[str]:
 
 
 def _told(values: Values) -> str:
-    parts = []
-    for key, value in values.items():
-        if key in ("header", "ts", "timestamp", "stamp"):
-            continue
-        parts.append(f"{key}: {_short(value)}")
-    return "; ".join(parts)[:160] or "no fields"
+    times = ("header", "ts", "timestamp", "stamp")
+    return (
+        "; ".join(f"{key}: {_short(value)}" for key, value in values.items() if key not in times)[:160] or "no fields"
+    )
 
 
 def _short(value: Any) -> str:
     if isinstance(value, np.ndarray):
-        more = ", ..." if value.size > _SHOWN else ""
-        return f"[{', '.join(f'{number:.4g}' for number in value[:_SHOWN].tolist())}{more}]"
+        return first_numbers(value)
     if isinstance(value, bytes):
         return f"{len(value)} bytes"
     if isinstance(value, list):
-        return f"[{', '.join(_short(item) for item in value[:_SHOWN])}{', ...' if len(value) > _SHOWN else ''}]"
+        return f"[{', '.join(_short(item) for item in value[:SHOWN])}{', ...' if len(value) > SHOWN else ''}]"
     if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{key}: {_short(item)}" for key, item in list(value.items())[:_SHOWN]) + "}"
+        return "{" + ", ".join(f"{key}: {_short(item)}" for key, item in list(value.items())[:SHOWN]) + "}"
     return (
         json.dumps(value[:40]) if isinstance(value, str) else f"{value:.6g}" if isinstance(value, float) else str(value)
     )
@@ -183,7 +173,7 @@ def _short(value: Any) -> str:
 
 def _vectors(name: str, topic: _Topic) -> Iterator[_Vector]:
     """The joint positions, or other numbers, that a topic holds."""
-    if not topic.values or any(_is_picture(values) for values in topic.values[:1]):
+    if not topic.values or _head(topic.values[0]) is not None:
         return
     for path in _VECTOR_FIELDS:
         try:
@@ -195,22 +185,15 @@ def _vectors(name: str, topic: _Topic) -> Iterator[_Vector]:
             continue
         lower = name.lower()
         role = "action" if _ACTION.search(lower) else "state" if _STATE.search(lower) else ""
-        yield _Vector(
-            topic=name,
-            field=path,
-            layout=layout,
-            has_names=layout.names_steps is not None,
-            role=role,
-            rate_hz=topic.rate_hz,
-        )
+        yield _Vector(topic=name, field=path, layout=layout, role=role, rate_hz=topic.rate_hz)
         return
 
 
-def _cameras(topics: Mapping[str, _Topic]) -> Iterator[tuple[str, str]]:
-    """(name, topic) of each camera: of several topics of the same one, the coded one."""
+def _cameras(topics: Mapping[str, _Topic]) -> dict[str, str]:
+    """Name of each camera -> topic: of several topics of the same one, the coded one."""
     heads = {name: _head(topic.values[0]) for name, topic in topics.items() if topic.values}
     pictures = [name for name, head in heads.items() if head is not None]
-    taken: set[str] = set()
+    cameras: dict[str, str] = {}
     for name in sorted(pictures):
         if any(other != name and other.startswith(f"{name}/") for other in pictures):
             continue  # image_raw beside image_raw/compressed: the same pictures
@@ -220,24 +203,14 @@ def _cameras(topics: Mapping[str, _Topic]) -> Iterator[tuple[str, str]]:
         words = [word for word in _CAMERA_WORD.split(name.lower()) if word and word not in ignored]
         camera = "_".join([*dict.fromkeys(words[-2:])] or ["camera"]) + ("_depth" if is_depth else "")
         camera = camera if camera[0].isalpha() else f"camera_{camera}"
-        camera = unique_name(camera, taken)
-        taken.add(camera)
-        yield camera, name
+        cameras[unique_name(camera, cameras)] = name
+    return cameras
 
 
 def _info_topic(topic: str, topics: Mapping[str, _Topic]) -> list[str]:
     base = topic.removesuffix("/compressed").removesuffix("/compressedDepth").rpartition("/")[0]
     name = f"{base}/camera_info"
     return [f"info_topic = {quoted(name)}"] if name in topics else []
-
-
-def _robot_name(bag: Bag) -> str:
-    return re.sub(r"[^A-Za-z0-9_]+", "_", bag.name).strip("_") or "robot"
-
-
-def _robot_model(topics: Mapping[str, _Topic]) -> list[str]:
-    found = next((name for name in sorted(topics) if name.endswith("robot_description")), "")
-    return [f"urdf_topic = {quoted(found)}"] if found else ['# urdf = "robot.urdf"']
 
 
 def _task(topics: Mapping[str, _Topic], bag: Bag) -> list[str]:
@@ -290,26 +263,18 @@ def _features(vectors: Sequence[_Vector]) -> Iterator[str]:
     if not states and len(others) == 1:
         states, others = others, []
     for name, chosen in (("observation.state", states), ("action", actions)):
-        double = _doubles(chosen)
+        labels = [label for vector in chosen for label in vector.layout.names]
+        are_double = len(set(labels)) < len(labels)
         for vector in chosen:
-            yield from _source(name, vector, prefix=_prefix(vector, chosen) if double else "")
+            yield from _source(name, vector, prefix=_prefix(vector, chosen) if are_double else "")
         if not chosen and name == "observation.state":
             yield from ("", "# No topic says that it is the robot's state: take one of those above.")
         elif not chosen:
-            yield from (
-                "",
-                "# No topic says that it is a command, so the next state is the action.",
-                "[[features.action]]",
-            )
-            yield 'next = "observation.state"'
+            yield from ("", "# No topic says that it is a command, so the next state is the action.")
+            yield from ("[[features.action]]", 'next = "observation.state"')
     for vector in others:
         for line in _source("observation.extra", vector, prefix=""):
             yield f"# {line}" if line else ""
-
-
-def _doubles(chosen: Sequence[_Vector]) -> bool:
-    names = [name for vector in chosen for name in vector.layout.names]
-    return len(set(names)) < len(names)
 
 
 def _prefix(vector: _Vector, chosen: Sequence[_Vector]) -> str:
@@ -322,7 +287,7 @@ def _prefix(vector: _Vector, chosen: Sequence[_Vector]) -> str:
 def _source(feature: str, vector: _Vector, *, prefix: str) -> Iterator[str]:
     key = feature if "." not in feature else f'"{feature}"'
     yield from ("", f"[[features.{key}]]", f"topic = {quoted(vector.topic)}", f"field = {quoted(vector.field)}")
-    if vector.has_names:
+    if vector.layout.names_steps is not None:
         yield f"joints = [{', '.join(quoted(name) for name in vector.layout.names)}]"
     if prefix:
         yield f"prefix = {quoted(prefix)}"

@@ -5,6 +5,12 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Container
+from typing import Any
+
+from numpy.typing import NDArray
+
+SHOWN = 4
+"""Of the numbers or fields of a value, in a comment."""
 
 _NUMBER = re.compile(r"[_\-. \d]*\d$")
 """Of an episode or a day. Names are foreign: a repetition within another would take exponential time."""
@@ -20,6 +26,12 @@ def unique_name(name: str, taken: Container[str]) -> str:
     while name in taken:
         name += "_2"
     return name
+
+
+def first_numbers(numbers: NDArray[Any]) -> str:
+    """The first few of (N,), for a comment."""
+    more = ", ..." if len(numbers) > SHOWN else ""
+    return f"[{', '.join(f'{number:.4g}' for number in numbers[:SHOWN].tolist())}{more}]"
 
 
 def quoted(text: str) -> str:

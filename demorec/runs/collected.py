@@ -122,11 +122,9 @@ def load_collected_run(folder: Path) -> CollectedRun:
         for derived in ("format", "kind", "digest"):
             plain.pop(derived)
         return from_plain(plain, CollectedRun)
-    except OSError as error:
+    except (OSError, ValueError, KeyError, TypeError) as error:
         damaged = DamagedRunFileError(f"run.json is damaged ({in_words(error)}): {path}")
         raise resource_error(error, path) or damaged from error
-    except (ValueError, KeyError, TypeError) as error:
-        raise DamagedRunFileError(f"run.json is damaged ({in_words(error)}): {path}") from error
 
 
 class CollectedFolder:
@@ -146,27 +144,19 @@ class CollectedFolder:
         self.path = path
         self.recovered: list[Path] = []
         self._session = CollectedSession(started=_now())
-        known, is_damaged = self._known()
+        known, is_damaged = CollectedRun(robot="", fps=1), False
+        if os.path.lexists(path / RUN_NAME):
+            try:
+                known = load_collected_run(path)
+            except DamagedRunFileError:  # the recordings know what it said
+                is_damaged = True
         if recovers:
             self._recover_parts()
         self._sessions = known.sessions
         lines = {line.file: line for line in known.episodes}
-        self.episodes = [self._line(file, lines) for file in self._recordings()]
+        self.episodes = [self._line(file, lines) for file in sorted((path / EPISODES).glob("episode_*.mcap"))]
         if is_damaged:
             (path / RUN_NAME).rename(free_name(path / f"{RUN_NAME}.damaged"))
-
-    def _known(self) -> tuple[CollectedRun, bool]:
-        """What run.json says, and whether it is there but cannot be read: the recordings know what it said."""
-        nothing = CollectedRun(robot="", fps=1)
-        if not os.path.lexists(self.path / RUN_NAME):
-            return nothing, False
-        try:
-            return load_collected_run(self.path), False
-        except DamagedRunFileError:
-            return nothing, True
-
-    def _recordings(self) -> list[Path]:
-        return sorted((self.path / EPISODES).glob("episode_*.mcap"))
 
     def _recover_parts(self) -> None:
         for part in sorted((self.path / EPISODES).glob("episode_*.mcap.part")):

@@ -16,6 +16,7 @@ from demorec.errors import ConfigError, resource_error
 from demorec.lerobot.paths import INFO_PATH
 from demorec.runs.run_file import EPISODES, FAILED, RUN_NAME
 from demorec.safety.files import HDF5_MAGIC, MCAP_MAGIC, RERUN_MAGICS, irregular_kind, open_regular
+from demorec.safety.replacing import shown
 
 PathKind = Literal[
     "recording",
@@ -37,26 +38,18 @@ EPISODE_FOLDERS: tuple[PathKind, ...] = ("run", "recordings", "evaluation")
 
 EVALUATION_NAME = "evaluation.json"
 
-_NAMES: dict[PathKind, str] = {
-    "recording": "a recording (.mcap)",
-    "unfinished": "an unfinished recording (.part)",
-    "rrd": "a Rerun file (.rrd)",
-    "hdf5": "an HDF5 file",
-    "rosbag": "a rosbag",
-    "run": "a run",
-    "evaluation": "an evaluation",
-    "dataset": "a LeRobot dataset",
-    "recordings": "a folder of recordings",
+_WORDS: dict[PathKind, tuple[str, str]] = {
+    "recording": ("a recording (.mcap)", ""),
+    "unfinished": ("an unfinished recording (.part)", "; demorec recover keeps what is whole in it"),
+    "rrd": ("a Rerun file (.rrd)", "; demorec view shows it by a name that ends in .rrd"),
+    "hdf5": ("an HDF5 file", "; name the run that it was made from, or make one of it (demorec import hdf5)"),
+    "rosbag": ("a rosbag", ""),
+    "run": ("a run", "; name one of its recordings"),
+    "evaluation": ("an evaluation", "; name one of its recordings"),
+    "dataset": ("a LeRobot dataset", "; name the run that it was made from"),
+    "recordings": ("a folder of recordings", "; name one of them"),
 }
-_ADVICE: dict[PathKind, str] = {
-    "unfinished": "; demorec recover keeps what is whole in it",
-    "rrd": "; demorec view shows it by a name that ends in .rrd",
-    "hdf5": "; name the run that it was made from, or make one of it (demorec import hdf5)",
-    "dataset": "; name the run that it was made from",
-    "run": "; name one of its recordings",
-    "evaluation": "; name one of its recordings",
-    "recordings": "; name one of them",
-}
+"""What each kind is called, and what to do where it was not expected."""
 _MAGICS: tuple[tuple[bytes, PathKind], ...] = (
     (MCAP_MAGIC, "recording"),
     *((magic, "rrd") for magic in RERUN_MAGICS),
@@ -72,8 +65,6 @@ _MARKS: tuple[tuple[str, PathKind], ...] = (
     ("metadata.yaml", "rosbag"),
 )
 """The file by whose presence a folder is known."""
-
-_SHOWN = 5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,9 +121,9 @@ def expect(path: Path, *kinds: PathKind) -> Found:
     if found.reason:
         raise ConfigError(f"{found.reason}: {path}")
     if found.kind not in kinds:
-        taken = [_NAMES[kind] for kind in kinds]
+        taken, (name, advice) = [_WORDS[kind][0] for kind in kinds], _WORDS[found.kind]
         allowed = " or ".join(filter(None, (", ".join(taken[:-1]), taken[-1])))
-        raise ConfigError(f"Expected {allowed}, found {_NAMES[found.kind]}{_ADVICE.get(found.kind, '')}: {path}")
+        raise ConfigError(f"Expected {allowed}, found {name}{advice}: {path}")
     return found
 
 
@@ -141,7 +132,7 @@ def expect_recordings(found: Found, files: Sequence[Path]) -> None:
     if files:
         return
     only = " but failed attempts, in failed/" if found.failed else ""
-    raise ConfigError(f"There is no finished recording in {_NAMES[found.kind]}{only}: {found.path}")
+    raise ConfigError(f"There is no finished recording in {_WORDS[found.kind][0]}{only}: {found.path}")
 
 
 def _file(path: Path) -> Found:
@@ -192,5 +183,5 @@ def _nothing_in(path: Path, entries: Sequence[str]) -> str:
         return f"{reason}; it has unfinished recordings, of which demorec recover {parts[0]} reads one"
     below = sorted(name for name in entries if _is_there(path / name / RUN_NAME) or _is_there(path / name / EPISODES))
     if below:
-        return f"{reason}; it holds runs, name one ({', '.join(below[:_SHOWN])}{', ...' if below[_SHOWN:] else ''})"
+        return f"{reason}; it holds runs, name one ({shown(below)})"
     return reason

@@ -212,7 +212,7 @@ def load_run_file(folder: Path) -> RunFile:
             raise ConfigError(
                 f"run.json has format {str(plain['format'])[:40]}, this demorec knows up to {RUN_FORMAT}: {path}"
             )
-        attempts = [_attempt_line(line) for line in plain.pop("episodes") if line["state"] != "planned"]
+        attempts = [line for line in plain.pop("episodes") if line.pop("state") != "planned"]
         for derived in ("format", "config_digest", "digest", "complete"):
             plain.pop(derived)
         run = from_plain({**plain, "attempts": attempts}, RunFile)
@@ -220,11 +220,9 @@ def load_run_file(folder: Path) -> RunFile:
         return run.with_attempts(run.attempts)
     except FileNotFoundError as error:
         raise ConfigError(f"No run.json, so this is no run of generate-dataset: {folder}") from error
-    except OSError as error:
-        damaged = DamagedRunFileError(f"run.json is damaged ({error.strerror}): {path}")
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        damaged = DamagedRunFileError(f"run.json is damaged ({in_words(error)}): {path}")
         raise resource_error(error, path) or damaged from error
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise DamagedRunFileError(f"run.json is damaged ({in_words(error)}): {path}") from error
 
 
 def recording_name(episode_index: int, attempt: int, *, success: bool) -> str:
@@ -288,7 +286,3 @@ def _episode_lines(run: RunFile, attempts: list[dict[str, Any]]) -> Iterable[dic
     for index in range(run.num_episodes):
         if index not in tried:
             yield {"state": "planned", "episode_index": index, "seed": run.config.seed}
-
-
-def _attempt_line(line: dict[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in line.items() if key != "state"}

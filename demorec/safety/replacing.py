@@ -9,10 +9,9 @@ folder is moved aside first and deleted last.
 from __future__ import annotations
 
 import fcntl
-import json
 import os
 import shutil
-import stat
+import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -20,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from demorec.errors import ConfigError
-from demorec.safety.files import MCAP_MAGIC, RERUN_MAGICS
+from demorec.safety.files import MCAP_MAGIC, RERUN_MAGICS, read_json_limited
 
 _SHOWN = 5
 """How many foreign files a refusal names."""
@@ -98,30 +97,25 @@ def check_replaceable(
 def obstacle(target: Path, kind: ReplaceableKind, sources: Iterable[Path] = ()) -> str:
     """Why `target` must not be replaced, as `check_replaceable` tells it; "" when it may be, or nothing is there."""
     try:
-        return _obstacle(target, kind, sources) if os.path.lexists(target) else ""
+        if not os.path.lexists(target):
+            return ""
+        if not target.exists():
+            return "it is a link to something that is not there"
+        if reason := use_as_source(target.resolve(), sources):
+            return reason
+        if kind.is_folder and not target.is_dir():
+            return f"it is a file, not {kind.name}"
+        if not kind.is_folder and not target.is_file():
+            return f"it is {'a folder' if target.is_dir() else 'no regular file'}, not {kind.name}"
+        reason = protection(target) if kind.is_folder else ""
+        if reason or _is_empty(target):
+            return reason
+        if not kind.recognises(target):
+            return f"it is not {kind.name}"
+        foreign = kind.strangers(target)
+        return f"it holds what is not part of {kind.name} ({shown(foreign)})" if foreign else ""
     except OSError as error:
         return f"it cannot be read ({error.strerror})"
-
-
-def _obstacle(target: Path, kind: ReplaceableKind, sources: Iterable[Path]) -> str:
-    if not target.exists():
-        return "it is a link to something that is not there"
-    reason = use_as_source(target.resolve(), sources)
-    if reason:
-        return reason
-    if not kind.is_folder:
-        if not target.is_file():
-            return f"it is {'a folder' if target.is_dir() else 'no regular file'}, not {kind.name}"
-    elif not target.is_dir():
-        return f"it is a file, not {kind.name}"
-    else:
-        reason = protection(target)
-    if reason or _is_empty(target):
-        return reason
-    if not kind.recognises(target):
-        return f"it is not {kind.name}"
-    foreign = kind.strangers(target)
-    return f"it holds what is not part of {kind.name} ({shown(foreign)})" if foreign else ""
 
 
 def use_as_source(target: Path, sources: Iterable[Path]) -> str:
@@ -171,8 +165,8 @@ def files_below(folder: Path) -> Iterator[str]:
 def json_object(path: Path) -> dict[str, Any]:
     """The JSON object in a regular file; {} when there is none."""
     try:
-        found = json.loads(path.read_text()) if stat.S_ISREG(path.stat().st_mode) else {}
-    except (OSError, ValueError, RecursionError):
+        found = read_json_limited(path, sys.maxsize)
+    except (OSError, ValueError):
         return {}
     return found if isinstance(found, dict) else {}
 

@@ -29,10 +29,10 @@ from support.hdf5 import (
 
 from demorec.errors import ConfigError
 from demorec.hdf5.foreign import ForeignFile, Hdf5Error, StoredArray
-from demorec.ingest.frames_writer import Picture
+from demorec.ingest.frames_writer import FramesImport, Picture
 from demorec.ingest.hdf5_episodes import episode_places
-from demorec.ingest.hdf5_features import Hdf5FitError, stored_feature
-from demorec.ingest.hdf5_import import Hdf5Import, import_hdf5
+from demorec.ingest.hdf5_features import Hdf5FitError, StoredFeature
+from demorec.ingest.hdf5_import import import_hdf5
 from demorec.ingest.hdf5_mapping import DatasetPart, Hdf5Episodes
 from demorec.ingest.hdf5_pictures import StoredCamera
 from demorec.ingest.hdf5_suggest import suggested_hdf5_mapping
@@ -58,7 +58,7 @@ def suggested(file: Path, changes: dict[str, str] | None = None) -> Path:
     return path
 
 
-def imported(*files: Path, changes: dict[str, str] | None = None) -> tuple[Hdf5Import, Path]:
+def imported(*files: Path, changes: dict[str, str] | None = None) -> tuple[FramesImport, Path]:
     """Files imported by the suggested mapping of the first."""
     run = files[0].with_name("run")
     return import_hdf5(files, suggested(files[0], changes), run), run
@@ -123,7 +123,7 @@ def test_a_mask_chooses_and_a_dataset_tells_the_outcome(tmp_path: Path) -> None:
     assert (result.num_episodes, result.num_frames) == (2, 13)
     lines = load_collected_run(run).episodes
     assert [(line.num_frames, line.success) for line in lines] == [(7, True), (6, False)]
-    assert result.left_out == ("dones", "states", "next_obs")
+    assert tuple(result.left_out) == ("dones", "states", "next_obs")
 
 
 @pytest.mark.parametrize("is_compressed", [False, True])
@@ -464,10 +464,10 @@ def test_whole_numbers_are_exact(edge: int, tmp_path: Path) -> None:
         file["other"] = np.array([[edge + (1 if edge > 0 else -1)]])
         file["unsigned"] = np.array([[2**64 - 1]], np.uint64)
     with ForeignFile(tmp_path / "a.hdf5") as opened:
-        held = stored_feature("a", [DatasetPart(dataset="held")], [array("held")], shift=0)
+        held = StoredFeature("a", [DatasetPart(dataset="held")], [array("held")], shift=0)
         assert [vector.tolist() for vector in held.vectors(1)] == [[edge]]
         for name in ("other", "unsigned"):
-            feature = stored_feature("a", [DatasetPart(dataset=name)], [array(name)], shift=0)
+            feature = StoredFeature("a", [DatasetPart(dataset=name)], [array(name)], shift=0)
             with pytest.raises(Hdf5FitError, match="whole numbers that float64 cannot hold"):
                 list(feature.vectors(1))
 

@@ -10,9 +10,9 @@ from support.bag_faults import FAULTS, hurt
 
 from demorec.ingest.bag import open_bag
 from demorec.ingest.channel import BagError
+from demorec.ingest.findings import all_findings
 from demorec.ingest.import_run import import_bags
 from demorec.ingest.mapping import read_mapping
-from demorec.ingest.report import all_findings
 from demorec.ingest.rows import Timelines
 from demorec.ingest.streams import read_streams
 from demorec.tables import CHECKS
@@ -28,7 +28,7 @@ def notes() -> bags.Notes:
 def _findings(bag: Path, tmp_path: Path, text: str = MAPPING) -> set[str]:
     mapping = read_mapping(bag_mappings.write_mapping(text, tmp_path / "robot.toml"))
     streams = read_streams(open_bag(bag), mapping)
-    return {finding.kind for finding in all_findings(streams, Timelines(streams, mapping), mapping)}
+    return {finding.kind for finding in all_findings(Timelines(streams, mapping))}
 
 
 def test_there_are_enough() -> None:
