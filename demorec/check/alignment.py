@@ -6,8 +6,9 @@ import math
 
 import numpy as np
 
-from demorec.check.base import Measurement, check
+from demorec.check.base import Measurement, alignment_check
 from demorec.check.episode import CheckedEpisode
+from demorec.check.rows import finest_lag
 from demorec.geometry import Array
 from demorec.scene.scene import POSITION_GAIN
 
@@ -26,15 +27,31 @@ def measured_lag(before: Array, after: Array) -> tuple[float, float] | None:
         return None
     x, y = before[:, moving] / speed[moving], after[:, moving] / speed[moving]
     core = slice(MAX_LAG, len(x) - MAX_LAG)
-    lags = list(range(-MAX_LAG, MAX_LAG + 1))
+    lags = range(-MAX_LAG, MAX_LAG + 1)
     errors = [float((np.roll(y, -lag, axis=0)[core] - x[core]).var(axis=0).sum()) for lag in lags]
-    best = int(np.argmin(errors))
-    left_open = errors[best] / max(float(x[core].var(axis=0).sum()), 1e-12)
-    if best in (0, len(lags) - 1):
-        return float(lags[best]), left_open
-    low, middle, high = errors[best - 1 : best + 2]
-    bend = low - 2 * middle + high
-    return lags[best] + (0.5 * (low - high) / bend if bend > 0 else 0.0), left_open
+    return finest_lag(lags, errors), float(np.min(errors)) / max(float(x[core].var(axis=0).sum()), 1e-12)
+
+
+def nearest_lag(
+    before: Array, after: Array, moved: Array, *, reach: int, least: float = 0.0, fewest: int = 1
+) -> tuple[int, float] | None:
+    """By how many whole frames `after` (T, n) runs behind `before`, and how far apart the two are then.
+
+    What counts is the third of the moving frames in which they are nearest, in units of the way of `moved` (T, n) to
+    the next frame. None when nothing moves by `least`, or fewer than `fewest` frames do.
+    """
+    core = np.arange(reach, len(before) - reach)
+    if len(core) < 10:
+        return None
+    step = np.linalg.norm(moved[core + 1] - moved[core - 1], axis=1) / 2
+    moving = step > 0.3 * np.sqrt((step**2).mean())
+    if moving.sum() < fewest or step.max() < least:
+        return None
+    core, step = core[moving], step[moving]
+    lags = range(-reach, reach + 1)
+    off = [float(np.quantile(np.linalg.norm(after[core + lag] - before[core], axis=1) / step, 0.33)) for lag in lags]
+    best = int(np.argmin(off))
+    return lags[best], off[best]
 
 
 def servo_response(commands: Array, *, start: Array, substeps: int) -> Array:
@@ -67,8 +84,7 @@ def lag_error(before: Array, after: Array, *, what: str) -> Measurement | None:
     return Measurement(value=abs(lag), detail=f"{what}: {lag:+.2f} frames off")
 
 
-@check(
-    group="alignment",
+@alignment_check(
     measures="lag between states and what the commands ask for, frames",
     reads=(
         "/command",
@@ -87,10 +103,8 @@ def command_lag(episode: CheckedEpisode) -> Measurement | None:
     return lag_error(expected, c.joint_position[:, : episode.num_arm], what="states")
 
 
-@check(
-    group="alignment",
+@alignment_check(
     measures="lag between action and executed command, frames",
-    warn=0,
     reads=(
         "/action",
         "/command",
@@ -103,24 +117,16 @@ def action_lag(episode: CheckedEpisode) -> Measurement | None:
     third of the moving frames in which the two are nearest, in units of the way to the next frame.
     """
     action, command = episode.columns.action_joint_target, episode.columns.command_joint_target
-    if len(action) < 4 * MAX_LAG:
+    nearest = nearest_lag(action, command, action, reach=MAX_LAG, least=1e-4)
+    if nearest is None:
         return None
-    core = np.arange(MAX_LAG, len(action) - MAX_LAG)
-    step = np.linalg.norm(action[core + 1] - action[core - 1], axis=1) / 2
-    moving = step > 0.3 * np.sqrt((step**2).mean())
-    if not moving.any() or step.max() < 1e-4:
-        return None
-    core, step = core[moving], step[moving]
-    lags = range(-MAX_LAG, MAX_LAG + 1)
-    off = [float(np.quantile(np.linalg.norm(action[core] - command[core + lag], axis=1) / step, 0.33)) for lag in lags]
-    best = int(np.argmin(off))
-    if off[best] > 3.0:
+    lag, off = nearest
+    if off > 3.0:
         return Measurement(value=math.inf, detail="commands do not follow the actions at any lag")
-    return Measurement(value=abs(lags[best]), detail=f"commands run {lags[best]:+d} frames behind the actions")
+    return Measurement(value=abs(lag), detail=f"commands run {lag:+d} frames behind the actions")
 
 
-@check(
-    group="alignment",
+@alignment_check(
     measures="lag between gripper command and opening, frames beyond the motor's",
     reads=(
         "/command",

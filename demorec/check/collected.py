@@ -7,13 +7,16 @@ from __future__ import annotations
 
 import zlib
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from demorec.check.base import Found, Measurement, NotMeasured, check, worst
+from demorec.check.base import Found, Measurement, NotMeasured, check, collected_check, worst_frame
+from demorec.check.file import complete
 from demorec.recording import CollectedRecording
 from demorec.recording.collected.streams import SUBTASK
 from demorec.recording.collected.transforms import JointPositions
@@ -65,11 +68,9 @@ class CollectedSubject:
         }
 
 
-@check(
-    scope="collected",
+@collected_check(
     group="file",
     measures="collected episodes that cannot be opened (index, metadata, format version)",
-    warn=0,
     reads=("metadata demorec.collected",),
 )
 def collected_opens(subject: CollectedSubject) -> Measurement:
@@ -77,29 +78,22 @@ def collected_opens(subject: CollectedSubject) -> Measurement:
     return Measurement(value=0, detail=f"format {subject.recording.info.format_version} of {COLLECTED_VERSION}")
 
 
-@check(
-    scope="collected",
+@collected_check(
     group="file",
     measures="topics whose message count differs from the index; every chunk passes its CRC",
-    warn=0,
     reads=("metadata demorec.collected",),
 )
 def collected_checksums(subject: CollectedSubject) -> Measurement:
     """Every byte that holds a message passes its checksum, and the index counts the messages right."""
-    container = Container(subject.recording.path)
-    try:
+    with closing(Container(subject.recording.path)) as container:
         counts = Counter(message.topic for message in container.messages(tuple(container.channels)))
-    finally:
-        container.close()
     wrong = [topic for topic, (_, count) in subject.recording.topics.items() if counts[topic] != count]
     return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{sum(counts.values())} messages")
 
 
-@check(
-    scope="collected",
+@collected_check(
     group="file",
     measures="streams that do not decode into numbers, or into words",
-    warn=0,
     reads=("/frames", "/{feature}", SUBTASK),
 )
 def collected_readable(subject: CollectedSubject) -> Measurement:
@@ -108,25 +102,12 @@ def collected_readable(subject: CollectedSubject) -> Measurement:
     return Measurement(value=0, detail=f"{subject.columns.num_frames} frames{said}")
 
 
-@check(
-    scope="collected",
-    group="file",
-    measures="recordings that a crash cut off (recovered, without an outcome)",
-    warn=0,
-    fail=1,
-    reads=("metadata demorec.recovered",),
-)
-def collected_complete(subject: CollectedSubject) -> Measurement:
-    """The episode was recorded to its end."""
-    cut = subject.recording.outcome is None
-    return Measurement(value=int(cut), detail="recovered from a crash, no outcome" if cut else "")
+collected_complete = replace(complete, name="collected_complete", scope="collected")
 
 
-@check(
-    scope="collected",
+@collected_check(
     group="time",
     measures="frames and pictures that were dropped while recording",
-    warn=0,
     fail=float("inf"),
     reads=("metadata demorec.outcome",),
 )
@@ -139,8 +120,7 @@ def collected_drops(subject: CollectedSubject) -> Found:
     return Measurement(value=sum(outcome.drops.values()), detail=lost)
 
 
-@check(
-    scope="collected",
+@collected_check(
     group="time",
     measures="how much the frames' mean rate differs from the nominal one, as a share of it",
     warn=0.05,
@@ -156,8 +136,7 @@ def collected_rate(subject: CollectedSubject) -> Found:
     return Measurement(value=abs(rate / fps - 1), detail=f"{rate:.4g} Hz instead of {fps} Hz")
 
 
-@check(
-    scope="collected",
+@collected_check(
     group="time",
     measures="the longest time between two frames, in nominal periods",
     warn=2.5,
@@ -174,8 +153,7 @@ def collected_gaps(subject: CollectedSubject) -> Found:
     return Measurement(value=periods, frame=frame + 1, detail=f"{steps[frame] / 1e6:.4g} ms after the frame before")
 
 
-@check(
-    scope="collected",
+@collected_check(
     group="alignment",
     unit="s",
     measures="the largest distance between the stamps of a frame and of a sample that it holds",
@@ -183,14 +161,14 @@ def collected_gaps(subject: CollectedSubject) -> Found:
     fail=1.0,
     reads=("/frames",),
 )
-def collected_sample_age(subject: CollectedSubject) -> Found:
+def collected_sample_age(subject: CollectedSubject) -> Iterator[Found]:
     """What a frame holds was sensed at about its time."""
     columns = subject.columns
-    return worst(*(_oldest(columns.age_ns(name), None, name) for name in columns.stamps))
+    for name in columns.stamps:
+        yield worst_frame(np.abs(columns.age_ns(name)) / _NANOSECONDS, name)
 
 
-@check(
-    scope="collected",
+@collected_check(
     group="alignment",
     unit="s",
     measures="the largest distance between the stamps of a frame and of a picture that it holds",
@@ -198,76 +176,58 @@ def collected_sample_age(subject: CollectedSubject) -> Found:
     fail=1.0,
     reads=("/frames", "/camera/{camera}/h264"),
 )
-def collected_picture_age(subject: CollectedSubject) -> Found:
+def collected_picture_age(subject: CollectedSubject) -> Iterator[Found]:
     """The pictures that a frame holds were taken at about its time."""
     columns = subject.columns
-    found = []
     for camera, numbers in columns.pictures.items():
         frames = np.flatnonzero(numbers != NO_PICTURE)
-        found.append(_oldest(columns.picture_age_ns(camera), frames, f"camera {camera}"))
-    return worst(*found)
+        yield worst_frame(np.abs(columns.picture_age_ns(camera)) / _NANOSECONDS, f"camera {camera}", frames=frames)
 
 
-def _oldest(ages: NDArray[np.int64], frames: NDArray[np.intp] | None, what: str) -> Measurement | None:
-    if not len(ages):
-        return None
-    index = int(np.abs(ages).argmax())
-    frame = index if frames is None else int(frames[index])
-    return Measurement(value=abs(float(ages[index])) / _NANOSECONDS, frame=frame, detail=what)
-
-
-@check(
-    scope="collected",
+@collected_check(
     group="pictures",
     measures="the share of frames that have no picture of a camera",
-    warn=0,
     fail=0.5,
     reads=("/frames",),
 )
-def collected_missing_pictures(subject: CollectedSubject) -> Found:
+def collected_missing_pictures(subject: CollectedSubject) -> Iterator[Found]:
     """Every frame has a picture of every camera."""
-    found = []
     for camera, numbers in subject.columns.pictures.items():
         without = np.flatnonzero(numbers == NO_PICTURE)
         if len(numbers):
             first = int(without[0]) if len(without) else None
             told = f"camera {camera}: {len(without)} of {len(numbers)} frames"
-            found.append(Measurement(value=len(without) / len(numbers), frame=first, detail=told))
-    return worst(*found)
+            yield Measurement(value=len(without) / len(numbers), frame=first, detail=told)
 
 
-@check(
-    scope="collected",
+@collected_check(
     group="physics",
     measures="how far joints are beyond their limits, rad or m",
     warn=0.01,
     fail=0.2,
     reads=("/{feature}", "/robot_description"),
 )
-def collected_joint_limits(subject: CollectedSubject) -> Found:
+def collected_joint_limits(subject: CollectedSubject) -> Iterator[Found]:
     """Observed joints are within the limits of the URDF."""
     info = subject.recording.info
     if not info.urdf:
-        return NotMeasured(why="the robot's URDF is not known")
+        yield NotMeasured(why="the robot's URDF is not known")
+        return
     positions = JointPositions(info.features)
     limits = {joint.name: (joint.lower, joint.upper) for joint in Urdf.parse(info.urdf).joints}
     if not positions.joints or not subject.columns.num_frames:
-        return NotMeasured(why="no element of the observations is said to be a joint's position")
+        yield NotMeasured(why="no element of the observations is said to be a joint's position")
+        return
     values = positions.of(subject.columns.features)
-    found = []
-    for index, joint in enumerate(positions.joints):
+    for joint, column in zip(positions.joints, values.T, strict=False):
         lower, upper = limits[joint]
-        beyond = np.maximum(values[:, index] - upper, lower - values[:, index])
-        frame = int(beyond.argmax())
-        found.append(Measurement(value=max(float(beyond[frame]), 0.0), frame=frame, detail=joint))
-    return worst(*found)
+        if (beyond := worst_frame(np.maximum(column - upper, lower - column), joint)) is not None:
+            yield replace(beyond, value=max(beyond.value, 0.0))
 
 
-@check(
-    scope="collected",
+@collected_check(
     group="physics",
     measures="observed features that never change while the actions do",
-    warn=0,
     fail=1,
     reads=("/{feature}",),
 )
@@ -283,12 +243,10 @@ def collected_stuck(subject: CollectedSubject) -> Found:
     return Measurement(value=len(stuck), detail=", ".join(stuck))
 
 
-@check(
-    scope="collected",
+@collected_check(
     group="pictures",
     measures="cameras whose pictures do not decode, are of another size, or show one colour, or no distance, in more "
     "than half of them",
-    warn=0,
     needs_pictures=True,
     reads=("/camera/{camera}/h264", "/camera/{camera}/depth"),
 )
@@ -296,29 +254,22 @@ def collected_pictures(subject: CollectedSubject) -> Found:
     """Every picture decodes and shows something."""
     if not subject.recording.info.cameras:
         return None
-    measured = subject.measured.items()
-    blank = [
-        camera for camera, levels in subject.contrast.items() if levels and float(np.median(levels)) < _BLANK_LEVELS
-    ]
-    blank += [camera for camera, shares in measured if shares and float(np.median(shares)) == 0]
+    blank = [name for name, levels in subject.contrast.items() if levels and float(np.median(levels)) < _BLANK_LEVELS]
+    blank += [name for name, shares in subject.measured.items() if shares and float(np.median(shares)) == 0]
     return Measurement(value=len(blank), detail=", ".join(f"camera {camera} shows nothing" for camera in blank))
 
 
-@check(
-    scope="collected",
+@collected_check(
     group="pictures",
     measures="pairs of cameras with the same coded pictures",
-    warn=0,
     reads=("/camera/{camera}/h264",),
 )
 def collected_distinct_cameras(subject: CollectedSubject) -> Found:
     """No two cameras give the very same pictures, as when one is plugged in under two names."""
-    digests = {}
-    for camera in subject.recording.cameras:
-        digest = 0
+    digests = dict.fromkeys(subject.recording.cameras, 0)
+    for camera in digests:
         for packet in subject.recording.packets(camera):
-            digest = zlib.crc32(packet.data, digest)
-        digests[camera] = digest
+            digests[camera] = zlib.crc32(packet.data, digests[camera])
     if len(digests) < 2:
         return None
     twins = [camera for camera, digest in digests.items() if list(digests.values()).count(digest) > 1 and digest]
@@ -329,7 +280,6 @@ def collected_distinct_cameras(subject: CollectedSubject) -> Found:
     scope="collected_run",
     group="run",
     measures="recordings of a collected run that are missing, unlisted or other files than run.json lists",
-    warn=0,
     reads=("metadata demorec.collected",),
 )
 def collected_run_files(folder: Path) -> Measurement:

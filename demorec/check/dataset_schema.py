@@ -9,7 +9,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from demorec.check.base import Measurement, check
+from demorec.check.base import Measurement, dataset_check
 from demorec.check.dataset import Dataset
 from demorec.errors import ExportError, in_words
 from demorec.lerobot.files import check_video, open_table, read_json
@@ -26,11 +26,8 @@ _RATE_TOLERANCE = 0.01
 """Files that were put together have rates that are a little off."""
 
 
-@check(
-    group="dataset",
-    scope="dataset",
+@dataset_check(
     measures="statements of info.json that its tables and videos contradict",
-    warn=0,
     reads=("meta/info.json",),
 )
 def dataset_schema(dataset: Dataset) -> Measurement:
@@ -149,11 +146,8 @@ def _splits(dataset: Dataset) -> Iterator[str]:
         yield f"the splits have {len(used)} of {dataset.info.total_episodes} episodes"
 
 
-@check(
-    group="dataset",
-    scope="dataset",
+@dataset_check(
     measures="statements of info.json that the episodes' own descriptions contradict",
-    warn=0,
     reads=(
         "meta/info.json",
         "demorec/",

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from demorec.check.base import Found, Measurement, NotMeasured, check, worst
+from demorec.check.base import Found, Measurement, NotMeasured, run_check, worst
 from demorec.check.coverage import infos_by_task, largest_gap, start_vector, twins
 from demorec.errors import ConfigError, RecordingError, in_words, resource_error
 from demorec.geometry import Array
@@ -116,11 +116,8 @@ class CheckedRun:
         ]
 
 
-@check(
-    group="run",
-    scope="run",
+@run_check(
     measures="files missing, changed since they were made, or not in run.json",
-    warn=0,
     reads=(
         "run.attempts.file",
         "run.attempts.sha256",
@@ -145,11 +142,8 @@ def run_files(run: CheckedRun) -> Measurement:
     return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{len(there)} recordings")
 
 
-@check(
-    group="run",
-    scope="run",
+@run_check(
     measures="recordings whose own account differs from run.json or the run",
-    warn=0,
     reads=(
         "run.attempts.episode_index",
         "run.attempts.attempt",
@@ -211,11 +205,8 @@ def _contradictions(run: CheckedRun, line: dict[str, Any]) -> Iterator[str]:
             yield f"{name} of {file} is {str(value)[:40]!r}, run.json says {str(line[name])[:40]!r}"
 
 
-@check(
-    group="run",
-    scope="run",
+@run_check(
     measures="episodes that have the start or the motion of another",
-    warn=0,
     reads=(
         "info.scene.bodies.world_from_body",
         "info.scene.bodies.shape",
@@ -249,9 +240,7 @@ def motion_vector(joint_position: Array) -> Array:
     return np.asarray(joint_position[moments], dtype=np.float64).reshape(-1)
 
 
-@check(
-    group="run",
-    scope="run",
+@run_check(
     measures="largest gap in the range of a randomised quantity, share",
     warn=0.35,
     fail=0.6,
@@ -272,11 +261,8 @@ def worst_gap(infos: Sequence[EpisodeInfo]) -> Measurement | None:
     return worst(*(largest_gap(group) for group in infos_by_task(infos).values()))
 
 
-@check(
-    group="run",
-    scope="run",
+@run_check(
     measures="episodes that the run's dataset lacks or has too many",
-    warn=0,
     reads=(
         "run.num_episodes",
         "run.attempts.success",
