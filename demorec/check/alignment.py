@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 
-from demorec.check.base import Measurement, alignment_check
+from demorec.check.base import Found, Measurement, alignment_check
 from demorec.check.episode import CheckedEpisode
 from demorec.check.rows import finest_lag
 from demorec.geometry import Array
@@ -133,11 +134,10 @@ def action_lag(episode: CheckedEpisode) -> Measurement | None:
         "/gripper",
     ),
 )
-def gripper_lag(episode: CheckedEpisode) -> Measurement | None:
+def gripper_lag(episode: CheckedEpisode) -> Iterator[Found]:
     """The opening starts to follow within a few frames of each command to close or open, and never before it."""
     c, fps = episode.columns, episode.info.fps
     jumps = np.flatnonzero(np.abs(np.diff(c.command_gripper)) > 0.01) + 1
-    found = None
     for frame in jumps.tolist():
         direction = math.copysign(1.0, float(c.command_gripper[frame] - c.command_gripper[frame - 1]))
         window = slice(max(frame - round(0.4 * fps), 0), frame + round(0.5 * fps) + 1)
@@ -149,6 +149,4 @@ def gripper_lag(episode: CheckedEpisode) -> Measurement | None:
         # earliest; closing fingers need a frame or two to speed up.
         late = start - frame
         off = float(-late if late < 0 else max(late - 0.1 * fps, 0.0))
-        if off < 0 or found is None or off > found.value:
-            found = Measurement(value=off, frame=frame, detail=f"starts {late} frames after the command")
-    return found
+        yield Measurement(value=off, frame=frame, detail=f"starts {late} frames after the command")

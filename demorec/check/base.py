@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial, wraps
-from typing import Any, Literal, overload
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,11 @@ _BLOCKED = "it needs what is damaged"
 
 COLOR_TOPICS = ("/camera/{camera}/h264", "/camera/{camera}/video", "/camera/{camera}/image/compressed")
 """Where a camera's coded colour pictures are, whatever the codec; for `Check.reads`."""
+PICTURE_TOPICS = (*COLOR_TOPICS, "/camera/{camera}/depth", "/camera/{camera}/segmentation")
+"""The same with its other pictures."""
+MOTION_TOPICS = ("/joint_states", "/object/{body}/pose")
+"""Where it is said how everything moves that a camera sees."""
+EE_TOPICS = ("/ee_pose", "/action/ee_pose", "/command/ee_pose")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -233,14 +238,6 @@ outcome_check = partial(check, group="outcome")
 collected_check = partial(check, scope="collected")
 run_check = partial(check, group="run", scope="run")
 dataset_check = partial(check, group="dataset", scope="dataset")
-
-
-@overload
-def worst(*found: Measurement | None) -> Measurement | None: ...
-
-
-@overload
-def worst(*found: Found) -> Found: ...
 
 
 def worst(*found: Found) -> Found:

@@ -9,6 +9,8 @@ import numpy as np
 
 from demorec.check.base import (
     COLOR_TOPICS,
+    MOTION_TOPICS,
+    PICTURE_TOPICS,
     Found,
     Measurement,
     NotMeasured,
@@ -118,7 +120,7 @@ def projection(episode: CheckedEpisode, camera: Camera, compared: PictureCompari
     if usual > UNRELATED:
         detail = f"camera {camera.name}: its pictures show something else than the recorded numbers ({usual:.0f})"
         return Measurement(value=math.inf, frame=int(np.argmax(compared.unlike)), detail=detail)
-    told = (episode.recorded_intrinsics(camera.name) - camera.intrinsics)[:2, 2] / camera.height
+    told = (episode.recording.calibration(camera.name).intrinsics - camera.intrinsics)[:2, 2] / camera.height
     off = float(np.linalg.norm(compared.shift - told))
     detail = f"camera {camera.name}: {off * camera.height:.2f} px"
     return Measurement(value=100 * max(off - _allowance(episode, camera), 0.0), detail=detail)
@@ -136,7 +138,7 @@ def projection(episode: CheckedEpisode, camera: Camera, compared: PictureCompari
 @of_each_camera
 def projected_size(episode: CheckedEpisode, camera: Camera, compared: PictureComparison) -> Found:
     """Things are as large in the picture as their distance and K make them: catches a wrong focal length or scale."""
-    told = float(episode.recorded_intrinsics(camera.name)[1, 1] / camera.intrinsics[1, 1])
+    told = float(episode.recording.calibration(camera.name).intrinsics[1, 1] / camera.intrinsics[1, 1])
     size = (1 + compared.scale) / told
     return Measurement(value=abs(size - 1), detail=f"camera {camera.name}: things appear {size:.3f} times as large")
 
@@ -144,13 +146,7 @@ def projected_size(episode: CheckedEpisode, camera: Camera, compared: PictureCom
 @alignment_check(
     measures="lag between pictures and numbers, frames",
     needs_pictures=True,
-    reads=(
-        *COLOR_TOPICS,
-        "/camera/{camera}/depth",
-        "/camera/{camera}/segmentation",
-        "/joint_states",
-        "/object/{body}/pose",
-    ),
+    reads=(*PICTURE_TOPICS, *MOTION_TOPICS),
 )
 def picture_lag(episode: CheckedEpisode) -> Iterator[Found]:
     """Picture t shows state t: robot and objects are where the numbers of the same frame put them.
@@ -169,8 +165,7 @@ def picture_lag(episode: CheckedEpisode) -> Iterator[Found]:
     needs_pictures=True,
     reads=(
         "/camera/{camera}/depth",
-        "/joint_states",
-        "/object/{body}/pose",
+        *MOTION_TOPICS,
         "info.scene.bodies.shape",
         "info.scene.cameras.far",
     ),
@@ -185,8 +180,7 @@ def depth_matches_scene(episode: CheckedEpisode) -> Iterator[Found]:
     needs_pictures=True,
     reads=(
         "/camera/{camera}/segmentation",
-        "/joint_states",
-        "/object/{body}/pose",
+        *MOTION_TOPICS,
         "info.scene.bodies.shape",
     ),
 )

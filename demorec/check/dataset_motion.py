@@ -9,10 +9,10 @@ import numpy as np
 
 from demorec.check.alignment import nearest_lag, servo_response
 from demorec.check.base import Found, Measurement, dataset_check, worst, worst_frame
-from demorec.check.coverage import twins
+from demorec.check.coverage import twins, worst_gap
 from demorec.check.dataset import Dataset, Rows
 from demorec.check.rows import LinkMatrices, displacement, matrices
-from demorec.check.run import motion_vector, worst_gap
+from demorec.check.run import motion_vector
 from demorec.errors import NotAllowedError
 from demorec.geometry import Array
 from demorec.scene.assets import asset_path
@@ -30,8 +30,7 @@ def dataset_duplicates(dataset: Dataset) -> Measurement | None:
     if len(dataset.rows) < 2 or STATE not in dataset.info.features:
         return None
     motions = [motion_vector(rows[STATE]) for rows in dataset.rows]
-    count, pair = twins(motions, [f"episode {n}" for n in range(len(motions))], tolerance=1e-4)
-    return Measurement(value=count, detail=pair or f"{len(motions)} different motions")
+    return twins(motions, [f"episode {n}" for n in range(len(motions))], "motions")
 
 
 @dataset_check(
@@ -40,7 +39,7 @@ def dataset_duplicates(dataset: Dataset) -> Measurement | None:
     fail=0.6,
     reads=("demorec/",),
 )
-def dataset_coverage(dataset: Dataset) -> Measurement | None:
+def dataset_coverage(dataset: Dataset) -> Found:
     """Start places, yaws, sizes and goals are spread over their ranges (judged from 50 episodes on)."""
     return worst_gap(dataset.infos)
 
@@ -101,14 +100,14 @@ def dataset_velocity(dataset: Dataset) -> Measurement | None:
         "demorec/",
     ),
 )
-def dataset_forward_kinematics(dataset: Dataset) -> Measurement | None:
+def dataset_forward_kinematics(dataset: Dataset) -> Found:
     """The TCP's pose is that of the joints, wherever the dataset has it (float32; 0.1 m per rad of rotation)."""
     found = []
     for each in dataset.described():
-        number, rows, info = each.number, each.rows, each.info
+        rows, info = each.rows, each.info
         if not (told := _tcp_poses(dataset, info, rows)):
             return None
-        if (model := dataset.robot_digests[number]) is not None:
+        if (model := dataset.robot_digests[each.number]) is not None:
             urdf = dataset.robots[model].model
         else:
             try:
@@ -118,7 +117,7 @@ def dataset_forward_kinematics(dataset: Dataset) -> Measurement | None:
         joints = dict(zip(info.robot.arm_joints, rows[STATE].astype(np.float64).T, strict=False))
         fk = LinkMatrices(urdf, joints, len(rows[STATE]))[info.robot.tcp_link]
         for name, poses in told.items():
-            found.append(worst_frame(displacement(matrices(poses), fk), f"{name}, episode {number}"))
+            found.append(worst_frame(displacement(matrices(poses), fk), f"{name}, episode {each.number}"))
     return worst(*found)
 
 
@@ -137,7 +136,7 @@ def _tcp_poses(dataset: Dataset, info: EpisodeInfo, rows: Rows) -> dict[str, Arr
         "observation.state",
     ),
 )
-def dataset_action_lag(dataset: Dataset) -> Measurement | None:
+def dataset_action_lag(dataset: Dataset) -> Iterator[Found]:
     """Action t is what leads from observation t to t + 1, in every episode; catches shifted and made-up actions.
 
     Poses are compared by position. Exploration noise is in the states and not in the actions: what counts is the
@@ -145,11 +144,10 @@ def dataset_action_lag(dataset: Dataset) -> Measurement | None:
     it is taken back in them and they cannot be: then their course, smoothed, is compared with that of the changes of
     state, all episodes together, and two frames are allowed.
     """
-    found, wishes, changes = [], [], []
+    wishes, changes = [], []
     for each in dataset.described():
-        number, rows, info = each.number, each.rows, each.info
-        kind = dataset.action_kind(info)
-        if kind is None:
+        rows, info = each.rows, each.info
+        if (kind := dataset.action_kind(info)) is None:
             continue
         action, state = rows[ACTION].astype(np.float64), rows[STATE].astype(np.float64)
         arm = len(info.robot.arm_joints)
@@ -174,10 +172,9 @@ def dataset_action_lag(dataset: Dataset) -> Measurement | None:
         if (nearest := nearest_lag(expected, reached, reached, reach=3, fewest=10)) is not None:
             lag, off = nearest
             value, words = (math.inf, "unrelated") if off > 3.0 else (abs(lag), f"{lag:+d} frames")
-            found.append(Measurement(value=value, detail=f"episode {number}: {words}"))
+            yield Measurement(value=value, detail=f"episode {each.number}: {words}")
     if wishes:
-        found.append(_course_lag(wishes, changes))
-    return worst(*found)
+        yield _course_lag(wishes, changes)
 
 
 def _course_lag(wishes: list[Array], changes: list[Array], *, reach: int = 4, window: int = 9) -> Measurement:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -69,16 +70,17 @@ def _off_colour(said: Any, mean: Array, detail: str) -> Measurement:
     return Measurement(value=value, detail=detail)
 
 
-@dataset_check(
+drawn_check = partial(
+    dataset_check,
+    needs_pictures=True,
+    reads=("observation.images.{camera}", "observation.state", "demorec/"),
+)
+
+
+@drawn_check(
     measures="difference of an episode's first pictures from what its states and scene make of them, median of 255",
     warn=13.0,
     fail=16.0,
-    needs_pictures=True,
-    reads=(
-        "observation.images.{camera}",
-        "observation.state",
-        "demorec/",
-    ),
 )
 def dataset_pictures_as_drawn(dataset: Dataset) -> Iterator[Found]:
     """Each video shows its own episode by its own camera, drawn anew until the fingers close, for 3 s at most."""
@@ -86,16 +88,10 @@ def dataset_pictures_as_drawn(dataset: Dataset) -> Iterator[Found]:
         yield judge_unlike(compared, f"camera {camera}, episode {number}")
 
 
-@dataset_check(
+@drawn_check(
     measures="lag between an episode's first pictures and its states, frames",
     warn=0.4,
     fail=0.7,
-    needs_pictures=True,
-    reads=(
-        "observation.images.{camera}",
-        "observation.state",
-        "demorec/",
-    ),
 )
 def dataset_picture_lag(dataset: Dataset) -> Iterator[Found]:
     """Picture t shows state t, in each episode and camera, until the fingers close, for 3 s at most."""

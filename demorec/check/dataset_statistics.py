@@ -128,7 +128,7 @@ def _off(
     between: Mapping[str, tuple[Array, Array]] = MappingProxyType({}),
     *,
     detail: str,
-) -> Measurement:
+) -> Found:
     """How far the worst quantity of a feature is off, by the nearer of two values where there are two; by no more than
     `_MERGED` where it lies between two others.
     """
@@ -149,6 +149,4 @@ def _off(
             off = float(np.where(is_between, _MERGED, distance).max())
             merged = ", between the episodes' own, as LeRobot's merge leaves it" if off == _MERGED else ""
         found.append(Measurement(value=off, detail=f"{quantity} of {detail}{merged}"))
-    measurement = worst(*found)
-    assert measurement is not None
-    return measurement
+    return worst(*found)

@@ -77,28 +77,21 @@ class _Dynamics:
         return found
 
     @cached_property
-    def is_free(self) -> NDArray[np.bool_]:
-        """(T,) frames in which the hand touches nothing but what it carries."""
-        c = self.episode.columns
-        carries = np.zeros(c.num_frames, dtype=bool)
-        for name in c.object_poses:
-            carries |= self.episode.is_carried(name, LIFTED_HEIGHT)
-        return np.asarray((c.contact_force == 0) | carries, dtype=np.bool_)
+    def is_judged(self) -> NDArray[np.bool_]:
+        """(T,) frames whose forces are known: the hand touches nothing but what it carries, and moves smoothly.
 
-    @cached_property
-    def is_smooth(self) -> NDArray[np.bool_]:
-        """(T,) frames whose acceleration is told by the frames around them; the two at either end have too few."""
+        Its acceleration is told by the frames around; the two frames at either end have too few.
+        """
+        c = self.episode.columns
+        free = c.contact_force == 0
+        for name in c.object_poses:
+            free = free | self.episode.is_carried(name, LIFTED_HEIGHT)
         point = self.episode.world_from_tcp[:, :3, 3]
         acceleration = np.diff(point, 2, axis=0) * self.episode.info.fps**2
         change = np.linalg.norm(np.diff(acceleration, axis=0), axis=1)
         smooth = np.zeros(len(point), dtype=np.bool_)
         smooth[2:-2] = np.maximum(change[:-1], change[1:]) < MAX_CHANGE
-        return smooth
-
-    @cached_property
-    def is_judged(self) -> NDArray[np.bool_]:
-        """(T,) frames whose forces are known: the hand is free and moves smoothly."""
-        return self.is_free & self.is_smooth
+        return np.asarray(free & smooth)
 
     def below(self, joint: str) -> list[_Load]:
         """What a joint bears."""

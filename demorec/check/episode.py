@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, wraps
 from pathlib import Path
@@ -70,7 +70,7 @@ class CheckedEpisode:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._recording: Recording | None = None
+        self._opened = ExitStack()
         self._pictures: dict[tuple[str, ImageKind], PictureSummary] = {}
         self._comparisons: dict[tuple[str, ImageKind], PictureComparison] = {}
         self._shared: dict[Callable[[CheckedEpisode], object], object] = {}
@@ -85,10 +85,7 @@ class CheckedEpisode:
 
     def close(self) -> None:
         """Close the file; harmless when called twice."""
-        if self._recording is not None:
-            self._recording.close()
-        if "container" in self.__dict__:
-            self.container.close()
+        self._opened.close()
 
     def shared[T](self, compute: Callable[[CheckedEpisode], T]) -> T:
         """What a function makes of the episode, computed once for all checks that ask for it."""
@@ -96,12 +93,10 @@ class CheckedEpisode:
             self._shared[compute] = compute(self)
         return cast(T, self._shared[compute])
 
-    @property
+    @cached_property
     def recording(self) -> Recording:
         """The open recording."""
-        if self._recording is None:
-            self._recording = Recording(self.path)
-        return self._recording
+        return self._opened.enter_context(Recording(self.path))
 
     @property
     def info(self) -> EpisodeInfo:
@@ -163,7 +158,7 @@ class CheckedEpisode:
     @cached_property
     def container(self) -> Container:
         """The file's messages and metadata as they are."""
-        return Container(self.path)
+        return self._opened.enter_context(closing(Container(self.path)))
 
     # ------------------------------------------------------------------------------------------- the robot
 
@@ -235,10 +230,6 @@ class CheckedEpisode:
     def cameras(self) -> tuple[Camera, ...]:
         """Of the scene."""
         return self.info.scene.cameras
-
-    def recorded_intrinsics(self, camera: str) -> Array:
-        """(3, 3) K as the camera's own calibration message has it, which is what other programs read."""
-        return self.recording.calibration(camera).intrinsics
 
     def kinds(self, camera: str) -> tuple[ImageKind, ...]:
         """Which pictures of a camera were recorded."""

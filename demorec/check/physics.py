@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from demorec.check.base import Found, Measurement, physics_check, worst_entry, worst_frame
+from demorec.check.base import EE_TOPICS, Found, Measurement, physics_check, worst_entry, worst_frame
 from demorec.check.episode import CheckedEpisode
 from demorec.check.rows import displacement, matrices
 
@@ -18,9 +18,7 @@ from demorec.check.rows import displacement, matrices
         "/gripper",
         "/action",
         "/command",
-        "/ee_pose",
-        "/action/ee_pose",
-        "/command/ee_pose",
+        *EE_TOPICS,
         "/wrench",
         "/object/{body}/pose",
         "/camera/{camera}/pose",
@@ -155,9 +153,7 @@ def velocity_matches_position(episode: CheckedEpisode) -> Measurement | None:
     warn=1e-6,
     fail=1e-4,
     reads=(
-        "/ee_pose",
-        "/action/ee_pose",
-        "/command/ee_pose",
+        *EE_TOPICS,
         "/joint_states",
         "/action",
         "/command",
@@ -182,9 +178,7 @@ def forward_kinematics(episode: CheckedEpisode) -> Iterator[Found]:
     warn=1e-6,
     fail=1e-3,
     reads=(
-        "/ee_pose",
-        "/action/ee_pose",
-        "/command/ee_pose",
+        *EE_TOPICS,
         "/object/{body}/pose",
         "/camera/{camera}/pose",
     ),

@@ -8,7 +8,16 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.check.base import COLOR_TOPICS, Found, Measurement, NotMeasured, picture_check, worst_frame
+from demorec.check.base import (
+    COLOR_TOPICS,
+    MOTION_TOPICS,
+    PICTURE_TOPICS,
+    Found,
+    Measurement,
+    NotMeasured,
+    picture_check,
+    worst_frame,
+)
 from demorec.check.drawn import PictureComparison, judge_unlike
 from demorec.check.episode import CheckedEpisode, of_each_camera
 from demorec.check.rows import longest_run
@@ -26,11 +35,7 @@ _PREDICTED_WEIGHT = 0.5
 
 @picture_check(
     measures="frames without a picture that decodes",
-    reads=(
-        *COLOR_TOPICS,
-        "/camera/{camera}/depth",
-        "/camera/{camera}/segmentation",
-    ),
+    reads=PICTURE_TOPICS,
 )
 def pictures_decode(episode: CheckedEpisode) -> Iterator[Found]:
     """Every camera's video, depth and labels decode to their end, one picture a frame."""
@@ -47,7 +52,7 @@ def pictures_decode(episode: CheckedEpisode) -> Iterator[Found]:
 
 @picture_check(
     measures="pictures that are nearly all black or nearly all white",
-    reads=(*COLOR_TOPICS,),
+    reads=COLOR_TOPICS,
 )
 def pictures_exposed(episode: CheckedEpisode) -> Iterator[Found]:
     """No picture is black or burnt out: 95 % of its pixels darker than 12 or brighter than 250 of 255."""
@@ -60,7 +65,7 @@ def pictures_exposed(episode: CheckedEpisode) -> Iterator[Found]:
 
 @picture_check(
     measures="largest share of a picture that is black or white",
-    reads=(*COLOR_TOPICS,),
+    reads=COLOR_TOPICS,
 )
 def exposure(episode: CheckedEpisode) -> Iterator[Found]:
     """Most of every picture is neither under- nor overexposed."""
@@ -86,11 +91,7 @@ def pictures_as_drawn(episode: CheckedEpisode) -> Iterator[Found]:
 
 @picture_check(
     measures="difference of a single picture from what was recorded at its frame, beyond the usual, of 255",
-    reads=(
-        *COLOR_TOPICS,
-        "/joint_states",
-        "/object/{body}/pose",
-    ),
+    reads=(*COLOR_TOPICS, *MOTION_TOPICS),
 )
 @of_each_camera
 def odd_pictures(episode: CheckedEpisode, camera: Camera, compared: PictureComparison) -> Found:
@@ -120,11 +121,7 @@ def _stale(compared: PictureComparison) -> NDArray[np.bool_]:
 
 @picture_check(
     measures="longest run of unchanged pictures while something moves before the camera, frames",
-    reads=(
-        *COLOR_TOPICS,
-        "/joint_states",
-        "/object/{body}/pose",
-    ),
+    reads=(*COLOR_TOPICS, *MOTION_TOPICS),
 )
 @of_each_camera
 def frozen(episode: CheckedEpisode, camera: Camera, compared: PictureComparison) -> Found:
@@ -134,11 +131,7 @@ def frozen(episode: CheckedEpisode, camera: Camera, compared: PictureComparison)
 
 @picture_check(
     measures="pictures that repeat the one before, in the midst of motion",
-    reads=(
-        *COLOR_TOPICS,
-        "/joint_states",
-        "/object/{body}/pose",
-    ),
+    reads=(*COLOR_TOPICS, *MOTION_TOPICS),
 )
 @of_each_camera
 def repeated_pictures(episode: CheckedEpisode, camera: Camera, compared: PictureComparison) -> Found:
@@ -159,7 +152,7 @@ def _stale_frames(camera: Camera, compared: PictureComparison, count: int, first
 
 @picture_check(
     measures="likeness of two cameras' pictures (correlation over time)",
-    reads=(*COLOR_TOPICS,),
+    reads=COLOR_TOPICS,
 )
 def distinct_cameras(episode: CheckedEpisode) -> Iterator[Found]:
     """Two cameras in different places do not show the same pictures."""

@@ -11,7 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from demorec.check.base import Found, Measurement, NotMeasured, alignment_check, file_check, worst_frame
+from demorec.check.base import PICTURE_TOPICS, Found, Measurement, NotMeasured, alignment_check, file_check, worst_frame
 from demorec.check.episode import CheckedEpisode
 from demorec.check.rows import displacement, matrices
 from demorec.errors import SceneError
@@ -175,14 +175,7 @@ def phase_events(episode: CheckedEpisode) -> Measurement:
 
 @file_check(
     measures="picture messages that are not what their coded pictures make of them",
-    reads=(
-        "/camera/{camera}/h264",
-        "/camera/{camera}/video",
-        "/camera/{camera}/image/compressed",
-        "/camera/{camera}/depth",
-        "/camera/{camera}/segmentation",
-        "cameras.video.codec",
-    ),
+    reads=(*PICTURE_TOPICS, "cameras.video.codec"),
 )
 def picture_messages(episode: CheckedEpisode) -> Iterator[Found]:
     """/video has the pictures of /h264 byte for byte; every message has its camera's frame, its format and its time."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -12,16 +12,16 @@ from typing import Any
 import numpy as np
 
 from demorec.check.base import Found, Measurement, NotMeasured, run_check, worst
-from demorec.check.coverage import infos_by_task, largest_gap, start_vector, twins
+from demorec.check.coverage import start_vector, twins, worst_gap
 from demorec.errors import ConfigError, RecordingError, in_words, resource_error
 from demorec.geometry import Array
 from demorec.lerobot.files import read_json
 from demorec.lerobot.paths import INFO_PATH
 from demorec.recording import Recording
+from demorec.runs.run_file import EPISODES, FAILED, RUN_NAME
 from demorec.safety.files import open_regular, read_json_limited
 from demorec.scene.episode import EpisodeInfo, Outcome
 
-RUN_NAME = "run.json"
 _MAX_JSON_BYTES = 2 << 30
 _LINE = {"episode_index": int, "attempt": int, "seed": int, "success": bool, "file": str, "sha256": str}
 """What the line of an attempt says, as far as it is checked."""
@@ -82,7 +82,7 @@ class CheckedRun:
     @property
     def recordings(self) -> list[Path]:
         """Every recording there is, successes first."""
-        return [*sorted((self.path / "episodes").glob("*.mcap")), *sorted((self.path / "failed").glob("*.mcap"))]
+        return [path for folder in (EPISODES, FAILED) for path in sorted((self.path / folder).glob("*.mcap"))]
 
     @cached_property
     def told(self) -> dict[str, Told]:
@@ -222,13 +222,9 @@ def run_duplicates(run: CheckedRun) -> Found:
     config = run.run.get("config", {})
     if config.get("fixed"):
         return NotMeasured(why="--fixed asks for one layout, every episode of which starts alike")
-    starts = [start_vector(run.infos[file].scene) for file in files]
-    motions = [run.told[file].motion for file in files]
-    same_start, start_pair = twins(starts, files, tolerance=1e-4)
-    same_motion, motion_pair = twins(motions, files, tolerance=1e-4)
     return worst(
-        Measurement(value=same_start, detail=start_pair or f"{len(files)} different starts"),
-        Measurement(value=same_motion, detail=motion_pair or f"{len(files)} different motions"),
+        twins([start_vector(run.infos[file].scene) for file in files], files, "starts"),
+        twins([run.told[file].motion for file in files], files, "motions"),
     )
 
 
@@ -251,14 +247,9 @@ def motion_vector(joint_position: Array) -> Array:
         "info.scene.goals.onto_from_goal",
     ),
 )
-def run_coverage(run: CheckedRun) -> Measurement | None:
+def run_coverage(run: CheckedRun) -> Found:
     """Start places, yaws, sizes and goals are spread over their ranges (judged from 50 episodes on)."""
     return worst_gap(run.successes)
-
-
-def worst_gap(infos: Sequence[EpisodeInfo]) -> Measurement | None:
-    """The largest gap over all tasks."""
-    return worst(*(largest_gap(group) for group in infos_by_task(infos).values()))
 
 
 @run_check(

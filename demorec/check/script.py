@@ -65,10 +65,8 @@ class PhaseStretch:
 
 def _stretches(phases: tuple[str, ...]) -> list[PhaseStretch]:
     starts = [frame for frame, phase in enumerate(phases) if frame == 0 or phase != phases[frame - 1]]
-    ends = [*starts[1:], len(phases)]
-    return [
-        PhaseStretch(phase=phases[first], first=first, last=end - 1) for first, end in zip(starts, ends, strict=False)
-    ]
+    ends = pairwise([*starts, len(phases)])
+    return [PhaseStretch(phase=phases[first], first=first, last=end - 1) for first, end in ends]
 
 
 def _is_scripted(episode: CheckedEpisode) -> NotMeasured | None:

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from demorec.check.base import Found, Measurement, time_check, worst_frame
+from demorec.check.base import COLOR_TOPICS, Found, Measurement, time_check, worst_frame
 from demorec.check.episode import CheckedEpisode
 from demorec.recording import channels
 from demorec.recording.streams import frame_streams
@@ -76,12 +76,7 @@ def stamps(episode: CheckedEpisode) -> Iterator[Found]:
 
 @time_check(
     measures="pictures missing, surplus, off their frame's time, or too far from a keyframe",
-    reads=(
-        "/camera/{camera}/h264",
-        "/camera/{camera}/video",
-        "/camera/{camera}/image/compressed",
-        "cameras.video.gop",
-    ),
+    reads=(*COLOR_TOPICS, "cameras.video.gop"),
 )
 def video_frames(episode: CheckedEpisode) -> Iterator[Found]:
     """Each camera has one coded picture a frame at the frame's time, and a keyframe at least every GOP."""
