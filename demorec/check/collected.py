@@ -10,7 +10,6 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +23,7 @@ from demorec.recording.container import Container
 from demorec.recording.video import decode
 from demorec.runs.collected import load_collected_run
 from demorec.runs.run_file import EPISODES, sha256_of
-from demorec.scene.collected import COLLECTED_VERSION, NO_PICTURE, CollectedColumns
+from demorec.scene.collected import COLLECTED_VERSION, NO_PICTURE
 from demorec.scene.urdf import Urdf
 
 NOT_APPLICABLE = "not applicable: the episode was collected, and this needs the scene of a simulated one"
@@ -35,47 +34,14 @@ _STILL_FRAMES = 20
 """Of an episode with fewer frames nobody can tell a stuck sensor from a still robot."""
 
 
-class CollectedSubject:
-    """A recording of a collected episode, open for the checks.
-
-    Attributes:
-        recording: It.
-    """
-
-    def __init__(self, recording: CollectedRecording) -> None:
-        self.recording = recording
-
-    @property
-    def columns(self) -> CollectedColumns:
-        """All numbers."""
-        return self.recording.columns()
-
-    @cached_property
-    def contrast(self) -> dict[str, list[float]]:
-        """Camera -> standard deviation of the levels of each of its pictures, decoded once."""
-        found = {}
-        for camera in self.recording.cameras:
-            images = decode(self.recording.video_settings(camera), self.recording.packets(camera))
-            found[camera] = [float(image[::4, ::4].std()) for image in images]
-        return found
-
-    @cached_property
-    def measured(self) -> dict[str, list[float]]:
-        """Depth camera -> in each of its pictures, the share of pixels that measured a distance."""
-        return {
-            camera: [float(np.mean(np.isfinite(values) & (values > 0))) for values in self.recording.distances(camera)]
-            for camera in self.recording.depth_cameras
-        }
-
-
 @collected_check(
     group="file",
     measures="collected episodes that cannot be opened (index, metadata, format version)",
     reads=("metadata demorec.collected",),
 )
-def collected_opens(subject: CollectedSubject) -> Measurement:
+def collected_opens(recording: CollectedRecording) -> Measurement:
     """The index and the metadata pass their checksums and are of a known format version."""
-    return Measurement(value=0, detail=f"format {subject.recording.info.format_version} of {COLLECTED_VERSION}")
+    return Measurement(value=0, detail=f"format {recording.info.format_version} of {COLLECTED_VERSION}")
 
 
 @collected_check(
@@ -83,11 +49,11 @@ def collected_opens(subject: CollectedSubject) -> Measurement:
     measures="topics whose message count differs from the index; every chunk passes its CRC",
     reads=("metadata demorec.collected",),
 )
-def collected_checksums(subject: CollectedSubject) -> Measurement:
+def collected_checksums(recording: CollectedRecording) -> Measurement:
     """Every byte that holds a message passes its checksum, and the index counts the messages right."""
-    with closing(Container(subject.recording.path)) as container:
+    with closing(Container(recording.path)) as container:
         counts = Counter(message.topic for message in container.messages(tuple(container.channels)))
-    wrong = [topic for topic, (_, count) in subject.recording.topics.items() if counts[topic] != count]
+    wrong = [topic for topic, (_, count) in recording.topics.items() if counts[topic] != count]
     return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{sum(counts.values())} messages")
 
 
@@ -96,10 +62,10 @@ def collected_checksums(subject: CollectedSubject) -> Measurement:
     measures="streams that do not decode into numbers, or into words",
     reads=("/frames", "/{feature}", SUBTASK),
 )
-def collected_readable(subject: CollectedSubject) -> Measurement:
+def collected_readable(recording: CollectedRecording) -> Measurement:
     """Every message has the layout that the metadata promises, at its frame's time."""
-    said = f", {len(subject.recording.subtasks)} subtasks" if subject.recording.subtasks else ""
-    return Measurement(value=0, detail=f"{subject.columns.num_frames} frames{said}")
+    said = f", {len(recording.subtasks)} subtasks" if recording.subtasks else ""
+    return Measurement(value=0, detail=f"{recording.columns().num_frames} frames{said}")
 
 
 collected_complete = replace(complete, name="collected_complete", scope="collected")
@@ -111,9 +77,9 @@ collected_complete = replace(complete, name="collected_complete", scope="collect
     fail=float("inf"),
     reads=("metadata demorec.outcome",),
 )
-def collected_drops(subject: CollectedSubject) -> Found:
+def collected_drops(recording: CollectedRecording) -> Found:
     """What came could be taken."""
-    outcome = subject.recording.outcome
+    outcome = recording.outcome
     if outcome is None:
         return NotMeasured(why="the recording has no outcome, which would tell")
     lost = ", ".join(f"{count} of {what}" for what, count in outcome.drops.items() if count)
@@ -127,9 +93,9 @@ def collected_drops(subject: CollectedSubject) -> Found:
     fail=0.5,
     reads=("/frames",),
 )
-def collected_rate(subject: CollectedSubject) -> Found:
+def collected_rate(recording: CollectedRecording) -> Found:
     """The frames came at the rate that the episode names, by which datasets and policies go."""
-    times, fps = subject.columns.time_ns, subject.recording.info.fps
+    times, fps = recording.columns().time_ns, recording.info.fps
     if len(times) < 2:
         return None
     rate = (len(times) - 1) * _NANOSECONDS / float(times[-1] - times[0])
@@ -143,13 +109,13 @@ def collected_rate(subject: CollectedSubject) -> Found:
     fail=30,
     reads=("/frames",),
 )
-def collected_gaps(subject: CollectedSubject) -> Found:
+def collected_gaps(recording: CollectedRecording) -> Found:
     """No frames are missing between others."""
-    steps = np.diff(subject.columns.time_ns)
+    steps = np.diff(recording.columns().time_ns)
     if not len(steps):
         return None
     frame = int(steps.argmax())
-    periods = float(steps[frame]) * subject.recording.info.fps / _NANOSECONDS
+    periods = float(steps[frame]) * recording.info.fps / _NANOSECONDS
     return Measurement(value=periods, frame=frame + 1, detail=f"{steps[frame] / 1e6:.4g} ms after the frame before")
 
 
@@ -161,9 +127,9 @@ def collected_gaps(subject: CollectedSubject) -> Found:
     fail=1.0,
     reads=("/frames",),
 )
-def collected_sample_age(subject: CollectedSubject) -> Iterator[Found]:
+def collected_sample_age(recording: CollectedRecording) -> Iterator[Found]:
     """What a frame holds was sensed at about its time."""
-    columns = subject.columns
+    columns = recording.columns()
     for name in columns.stamps:
         yield worst_frame(np.abs(columns.age_ns(name)) / _NANOSECONDS, name)
 
@@ -176,9 +142,9 @@ def collected_sample_age(subject: CollectedSubject) -> Iterator[Found]:
     fail=1.0,
     reads=("/frames", "/camera/{camera}/h264"),
 )
-def collected_picture_age(subject: CollectedSubject) -> Iterator[Found]:
+def collected_picture_age(recording: CollectedRecording) -> Iterator[Found]:
     """The pictures that a frame holds were taken at about its time."""
-    columns = subject.columns
+    columns = recording.columns()
     for camera, numbers in columns.pictures.items():
         frames = np.flatnonzero(numbers != NO_PICTURE)
         yield worst_frame(np.abs(columns.picture_age_ns(camera)) / _NANOSECONDS, f"camera {camera}", frames=frames)
@@ -190,9 +156,9 @@ def collected_picture_age(subject: CollectedSubject) -> Iterator[Found]:
     fail=0.5,
     reads=("/frames",),
 )
-def collected_missing_pictures(subject: CollectedSubject) -> Iterator[Found]:
+def collected_missing_pictures(recording: CollectedRecording) -> Iterator[Found]:
     """Every frame has a picture of every camera."""
-    for camera, numbers in subject.columns.pictures.items():
+    for camera, numbers in recording.columns().pictures.items():
         without = np.flatnonzero(numbers == NO_PICTURE)
         if len(numbers):
             first = int(without[0]) if len(without) else None
@@ -207,18 +173,18 @@ def collected_missing_pictures(subject: CollectedSubject) -> Iterator[Found]:
     fail=0.2,
     reads=("/{feature}", "/robot_description"),
 )
-def collected_joint_limits(subject: CollectedSubject) -> Iterator[Found]:
+def collected_joint_limits(recording: CollectedRecording) -> Iterator[Found]:
     """Observed joints are within the limits of the URDF."""
-    info = subject.recording.info
+    info = recording.info
     if not info.urdf:
         yield NotMeasured(why="the robot's URDF is not known")
         return
     positions = JointPositions(info.features)
     limits = {joint.name: (joint.lower, joint.upper) for joint in Urdf.parse(info.urdf).joints}
-    if not positions.joints or not subject.columns.num_frames:
+    if not positions.joints or not recording.columns().num_frames:
         yield NotMeasured(why="no element of the observations is said to be a joint's position")
         return
-    values = positions.of(subject.columns.features)
+    values = positions.of(recording.columns().features)
     for joint, column in zip(positions.joints, values.T, strict=False):
         lower, upper = limits[joint]
         if (beyond := worst_frame(np.maximum(column - upper, lower - column), joint)) is not None:
@@ -231,10 +197,10 @@ def collected_joint_limits(subject: CollectedSubject) -> Iterator[Found]:
     fail=1,
     reads=("/{feature}",),
 )
-def collected_stuck(subject: CollectedSubject) -> Found:
+def collected_stuck(recording: CollectedRecording) -> Found:
     """Sensors are alive: no feature of the observations stays at one value, in all elements, while commands change."""
-    features = subject.columns.features
-    if subject.columns.num_frames < _STILL_FRAMES:
+    features = recording.columns().features
+    if recording.columns().num_frames < _STILL_FRAMES:
         return NotMeasured(why=f"the episode has fewer than {_STILL_FRAMES} frames")
     changing = {name for name, values in features.items() if np.ptp(values, axis=0).any()}
     if "action" in features and "action" not in changing:
@@ -250,12 +216,21 @@ def collected_stuck(subject: CollectedSubject) -> Found:
     needs_pictures=True,
     reads=("/camera/{camera}/h264", "/camera/{camera}/depth"),
 )
-def collected_pictures(subject: CollectedSubject) -> Found:
+def collected_pictures(recording: CollectedRecording) -> Found:
     """Every picture decodes and shows something."""
-    if not subject.recording.info.cameras:
+    if not recording.info.cameras:
         return None
-    blank = [name for name, levels in subject.contrast.items() if levels and float(np.median(levels)) < _BLANK_LEVELS]
-    blank += [name for name, shares in subject.measured.items() if shares and float(np.median(shares)) == 0]
+    blank, unmeasured = [], []
+    for camera in recording.depth_cameras:
+        shares = [float(np.mean(np.isfinite(values) & (values > 0))) for values in recording.distances(camera)]
+        if shares and float(np.median(shares)) == 0:
+            unmeasured.append(camera)
+    for camera in recording.cameras:
+        images = decode(recording.video_settings(camera), recording.packets(camera))
+        deviations = [float(image[::4, ::4].std()) for image in images]
+        if deviations and float(np.median(deviations)) < _BLANK_LEVELS:
+            blank.append(camera)
+    blank += unmeasured
     return Measurement(value=len(blank), detail=", ".join(f"camera {camera} shows nothing" for camera in blank))
 
 
@@ -264,11 +239,11 @@ def collected_pictures(subject: CollectedSubject) -> Found:
     measures="pairs of cameras with the same coded pictures",
     reads=("/camera/{camera}/h264",),
 )
-def collected_distinct_cameras(subject: CollectedSubject) -> Found:
+def collected_distinct_cameras(recording: CollectedRecording) -> Found:
     """No two cameras give the very same pictures, as when one is plugged in under two names."""
-    digests = dict.fromkeys(subject.recording.cameras, 0)
+    digests = dict.fromkeys(recording.cameras, 0)
     for camera in digests:
-        for packet in subject.recording.packets(camera):
+        for packet in recording.packets(camera):
             digests[camera] = zlib.crc32(packet.data, digests[camera])
     if len(digests) < 2:
         return None

@@ -8,8 +8,7 @@ from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, wraps
 from pathlib import Path
-from types import TracebackType
-from typing import Self, cast
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,31 +60,19 @@ class TopicScan:
     first: bytes
 
 
-class CheckedEpisode:
-    """One recording; a context manager. Properties raise RecordingError where the file does not give them.
+class CheckedEpisode(ExitStack):
+    """One recording, closed at the end of a `with`. Properties raise RecordingError where the file does not give them.
 
     Args:
         path: The recording.
     """
 
     def __init__(self, path: Path) -> None:
+        super().__init__()
         self.path = path
-        self._opened = ExitStack()
         self._pictures: dict[tuple[str, ImageKind], PictureSummary] = {}
         self._comparisons: dict[tuple[str, ImageKind], PictureComparison] = {}
         self._shared: dict[Callable[[CheckedEpisode], object], object] = {}
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Close the file; harmless when called twice."""
-        self._opened.close()
 
     def shared[T](self, compute: Callable[[CheckedEpisode], T]) -> T:
         """What a function makes of the episode, computed once for all checks that ask for it."""
@@ -96,7 +83,7 @@ class CheckedEpisode:
     @cached_property
     def recording(self) -> Recording:
         """The open recording."""
-        return self._opened.enter_context(Recording(self.path))
+        return self.enter_context(Recording(self.path))
 
     @property
     def info(self) -> EpisodeInfo:
@@ -158,7 +145,7 @@ class CheckedEpisode:
     @cached_property
     def container(self) -> Container:
         """The file's messages and metadata as they are."""
-        return self._opened.enter_context(closing(Container(self.path)))
+        return self.enter_context(closing(Container(self.path)))
 
     # ------------------------------------------------------------------------------------------- the robot
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from demorec.check.base import Check, Group, Level, Result, Scope
-from demorec.check.collected import NOT_APPLICABLE, CollectedSubject
+from demorec.check.collected import NOT_APPLICABLE
 from demorec.check.dataset import Dataset
 from demorec.check.episode import CheckedEpisode
 from demorec.check.run import CheckedRun
@@ -160,13 +160,12 @@ def check_subject(subject: Subject, options: CheckOptions) -> SubjectReport:
     checks = options.checks(subject.kind)
     if subject.kind == "recording" and is_collected(subject.path):
         with CollectedRecording(subject.path) as recording:
-            episode = CollectedSubject(recording)
             gates = ("collected_opens", "collected_readable")
-            found = _run(options.checks("collected"), episode, gates, lambda: episode.columns)
+            found = _run(options.checks("collected"), recording, gates, recording.columns)
         found += [check.skipped(NOT_APPLICABLE) for check in checks]
     elif subject.kind == "recording":
-        with CheckedEpisode(subject.path) as simulated:
-            found = _run(checks, simulated, ("opens", "readable"), lambda: simulated.columns)
+        with CheckedEpisode(subject.path) as episode:
+            found = _run(checks, episode, ("opens", "readable"), lambda: episode.columns)
     elif subject.kind == "run" and is_collected_run(subject.path):
         found = [check.run(subject.path) for check in options.checks("collected_run")]
         found += [check.skipped(NOT_APPLICABLE) for check in checks]

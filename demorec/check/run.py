@@ -103,17 +103,11 @@ class CheckedRun:
         return found
 
     @property
-    def infos(self) -> dict[str, EpisodeInfo]:
-        """File (relative) -> its info, of the recordings that can be read."""
-        return {file: told.info for file, told in self.told.items()}
-
-    @property
     def successes(self) -> list[EpisodeInfo]:
         """Infos of the recordings in episodes/ that were asked for last (others may be there from a larger request)."""
         asked = self.run["num_episodes"]
-        return [
-            info for file, info in self.infos.items() if file.startswith("episodes/") and info.episode_index < asked
-        ]
+        infos = [told.info for file, told in self.told.items() if file.startswith("episodes/")]
+        return [info for info in infos if info.episode_index < asked]
 
 
 @run_check(
@@ -216,14 +210,14 @@ def _contradictions(run: CheckedRun, line: dict[str, Any]) -> Iterator[str]:
 )
 def run_duplicates(run: CheckedRun) -> Found:
     """Every episode is there once: no two start alike (within a tenth of a millimetre) or move alike."""
-    files = [file for file in run.infos if file.startswith("episodes/")]
+    files = [file for file in run.told if file.startswith("episodes/")]
     if len(files) < 2:
         return None
     config = run.run.get("config", {})
     if config.get("fixed"):
         return NotMeasured(why="--fixed asks for one layout, every episode of which starts alike")
     return worst(
-        twins([start_vector(run.infos[file].scene) for file in files], files, "starts"),
+        twins([start_vector(run.told[file].info.scene) for file in files], files, "starts"),
         twins([run.told[file].motion for file in files], files, "motions"),
     )
 
