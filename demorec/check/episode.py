@@ -24,7 +24,7 @@ from demorec.geometry import Array
 from demorec.recording import Recording, channels
 from demorec.recording.chunks import Block
 from demorec.recording.container import Container
-from demorec.scene.episode import EpisodeColumns, EpisodeInfo, Event, frame_time_ns
+from demorec.scene.episode import EpisodeColumns, EpisodeInfo, Event, Outcome, frame_time_ns
 from demorec.scene.scene import Camera
 from demorec.scene.urdf import Urdf
 
@@ -89,6 +89,11 @@ class CheckedEpisode(ExitStack):
     def info(self) -> EpisodeInfo:
         """What was known before the first frame."""
         return self.recording.info
+
+    @property
+    def outcome(self) -> Outcome | None:
+        """What was known after its last frame."""
+        return self.recording.outcome
 
     @cached_property
     def columns(self) -> EpisodeColumns:

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from demorec.check.base import Measurement, file_check
 from demorec.check.episode import CheckedEpisode
-from demorec.recording import channels, messages
+from demorec.recording import CollectedRecording, channels, messages
 from demorec.recording.streams import frame_streams
 from demorec.scene.episode import FORMAT_VERSION
 
@@ -104,7 +104,7 @@ def readable(episode: CheckedEpisode) -> Measurement:
     fail=1,
     reads=("metadata demorec.recovered",),
 )
-def complete(episode: CheckedEpisode) -> Measurement:
+def complete(episode: CheckedEpisode | CollectedRecording) -> Measurement:
     """The episode was recorded to its end."""
-    cut = episode.recording.outcome is None
+    cut = episode.outcome is None
     return Measurement(value=int(cut), detail="recovered from a crash, no outcome" if cut else "")

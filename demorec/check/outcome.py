@@ -32,7 +32,7 @@ AT_LEAST = ("on_support", "on_table", "gripper_width")
 )
 def outcome_consistent(episode: CheckedEpisode) -> Measurement | None:
     """Each condition passed as value and limit have it, success as the conditions; a failure has phase and reason."""
-    outcome = episode.recording.outcome
+    outcome = episode.outcome
     if outcome is None:
         return None
     failed = [condition.name for condition in outcome.checks if not condition.passed]
@@ -78,7 +78,7 @@ def _possible(episode: CheckedEpisode, condition: SuccessCheck) -> set[bool]:
 )
 def end_values(episode: CheckedEpisode) -> Iterator[Found]:
     """Height, tilt and opening that the outcome names are those of the last frame, in which all is at rest."""
-    outcome, scene, c = episode.recording.outcome, episode.info.scene, episode.columns
+    outcome, scene, c = episode.outcome, episode.info.scene, episode.columns
     if outcome is None or not outcome.success or not c.num_frames:
         return
     frame = c.num_frames - 1
@@ -111,7 +111,7 @@ def end_values(episode: CheckedEpisode) -> Iterator[Found]:
 )
 def final_state(episode: CheckedEpisode) -> Iterator[Found]:
     """An object that is said to lie at its goal lies there in the last recorded frame."""
-    outcome, scene, c = episode.recording.outcome, episode.info.scene, episode.columns
+    outcome, scene, c = episode.outcome, episode.info.scene, episode.columns
     if outcome is None or not outcome.success or not scene.goals or not c.num_frames:
         return
     said = {condition.name: condition for condition in outcome.checks}
@@ -140,7 +140,7 @@ def final_state(episode: CheckedEpisode) -> Iterator[Found]:
 )
 def at_rest_in_the_end(episode: CheckedEpisode) -> Iterator[Found]:
     """After a success the objects lie still: the recording does not stop in mid-motion."""
-    outcome, c = episode.recording.outcome, episode.columns
+    outcome, c = episode.outcome, episode.columns
     if outcome is None or not outcome.success or c.num_frames < 3:
         return
     for name in dict.fromkeys(goal.object for goal in episode.info.scene.goals):

@@ -64,7 +64,7 @@ def latched_messages(episode: CheckedEpisode) -> Found:
 )
 def metadata_agrees(episode: CheckedEpisode) -> Measurement:
     """What the metadata say in short, for people and other tools, is what they say at length."""
-    info, outcome = episode.info, episode.recording.outcome
+    info, outcome = episode.info, episode.outcome
     brief = episode.container.metadata(metadata.EPISODE) or {}
     brief_outcome = episode.container.metadata(metadata.OUTCOME) or {}
     said: dict[str, object] = {

@@ -137,7 +137,7 @@ def story(episode: CheckedEpisode) -> Found:
     told = [time_ns for time_ns, event in episode.recording.events() if event.name == INTERJECTION_EVENT]
     if [int(episode.frame_times[frame]) for frame in corrected] != told:
         wrong.append(f"{len(told)} interjections at other frames than those where the expert listens ({corrected})")
-    outcome, goals = episode.recording.outcome, episode.info.scene.goals
+    outcome, goals = episode.outcome, episode.info.scene.goals
     if outcome is not None and outcome.success and len(approaches) != len(goals) + outcome.num_retries:
         wrong.append(f"{len(approaches)} approaches for {len(goals)} goals and {outcome.num_retries} retries")
     frame = strange[0][0] if strange else None
