@@ -201,7 +201,8 @@ def check(
 ) -> Callable[[Callable[[Any], Found | Iterator[Found]]], Check]:
     """Make a `Check` of a function; its name is the function's. Of a generator the `worst` that it yields is judged.
 
-    A check that stands in `demorec.check.limits` has the limits of there; without `fail` there are no warnings.
+    A check that stands in `demorec.check.limits` has the limits of there, whatever it is given here. Without `fail`
+    there are no warnings, and without any limit nothing above zero passes.
     """
 
     def wrap(function: Callable[[Any], Found | Iterator[Found]]) -> Check:
