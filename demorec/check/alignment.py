@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 
-from demorec.check.base import Measurement, check
+from demorec.check.base import Found, Measurement, alignment_check
 from demorec.check.episode import CheckedEpisode
+from demorec.check.rows import finest_lag
 from demorec.geometry import Array
 from demorec.scene.scene import POSITION_GAIN
 
@@ -26,15 +28,31 @@ def measured_lag(before: Array, after: Array) -> tuple[float, float] | None:
         return None
     x, y = before[:, moving] / speed[moving], after[:, moving] / speed[moving]
     core = slice(MAX_LAG, len(x) - MAX_LAG)
-    lags = list(range(-MAX_LAG, MAX_LAG + 1))
+    lags = range(-MAX_LAG, MAX_LAG + 1)
     errors = [float((np.roll(y, -lag, axis=0)[core] - x[core]).var(axis=0).sum()) for lag in lags]
-    best = int(np.argmin(errors))
-    left_open = errors[best] / max(float(x[core].var(axis=0).sum()), 1e-12)
-    if best in (0, len(lags) - 1):
-        return float(lags[best]), left_open
-    low, middle, high = errors[best - 1 : best + 2]
-    bend = low - 2 * middle + high
-    return lags[best] + (0.5 * (low - high) / bend if bend > 0 else 0.0), left_open
+    return finest_lag(lags, errors), float(np.min(errors)) / max(float(x[core].var(axis=0).sum()), 1e-12)
+
+
+def nearest_lag(
+    before: Array, after: Array, moved: Array, *, reach: int, least: float = 0.0, fewest: int = 1
+) -> tuple[int, float] | None:
+    """By how many whole frames `after` (T, n) runs behind `before`, and how far apart the two are then.
+
+    What counts is the third of the moving frames in which they are nearest, in units of the way of `moved` (T, n) to
+    the next frame. None when nothing moves by `least`, or fewer than `fewest` frames do.
+    """
+    core = np.arange(reach, len(before) - reach)
+    if len(core) < 10:
+        return None
+    step = np.linalg.norm(moved[core + 1] - moved[core - 1], axis=1) / 2
+    moving = step > 0.3 * np.sqrt((step**2).mean())
+    if moving.sum() < fewest or step.max() < least:
+        return None
+    core, step = core[moving], step[moving]
+    lags = range(-reach, reach + 1)
+    off = [float(np.quantile(np.linalg.norm(after[core + lag] - before[core], axis=1) / step, 0.33)) for lag in lags]
+    best = int(np.argmin(off))
+    return lags[best], off[best]
 
 
 def servo_response(commands: Array, *, start: Array, substeps: int) -> Array:
@@ -67,8 +85,7 @@ def lag_error(before: Array, after: Array, *, what: str) -> Measurement | None:
     return Measurement(value=abs(lag), detail=f"{what}: {lag:+.2f} frames off")
 
 
-@check(
-    group="alignment",
+@alignment_check(
     measures="lag between states and what the commands ask for, frames",
     reads=(
         "/command",
@@ -87,10 +104,8 @@ def command_lag(episode: CheckedEpisode) -> Measurement | None:
     return lag_error(expected, c.joint_position[:, : episode.num_arm], what="states")
 
 
-@check(
-    group="alignment",
+@alignment_check(
     measures="lag between action and executed command, frames",
-    warn=0,
     reads=(
         "/action",
         "/command",
@@ -103,35 +118,26 @@ def action_lag(episode: CheckedEpisode) -> Measurement | None:
     third of the moving frames in which the two are nearest, in units of the way to the next frame.
     """
     action, command = episode.columns.action_joint_target, episode.columns.command_joint_target
-    if len(action) < 4 * MAX_LAG:
+    nearest = nearest_lag(action, command, action, reach=MAX_LAG, least=1e-4)
+    if nearest is None:
         return None
-    core = np.arange(MAX_LAG, len(action) - MAX_LAG)
-    step = np.linalg.norm(action[core + 1] - action[core - 1], axis=1) / 2
-    moving = step > 0.3 * np.sqrt((step**2).mean())
-    if not moving.any() or step.max() < 1e-4:
-        return None
-    core, step = core[moving], step[moving]
-    lags = range(-MAX_LAG, MAX_LAG + 1)
-    off = [float(np.quantile(np.linalg.norm(action[core] - command[core + lag], axis=1) / step, 0.33)) for lag in lags]
-    best = int(np.argmin(off))
-    if off[best] > 3.0:
+    lag, off = nearest
+    if off > 3.0:
         return Measurement(value=math.inf, detail="commands do not follow the actions at any lag")
-    return Measurement(value=abs(lags[best]), detail=f"commands run {lags[best]:+d} frames behind the actions")
+    return Measurement(value=abs(lag), detail=f"commands run {lag:+d} frames behind the actions")
 
 
-@check(
-    group="alignment",
+@alignment_check(
     measures="lag between gripper command and opening, frames beyond the motor's",
     reads=(
         "/command",
         "/gripper",
     ),
 )
-def gripper_lag(episode: CheckedEpisode) -> Measurement | None:
+def gripper_lag(episode: CheckedEpisode) -> Iterator[Found]:
     """The opening starts to follow within a few frames of each command to close or open, and never before it."""
     c, fps = episode.columns, episode.info.fps
     jumps = np.flatnonzero(np.abs(np.diff(c.command_gripper)) > 0.01) + 1
-    found = None
     for frame in jumps.tolist():
         direction = math.copysign(1.0, float(c.command_gripper[frame] - c.command_gripper[frame - 1]))
         window = slice(max(frame - round(0.4 * fps), 0), frame + round(0.5 * fps) + 1)
@@ -143,6 +149,4 @@ def gripper_lag(episode: CheckedEpisode) -> Measurement | None:
         # earliest; closing fingers need a frame or two to speed up.
         late = start - frame
         off = float(-late if late < 0 else max(late - 0.1 * fps, 0.0))
-        if off < 0 or found is None or off > found.value:
-            found = Measurement(value=off, frame=frame, detail=f"starts {late} frames after the command")
-    return found
+        yield Measurement(value=off, frame=frame, detail=f"starts {late} frames after the command")

@@ -9,12 +9,17 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, overload
+from functools import partial, wraps
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
 
 from demorec.check.limits import limit_table
 from demorec.errors import DemorecError, MissingDependencyError, NotAllowedError, resource_error
+from demorec.geometry import Array
 
 Level = Literal["pass", "warn", "fail", "skip"]
 Scope = Literal["recording", "collected", "run", "collected_run", "dataset"]
@@ -25,6 +30,11 @@ _BLOCKED = "it needs what is damaged"
 
 COLOR_TOPICS = ("/camera/{camera}/h264", "/camera/{camera}/video", "/camera/{camera}/image/compressed")
 """Where a camera's coded colour pictures are, whatever the codec; for `Check.reads`."""
+PICTURE_TOPICS = (*COLOR_TOPICS, "/camera/{camera}/depth", "/camera/{camera}/segmentation")
+"""The same with its other pictures."""
+MOTION_TOPICS = ("/joint_states", "/object/{body}/pose")
+"""Where it is said how everything moves that a camera sees."""
+EE_TOPICS = ("/ee_pose", "/action/ee_pose", "/command/ee_pose")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,13 +113,11 @@ class Check:
             return self.skipped(str(error))
         except NotAllowedError as error:  # a model of the user's own, which says nothing about the recording
             return self.skipped(f"not measured: {error}")
-        except DemorecError as error:
-            if (lack := resource_error(error)) is not None:
-                raise lack from error
-            return self._result("fail", Measurement(value=math.nan, detail=str(error)))
         except Exception as error:
             if (lack := resource_error(error)) is not None:
                 raise lack from error
+            if isinstance(error, DemorecError):
+                return self._result("fail", Measurement(value=math.nan, detail=str(error)))
             # What is broken in a way that nobody foresaw must not take the other checks' findings with it.
             logging.getLogger(__name__).debug("check %s", self.name, exc_info=True)
             odd = Measurement(value=math.nan, detail="the data are such that this check cannot be computed on them")
@@ -184,47 +192,53 @@ def check(
     *,
     group: Group,
     measures: str,
-    warn: float | None = None,
+    warn: float = 0,
     fail: float | None = None,
     unit: str = "",
     scope: Scope = "recording",
     needs_pictures: bool = False,
     reads: tuple[str, ...] = (),
-) -> Callable[[Callable[[Any], Found]], Check]:
-    """Make a `Check` of a function; its name is the function's.
+) -> Callable[[Callable[[Any], Found | Iterator[Found]]], Check]:
+    """Make a `Check` of a function; its name is the function's. Of a generator the `worst` that it yields is judged.
 
-    Without `warn` its limits are those of `demorec.check.limits`; without `fail` there is no range for warnings.
+    A check that stands in `demorec.check.limits` has the limits of there, whatever it is given here. Without `fail`
+    there are no warnings, and without any limit nothing above zero passes.
     """
 
-    def wrap(function: Callable[[Any], Found]) -> Check:
+    def wrap(function: Callable[[Any], Found | Iterator[Found]]) -> Check:
+        @wraps(function)
+        def measure(subject: object) -> Found:
+            found = function(subject)
+            return worst(*found) if isinstance(found, Iterator) else found
+
         name = function.__name__
-        if warn is None:
-            limits = limit_table().checks[name]
-            lower, upper = limits.warn, limits.fail
-        else:
-            lower, upper = warn, warn if fail is None else fail
+        limits = limit_table().checks.get(name)
         return Check(
             name=name,
             group=group,
             scope=scope,
             measures=measures,
             unit=unit,
-            warn=lower,
-            fail=upper,
+            warn=limits.warn if limits else warn,
+            fail=limits.fail if limits else warn if fail is None else fail,
             needs_pictures=needs_pictures,
             reads=reads,
-            measure=function,
+            measure=measure,
         )
 
     return wrap
 
 
-@overload
-def worst(*found: Measurement | None) -> Measurement | None: ...
-
-
-@overload
-def worst(*found: Found) -> Found: ...
+file_check = partial(check, group="file")
+time_check = partial(check, group="time")
+physics_check = partial(check, group="physics")
+alignment_check = partial(check, group="alignment")
+calibration_check = partial(check, group="calibration")
+picture_check = partial(check, group="pictures", needs_pictures=True)
+outcome_check = partial(check, group="outcome")
+collected_check = partial(check, scope="collected")
+run_check = partial(check, group="run", scope="run")
+dataset_check = partial(check, group="dataset", scope="dataset")
 
 
 def worst(*found: Found) -> Found:
@@ -240,3 +254,21 @@ def worst(*found: Found) -> Found:
     if not reasons:
         return largest
     return replace(largest, detail="; ".join([largest.detail, *(f"not measured: {why}" for why in reasons)]))
+
+
+def worst_frame(
+    off: Array, detail: str = "", *, first: int = 0, frames: NDArray[np.intp] | None = None
+) -> Measurement | None:
+    """The largest of (T,) values and its frame, those from `first` on or `frames`; None when there are no values."""
+    if not len(off):
+        return None
+    row = int(np.argmax(off))
+    return Measurement(value=float(off[row]), frame=row + first if frames is None else int(frames[row]), detail=detail)
+
+
+def worst_entry(table: Array, names: Sequence[str], *, first: int = 0) -> Measurement | None:
+    """The same of (T, n) values, with the name of the column."""
+    if not table.size:
+        return None
+    row, column = divmod(int(np.argmax(table)), table.shape[1])
+    return Measurement(value=float(table[row, column]), frame=row + first, detail=names[column])

@@ -3,12 +3,24 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 
-from demorec.check.base import COLOR_TOPICS, Found, Measurement, NotMeasured, check, worst
+from demorec.check.base import (
+    COLOR_TOPICS,
+    MOTION_TOPICS,
+    PICTURE_TOPICS,
+    Found,
+    Measurement,
+    NotMeasured,
+    alignment_check,
+    calibration_check,
+    worst_frame,
+)
 from demorec.check.cells import ImageKind
-from demorec.check.episode import CheckedEpisode
+from demorec.check.drawn import PictureComparison, judge_lag
+from demorec.check.episode import CheckedEpisode, of_each_camera
 from demorec.check.rows import displacement, matrices
 from demorec.errors import RecordingError
 from demorec.geometry import Array
@@ -20,8 +32,7 @@ UNRELATED = 16.0
 """Root mean square difference of all pictures from the drawn ones, of 255, from which on they show something else."""
 
 
-@check(
-    group="calibration",
+@calibration_check(
     measures="K of the camera's message against size and field of view",
     unit="px",
     warn=0.01,
@@ -33,24 +44,21 @@ UNRELATED = 16.0
         "info.scene.cameras.height",
     ),
 )
-def intrinsics(episode: CheckedEpisode) -> Found:
+def intrinsics(episode: CheckedEpisode) -> Iterator[Found]:
     """The calibration message agrees with the scene's camera and the pictures' size."""
-    found = []
     for camera in episode.cameras:
         scan = episode.scan.get(channels.camera_topic(camera.name, "camera_info"))
         if scan is None or not scan.first:
-            found.append(Measurement(value=math.inf, detail=f"camera {camera.name} has no calibration"))
+            yield Measurement(value=math.inf, detail=f"camera {camera.name} has no calibration")
             continue
         told = episode.recording.calibration(camera.name)
         settings = episode.recording.video_settings(camera.name)
         off = float(np.abs(told.intrinsics - camera.intrinsics).max())
         off = max(off, abs(told.width - settings.width), abs(told.height - settings.height))
-        found.append(Measurement(value=off, detail=f"camera {camera.name}"))
-    return worst(*found)
+        yield Measurement(value=off, detail=f"camera {camera.name}")
 
 
-@check(
-    group="calibration",
+@calibration_check(
     measures="extrinsics against the camera's mount on the robot",
     unit="m",
     warn=1e-5,
@@ -62,15 +70,11 @@ def intrinsics(episode: CheckedEpisode) -> Found:
         "info.scene.robot.world_from_base",
     ),
 )
-def extrinsics(episode: CheckedEpisode) -> Found:
+def extrinsics(episode: CheckedEpisode) -> Iterator[Found]:
     """Recorded camera poses are those of the mount, by forward kinematics (0.1 m per rad of rotation)."""
-    found = []
     for camera in episode.cameras:
         off = displacement(matrices(episode.columns.world_from_camera[camera.name]), _expected(episode, camera))
-        if len(off):
-            frame = int(np.argmax(off))
-            found.append(Measurement(value=float(off[frame]), frame=frame, detail=f"camera {camera.name}"))
-    return worst(*found)
+        yield worst_frame(off, f"camera {camera.name}")
 
 
 def _expected(episode: CheckedEpisode, camera: Camera) -> Array:
@@ -78,12 +82,11 @@ def _expected(episode: CheckedEpisode, camera: Camera) -> Array:
     if camera.mount == "world":
         return np.broadcast_to(mounted, (episode.num_frames, 4, 4))
     try:
-        link = episode.base_from_link(camera.mount)
+        return np.asarray(episode.world_from_link(camera.mount) @ mounted)
     except RecordingError as error:
         if not isinstance(error.__cause__, KeyError):  # damage is no wrong camera
             raise
         return np.full((episode.num_frames, 4, 4), np.inf)
-    return np.asarray(episode.world_from_base @ link @ mounted)
 
 
 def _allowance(episode: CheckedEpisode, camera: Camera) -> float:
@@ -94,8 +97,7 @@ def _allowance(episode: CheckedEpisode, camera: Camera) -> float:
     return angle / (2 * math.tan(camera.fov_y / 2))
 
 
-@check(
-    group="calibration",
+@calibration_check(
     measures="shift of the pictures against what the recorded numbers make of them, of the height",
     unit="%",
     needs_pictures=True,
@@ -106,33 +108,25 @@ def _allowance(episode: CheckedEpisode, camera: Camera) -> float:
         "info.behaviour",
     ),
 )
-def projection(episode: CheckedEpisode) -> Found:
+@of_each_camera
+def projection(episode: CheckedEpisode, camera: Camera, compared: PictureComparison) -> Found:
     """Recorded poses, projected with K and extrinsics, fall where the picture has them.
 
     The pictures are drawn anew from joints, objects, K and mounts, and the shift that fits best is measured over all
     frames. Catches mirrored and flipped pictures, a wrong K, pictures or the name of another camera, swapped colours.
     Where the episode has a calibration error of its own, which it names, that much is allowed.
     """
-    found: list[Found] = []
-    for camera in episode.cameras:
-        compared = episode.compared(camera)
-        if isinstance(compared, NotMeasured):
-            found.append(compared)
-            continue
-        usual = float(np.median(compared.unlike))
-        if usual > UNRELATED:
-            detail = f"camera {camera.name}: its pictures show something else than the recorded numbers ({usual:.0f})"
-            found.append(Measurement(value=math.inf, frame=int(np.argmax(compared.unlike)), detail=detail))
-            continue
-        told = (episode.recorded_intrinsics(camera.name) - camera.intrinsics)[:2, 2] / camera.height
-        off = float(np.linalg.norm(compared.shift - told))
-        detail = f"camera {camera.name}: {off * camera.height:.2f} px"
-        found.append(Measurement(value=100 * max(off - _allowance(episode, camera), 0.0), detail=detail))
-    return worst(*found)
+    usual = float(np.median(compared.unlike))
+    if usual > UNRELATED:
+        detail = f"camera {camera.name}: its pictures show something else than the recorded numbers ({usual:.0f})"
+        return Measurement(value=math.inf, frame=int(np.argmax(compared.unlike)), detail=detail)
+    told = (episode.recording.calibration(camera.name).intrinsics - camera.intrinsics)[:2, 2] / camera.height
+    off = float(np.linalg.norm(compared.shift - told))
+    detail = f"camera {camera.name}: {off * camera.height:.2f} px"
+    return Measurement(value=100 * max(off - _allowance(episode, camera), 0.0), detail=detail)
 
 
-@check(
-    group="calibration",
+@calibration_check(
     measures="size of what the pictures show against what the recorded numbers make of it, off 1",
     needs_pictures=True,
     reads=(
@@ -141,96 +135,63 @@ def projection(episode: CheckedEpisode) -> Found:
         "info.scene.cameras.fov_y",
     ),
 )
-def projected_size(episode: CheckedEpisode) -> Found:
+@of_each_camera
+def projected_size(episode: CheckedEpisode, camera: Camera, compared: PictureComparison) -> Found:
     """Things are as large in the picture as their distance and K make them: catches a wrong focal length or scale."""
-    found: list[Found] = []
-    for camera in episode.cameras:
-        compared = episode.compared(camera)
-        if isinstance(compared, NotMeasured):
-            found.append(compared)
-            continue
-        told = float(episode.recorded_intrinsics(camera.name)[1, 1] / camera.intrinsics[1, 1])
-        size = (1 + compared.scale) / told
-        detail = f"camera {camera.name}: things appear {size:.3f} times as large"
-        found.append(Measurement(value=abs(size - 1), detail=detail))
-    return worst(*found)
+    told = float(episode.recording.calibration(camera.name).intrinsics[1, 1] / camera.intrinsics[1, 1])
+    size = (1 + compared.scale) / told
+    return Measurement(value=abs(size - 1), detail=f"camera {camera.name}: things appear {size:.3f} times as large")
 
 
-@check(
-    group="alignment",
+@alignment_check(
     measures="lag between pictures and numbers, frames",
     needs_pictures=True,
-    reads=(
-        *COLOR_TOPICS,
-        "/camera/{camera}/depth",
-        "/camera/{camera}/segmentation",
-        "/joint_states",
-        "/object/{body}/pose",
-    ),
+    reads=(*PICTURE_TOPICS, *MOTION_TOPICS),
 )
-def picture_lag(episode: CheckedEpisode) -> Found:
+def picture_lag(episode: CheckedEpisode) -> Iterator[Found]:
     """Picture t shows state t: robot and objects are where the numbers of the same frame put them.
 
     Colour, depth and labels of each camera against the pictures that are drawn of the frames before and after. Where
     less than a dozen frames show any motion nothing is told.
     """
-    found: list[Found] = []
     for camera in episode.cameras:
         for kind in episode.kinds(camera.name):
-            compared = episode.compared(camera, kind)
-            if isinstance(compared, NotMeasured):
-                found.append(compared)
-            elif compared.lag is None:
-                found.append(NotMeasured(why=f"too little moves before camera {camera.name}"))
-            else:
-                detail = f"camera {camera.name}, {kind}: {compared.lag:+.2f} frames late"
-                found.append(Measurement(value=abs(compared.lag), detail=detail))
-    return worst(*found)
+            what = f"camera {camera.name}, {kind}"
+            yield judge_lag(episode.compared(camera, kind), what, f"camera {camera.name}")
 
 
-@check(
-    group="calibration",
+@calibration_check(
     measures="share of a depth picture that is not what the recorded numbers make of it",
     needs_pictures=True,
     reads=(
         "/camera/{camera}/depth",
-        "/joint_states",
-        "/object/{body}/pose",
+        *MOTION_TOPICS,
         "info.scene.bodies.shape",
         "info.scene.cameras.far",
     ),
 )
-def depth_matches_scene(episode: CheckedEpisode) -> Found:
+def depth_matches_scene(episode: CheckedEpisode) -> Iterator[Found]:
     """Depth is metres along the optical axis, in every frame: catches other units, distances along the ray, flips."""
     return _strays(episode, "depth")
 
 
-@check(
-    group="calibration",
+@calibration_check(
     measures="share of a picture of labels that is not what the recorded numbers make of it",
     needs_pictures=True,
     reads=(
         "/camera/{camera}/segmentation",
-        "/joint_states",
-        "/object/{body}/pose",
+        *MOTION_TOPICS,
         "info.scene.bodies.shape",
     ),
 )
-def segmentation_matches_scene(episode: CheckedEpisode) -> Found:
+def segmentation_matches_scene(episode: CheckedEpisode) -> Iterator[Found]:
     """Every pixel has the label of the body that geometry puts there, in every frame."""
     return _strays(episode, "labels")
 
 
-def _strays(episode: CheckedEpisode, kind: ImageKind) -> Found:
-    """The largest share of any picture of a kind."""
-    found: list[Found] = []
+def _strays(episode: CheckedEpisode, kind: ImageKind) -> Iterator[Found]:
+    """The largest share of any picture of a kind, of each camera."""
     for camera in episode.cameras:
-        if kind not in episode.kinds(camera.name):
-            continue
-        share = episode.strays(camera, kind)
-        if isinstance(share, NotMeasured):
-            found.append(share)
-            continue
-        frame = int(np.argmax(share))
-        found.append(Measurement(value=float(share[frame]), frame=frame, detail=f"camera {camera.name}"))
-    return worst(*found)
+        if kind in episode.kinds(camera.name):
+            share = episode.strays(camera, kind)
+            yield share if isinstance(share, NotMeasured) else worst_frame(share, f"camera {camera.name}")

@@ -7,13 +7,15 @@ from __future__ import annotations
 
 import zlib
 from collections import Counter
-from functools import cached_property
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from demorec.check.base import Found, Measurement, NotMeasured, check, worst
+from demorec.check.base import Found, Measurement, NotMeasured, check, collected_check, worst_frame
+from demorec.check.file import complete
 from demorec.recording import CollectedRecording
 from demorec.recording.collected.streams import SUBTASK
 from demorec.recording.collected.transforms import JointPositions
@@ -21,7 +23,7 @@ from demorec.recording.container import Container
 from demorec.recording.video import decode
 from demorec.runs.collected import load_collected_run
 from demorec.runs.run_file import EPISODES, sha256_of
-from demorec.scene.collected import COLLECTED_VERSION, NO_PICTURE, CollectedColumns
+from demorec.scene.collected import COLLECTED_VERSION, NO_PICTURE
 from demorec.scene.urdf import Urdf
 
 NOT_APPLICABLE = "not applicable: the episode was collected, and this needs the scene of a simulated one"
@@ -32,150 +34,92 @@ _STILL_FRAMES = 20
 """Of an episode with fewer frames nobody can tell a stuck sensor from a still robot."""
 
 
-class CollectedSubject:
-    """A recording of a collected episode, open for the checks.
-
-    Attributes:
-        recording: It.
-    """
-
-    def __init__(self, recording: CollectedRecording) -> None:
-        self.recording = recording
-
-    @property
-    def columns(self) -> CollectedColumns:
-        """All numbers."""
-        return self.recording.columns()
-
-    @cached_property
-    def contrast(self) -> dict[str, list[float]]:
-        """Camera -> standard deviation of the levels of each of its pictures, decoded once."""
-        found = {}
-        for camera in self.recording.cameras:
-            images = decode(self.recording.video_settings(camera), self.recording.packets(camera))
-            found[camera] = [float(image[::4, ::4].std()) for image in images]
-        return found
-
-    @cached_property
-    def measured(self) -> dict[str, list[float]]:
-        """Depth camera -> in each of its pictures, the share of pixels that measured a distance."""
-        return {
-            camera: [float(np.mean(np.isfinite(values) & (values > 0))) for values in self.recording.distances(camera)]
-            for camera in self.recording.depth_cameras
-        }
-
-
-@check(
-    scope="collected",
+@collected_check(
     group="file",
     measures="collected episodes that cannot be opened (index, metadata, format version)",
-    warn=0,
     reads=("metadata demorec.collected",),
 )
-def collected_opens(subject: CollectedSubject) -> Measurement:
+def collected_opens(recording: CollectedRecording) -> Measurement:
     """The index and the metadata pass their checksums and are of a known format version."""
-    return Measurement(value=0, detail=f"format {subject.recording.info.format_version} of {COLLECTED_VERSION}")
+    return Measurement(value=0, detail=f"format {recording.info.format_version} of {COLLECTED_VERSION}")
 
 
-@check(
-    scope="collected",
+@collected_check(
     group="file",
     measures="topics whose message count differs from the index; every chunk passes its CRC",
-    warn=0,
     reads=("metadata demorec.collected",),
 )
-def collected_checksums(subject: CollectedSubject) -> Measurement:
+def collected_checksums(recording: CollectedRecording) -> Measurement:
     """Every byte that holds a message passes its checksum, and the index counts the messages right."""
-    container = Container(subject.recording.path)
-    try:
+    with closing(Container(recording.path)) as container:
         counts = Counter(message.topic for message in container.messages(tuple(container.channels)))
-    finally:
-        container.close()
-    wrong = [topic for topic, (_, count) in subject.recording.topics.items() if counts[topic] != count]
+    wrong = [topic for topic, (_, count) in recording.topics.items() if counts[topic] != count]
     return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{sum(counts.values())} messages")
 
 
-@check(
-    scope="collected",
+@collected_check(
     group="file",
     measures="streams that do not decode into numbers, or into words",
-    warn=0,
     reads=("/frames", "/{feature}", SUBTASK),
 )
-def collected_readable(subject: CollectedSubject) -> Measurement:
+def collected_readable(recording: CollectedRecording) -> Measurement:
     """Every message has the layout that the metadata promises, at its frame's time."""
-    said = f", {len(subject.recording.subtasks)} subtasks" if subject.recording.subtasks else ""
-    return Measurement(value=0, detail=f"{subject.columns.num_frames} frames{said}")
+    said = f", {len(recording.subtasks)} subtasks" if recording.subtasks else ""
+    return Measurement(value=0, detail=f"{recording.columns().num_frames} frames{said}")
 
 
-@check(
-    scope="collected",
-    group="file",
-    measures="recordings that a crash cut off (recovered, without an outcome)",
-    warn=0,
-    fail=1,
-    reads=("metadata demorec.recovered",),
-)
-def collected_complete(subject: CollectedSubject) -> Measurement:
-    """The episode was recorded to its end."""
-    cut = subject.recording.outcome is None
-    return Measurement(value=int(cut), detail="recovered from a crash, no outcome" if cut else "")
+collected_complete = replace(complete, name="collected_complete", scope="collected")
 
 
-@check(
-    scope="collected",
+@collected_check(
     group="time",
     measures="frames and pictures that were dropped while recording",
-    warn=0,
     fail=float("inf"),
     reads=("metadata demorec.outcome",),
 )
-def collected_drops(subject: CollectedSubject) -> Found:
+def collected_drops(recording: CollectedRecording) -> Found:
     """What came could be taken."""
-    outcome = subject.recording.outcome
+    outcome = recording.outcome
     if outcome is None:
         return NotMeasured(why="the recording has no outcome, which would tell")
     lost = ", ".join(f"{count} of {what}" for what, count in outcome.drops.items() if count)
     return Measurement(value=sum(outcome.drops.values()), detail=lost)
 
 
-@check(
-    scope="collected",
+@collected_check(
     group="time",
     measures="how much the frames' mean rate differs from the nominal one, as a share of it",
     warn=0.05,
     fail=0.5,
     reads=("/frames",),
 )
-def collected_rate(subject: CollectedSubject) -> Found:
+def collected_rate(recording: CollectedRecording) -> Found:
     """The frames came at the rate that the episode names, by which datasets and policies go."""
-    times, fps = subject.columns.time_ns, subject.recording.info.fps
+    times, fps = recording.columns().time_ns, recording.info.fps
     if len(times) < 2:
         return None
     rate = (len(times) - 1) * _NANOSECONDS / float(times[-1] - times[0])
     return Measurement(value=abs(rate / fps - 1), detail=f"{rate:.4g} Hz instead of {fps} Hz")
 
 
-@check(
-    scope="collected",
+@collected_check(
     group="time",
     measures="the longest time between two frames, in nominal periods",
     warn=2.5,
     fail=30,
     reads=("/frames",),
 )
-def collected_gaps(subject: CollectedSubject) -> Found:
+def collected_gaps(recording: CollectedRecording) -> Found:
     """No frames are missing between others."""
-    steps = np.diff(subject.columns.time_ns)
+    steps = np.diff(recording.columns().time_ns)
     if not len(steps):
         return None
     frame = int(steps.argmax())
-    periods = float(steps[frame]) * subject.recording.info.fps / _NANOSECONDS
+    periods = float(steps[frame]) * recording.info.fps / _NANOSECONDS
     return Measurement(value=periods, frame=frame + 1, detail=f"{steps[frame] / 1e6:.4g} ms after the frame before")
 
 
-@check(
-    scope="collected",
+@collected_check(
     group="alignment",
     unit="s",
     measures="the largest distance between the stamps of a frame and of a sample that it holds",
@@ -183,14 +127,14 @@ def collected_gaps(subject: CollectedSubject) -> Found:
     fail=1.0,
     reads=("/frames",),
 )
-def collected_sample_age(subject: CollectedSubject) -> Found:
+def collected_sample_age(recording: CollectedRecording) -> Iterator[Found]:
     """What a frame holds was sensed at about its time."""
-    columns = subject.columns
-    return worst(*(_oldest(columns.age_ns(name), None, name) for name in columns.stamps))
+    columns = recording.columns()
+    for name in columns.stamps:
+        yield worst_frame(np.abs(columns.age_ns(name)) / _NANOSECONDS, name)
 
 
-@check(
-    scope="collected",
+@collected_check(
     group="alignment",
     unit="s",
     measures="the largest distance between the stamps of a frame and of a picture that it holds",
@@ -198,83 +142,65 @@ def collected_sample_age(subject: CollectedSubject) -> Found:
     fail=1.0,
     reads=("/frames", "/camera/{camera}/h264"),
 )
-def collected_picture_age(subject: CollectedSubject) -> Found:
+def collected_picture_age(recording: CollectedRecording) -> Iterator[Found]:
     """The pictures that a frame holds were taken at about its time."""
-    columns = subject.columns
-    found = []
+    columns = recording.columns()
     for camera, numbers in columns.pictures.items():
         frames = np.flatnonzero(numbers != NO_PICTURE)
-        found.append(_oldest(columns.picture_age_ns(camera), frames, f"camera {camera}"))
-    return worst(*found)
+        yield worst_frame(np.abs(columns.picture_age_ns(camera)) / _NANOSECONDS, f"camera {camera}", frames=frames)
 
 
-def _oldest(ages: NDArray[np.int64], frames: NDArray[np.intp] | None, what: str) -> Measurement | None:
-    if not len(ages):
-        return None
-    index = int(np.abs(ages).argmax())
-    frame = index if frames is None else int(frames[index])
-    return Measurement(value=abs(float(ages[index])) / _NANOSECONDS, frame=frame, detail=what)
-
-
-@check(
-    scope="collected",
+@collected_check(
     group="pictures",
     measures="the share of frames that have no picture of a camera",
-    warn=0,
     fail=0.5,
     reads=("/frames",),
 )
-def collected_missing_pictures(subject: CollectedSubject) -> Found:
+def collected_missing_pictures(recording: CollectedRecording) -> Iterator[Found]:
     """Every frame has a picture of every camera."""
-    found = []
-    for camera, numbers in subject.columns.pictures.items():
+    for camera, numbers in recording.columns().pictures.items():
         without = np.flatnonzero(numbers == NO_PICTURE)
         if len(numbers):
             first = int(without[0]) if len(without) else None
             told = f"camera {camera}: {len(without)} of {len(numbers)} frames"
-            found.append(Measurement(value=len(without) / len(numbers), frame=first, detail=told))
-    return worst(*found)
+            yield Measurement(value=len(without) / len(numbers), frame=first, detail=told)
 
 
-@check(
-    scope="collected",
+@collected_check(
     group="physics",
     measures="how far joints are beyond their limits, rad or m",
     warn=0.01,
     fail=0.2,
     reads=("/{feature}", "/robot_description"),
 )
-def collected_joint_limits(subject: CollectedSubject) -> Found:
+def collected_joint_limits(recording: CollectedRecording) -> Iterator[Found]:
     """Observed joints are within the limits of the URDF."""
-    info = subject.recording.info
+    info = recording.info
     if not info.urdf:
-        return NotMeasured(why="the robot's URDF is not known")
+        yield NotMeasured(why="the robot's URDF is not known")
+        return
     positions = JointPositions(info.features)
     limits = {joint.name: (joint.lower, joint.upper) for joint in Urdf.parse(info.urdf).joints}
-    if not positions.joints or not subject.columns.num_frames:
-        return NotMeasured(why="no element of the observations is said to be a joint's position")
-    values = positions.of(subject.columns.features)
-    found = []
-    for index, joint in enumerate(positions.joints):
+    if not positions.joints or not recording.columns().num_frames:
+        yield NotMeasured(why="no element of the observations is said to be a joint's position")
+        return
+    values = positions.of(recording.columns().features)
+    for joint, column in zip(positions.joints, values.T, strict=False):
         lower, upper = limits[joint]
-        beyond = np.maximum(values[:, index] - upper, lower - values[:, index])
-        frame = int(beyond.argmax())
-        found.append(Measurement(value=max(float(beyond[frame]), 0.0), frame=frame, detail=joint))
-    return worst(*found)
+        if (beyond := worst_frame(np.maximum(column - upper, lower - column), joint)) is not None:
+            yield replace(beyond, value=max(beyond.value, 0.0))
 
 
-@check(
-    scope="collected",
+@collected_check(
     group="physics",
     measures="observed features that never change while the actions do",
-    warn=0,
     fail=1,
     reads=("/{feature}",),
 )
-def collected_stuck(subject: CollectedSubject) -> Found:
+def collected_stuck(recording: CollectedRecording) -> Found:
     """Sensors are alive: no feature of the observations stays at one value, in all elements, while commands change."""
-    features = subject.columns.features
-    if subject.columns.num_frames < _STILL_FRAMES:
+    features = recording.columns().features
+    if recording.columns().num_frames < _STILL_FRAMES:
         return NotMeasured(why=f"the episode has fewer than {_STILL_FRAMES} frames")
     changing = {name for name, values in features.items() if np.ptp(values, axis=0).any()}
     if "action" in features and "action" not in changing:
@@ -283,42 +209,42 @@ def collected_stuck(subject: CollectedSubject) -> Found:
     return Measurement(value=len(stuck), detail=", ".join(stuck))
 
 
-@check(
-    scope="collected",
+@collected_check(
     group="pictures",
     measures="cameras whose pictures do not decode, are of another size, or show one colour, or no distance, in more "
     "than half of them",
-    warn=0,
     needs_pictures=True,
     reads=("/camera/{camera}/h264", "/camera/{camera}/depth"),
 )
-def collected_pictures(subject: CollectedSubject) -> Found:
+def collected_pictures(recording: CollectedRecording) -> Found:
     """Every picture decodes and shows something."""
-    if not subject.recording.info.cameras:
+    if not recording.info.cameras:
         return None
-    measured = subject.measured.items()
-    blank = [
-        camera for camera, levels in subject.contrast.items() if levels and float(np.median(levels)) < _BLANK_LEVELS
-    ]
-    blank += [camera for camera, shares in measured if shares and float(np.median(shares)) == 0]
+    blank, unmeasured = [], []
+    for camera in recording.depth_cameras:
+        shares = [float(np.mean(np.isfinite(values) & (values > 0))) for values in recording.distances(camera)]
+        if shares and float(np.median(shares)) == 0:
+            unmeasured.append(camera)
+    for camera in recording.cameras:
+        images = decode(recording.video_settings(camera), recording.packets(camera))
+        deviations = [float(image[::4, ::4].std()) for image in images]
+        if deviations and float(np.median(deviations)) < _BLANK_LEVELS:
+            blank.append(camera)
+    blank += unmeasured
     return Measurement(value=len(blank), detail=", ".join(f"camera {camera} shows nothing" for camera in blank))
 
 
-@check(
-    scope="collected",
+@collected_check(
     group="pictures",
     measures="pairs of cameras with the same coded pictures",
-    warn=0,
     reads=("/camera/{camera}/h264",),
 )
-def collected_distinct_cameras(subject: CollectedSubject) -> Found:
+def collected_distinct_cameras(recording: CollectedRecording) -> Found:
     """No two cameras give the very same pictures, as when one is plugged in under two names."""
-    digests = {}
-    for camera in subject.recording.cameras:
-        digest = 0
-        for packet in subject.recording.packets(camera):
-            digest = zlib.crc32(packet.data, digest)
-        digests[camera] = digest
+    digests = dict.fromkeys(recording.cameras, 0)
+    for camera in digests:
+        for packet in recording.packets(camera):
+            digests[camera] = zlib.crc32(packet.data, digests[camera])
     if len(digests) < 2:
         return None
     twins = [camera for camera, digest in digests.items() if list(digests.values()).count(digest) > 1 and digest]
@@ -329,7 +255,6 @@ def collected_distinct_cameras(subject: CollectedSubject) -> Found:
     scope="collected_run",
     group="run",
     measures="recordings of a collected run that are missing, unlisted or other files than run.json lists",
-    warn=0,
     reads=("metadata demorec.collected",),
 )
 def collected_run_files(folder: Path) -> Measurement:

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from PIL import Image, ImageDraw
 
-from demorec.check.base import Measurement
+from demorec.check.base import Found, Measurement, worst
 from demorec.errors import ConfigError
 from demorec.geometry import Array
 from demorec.safety.replacing import PICTURE, written_whole
@@ -23,6 +22,7 @@ _MIN_VALUES = 10
 """A quantity with fewer distinct values was not drawn from a range."""
 _MAX_SHARE = 1 / 8
 """A value that more of the episodes share was chosen and not drawn."""
+_TWIN_DISTANCE = 1e-4
 _SIZE, _LEFT, _TOP = 360, 56, 32
 _PLOT_WIDTH, _PLOT_HEIGHT, _PLOT_LEFT, _PLOT_BELOW = 140, 84, 44, 48
 _COLUMNS = 3
@@ -77,6 +77,14 @@ def _values(scene: Scene) -> dict[str, float]:
     return values
 
 
+def worst_gap(infos: Sequence[EpisodeInfo]) -> Found:
+    """The largest gap over all tasks."""
+    by_task: dict[str, list[EpisodeInfo]] = {}
+    for info in infos:
+        by_task.setdefault(info.task, []).append(info)
+    return worst(*map(largest_gap, by_task.values()))
+
+
 def largest_gap(infos: Sequence[EpisodeInfo]) -> Measurement | None:
     """The largest stretch of any randomised quantity in which no episode lies, as a share of its range."""
     if len(infos) < MIN_EPISODES:
@@ -106,8 +114,8 @@ def start_vector(scene: Scene) -> Array:
     return np.concatenate(parts)
 
 
-def twins(rows: Sequence[Array], names: Sequence[str], *, tolerance: float) -> tuple[int, str]:
-    """How many rows are within `tolerance` (root mean square) of an earlier one, and the first such pair."""
+def twins(rows: Sequence[Array], names: Sequence[str], what: str) -> Measurement:
+    """How many rows are within 1e-4 (root mean square) of an earlier one, and the first such pair; `what` they are."""
     count, first = 0, ""
     by_length: dict[int, list[int]] = {}
     for index, row in enumerate(rows):
@@ -117,29 +125,21 @@ def twins(rows: Sequence[Array], names: Sequence[str], *, tolerance: float) -> t
         # Sorted along the widest column, only neighbours within the tolerance have to be compared.
         axis = int(np.argmax(np.ptp(table, axis=0))) if len(table) > 1 else 0
         order = np.argsort(table[:, axis], kind="stable")
-        reach = tolerance * math.sqrt(table.shape[1]) if table.size else 0.0
+        reach = _TWIN_DISTANCE * math.sqrt(table.shape[1]) if table.size else 0.0
         is_twin = np.zeros(len(group), dtype=bool)
         for place, i in enumerate(order):
             for j in order[place + 1 :]:
                 if table[j, axis] - table[i, axis] > reach:
                     break
-                if math.sqrt(float(((table[i] - table[j]) ** 2).mean())) <= tolerance:
+                if math.sqrt(float(((table[i] - table[j]) ** 2).mean())) <= _TWIN_DISTANCE:
                     later, earlier = max(i, j), min(i, j)
                     is_twin[later] = True
                     first = first or f"{names[group[later]]} is like {names[group[earlier]]}"
         count += int(is_twin.sum())
-    return count, first
+    return Measurement(value=count, detail=first or f"{len(rows)} different {what}")
 
 
-@dataclass(frozen=True, kw_only=True)
-class CoveragePicture:
-    """What was drawn: the file and how many episodes are in it."""
-
-    path: Path
-    num_episodes: int
-
-
-def draw_coverage(infos: Sequence[EpisodeInfo], path: Path) -> CoveragePicture:
+def draw_coverage(infos: Sequence[EpisodeInfo], path: Path) -> None:
     """A PNG file: starts (dots, in the object's colour) and goals (rings) from above, and a histogram per quantity.
 
     Raises:
@@ -162,7 +162,6 @@ def draw_coverage(infos: Sequence[EpisodeInfo], path: Path) -> CoveragePicture:
             image.save(part, format="png")
     except OSError as error:
         raise ConfigError(f"The picture cannot be written ({error.strerror or error}): {path}") from error
-    return CoveragePicture(path=path, num_episodes=len(infos))
 
 
 def _draw_map(draw: ImageDraw.ImageDraw, infos: Sequence[EpisodeInfo]) -> None:
@@ -227,11 +226,3 @@ def _draw_histogram(draw: ImageDraw.ImageDraw, name: str, values: Array, left: i
     draw.text((left - 4, top), str(most), fill="black", anchor="rt")
     draw.text((left - 4, bottom), "0", fill="black", anchor="rb")
     draw.text((left + _PLOT_WIDTH / 2, bottom + 18), "episodes per bin", fill="grey", anchor="mt")
-
-
-def infos_by_task(infos: Sequence[EpisodeInfo]) -> Mapping[str, list[EpisodeInfo]]:
-    """Episodes of the same task and scene layout."""
-    groups: dict[str, list[EpisodeInfo]] = {}
-    for info in infos:
-        groups.setdefault(info.task, []).append(info)
-    return groups

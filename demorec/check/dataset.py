@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 
 from demorec.check.base import NotMeasured
@@ -54,6 +55,12 @@ class DescribedEpisode:
     rows: Rows
     kept: dict[str, Any]
     info: EpisodeInfo
+
+
+def read_rows(folder: Path, names: Sequence[str], *, schema: pa.Schema | None = None) -> list[dict[str, Any]]:
+    """Some columns of all tables of episodes below a folder, as `read_table` reads each."""
+    paths = sorted((folder / "episodes").glob("*/*.parquet"))
+    return [row for path in paths for row in read_table(path, names, schema=schema).to_pylist()]
 
 
 class Dataset:
@@ -117,15 +124,19 @@ class Dataset:
         return self._pictures[key]
 
     @cached_property
-    def compared(self) -> list[Mapping[str, PictureComparison] | NotMeasured]:
-        """Camera -> how each episode begins in its pictures, against states and scene; only with a sidecar."""
+    def compared(self) -> list[tuple[int, str, PictureComparison | NotMeasured]]:
+        """(episode, camera, how its pictures begin against states and scene); only with a sidecar.
+
+        Where nothing can be told of an episode it is there once, without a camera.
+        """
         keys = {key.removeprefix(IMAGE_PREFIX): key for key in self.colour_keys}
-        found = []
+        found: list[tuple[int, str, PictureComparison | NotMeasured]] = []
         for each in self.described():
-            number, rows, info = each.number, each.rows, each.info
-            names = [camera.name for camera in info.scene.cameras if camera.name in keys]
-            seen = {name: self.pictures(keys[name])[number].cells.astype(np.float32) for name in names}
-            found.append(compare_beginning(info, rows[STATE].astype(np.float64), self.info.fps, seen))
+            names = [camera.name for camera in each.info.scene.cameras if camera.name in keys]
+            seen = {name: self.pictures(keys[name])[each.number].cells.astype(np.float32) for name in names}
+            compared = compare_beginning(each.info, each.rows[STATE].astype(np.float64), self.info.fps, seen)
+            of_cameras = {"": compared} if isinstance(compared, NotMeasured) else compared
+            found += [(each.number, camera, pictures) for camera, pictures in of_cameras.items()]
         return found
 
     @cached_property
@@ -135,10 +146,7 @@ class Dataset:
             "episode_index", "success", "num_retries", "content_digest", "frame_stride", "phases", "objects", "goals",
             "deliberate_miss_frames", "episode_info",
         ]  # fmt: skip
-        rows: list[dict[str, Any]] = []
-        for path in sorted((self.path / SIDECAR_DIR / "episodes").glob("*/*.parquet")):
-            rows += read_table(path, names, schema=EPISODE_SCHEMA).to_pylist()
-        return rows
+        return read_rows(self.path / SIDECAR_DIR, names, schema=EPISODE_SCHEMA)
 
     @cached_property
     def robot_digests(self) -> dict[int, str | None]:

@@ -6,18 +6,15 @@ from typing import Any
 
 import numpy as np
 
-from demorec.check.base import Measurement, check
+from demorec.check.base import Measurement, dataset_check
 from demorec.check.dataset import Dataset
 from demorec.lerobot.facts import facts_of
 from demorec.lerobot.files import open_table, read_table
 from demorec.lerobot.progress import PROGRESS_PATH, STAGE_COLUMNS, progress_table, read_progress
 
 
-@check(
-    group="dataset",
-    scope="dataset",
+@dataset_check(
     measures="columns of the table of episodes that the sidecar contradicts",
-    warn=0,
     reads=("meta/episodes", "demorec/"),
 )
 def dataset_facts(dataset: Dataset) -> Measurement | None:
@@ -48,11 +45,8 @@ def dataset_facts(dataset: Dataset) -> Measurement | None:
     return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{len(rows)} episodes")
 
 
-@check(
-    group="dataset",
-    scope="dataset",
+@dataset_check(
     measures="rows of sarm_progress.parquet that the episodes' stages contradict",
-    warn=0,
     reads=(PROGRESS_PATH, "meta/episodes"),
 )
 def dataset_progress(dataset: Dataset) -> Measurement | None:

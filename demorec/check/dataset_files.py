@@ -12,7 +12,7 @@ import tempfile
 
 import numpy as np
 
-from demorec.check.base import Measurement, check
+from demorec.check.base import Measurement, dataset_check
 from demorec.check.dataset import Dataset
 from demorec.errors import ExportError, MissingDependencyError
 from demorec.lerobot.inspect import dataset_problems, episode_digests
@@ -20,11 +20,8 @@ from demorec.lerobot.reader import PacketReader
 from demorec.lerobot.verify import LEROBOT, lerobot_is_installed
 
 
-@check(
-    group="dataset",
-    scope="dataset",
+@dataset_check(
     measures="tables that cannot be read",
-    warn=0,
     reads=(
         "meta/info.json",
         "meta/episodes",
@@ -36,11 +33,8 @@ def dataset_readable(dataset: Dataset) -> Measurement:
     return Measurement(value=0, detail=f"{len(dataset.rows)} episodes, {frames} frames, {len(dataset.tasks)} tasks")
 
 
-@check(
-    group="dataset",
-    scope="dataset",
+@dataset_check(
     measures="counters, indices and timestamps that are not as they must be",
-    warn=0,
     reads=(
         "timestamp",
         "frame_index",
@@ -80,11 +74,8 @@ def dataset_counts(dataset: Dataset) -> Measurement:
     return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{start} frames at {info.fps} fps")
 
 
-@check(
-    group="dataset",
-    scope="dataset",
+@dataset_check(
     measures="episodes without a coded picture for every frame",
-    warn=0,
     reads=(
         "observation.images.{camera}",
         "observation.images.{camera}_depth",
@@ -116,11 +107,8 @@ def dataset_videos(dataset: Dataset) -> Measurement | None:
     return Measurement(value=len(wrong), detail="; ".join(wrong[:2]) or f"{len(dataset.info.video_keys)} cameras")
 
 
-@check(
-    group="dataset",
-    scope="dataset",
+@dataset_check(
     measures="episodes on which dataset and sidecar disagree",
-    warn=0,
     reads=("demorec/",),
 )
 def dataset_sidecar(dataset: Dataset) -> Measurement | None:
@@ -162,11 +150,8 @@ print(json.dumps({"episodes": dataset.num_episodes, "frames": len(dataset)}))
 """
 
 
-@check(
-    group="dataset",
-    scope="dataset",
+@dataset_check(
     measures="errors when the installed LeRobot opens it",
-    warn=0,
     needs_pictures=True,
     reads=("meta/info.json",),
 )

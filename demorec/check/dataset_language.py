@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from demorec.check.base import Found, Measurement, NotMeasured, check
+from demorec.check.base import Found, Measurement, NotMeasured, dataset_check
 from demorec.check.dataset import Dataset
 from demorec.language.kinds import STATES
 from demorec.language.questions import ANSWERS
@@ -31,11 +31,8 @@ _EVENTS = {*_ABOUT_PICTURES, "interjection", None}
 _ROLES = ("user", "assistant", "system", "tool")
 
 
-@check(
-    group="dataset",
-    scope="dataset",
+@dataset_check(
     measures="entries of the language columns that are not as LeRobot has them",
-    warn=0,
     reads=COLUMNS,
 )
 def dataset_language(dataset: Dataset) -> Measurement | None:
@@ -125,11 +122,8 @@ def _points(answer: Row) -> Iterator[tuple[float, float]]:
         yield (float(point[0]), float(point[1])) if numbers else (math.nan, math.nan)
 
 
-@check(
-    group="dataset",
-    scope="dataset",
+@dataset_check(
     measures="statements that the phases, the scene or the boxes beside the dataset contradict",
-    warn=0,
     reads=(*COLUMNS, "demorec/"),
 )
 def dataset_language_truth(dataset: Dataset) -> Found:

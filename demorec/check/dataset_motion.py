@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 
-from demorec.check.alignment import servo_response
-from demorec.check.base import Measurement, check, worst
-from demorec.check.coverage import infos_by_task, largest_gap, twins
+from demorec.check.alignment import nearest_lag, servo_response
+from demorec.check.base import Found, Measurement, dataset_check, worst, worst_frame
+from demorec.check.coverage import twins, worst_gap
 from demorec.check.dataset import Dataset, Rows
 from demorec.check.rows import LinkMatrices, displacement, matrices
 from demorec.check.run import motion_vector
@@ -20,11 +21,8 @@ from demorec.scene.features import ACTION, EE_POSE, STATE, VELOCITY
 from demorec.scene.urdf import Urdf
 
 
-@check(
-    group="dataset",
-    scope="dataset",
+@dataset_check(
     measures="episodes that move like another",
-    warn=0,
     reads=("observation.state",),
 )
 def dataset_duplicates(dataset: Dataset) -> Measurement | None:
@@ -32,50 +30,39 @@ def dataset_duplicates(dataset: Dataset) -> Measurement | None:
     if len(dataset.rows) < 2 or STATE not in dataset.info.features:
         return None
     motions = [motion_vector(rows[STATE]) for rows in dataset.rows]
-    count, pair = twins(motions, [f"episode {n}" for n in range(len(motions))], tolerance=1e-4)
-    return Measurement(value=count, detail=pair or f"{len(motions)} different motions")
+    return twins(motions, [f"episode {n}" for n in range(len(motions))], "motions")
 
 
-@check(
-    group="dataset",
-    scope="dataset",
+@dataset_check(
     measures="largest gap in the range of a randomised quantity, share",
     warn=0.35,
     fail=0.6,
     reads=("demorec/",),
 )
-def dataset_coverage(dataset: Dataset) -> Measurement | None:
+def dataset_coverage(dataset: Dataset) -> Found:
     """Start places, yaws, sizes and goals are spread over their ranges (judged from 50 episodes on)."""
-    return worst(*(largest_gap(group) for group in infos_by_task(dataset.infos).values()))
+    return worst_gap(dataset.infos)
 
 
-@check(
-    group="dataset",
-    scope="dataset",
+@dataset_check(
     measures="state against joint limits and the gripper's range",
     unit="rad, m",
     warn=0.005,
     fail=0.05,
     reads=("observation.state",),
 )
-def dataset_joint_limits(dataset: Dataset) -> Measurement | None:
+def dataset_joint_limits(dataset: Dataset) -> Iterator[Found]:
     """States are rad and metres within the robot's limits."""
-    found = []
     for each in dataset.described():
-        number, rows, info = each.number, each.rows, each.info
-        robot = info.robot
-        state = rows[STATE].astype(np.float64)[:, : len(robot.arm_joints) + 1]
+        robot = each.info.robot
+        state = each.rows[STATE].astype(np.float64)[:, : len(robot.arm_joints) + 1]
         low = np.array([*robot.position_lower, 0.0])
         high = np.array([*robot.position_upper, robot.gripper.max_width])
         beyond = np.maximum(np.maximum(low - state, state - high), 0.0)
-        frame = int(np.argmax(beyond.max(axis=1)))
-        found.append(Measurement(value=float(beyond.max()), frame=frame, detail=f"episode {number}"))
-    return worst(*found)
+        yield worst_frame(beyond.max(axis=1), f"episode {each.number}")
 
 
-@check(
-    group="dataset",
-    scope="dataset",
+@dataset_check(
     measures="ratio of state differences to velocities, off 1",
     warn=0.1,
     fail=0.16,
@@ -102,9 +89,7 @@ def dataset_velocity(dataset: Dataset) -> Measurement | None:
     return Measurement(value=value, detail=f"ratio {product / square:.3f}")
 
 
-@check(
-    group="dataset",
-    scope="dataset",
+@dataset_check(
     measures="EE pose against forward kinematics of the joints",
     unit="m",
     warn=1e-4,
@@ -115,14 +100,14 @@ def dataset_velocity(dataset: Dataset) -> Measurement | None:
         "demorec/",
     ),
 )
-def dataset_forward_kinematics(dataset: Dataset) -> Measurement | None:
+def dataset_forward_kinematics(dataset: Dataset) -> Found:
     """The TCP's pose is that of the joints, wherever the dataset has it (float32; 0.1 m per rad of rotation)."""
     found = []
     for each in dataset.described():
-        number, rows, info = each.number, each.rows, each.info
+        rows, info = each.rows, each.info
         if not (told := _tcp_poses(dataset, info, rows)):
             return None
-        if (model := dataset.robot_digests[number]) is not None:
+        if (model := dataset.robot_digests[each.number]) is not None:
             urdf = dataset.robots[model].model
         else:
             try:
@@ -132,9 +117,7 @@ def dataset_forward_kinematics(dataset: Dataset) -> Measurement | None:
         joints = dict(zip(info.robot.arm_joints, rows[STATE].astype(np.float64).T, strict=False))
         fk = LinkMatrices(urdf, joints, len(rows[STATE]))[info.robot.tcp_link]
         for name, poses in told.items():
-            off = displacement(matrices(poses), fk)
-            frame = int(np.argmax(off))
-            found.append(Measurement(value=float(off[frame]), frame=frame, detail=f"{name}, episode {number}"))
+            found.append(worst_frame(displacement(matrices(poses), fk), f"{name}, episode {each.number}"))
     return worst(*found)
 
 
@@ -146,17 +129,14 @@ def _tcp_poses(dataset: Dataset, info: EpisodeInfo, rows: Rows) -> dict[str, Arr
     return told
 
 
-@check(
-    group="dataset",
-    scope="dataset",
+@dataset_check(
     measures="lag between action and state, off the contract's, frames",
-    warn=0,
     reads=(
         "action",
         "observation.state",
     ),
 )
-def dataset_action_lag(dataset: Dataset) -> Measurement | None:
+def dataset_action_lag(dataset: Dataset) -> Iterator[Found]:
     """Action t is what leads from observation t to t + 1, in every episode; catches shifted and made-up actions.
 
     Poses are compared by position. Exploration noise is in the states and not in the actions: what counts is the
@@ -164,11 +144,10 @@ def dataset_action_lag(dataset: Dataset) -> Measurement | None:
     it is taken back in them and they cannot be: then their course, smoothed, is compared with that of the changes of
     state, all episodes together, and two frames are allowed.
     """
-    found, wishes, changes = [], [], []
+    wishes, changes = [], []
     for each in dataset.described():
-        number, rows, info = each.number, each.rows, each.info
-        kind = dataset.action_kind(info)
-        if kind is None:
+        rows, info = each.rows, each.info
+        if (kind := dataset.action_kind(info)) is None:
             continue
         action, state = rows[ACTION].astype(np.float64), rows[STATE].astype(np.float64)
         arm = len(info.robot.arm_joints)
@@ -189,13 +168,13 @@ def dataset_action_lag(dataset: Dataset) -> Measurement | None:
             wishes.append(servo_response(action[:, :width], start=np.zeros(width), substeps=substeps)[1:])
             changes.append(np.diff(reached, axis=0))
             continue
-        lag = _quantile_lag(action[:, :width], reached, start, substeps=substeps)
-        if lag is not None:
-            detail = f"episode {number}: {lag:+g} frames" if math.isfinite(lag) else f"episode {number}: unrelated"
-            found.append(Measurement(value=abs(lag), detail=detail))
+        expected = servo_response(action[:, :width], start=start, substeps=substeps)
+        if (nearest := nearest_lag(expected, reached, reached, reach=3, fewest=10)) is not None:
+            lag, off = nearest
+            value, words = (math.inf, "unrelated") if off > 3.0 else (abs(lag), f"{lag:+d} frames")
+            yield Measurement(value=value, detail=f"episode {each.number}: {words}")
     if wishes:
-        found.append(_course_lag(wishes, changes))
-    return worst(*found)
+        yield _course_lag(wishes, changes)
 
 
 def _course_lag(wishes: list[Array], changes: list[Array], *, reach: int = 4, window: int = 9) -> Measurement:
@@ -217,19 +196,3 @@ def _course_lag(wishes: list[Array], changes: list[Array], *, reach: int = 4, wi
     if likeness < 0.5:
         return Measurement(value=math.inf, detail=f"actions and changes of state are unrelated ({likeness:.2f})")
     return Measurement(value=max(abs(lag) - 2, 0), detail=f"all episodes: {lag:+d} frames, likeness {likeness:.2f}")
-
-
-def _quantile_lag(wanted: Array, reached: Array, start: Array, *, substeps: int) -> float | None:
-    expected = servo_response(wanted, start=start, substeps=substeps)
-    shifts = range(-3, 4)
-    core = np.arange(3, len(expected) - 3)
-    if len(core) < 10:
-        return None
-    step = np.linalg.norm(reached[core + 1] - reached[core - 1], axis=1) / 2
-    moving = step > 0.3 * math.sqrt(float((step**2).mean()))
-    core, step = core[moving], step[moving]
-    if len(core) < 10:
-        return None
-    off = [float(np.quantile(np.linalg.norm(reached[core + k] - expected[core], axis=1) / step, 0.33)) for k in shifts]
-    best = int(np.argmin(off))
-    return math.inf if off[best] > 3.0 else float(shifts[best])

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from demorec.check.base import Measurement, check
+from demorec.check.base import Measurement, dataset_check
 from demorec.check.dataset import Dataset
 from demorec.errors import ExportError, without_path
 from demorec.lerobot.robots import read_robot
 
 
-@check(
-    group="dataset",
-    scope="dataset",
+@dataset_check(
     measures="descriptions of robots that are missing, changed or of another robot",
-    warn=0,
     reads=("demorec/",),
 )
 def dataset_robots(dataset: Dataset) -> Measurement | None:

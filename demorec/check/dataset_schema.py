@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
 
-from demorec.check.base import Measurement, check
+from demorec.check.base import Measurement, dataset_check
 from demorec.check.dataset import Dataset
 from demorec.errors import ExportError, in_words
 from demorec.lerobot.files import check_video, open_table, read_json
@@ -26,11 +26,8 @@ _RATE_TOLERANCE = 0.01
 """Files that were put together have rates that are a little off."""
 
 
-@check(
-    group="dataset",
-    scope="dataset",
+@dataset_check(
     measures="statements of info.json that its tables and videos contradict",
-    warn=0,
     reads=("meta/info.json",),
 )
 def dataset_schema(dataset: Dataset) -> Measurement:
@@ -89,29 +86,24 @@ def _names(dataset: Dataset) -> Iterator[str]:
 def _videos(dataset: Dataset) -> Iterator[str]:
     for key in dataset.info.video_keys:
         feature = dataset.info.features[key]
+        height, width = feature.shape[:2]
+        info = feature.info or {}
+        said: dict[str, Any] = {"height": height, "width": width}
+        said |= {name: info[f"video.{name}"] for name in ("codec", "pix_fmt") if info.get(f"video.{name}")}
         positions = dict.fromkeys(place.videos[key][0] for place in dataset.places)
         for position in positions:
             path = dataset.path / position.path(dataset.info.video_path or VIDEO_PATH, key)
             found, rate = _stream(path)
-            said = _said(feature)
             for quantity, value in found.items():
                 if quantity in said and said[quantity] != value:
                     yield f"{key}: {quantity} is {said[quantity]} in info.json, {value} in {path.name}"
             if not abs(rate - dataset.info.fps) <= _RATE_TOLERANCE * dataset.info.fps:
                 yield f"{key}: fps is {dataset.info.fps} in info.json, {rate:.4g} in {path.name}"
-        height, width = feature.shape[:2]
-        info = feature.info or {}
         for quantity, value in (("height", height), ("width", width), ("channels", feature.shape[2])):
             if info.get(f"video.{quantity}", value) != value:
                 yield f"{key}: video.{quantity} is {info[f'video.{quantity}']}, the shape has {value}"
         if info.get("video.fps", dataset.info.fps) != dataset.info.fps:
             yield f"{key}: video.fps is {info['video.fps']}, the dataset has {dataset.info.fps}"
-
-
-def _said(feature: Feature) -> Mapping[str, Any]:
-    info = feature.info or {}
-    said: dict[str, Any] = {"height": feature.shape[0], "width": feature.shape[1]}
-    return said | {name: info[f"video.{name}"] for name in ("codec", "pix_fmt") if info.get(f"video.{name}")}
 
 
 def _stream(path: Path) -> tuple[dict[str, Any], float]:
@@ -149,11 +141,8 @@ def _splits(dataset: Dataset) -> Iterator[str]:
         yield f"the splits have {len(used)} of {dataset.info.total_episodes} episodes"
 
 
-@check(
-    group="dataset",
-    scope="dataset",
+@dataset_check(
     measures="statements of info.json that the episodes' own descriptions contradict",
-    warn=0,
     reads=(
         "meta/info.json",
         "demorec/",

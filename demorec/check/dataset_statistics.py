@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
-from demorec.check.base import Measurement, check, worst
-from demorec.check.dataset import Dataset
+from demorec.check.base import Found, Measurement, dataset_check, worst
+from demorec.check.dataset import Dataset, read_rows
 from demorec.errors import ExportError, in_words
 from demorec.geometry import Array
-from demorec.lerobot.files import read_json, read_table
+from demorec.lerobot.files import read_json
 from demorec.lerobot.layout import STATS_PATH
 from demorec.lerobot.stats import NAMES, QUANTILES
 
@@ -24,9 +24,7 @@ _MERGED = 0.02
 """Standard deviations by which a quantile is off at most, where it may come from LeRobot's merge: a warning."""
 
 
-@check(
-    group="dataset",
-    scope="dataset",
+@dataset_check(
     measures="statistics against those recomputed from all rows, in standard deviations",
     warn=0.01,
     fail=0.05,
@@ -39,15 +37,15 @@ _MERGED = 0.02
         "action",
     ),
 )
-def dataset_statistics(dataset: Dataset) -> Measurement | None:
+def dataset_statistics(dataset: Dataset) -> Iterator[Found]:
     """meta/stats.json: minimum, maximum, mean, deviation, count and quantiles of every feature.
 
     A quantile may also be the mean of the episodes' ones, as LeRobot has it. Its merge takes means of the datasets' own
     instead, and drops the sidecar: without one, a quantile that lies between the episodes' own is warned of, no more.
     """
     if not dataset.rows:
-        return None
-    stats, found = read_statistics(dataset), []
+        return
+    stats = read_statistics(dataset)
     for name in _numeric(dataset):
         episodes = [_flat(rows[name]) for rows in dataset.rows]
         true = statistics_of(np.concatenate(episodes))
@@ -55,36 +53,28 @@ def dataset_statistics(dataset: Dataset) -> Measurement | None:
         own = {q: [np.quantile(values, share, axis=0) for values in episodes] for q, share in QUANTILES.items()}
         averaged = {q: np.average(values, axis=0, weights=weights) for q, values in own.items()}
         between = {} if dataset.sidecar else {q: (np.min(v, axis=0), np.max(v, axis=0)) for q, v in own.items()}
-        found.append(_off(stats.get(name), true, averaged, between, detail=name))
-    return worst(*found)
+        yield _off(stats.get(name), true, averaged, between, detail=name)
 
 
-@check(
-    group="dataset",
-    scope="dataset",
+@dataset_check(
     measures="statistics of single episodes against those recomputed, in standard deviations",
     warn=0.01,
     fail=0.05,
     reads=("meta/episodes",),
 )
-def dataset_episode_statistics(dataset: Dataset) -> Measurement | None:
+def dataset_episode_statistics(dataset: Dataset) -> Iterator[Found]:
     """The columns stats/... of the episodes' table, from which LeRobot merges those of several datasets."""
     names = _numeric(dataset)
-    tables = sorted((dataset.path / "meta" / "episodes").glob("*/*.parquet"))
-    columns = [f"stats/{name}/{quantity}" for name in names for quantity in NAMES]
-    told = [row for path in tables for row in read_table(path, columns).to_pylist()]
-    found = []
+    told = read_rows(dataset.path / "meta", [f"stats/{name}/{quantity}" for name in names for quantity in NAMES])
     for number, (row, rows) in enumerate(zip(told, dataset.rows, strict=False)):
         for name in names:
             said = {quantity: row[f"stats/{name}/{quantity}"] for quantity in NAMES}
-            found.append(_off(said, statistics_of(_flat(rows[name])), detail=f"episode {number}, {name}"))
-    return worst(*found)
+            yield _off(said, statistics_of(_flat(rows[name])), detail=f"episode {number}, {name}")
 
 
 def episode_column(dataset: Dataset, name: str) -> list[Any]:
     """The values of a column of the episodes' table; ExportError when there is none."""
-    tables = sorted((dataset.path / "meta" / "episodes").glob("*/*.parquet"))
-    return [value for path in tables for value in read_table(path, [name]).column(name).to_pylist()]
+    return [row[name] for row in read_rows(dataset.path / "meta", [name])]
 
 
 def read_statistics(dataset: Dataset) -> dict[str, Any]:
@@ -138,7 +128,7 @@ def _off(
     between: Mapping[str, tuple[Array, Array]] = MappingProxyType({}),
     *,
     detail: str,
-) -> Measurement:
+) -> Found:
     """How far the worst quantity of a feature is off, by the nearer of two values where there are two; by no more than
     `_MERGED` where it lies between two others.
     """
@@ -159,6 +149,4 @@ def _off(
             off = float(np.where(is_between, _MERGED, distance).max())
             merged = ", between the episodes' own, as LeRobot's merge leaves it" if off == _MERGED else ""
         found.append(Measurement(value=off, detail=f"{quantity} of {detail}{merged}"))
-    measurement = worst(*found)
-    assert measurement is not None
-    return measurement
+    return worst(*found)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from demorec.check.base import Found, Measurement, NotMeasured, check
+from demorec.check.base import Found, Measurement, NotMeasured, alignment_check, outcome_check
 from demorec.check.episode import CheckedEpisode
 from demorec.errors import ConfigError
 from demorec.plain import digest, from_plain
@@ -26,10 +26,8 @@ _SIGMAS = 8.0
 """Standard deviations within which every normally distributed number lies."""
 
 
-@check(
-    group="outcome",
+@outcome_check(
     measures="statements about the episode that its config contradicts",
-    warn=0,
     reads=(
         "info.config",
         "info.config_digest",
@@ -83,10 +81,8 @@ def _statements(episode: CheckedEpisode) -> Iterator[tuple[str, object, object]]
         yield f"segmentation of {camera.name}", labels, bool(config.get("segmentation"))
 
 
-@check(
-    group="outcome",
+@outcome_check(
     measures="things of the robot that its table has otherwise",
-    warn=0,
     reads=("info.robot", "info.scene.robot.scale"),
 )
 def robot_as_known(episode: CheckedEpisode) -> Found:
@@ -103,10 +99,8 @@ def robot_as_known(episode: CheckedEpisode) -> Found:
     return Measurement(value=len(wrong), detail=", ".join(wrong[:5]))
 
 
-@check(
-    group="outcome",
+@outcome_check(
     measures="colours that the instruction names and the scene lacks, or the other way round",
-    warn=0,
     reads=(
         "info.instruction",
         "info.scene.bodies.color_name",
@@ -132,10 +126,8 @@ def _goal_colors(scene: Scene) -> list[str]:
     return list(dict.fromkeys(name for goal in scene.goals if (name := scene.body(goal.object).color_name)))
 
 
-@check(
-    group="outcome",
+@outcome_check(
     measures="numbers drawn for the episode that its variation does not allow",
-    warn=0,
     reads=("info.behaviour", "info.config"),
 )
 def drawn_within_ranges(episode: CheckedEpisode) -> Found:
@@ -184,8 +176,7 @@ def _calibration_ranges(names: Iterable[str], ranges: Ranges) -> Iterator[tuple[
             yield name, (-allowed[word], allowed[word])
 
 
-@check(
-    group="alignment",
+@alignment_check(
     measures="exploration noise on the commands against what the behaviour says, factor off 1",
     reads=(
         "/action",

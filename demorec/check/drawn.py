@@ -19,7 +19,9 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from demorec.check.base import Found, Measurement, NotMeasured
 from demorec.check.cells import CellGrid, Cells, ImageKind, cell_side
+from demorec.check.rows import finest_lag
 from demorec.errors import RenderError, SceneError
 from demorec.geometry import Array
 from demorec.render import Renderer
@@ -207,6 +209,22 @@ class PictureComparison:
     shown: Array
 
 
+def judge_unlike(compared: PictureComparison | NotMeasured, what: str) -> Found:
+    """By how much the usual picture of a camera (`what`) is unlike the drawn one."""
+    if isinstance(compared, NotMeasured):
+        return compared
+    return Measurement(value=float(np.median(compared.unlike)), detail=what)
+
+
+def judge_lag(compared: PictureComparison | NotMeasured, what: str, view: str) -> Found:
+    """By how many frames pictures (`what`) run behind the numbers, or before them; `view` names their camera."""
+    if isinstance(compared, NotMeasured):
+        return compared
+    if compared.lag is None:
+        return NotMeasured(why=f"too little moves before {view}")
+    return Measurement(value=abs(compared.lag), detail=f"{what}: {compared.lag:+.2f} frames late")
+
+
 _STRAY: dict[ImageKind, float] = {"depth": 1.0, "labels": 4.0}
 """Of 255: what is off by more is another depth (12 mm) or label."""
 _TURNED_STRAY = 16.0
@@ -297,12 +315,7 @@ def _lag(seen: Cells, drawn: Cells, moving: NDArray[np.int64]) -> float | None:
         return None
     lags = range(-_MAX_LAG, _MAX_LAG + 1)
     errors = [float((_rms(seen, drawn, rows, lag) ** 2).mean()) for lag in lags]
-    best = int(np.argmin(errors))
-    if best in (0, len(errors) - 1):
-        return float(lags[best])
-    low, middle, high = errors[best - 1 : best + 2]
-    bend = low - 2 * middle + high
-    return lags[best] + (0.5 * (low - high) / bend if bend > 0 else 0.0)
+    return finest_lag(lags, errors)
 
 
 NOT_DRAWABLE = (SceneError, RenderError)

@@ -7,13 +7,14 @@ adds its weight. That is exact enough where nothing is hit and the motion is smo
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.check.base import Found, Measurement, NotMeasured, check, worst
+from demorec.check.base import Found, Measurement, NotMeasured, physics_check, worst
 from demorec.check.episode import CheckedEpisode
 from demorec.check.rows import longest_run
 from demorec.errors import SceneError
@@ -24,6 +25,8 @@ from demorec.scene.urdf import parse_xml
 MIN_LOAD = 3.0
 """N m: joints that bear less, root mean square, say nothing about efforts."""
 MIN_FRAMES = 20
+LIFTED_HEIGHT = 0.01
+"""Metres above its start from which on the arm bears an object in the hand."""
 MAX_CHANGE = 2.0
 """m/s^2: where the TCP's acceleration changes by more from one frame to the next, the frames do not tell what it is at
 one of them (noise on the commands shakes the arm within a frame). This leaves a fifth of gravity unknown at most."""
@@ -49,16 +52,12 @@ class _Dynamics:
         self.episode = episode
         self.loads = [*self._link_loads(), *self._carried_loads()]
 
-    def frames_of(self, link: str) -> Array:
-        """(T, 4, 4) world_from_link."""
-        return np.asarray(self.episode.world_from_base @ self.episode.base_from_link(link))
-
     def _link_loads(self) -> list[_Load]:
         episode = self.episode
         scale, found = episode.info.scene.robot.scale, []
         gravity = np.array(episode.info.scene.physics.gravity)
         for name, (mass, centre) in _inertials(episode.info.robot.urdf).items():
-            pose = self.frames_of(name)
+            pose = episode.world_from_link(name)
             point = pose[:, :3, :3] @ (scale * centre) + pose[:, :3, 3]
             acceleration = np.zeros_like(point)
             acceleration[1:-1] = (point[2:] - 2 * point[1:-1] + point[:-2]) * episode.info.fps**2
@@ -73,38 +72,26 @@ class _Dynamics:
         found = []
         for body in episode.info.scene.movable:
             point = episode.columns.object_poses[body.name][:, :3]
-            force: Array = self._carries(point)[:, None] * (-body.mass * gravity)
+            force: Array = episode.is_carried(body.name, LIFTED_HEIGHT)[:, None] * (-body.mass * gravity)
             found.append(_Load(point=point, force=force, joints=joints))
         return found
 
-    def _carries(self, point: Array) -> NDArray[np.bool_]:
-        c = self.episode.columns
-        near = np.linalg.norm(point - self.episode.world_from_tcp[:, :3, 3], axis=1) < 0.05
-        return np.asarray(near & (point[:, 2] > point[0, 2] + 0.01) & (c.command_gripper < 0.5 * c.gripper_width))
-
     @cached_property
-    def is_free(self) -> NDArray[np.bool_]:
-        """(T,) frames in which the hand touches nothing but what it carries."""
-        c = self.episode.columns
-        carries = np.zeros(c.num_frames, dtype=bool)
-        for poses in c.object_poses.values():
-            carries |= self._carries(poses[:, :3])
-        return np.asarray((c.contact_force == 0) | carries, dtype=np.bool_)
+    def is_judged(self) -> NDArray[np.bool_]:
+        """(T,) frames whose forces are known: the hand touches nothing but what it carries, and moves smoothly.
 
-    @cached_property
-    def is_smooth(self) -> NDArray[np.bool_]:
-        """(T,) frames whose acceleration is told by the frames around them; the two at either end have too few."""
+        Its acceleration is told by the frames around; the two frames at either end have too few.
+        """
+        c = self.episode.columns
+        free = c.contact_force == 0
+        for name in c.object_poses:
+            free = free | self.episode.is_carried(name, LIFTED_HEIGHT)
         point = self.episode.world_from_tcp[:, :3, 3]
         acceleration = np.diff(point, 2, axis=0) * self.episode.info.fps**2
         change = np.linalg.norm(np.diff(acceleration, axis=0), axis=1)
         smooth = np.zeros(len(point), dtype=np.bool_)
         smooth[2:-2] = np.maximum(change[:-1], change[1:]) < MAX_CHANGE
-        return smooth
-
-    @cached_property
-    def is_judged(self) -> NDArray[np.bool_]:
-        """(T,) frames whose forces are known: the hand is free and moves smoothly."""
-        return self.is_free & self.is_smooth
+        return np.asarray(free & smooth)
 
     def below(self, joint: str) -> list[_Load]:
         """What a joint bears."""
@@ -127,8 +114,7 @@ def _inertials(urdf: str) -> dict[str, tuple[float, Array]]:
     return found
 
 
-@check(
-    group="physics",
+@physics_check(
     measures="arm torques against inverse dynamics, median difference of the load",
     reads=("/joint_states", "info.scene.physics.gravity", "info.scene.bodies.mass", "/robot_description"),
 )
@@ -143,20 +129,18 @@ def effort_bears_the_arm(episode: CheckedEpisode) -> Found:
     judged, found = dynamics.is_judged, []
     for number, name in enumerate(episode.info.robot.arm_joints):
         joint = next(joint for joint in episode.urdf.joints if joint.name == name)
-        pose = dynamics.frames_of(joint.child)
+        pose = episode.world_from_link(joint.child)
         axis = pose[:, :3, :3] @ np.array(joint.axis)
         arms = [np.cross(load.point - pose[:, :3, 3], load.force) for load in dynamics.below(name)]
         torque = (axis * np.sum(arms, axis=0)).sum(axis=1)[judged]
         size = float(np.sqrt(np.median(torque**2)))
-        if size < MIN_LOAD:
-            continue
-        off = float(np.median(np.abs(episode.columns.joint_effort[judged, number] - torque))) / size
-        found.append(Measurement(value=off, detail=f"{name}, which bears {size:.0f} N m"))
+        if size >= MIN_LOAD:
+            off = float(np.median(np.abs(episode.columns.joint_effort[judged, number] - torque))) / size
+            found.append(Measurement(value=off, detail=f"{name}, which bears {size:.0f} N m"))
     return worst(*found) or NotMeasured(why="no joint of the arm bears a load")
 
 
-@check(
-    group="physics",
+@physics_check(
     measures="force on the hand against the weight and motion of what it bears, median difference of it",
     reads=("/wrench", "info.scene.physics.gravity", "info.scene.bodies.mass", "/robot_description"),
 )
@@ -171,7 +155,7 @@ def wrench_bears_the_hand(episode: CheckedEpisode) -> Found:
     link = episode.info.robot.hand_link
     mount = episode.urdf.path_to(link)[-1].name
     force = np.sum([load.force for load in dynamics.below(mount)], axis=0)
-    turned = np.einsum("tji,tj->ti", dynamics.frames_of(link)[:, :3, :3], force)
+    turned = np.einsum("tji,tj->ti", episode.world_from_link(link)[:, :3, :3], force)
     off = np.linalg.norm(wrench[:, :3] - turned, axis=1) / np.maximum(np.linalg.norm(turned, axis=1), 1e-6)
     judged = off[dynamics.is_judged]
     return Measurement(value=float(np.median(judged)), detail=f"{len(judged)} frames")
@@ -190,23 +174,19 @@ def _dynamics(episode: CheckedEpisode) -> _Dynamics | NotMeasured:
     return dynamics
 
 
-@check(
-    group="physics",
+@physics_check(
     measures="longest run of frames in which a sensor stands still to the last bit while the arm moves",
     warn=2,
     fail=4,
     reads=("/joint_states", "/ee_pose", "/wrench"),
 )
-def stuck_sensors(episode: CheckedEpisode) -> Found:
+def stuck_sensors(episode: CheckedEpisode) -> Iterator[Found]:
     """What is measured changes, if ever so little, while the arm moves."""
     c, n = episode.columns, episode.num_arm
     moves = np.abs(np.diff(c.joint_position[:, :n], axis=0)).max(axis=1, initial=0.0) > 1e-5
     tables = {"joint velocities": c.joint_velocity, "efforts": c.joint_effort[:, :n], "EE pose": c.base_from_tcp}
     if c.wrench is not None:
         tables["wrench"] = c.wrench
-    found: list[Measurement | None] = []
     for name, table in tables.items():
-        same = (table[1:] == table[:-1]).all(axis=1) & moves
-        length, start = longest_run(same)
-        found.append(Measurement(value=length, frame=start + 1 if length else None, detail=name))
-    return worst(*found)
+        length, start = longest_run((table[1:] == table[:-1]).all(axis=1) & moves)
+        yield Measurement(value=length, frame=start + 1 if length else None, detail=name)

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, wraps
 from pathlib import Path
-from types import TracebackType
-from typing import Self, cast
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.check.base import NotMeasured
+from demorec.check.base import Found, NotMeasured
 from demorec.check.cells import ImageKind
 from demorec.check.drawn import NOT_DRAWABLE, PictureComparison, compare, strays
 from demorec.check.episode_drawn import DrawnEpisode, draw_episode
@@ -25,7 +24,7 @@ from demorec.geometry import Array
 from demorec.recording import Recording, channels
 from demorec.recording.chunks import Block
 from demorec.recording.container import Container
-from demorec.scene.episode import EpisodeColumns, EpisodeInfo, Event, frame_time_ns
+from demorec.scene.episode import EpisodeColumns, EpisodeInfo, Event, Outcome, frame_time_ns
 from demorec.scene.scene import Camera
 from demorec.scene.urdf import Urdf
 
@@ -61,35 +60,19 @@ class TopicScan:
     first: bytes
 
 
-class CheckedEpisode:
-    """One recording; a context manager. Properties raise RecordingError where the file does not give them.
+class CheckedEpisode(ExitStack):
+    """One recording, closed at the end of a `with`. Properties raise RecordingError where the file does not give them.
 
     Args:
         path: The recording.
     """
 
     def __init__(self, path: Path) -> None:
+        super().__init__()
         self.path = path
-        self._recording: Recording | None = None
-        self._container: Container | None = None
         self._pictures: dict[tuple[str, ImageKind], PictureSummary] = {}
         self._comparisons: dict[tuple[str, ImageKind], PictureComparison] = {}
         self._shared: dict[Callable[[CheckedEpisode], object], object] = {}
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Close the file; harmless when called twice."""
-        if self._recording is not None:
-            self._recording.close()
-        if self._container is not None:
-            self._container.close()
 
     def shared[T](self, compute: Callable[[CheckedEpisode], T]) -> T:
         """What a function makes of the episode, computed once for all checks that ask for it."""
@@ -97,17 +80,20 @@ class CheckedEpisode:
             self._shared[compute] = compute(self)
         return cast(T, self._shared[compute])
 
-    @property
+    @cached_property
     def recording(self) -> Recording:
         """The open recording."""
-        if self._recording is None:
-            self._recording = Recording(self.path)
-        return self._recording
+        return self.enter_context(Recording(self.path))
 
     @property
     def info(self) -> EpisodeInfo:
         """What was known before the first frame."""
         return self.recording.info
+
+    @property
+    def outcome(self) -> Outcome | None:
+        """What was known after its last frame."""
+        return self.recording.outcome
 
     @cached_property
     def columns(self) -> EpisodeColumns:
@@ -127,19 +113,19 @@ class CheckedEpisode:
     @cached_property
     def scan(self) -> dict[str, TopicScan]:
         """Every message of every topic, read once: every chunk's checksum is verified on the way."""
-        with self.container() as container:
-            schemas = {name: container.schemas[c.schema_id].name for name, c in container.channels.items()}
-            found = {topic: _scan(schemas[topic], block) for topic, block in self.blocks.items()}
-            pictures = [topic for topic in schemas if topic not in found]
-            times: dict[str, list[int]] = {topic: [] for topic in pictures}
-            stamps: dict[str, list[int]] = {topic: [] for topic in pictures}
-            first: dict[str, bytes] = {}
-            for topic, time_ns, data in container.messages(pictures):
-                times[topic].append(time_ns)
-                stamps[topic].append(_stamp(data))
-                first.setdefault(topic, data)
-            for name in container.attachment_names:
-                container.attachment(name)
+        container = self.container
+        schemas = {name: container.schemas[c.schema_id].name for name, c in container.channels.items()}
+        found = {topic: _scan(schemas[topic], block) for topic, block in self.blocks.items()}
+        pictures = [topic for topic in schemas if topic not in found]
+        times: dict[str, list[int]] = {topic: [] for topic in pictures}
+        stamps: dict[str, list[int]] = {topic: [] for topic in pictures}
+        first: dict[str, bytes] = {}
+        for topic, time_ns, data in container.messages(pictures):
+            times[topic].append(time_ns)
+            stamps[topic].append(_stamp(data))
+            first.setdefault(topic, data)
+        for name in container.attachment_names:
+            container.attachment(name)
         for topic in pictures:
             found[topic] = TopicScan(
                 schema=schemas[topic],
@@ -152,30 +138,19 @@ class CheckedEpisode:
     @cached_property
     def blocks(self) -> dict[str, Block]:
         """topic -> all its messages, but for pictures, which would be too large to be in memory together."""
-        with self.container() as container:
-            pictures = {
-                channels.camera_topic(camera.name, stream)
-                for camera in self.cameras
-                for stream in channels.PICTURE_STREAMS
-            }
-            return container.blocks([topic for topic in container.channels if topic not in pictures])
+        streams = channels.PICTURE_STREAMS
+        pictures = {channels.camera_topic(camera.name, stream) for camera in self.cameras for stream in streams}
+        return self.container.blocks([topic for topic in self.container.channels if topic not in pictures])
 
     def block(self, topic: str) -> Block:
         """All messages of a topic that is none of pictures; an empty one where there is no such topic."""
         nothing = np.zeros(0, dtype=np.int64)
         return self.blocks.get(topic, Block(content=b"", time_ns=nothing, starts=nothing, lengths=nothing))
 
-    @contextmanager
-    def container(self) -> Iterator[Container]:
-        """The file's messages and metadata as they are."""
-        if self._container is None:
-            self._container = Container(self.path)
-        yield self._container
-
     @cached_property
-    def index_counts(self) -> dict[str, int]:
-        """topic -> number of messages according to the file's index."""
-        return {topic: count for topic, (_, count) in self.recording.topics.items()}
+    def container(self) -> Container:
+        """The file's messages and metadata as they are."""
+        return self.enter_context(closing(Container(self.path)))
 
     # ------------------------------------------------------------------------------------------- the robot
 
@@ -221,15 +196,25 @@ class CheckedEpisode:
         """(1, 4, 4)."""
         return self.info.scene.robot.world_from_base.matrix()[None]
 
+    def world_from_link(self, link: str) -> Array:
+        """(T, 4, 4) by forward kinematics of the recorded joints; RecordingError: unknown link."""
+        return np.asarray(self.world_from_base @ self.base_from_link(link))
+
     @cached_property
     def world_from_tcp(self) -> Array:
-        """(T, 4, 4) by forward kinematics of the recorded joints."""
-        fk = self.base_from_link(self.info.robot.tcp_link)
-        return np.asarray(self.world_from_base @ fk)
+        """The same of the tool centre point."""
+        return self.world_from_link(self.info.robot.tcp_link)
 
     def world_from_object(self, name: str) -> Array:
         """(T, 4, 4) of a movable body as recorded."""
         return matrices(self.columns.object_poses[name])
+
+    def is_carried(self, name: str, height: float) -> NDArray[np.bool_]:
+        """(T,) whether a closed hand has a movable body so many metres above its start."""
+        c, position = self.columns, self.columns.object_poses[name][:, :3]
+        near = np.linalg.norm(position - self.world_from_tcp[:, :3, 3], axis=1) < 0.05
+        is_closed = c.command_gripper < 0.5 * c.gripper_width
+        return np.asarray(near & (position[:, 2] > position[0, 2] + height) & is_closed)
 
     # ------------------------------------------------------------------------------------------- the cameras
 
@@ -237,10 +222,6 @@ class CheckedEpisode:
     def cameras(self) -> tuple[Camera, ...]:
         """Of the scene."""
         return self.info.scene.cameras
-
-    def recorded_intrinsics(self, camera: str) -> Array:
-        """(3, 3) K as the camera's own calibration message has it, which is what other programs read."""
-        return self.recording.calibration(camera).intrinsics
 
     def kinds(self, camera: str) -> tuple[ImageKind, ...]:
         """Which pictures of a camera were recorded."""
@@ -291,6 +272,20 @@ class CheckedEpisode:
             shift = compared.shift + self._drawn.shift.get(camera.name, 0.0)
             self._comparisons[camera.name, kind] = replace(compared, shift=shift)
         return self._comparisons[camera.name, kind]
+
+
+def of_each_camera(
+    judge: Callable[[CheckedEpisode, Camera, PictureComparison], Found],
+) -> Callable[[CheckedEpisode], Iterator[Found]]:
+    """A check of the colour pictures of one camera, against what the recorded numbers make of them, as one of all."""
+
+    @wraps(judge)
+    def judge_all(episode: CheckedEpisode) -> Iterator[Found]:
+        for camera in episode.cameras:
+            compared = episode.compared(camera)
+            yield compared if isinstance(compared, NotMeasured) else judge(episode, camera, compared)
+
+    return judge_all
 
 
 def _scan(schema: str, block: Block) -> TopicScan:

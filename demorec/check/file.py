@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from demorec.check.base import Measurement, check
+from demorec.check.base import Measurement, file_check
 from demorec.check.episode import CheckedEpisode
-from demorec.recording import channels, messages
+from demorec.recording import CollectedRecording, channels, messages
 from demorec.recording.streams import frame_streams
 from demorec.scene.episode import FORMAT_VERSION
 
 
-@check(
-    group="file",
+@file_check(
     measures="recordings that cannot be opened (index, metadata, format version)",
-    warn=0,
     reads=("info.format_version",),
 )
 def opens(episode: CheckedEpisode) -> Measurement:
@@ -23,10 +21,8 @@ def opens(episode: CheckedEpisode) -> Measurement:
     return Measurement(value=0, detail=f"format version {version} of {FORMAT_VERSION}")
 
 
-@check(
-    group="file",
+@file_check(
     measures="topics whose message count differs from the index; every chunk passes its CRC",
-    warn=0,
     reads=("metadata demorec.episode",),
 )
 def checksums(episode: CheckedEpisode) -> Measurement:
@@ -34,16 +30,14 @@ def checksums(episode: CheckedEpisode) -> Measurement:
     counts = {topic: len(scan.time_ns) for topic, scan in episode.scan.items()}
     wrong = [
         f"{topic}: {counts[topic]}, index says {count}"
-        for topic, count in episode.index_counts.items()
+        for topic, (_, count) in episode.recording.topics.items()
         if counts[topic] != count
     ]
     return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{sum(counts.values())} messages")
 
 
-@check(
-    group="file",
+@file_check(
     measures="topics that are missing, of another type or not one message a frame",
-    warn=0,
     reads=(
         "info.scene.cameras.name",
         "info.scene.bodies.name",
@@ -90,10 +84,8 @@ def _picture_streams(episode: CheckedEpisode, camera: str) -> Iterator[tuple[str
         yield channels.camera_topic(camera, "segmentation"), messages.COMPRESSED_IMAGE
 
 
-@check(
-    group="file",
+@file_check(
     measures="streams that do not decode into numbers",
-    warn=0,
     reads=(
         "/events",
         "/phase",
@@ -107,14 +99,12 @@ def readable(episode: CheckedEpisode) -> Measurement:
     return Measurement(value=0, detail=f"{num_frames} frames, {num_events} events")
 
 
-@check(
-    group="file",
+@file_check(
     measures="recordings that a crash cut off (recovered, without an outcome)",
-    warn=0,
     fail=1,
     reads=("metadata demorec.recovered",),
 )
-def complete(episode: CheckedEpisode) -> Measurement:
+def complete(episode: CheckedEpisode | CollectedRecording) -> Measurement:
     """The episode was recorded to its end."""
-    cut = episode.recording.outcome is None
+    cut = episode.outcome is None
     return Measurement(value=int(cut), detail="recovered from a crash, no outcome" if cut else "")

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
-from demorec.check.base import Measurement, check, worst
+from demorec.check.base import Found, Measurement, physics_check
 from demorec.check.episode import CheckedEpisode
 from demorec.geometry import Array
 from demorec.scene.scene import Shape
@@ -82,15 +83,14 @@ def _reach(body: Convex, world_from_body: Array, axes: Array) -> tuple[Array, Ar
     return centre + points.min(axis=1) - body.radius, centre + points.max(axis=1) + body.radius
 
 
-@check(
-    group="physics",
+@physics_check(
     measures="depth to which a finger is inside an object",
     unit="m",
     warn=0.001,
     fail=0.0015,
     reads=("/joint_states", "/robot_description", "/object/{body}/pose", "info.scene.bodies.shape.size"),
 )
-def finger_depth(episode: CheckedEpisode) -> Measurement | None:
+def finger_depth(episode: CheckedEpisode) -> Iterator[Found]:
     """Fingers press on the outside of what they hold (boxes, spheres, cylinders, capsules).
 
     The fingers are those of the recorded description, within a tenth of a millimetre. Not measured where no finger
@@ -98,9 +98,8 @@ def finger_depth(episode: CheckedEpisode) -> Measurement | None:
     """
     robot = episode.info.robot
     links = {link.name: link for link in read_links(episode.description)}
-    found = []
     for name in robot.gripper.finger_links:
-        finger = episode.world_from_base @ episode.base_from_link(name)
+        finger = episode.world_from_link(name)
         parts = [Convex.of_shape(shape).moved(shape.link_from_shape.matrix()) for shape in links[name].visuals]
         reach = max((float(np.linalg.norm(part.points, axis=1).max()) + part.radius for part in parts), default=0.0)
         for body in episode.info.scene.movable:
@@ -116,5 +115,4 @@ def finger_depth(episode: CheckedEpisode) -> Measurement | None:
             row = int(np.argmax(depth))
             if depth[row] > -NEAR:
                 value = max(float(depth[row]), 0.0)
-                found.append(Measurement(value=value, frame=int(near[row]), detail=f"{name} in {body.name}"))
-    return worst(*found)
+                yield Measurement(value=value, frame=int(near[row]), detail=f"{name} in {body.name}")

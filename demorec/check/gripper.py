@@ -6,10 +6,9 @@ import math
 
 import numpy as np
 
-from demorec.check.base import Found, Measurement, NotMeasured, check
+from demorec.check.base import Found, Measurement, NotMeasured, alignment_check, physics_check, worst_entry, worst_frame
 from demorec.check.episode import CheckedEpisode
 from demorec.check.objects import SOLID
-from demorec.geometry import Array
 from demorec.scene.scene import Body
 
 SETTLE_SECONDS = 0.6
@@ -18,8 +17,7 @@ CARRIED_HEIGHT = 0.03
 """Metres above its start from which on an object counts as carried."""
 
 
-@check(
-    group="alignment",
+@alignment_check(
     measures="gripper opening of the label against that of the executed command",
     unit="m",
     warn=1e-6,
@@ -29,15 +27,10 @@ CARRIED_HEIGHT = 0.03
 def gripper_label(episode: CheckedEpisode) -> Measurement | None:
     """Exploration noise is on the arm alone: the label asks for the opening that was sent."""
     c = episode.columns
-    if not c.num_frames:
-        return None
-    off = np.abs(c.action_gripper - c.command_gripper)
-    frame = int(np.argmax(off))
-    return Measurement(value=float(off[frame]), frame=frame, detail="")
+    return worst_frame(np.abs(c.action_gripper - c.command_gripper))
 
 
-@check(
-    group="physics",
+@physics_check(
     measures="gripper opening against a command that it has had the time to follow",
     unit="m",
     reads=("/gripper", "/command", "/joint_states"),
@@ -59,13 +52,10 @@ def gripper_follows(episode: CheckedEpisode) -> Found:
         return NotMeasured(why="the gripper's command never lasts")
     gap = c.gripper_width - c.command_gripper
     off = np.where(c.contact_force > 0, np.maximum(-gap, 0.0), np.abs(gap))
-    off = np.where(steady, off, 0.0)
-    frame = int(np.argmax(off))
-    return Measurement(value=float(off[frame]), frame=frame, detail=f"{int(steady.sum())} frames after the motion")
+    return worst_frame(np.where(steady, off, 0.0), f"{int(steady.sum())} frames after the motion")
 
 
-@check(
-    group="physics",
+@physics_check(
     measures="contact force on a carried object against that of the gripper's motors, off 1",
     reads=("/gripper", "info.robot.gripper.force", "/object/{body}/pose"),
 )
@@ -79,7 +69,7 @@ def grip_force(episode: CheckedEpisode) -> Found:
         return None
     if scene.hold != "friction":
         return NotMeasured(why="what is carried is held by a constraint")
-    carried = _carried(episode)
+    carried = np.any([episode.is_carried(body.name, CARRIED_HEIGHT) for body in scene.movable], axis=0)
     if carried.sum() < 10:
         return NotMeasured(why="nothing is carried for ten frames")
     expected = len(robot.gripper.joints) * robot.gripper.force
@@ -90,20 +80,7 @@ def grip_force(episode: CheckedEpisode) -> Found:
     )
 
 
-def _carried(episode: CheckedEpisode) -> Array:
-    """(T,) whether a closed hand has some object in the air."""
-    c = episode.columns
-    closed = c.command_gripper < 0.5 * c.gripper_width
-    lifted = np.zeros(c.num_frames, dtype=bool)
-    for body in episode.info.scene.movable:
-        pose = c.object_poses[body.name]
-        near = np.linalg.norm(pose[:, :3] - episode.world_from_tcp[:, :3, 3], axis=1) < 0.05
-        lifted |= near & (pose[:, 2] > pose[0, 2] + CARRIED_HEIGHT)
-    return np.asarray(closed & lifted)
-
-
-@check(
-    group="physics",
+@physics_check(
     measures="contact force while there is nothing within reach",
     unit="N",
     reads=("/gripper", "/object/{body}/pose"),
@@ -120,9 +97,7 @@ def touches_nothing(episode: CheckedEpisode) -> Measurement | None:
     alone &= c.gripper_width > 0.005
     if not alone.any():
         return None
-    force = np.where(alone, np.abs(c.contact_force), 0.0)
-    frame = int(np.argmax(force))
-    return Measurement(value=float(force[frame]), frame=frame, detail=f"{int(alone.sum())} frames alone")
+    return worst_frame(np.where(alone, np.abs(c.contact_force), 0.0), f"{int(alone.sum())} frames alone")
 
 
 def _top(body: Body) -> float:
@@ -131,8 +106,7 @@ def _top(body: Body) -> float:
     return float(body.world_from_body.position[2]) + share * body.shape.extents[2]
 
 
-@check(
-    group="physics",
+@physics_check(
     measures="largest motor torque or finger force in units of its limit",
     warn=1.001,
     fail=1.05,
@@ -142,8 +116,4 @@ def joint_effort(episode: CheckedEpisode) -> Measurement | None:
     """No motor gives more than it can; a gripper that presses gives all that it has."""
     c, n, robot = episode.columns, episode.num_arm, episode.info.robot
     limit = np.array([*robot.torque_limit, *[robot.gripper.force] * (len(robot.joint_names) - n)])
-    table = np.abs(c.joint_effort) / limit
-    if not table.size:
-        return None
-    frame, joint = (int(i) for i in np.unravel_index(int(np.argmax(table)), table.shape))
-    return Measurement(value=float(table[frame, joint]), frame=frame, detail=robot.joint_names[joint])
+    return worst_entry(np.abs(c.joint_effort) / limit, robot.joint_names)

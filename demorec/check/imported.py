@@ -5,7 +5,9 @@ The bags themselves need not be there any more.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import math
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,58 +22,43 @@ _TIMES = frozenset(
 _PICTURES = frozenset(("frozen", "same_pictures", "swapped", "size", "format", "keyframe", "frame_id"))
 _MOST_TOLD = 5
 
+import_check = partial(check, scope="collected_run", fail=math.inf, reads=("import.json",))
 
-@check(
-    scope="collected_run",
+
+@import_check(
     group="time",
     measures="findings about times in the bags that were imported: clocks, losses, gaps, jitter, order",
-    warn=0,
-    fail=float("inf"),
-    reads=("import.json",),
 )
 def import_times(folder: Path) -> Found:
     """The streams of the bags were whole, in order and on one clock."""
     return _found(folder, lambda kind: kind in _TIMES)
 
 
-@check(
-    scope="collected_run",
+@import_check(
     group="pictures",
     measures="findings about cameras in the bags that were imported: frozen, swapped, of several sizes",
-    warn=0,
-    fail=float("inf"),
-    reads=("import.json",),
 )
 def import_pictures(folder: Path) -> Found:
     """Each camera showed its own pictures, of one size and kind."""
     return _found(folder, lambda kind: kind in _PICTURES)
 
 
-@check(
-    scope="collected_run",
+@import_check(
     group="physics",
     measures="findings about numbers in the bags that were imported: NaN, stuck sensors, spikes, units",
-    warn=0,
-    fail=float("inf"),
-    reads=("import.json",),
 )
 def import_numbers(folder: Path) -> Found:
     """The numbers of the bags were such as robots have."""
     return _found(folder, lambda kind: kind not in _TIMES | _PICTURES)
 
 
-@check(
-    scope="collected_run",
+@import_check(
     group="run",
     measures="episodes that an import dropped, since something was missing or too old",
-    warn=0,
-    fail=float("inf"),
-    reads=("import.json",),
 )
 def import_dropped(folder: Path) -> Found:
     """Every episode that the bags hold is in the run."""
-    bags = _bags(folder)
-    if bags is None:
+    if (bags := _bags(folder)) is None:
         return None
     dropped = [row for bag in bags for row in bag.episodes if row.episode_index is None]
     return Measurement(value=len(dropped), detail="; ".join(row.reason for row in dropped[:_MOST_TOLD]))
@@ -85,15 +72,12 @@ def _bags(folder: Path) -> tuple[BagReport, ...] | None:
 
 
 def _found(folder: Path, is_mine: Callable[[str], bool]) -> Found:
-    bags = _bags(folder)
-    if bags is None:
+    if (bags := _bags(folder)) is None:
         return None
-    told = list(_told(bags, is_mine))
+    told = [
+        f"{bag.name}: {finding.kind}, {finding.stream}: {finding.text}".replace(", : ", ": ")
+        for bag in bags
+        for finding in bag.findings
+        if is_mine(finding.kind)
+    ]
     return Measurement(value=len(told), detail="; ".join(told[:_MOST_TOLD]))
-
-
-def _told(bags: tuple[BagReport, ...], is_mine: Callable[[str], bool]) -> Iterator[str]:
-    for bag in bags:
-        for finding in bag.findings:
-            if is_mine(finding.kind):
-                yield f"{bag.name}: {finding.kind}, {finding.stream}: {finding.text}".replace(", : ", ": ")

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.check.base import Measurement, check, worst
+from demorec.check.base import Found, Measurement, physics_check, worst_entry, worst_frame
 from demorec.check.episode import CheckedEpisode
 from demorec.check.rows import displacement, inverse, matrices
 from demorec.geometry import Array
@@ -27,8 +29,7 @@ def _speeds(episode: CheckedEpisode, name: str) -> Array:
 def _near_hand(episode: CheckedEpisode, body: Body) -> NDArray[np.bool_]:
     """(T,) whether hand or fingers may touch a body: its bounding sphere and a hand's breadth overlap."""
     radius = math.hypot(*body.shape.extents) / 2
-    hand = episode.base_from_link(episode.info.robot.hand_link)
-    hand = episode.world_from_base @ hand
+    hand = episode.world_from_link(episode.info.robot.hand_link)
     centre = episode.columns.object_poses[body.name][:, :3]
     near_tcp = np.linalg.norm(episode.world_from_tcp[:, :3, 3] - centre, axis=1) < radius + 0.06
     near_hand = np.linalg.norm(hand[:, :3, 3] - centre, axis=1) < radius + 0.12
@@ -72,8 +73,7 @@ def _held_for(flags: NDArray[np.bool_], count: int) -> NDArray[np.bool_]:
     return np.asarray(np.arange(len(flags)) - np.maximum.accumulate(last) <= count)
 
 
-@check(
-    group="physics",
+@physics_check(
     measures="fastest motion of an object that nothing touches",
     unit="m/s",
     reads=(
@@ -81,42 +81,30 @@ def _held_for(flags: NDArray[np.bool_], count: int) -> NDArray[np.bool_]:
         "/joint_states",
     ),
 )
-def object_motion(episode: CheckedEpisode) -> Measurement | None:
+def object_motion(episode: CheckedEpisode) -> Iterator[Found]:
     """An object moves only when touched, or for a moment after it (falling, rolling, tipping)."""
-    found = []
     for name, touched in _touched(episode).items():
         speed = np.linalg.norm(_speeds(episode, name), axis=1)
-        speed = np.where(touched, 0.0, speed)
-        if len(speed):
-            frame = int(np.argmax(speed))
-            found.append(Measurement(value=float(speed[frame]), frame=frame + 1, detail=name))
-    return worst(*found)
+        yield worst_frame(np.where(touched, 0.0, speed), name, first=1)
 
 
-@check(
-    group="physics",
+@physics_check(
     measures="object speed beyond that of the hand and of falling",
     unit="m/s",
     reads=("/object/{body}/pose",),
 )
-def teleports(episode: CheckedEpisode) -> Measurement | None:
+def teleports(episode: CheckedEpisode) -> Iterator[Found]:
     """No object jumps."""
-    c, fps = episode.columns, episode.info.fps
-    if c.num_frames < 2:
-        return None
-    hand = displacement(episode.world_from_tcp[1:], episode.world_from_tcp[:-1]) * fps
-    found = []
-    for name in c.object_poses:
+    hand = displacement(episode.world_from_tcp[1:], episode.world_from_tcp[:-1]) * episode.info.fps
+    for name in episode.columns.object_poses:
         velocity = _speeds(episode, name)
         falling = np.minimum(np.maximum(-velocity[:, 2], 0.0), 3.5)
         beyond = np.linalg.norm(velocity, axis=1) - hand - falling
-        frame = int(np.argmax(beyond))
-        found.append(Measurement(value=max(float(beyond[frame]), 0.0), frame=frame + 1, detail=name))
-    return worst(*found)
+        if (fastest := worst_frame(beyond, name, first=1)) is not None:
+            yield replace(fastest, value=max(fastest.value, 0.0))
 
 
-@check(
-    group="physics",
+@physics_check(
     measures="distance of the first frame from the scene's start",
     unit="m",
     reads=(
@@ -128,30 +116,24 @@ def teleports(episode: CheckedEpisode) -> Measurement | None:
         "info.scene.robot.gripper_width",
     ),
 )
-def starts_as_scene_says(episode: CheckedEpisode) -> Measurement | None:
+def starts_as_scene_says(episode: CheckedEpisode) -> Iterator[Found]:
     """Objects and joints begin where the scene put them (0.1 m per rad of rotation; 0.1 m per rad of a joint).
 
     Physics settles for 0.1 s before the first frame, in which an object may fall, by 5.5 cm at most.
     """
     c, scene = episode.columns, episode.info.scene
     if not c.num_frames:
-        return None
-    joints = np.abs(c.joint_position[0, : episode.num_arm] - np.array(scene.robot.joint_position))
-    worst_joint = int(np.argmax(joints))
-    found = [
-        Measurement(value=0.1 * float(joints[worst_joint]), frame=0, detail=episode.info.robot.arm_joints[worst_joint]),
-        Measurement(value=abs(float(c.gripper_width[0]) - scene.robot.gripper_width), frame=0, detail="gripper"),
-    ]
+        return
+    joints = 0.1 * np.abs(c.joint_position[:1, : episode.num_arm] - np.array(scene.robot.joint_position))
+    yield worst_entry(joints, episode.info.robot.arm_joints)
+    yield worst_frame(np.abs(c.gripper_width[:1] - scene.robot.gripper_width), "gripper")
     for body in scene.movable:
         placed = matrices(body.world_from_body.vector()[None])
         placed[0, 2, 3] -= min(max(float(placed[0, 2, 3] - c.object_poses[body.name][0, 2]), 0.0), 0.055)
-        off = displacement(matrices(c.object_poses[body.name][:1]), placed, lever=0.1)
-        found.append(Measurement(value=float(off[0]), frame=0, detail=body.name))
-    return worst(*found)
+        yield worst_frame(displacement(matrices(c.object_poses[body.name][:1]), placed), body.name)
 
 
-@check(
-    group="physics",
+@physics_check(
     measures="depth to which a body is inside another",
     unit="m",
     reads=(
@@ -160,12 +142,11 @@ def starts_as_scene_says(episode: CheckedEpisode) -> Measurement | None:
         "info.scene.bodies.collides",
     ),
 )
-def penetration(episode: CheckedEpisode) -> Measurement | None:
+def penetration(episode: CheckedEpisode) -> Iterator[Found]:
     """Nothing solid is inside anything solid (boxes, spheres, cylinders, capsules)."""
     scene = episode.info.scene
     movable = [body for body in scene.movable if body.shape.kind in SOLID]
     still = [b for b in scene.bodies if b.collides and not b.movable and b.shape.kind in SOLID]
-    found = []
     for number, body in enumerate(movable):
         pose = episode.world_from_object(body.name)
         for other in (*still, *movable[number + 1 :]):
@@ -180,12 +161,9 @@ def penetration(episode: CheckedEpisode) -> Measurement | None:
                 _depth_inside(body.shape, pose[near], other.shape, _rows(other_pose, near)),
                 _depth_inside(other.shape, _rows(other_pose, near), body.shape, pose[near]),
             )
-            row = int(np.argmax(depth))
-            detail = f"{body.name} in {other.name}"
-            found.append(Measurement(value=float(depth[row]), frame=int(near[row]), detail=detail))
-    if not found and movable:
-        return Measurement(value=0.0, detail="nothing comes near anything")
-    return worst(*found)
+            yield worst_frame(depth, f"{body.name} in {other.name}", frames=near)
+    if movable:
+        yield Measurement(value=0.0, detail="nothing comes near anything")
 
 
 def _rows(transforms: Array, rows: NDArray[np.intp]) -> Array:
@@ -231,20 +209,18 @@ def _surface_points(shape: Shape) -> Array:
     return np.concatenate([*rows, poles])
 
 
-@check(
-    group="physics",
+@physics_check(
     measures="frames in which an object moves through the air unheld",
     reads=(
         "/object/{body}/pose",
         "/gripper",
     ),
 )
-def carried_by_gripper(episode: CheckedEpisode) -> Measurement | None:
+def carried_by_gripper(episode: CheckedEpisode) -> Iterator[Found]:
     """While an object travels above where it rests, fingers press on it and stand as far apart as it is wide."""
     c, fps = episode.columns, episode.info.fps
     if c.num_frames < 3 or not episode.info.scene.movable:
-        return None
-    found = []
+        return
     # A contact that a frame happens to miss is none that was lost: the strongest of three neighbours counts.
     force = np.max([c.contact_force[:-2], c.contact_force[1:-1], c.contact_force[2:]], axis=0)
     width = c.gripper_width[1:-1]
@@ -266,7 +242,6 @@ def carried_by_gripper(episode: CheckedEpisode) -> Measurement | None:
                 f"{body.name}: {force[frame]:.2f} N, {distance[frame] * 1e3:.0f} mm from the TCP, "
                 f"opening {width[frame] * 1e3:.0f} mm"
             )
-            found.append(Measurement(value=int(wrong.sum()), frame=frame + 1, detail=detail))
+            yield Measurement(value=int(wrong.sum()), frame=frame + 1, detail=detail)
         else:
-            found.append(Measurement(value=0, detail=f"{body.name} travels {int(travelling.sum())} frames"))
-    return worst(*found)
+            yield Measurement(value=0, detail=f"{body.name} travels {int(travelling.sum())} frames")

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 
-from demorec.check.base import Found, Measurement, check, worst
+from demorec.check.base import Found, Measurement, outcome_check
 from demorec.check.episode import CheckedEpisode
 from demorec.check.rows import matrices
 from demorec.scene.episode import SuccessCheck
@@ -16,10 +17,8 @@ AT_LEAST = ("on_support", "on_table", "gripper_width")
 """Conditions of demorec's own tasks that hold from their limit up; all others hold up to it."""
 
 
-@check(
-    group="outcome",
+@outcome_check(
     measures="contradictions within the outcome",
-    warn=0,
     reads=(
         "outcome.success",
         "outcome.checks.name",
@@ -33,7 +32,7 @@ AT_LEAST = ("on_support", "on_table", "gripper_width")
 )
 def outcome_consistent(episode: CheckedEpisode) -> Measurement | None:
     """Each condition passed as value and limit have it, success as the conditions; a failure has phase and reason."""
-    outcome = episode.recording.outcome
+    outcome = episode.outcome
     if outcome is None:
         return None
     failed = [condition.name for condition in outcome.checks if not condition.passed]
@@ -66,8 +65,7 @@ def _possible(episode: CheckedEpisode, condition: SuccessCheck) -> set[bool]:
     return {at_least if condition.name.partition(":")[0] in AT_LEAST else at_most}
 
 
-@check(
-    group="outcome",
+@outcome_check(
     measures="values of the outcome against the last frame, in units of their limits",
     reads=(
         "outcome.checks.name",
@@ -78,13 +76,12 @@ def _possible(episode: CheckedEpisode, condition: SuccessCheck) -> set[bool]:
         "info.scene.goals.object",
     ),
 )
-def end_values(episode: CheckedEpisode) -> Found:
+def end_values(episode: CheckedEpisode) -> Iterator[Found]:
     """Height, tilt and opening that the outcome names are those of the last frame, in which all is at rest."""
-    outcome, scene, c = episode.recording.outcome, episode.info.scene, episode.columns
+    outcome, scene, c = episode.outcome, episode.info.scene, episode.columns
     if outcome is None or not outcome.success or not c.num_frames:
-        return None
+        return
     frame = c.num_frames - 1
-    found: list[Measurement | None] = []
     for condition in outcome.checks:
         name, _, body = condition.name.partition(":")
         body = body or (scene.goals[0].object if len(scene.goals) == 1 else "")
@@ -99,12 +96,10 @@ def end_values(episode: CheckedEpisode) -> Found:
         if value is not None and condition.limit > 0:
             detail = f"{condition.name}: {value:.4g}, outcome says {condition.value:.4g}"
             off = abs(value - condition.value) / condition.limit
-            found.append(Measurement(value=off, frame=frame, detail=detail))
-    return worst(*found)
+            yield Measurement(value=off, frame=frame, detail=detail)
 
 
-@check(
-    group="outcome",
+@outcome_check(
     measures="goal distance in the last frame against the outcome's",
     unit="m",
     reads=(
@@ -114,17 +109,15 @@ def end_values(episode: CheckedEpisode) -> Found:
         "info.scene.goals.onto_from_goal",
     ),
 )
-def final_state(episode: CheckedEpisode) -> Measurement | None:
+def final_state(episode: CheckedEpisode) -> Iterator[Found]:
     """An object that is said to lie at its goal lies there in the last recorded frame."""
-    outcome, scene, c = episode.recording.outcome, episode.info.scene, episode.columns
+    outcome, scene, c = episode.outcome, episode.info.scene, episode.columns
     if outcome is None or not outcome.success or not scene.goals or not c.num_frames:
-        return None
+        return
     said = {condition.name: condition for condition in outcome.checks}
-    found = []
     for goal in scene.goals:
         name = "distance_to_goal" if len(scene.goals) == 1 else f"distance_to_goal:{goal.object}"
-        condition = said.get(name)
-        if condition is None:
+        if (condition := said.get(name)) is None:
             continue
         wanted = goal.onto_from_goal.matrix()
         if goal.onto:
@@ -134,12 +127,10 @@ def final_state(episode: CheckedEpisode) -> Measurement | None:
         distance = math.dist(c.object_poses[goal.object][-1, :2], wanted[:2, 3])
         value = abs(distance - condition.value)
         detail = f"{goal.object}: {distance * 1e3:.1f} mm, outcome says {condition.value * 1e3:.1f} mm"
-        found.append(Measurement(value=value, frame=c.num_frames - 1, detail=detail))
-    return worst(*found)
+        yield Measurement(value=value, frame=c.num_frames - 1, detail=detail)
 
 
-@check(
-    group="outcome",
+@outcome_check(
     measures="speed of the goals' objects at the end",
     unit="m/s",
     reads=(
@@ -147,13 +138,11 @@ def final_state(episode: CheckedEpisode) -> Measurement | None:
         "info.scene.goals.object",
     ),
 )
-def at_rest_in_the_end(episode: CheckedEpisode) -> Measurement | None:
+def at_rest_in_the_end(episode: CheckedEpisode) -> Iterator[Found]:
     """After a success the objects lie still: the recording does not stop in mid-motion."""
-    outcome, c = episode.recording.outcome, episode.columns
+    outcome, c = episode.outcome, episode.columns
     if outcome is None or not outcome.success or c.num_frames < 3:
-        return None
-    found = []
+        return
     for name in dict.fromkeys(goal.object for goal in episode.info.scene.goals):
         step = float(np.linalg.norm(np.diff(c.object_poses[name][-2:, :3], axis=0))) * episode.info.fps
-        found.append(Measurement(value=step, frame=c.num_frames - 1, detail=name))
-    return worst(*found)
+        yield Measurement(value=step, frame=c.num_frames - 1, detail=name)

@@ -2,36 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
-from demorec.check.base import Measurement, check, worst
+from demorec.check.base import EE_TOPICS, Found, Measurement, physics_check, worst_entry, worst_frame
 from demorec.check.episode import CheckedEpisode
 from demorec.check.rows import displacement, matrices
-from demorec.geometry import Array
 
 
-def _worst_joint(episode: CheckedEpisode, table: Array, *, frame_offset: int = 0) -> Measurement | None:
-    """The largest entry of (T, n_arm), with its frame and joint."""
-    if not table.size:
-        return None
-    frame, joint = (int(i) for i in np.unravel_index(int(np.argmax(table)), table.shape))
-    return Measurement(
-        value=float(table[frame, joint]), frame=frame + frame_offset, detail=episode.info.robot.arm_joints[joint]
-    )
-
-
-@check(
-    group="physics",
+@physics_check(
     measures="numbers that are NaN or infinite",
-    warn=0,
     reads=(
         "/joint_states",
         "/gripper",
         "/action",
         "/command",
-        "/ee_pose",
-        "/action/ee_pose",
-        "/command/ee_pose",
+        *EE_TOPICS,
         "/wrench",
         "/object/{body}/pose",
         "/camera/{camera}/pose",
@@ -59,8 +46,7 @@ def finite_numbers(episode: CheckedEpisode) -> Measurement:
     return Measurement(value=total, frame=first[1], detail=first[0])
 
 
-@check(
-    group="physics",
+@physics_check(
     measures="joint positions beyond the robot's limits",
     unit="rad",
     warn=0.005,
@@ -73,18 +59,15 @@ def finite_numbers(episode: CheckedEpisode) -> Measurement:
         "info.robot.position_upper",
     ),
 )
-def joint_position(episode: CheckedEpisode) -> Measurement | None:
+def joint_position(episode: CheckedEpisode) -> Iterator[Found]:
     """Measured and commanded arm joints stay within the limits."""
     robot, c = episode.info.robot, episode.columns
     low, high = np.array(robot.position_lower), np.array(robot.position_upper)
-    found = []
     for table in (c.joint_position[:, : episode.num_arm], c.command_joint_target, c.action_joint_target):
-        found.append(_worst_joint(episode, np.maximum(np.maximum(low - table, table - high), 0.0)))
-    return worst(*found)
+        yield worst_entry(np.maximum(np.maximum(low - table, table - high), 0.0), robot.arm_joints)
 
 
-@check(
-    group="physics",
+@physics_check(
     measures="largest joint velocity in units of its limit",
     warn=1.1,
     fail=1.5,
@@ -95,18 +78,16 @@ def joint_position(episode: CheckedEpisode) -> Measurement | None:
         "info.robot.velocity_limit",
     ),
 )
-def joint_velocity(episode: CheckedEpisode) -> Measurement | None:
+def joint_velocity(episode: CheckedEpisode) -> Iterator[Found]:
     """Velocities, as recorded and as differences of measured and commanded positions."""
-    n, fps, c = episode.num_arm, episode.info.fps, episode.columns
+    n, fps, c, joints = episode.num_arm, episode.info.fps, episode.columns, episode.info.robot.arm_joints
     limit = np.array(episode.info.robot.velocity_limit)
-    found = [_worst_joint(episode, np.abs(c.joint_velocity[:, :n]) / limit)]
+    yield worst_entry(np.abs(c.joint_velocity[:, :n]) / limit, joints)
     for table in (c.joint_position[:, :n], c.command_joint_target, c.action_joint_target):
-        found.append(_worst_joint(episode, np.abs(np.diff(table, axis=0)) * fps / limit, frame_offset=1))
-    return worst(*found)
+        yield worst_entry(np.abs(np.diff(table, axis=0)) * fps / limit, joints, first=1)
 
 
-@check(
-    group="physics",
+@physics_check(
     measures="largest acceleration of the wanted motion in units of its limit",
     reads=(
         "/action",
@@ -118,13 +99,12 @@ def action_acceleration(episode: CheckedEpisode) -> Measurement | None:
 
     A target that stops from one frame to the next is the harder the shorter a frame is; that of 1/30 s is the measure.
     """
-    targets, fps = episode.columns.action_joint_target, episode.info.fps
-    limit = np.array(episode.info.robot.acceleration_limit)
-    return _worst_joint(episode, np.abs(np.diff(targets, 2, axis=0)) * fps * min(fps, 30) / limit, frame_offset=1)
+    targets, fps, robot = episode.columns.action_joint_target, episode.info.fps, episode.info.robot
+    acceleration = np.abs(np.diff(targets, 2, axis=0)) * fps * min(fps, 30)
+    return worst_entry(acceleration / np.array(robot.acceleration_limit), robot.arm_joints, first=1)
 
 
-@check(
-    group="physics",
+@physics_check(
     measures="largest acceleration of the measured motion in units of its limit",
     reads=(
         "/joint_states",
@@ -136,13 +116,12 @@ def joint_acceleration(episode: CheckedEpisode) -> Measurement | None:
 
     Looser than the limits of a real arm: exploration noise on the commands asks for several times as much.
     """
-    velocity, fps = episode.columns.joint_velocity[:, : episode.num_arm], episode.info.fps
-    limit = np.array(episode.info.robot.acceleration_limit)
-    return _worst_joint(episode, np.abs(np.diff(velocity, axis=0)) * fps / limit, frame_offset=1)
+    velocity, robot = episode.columns.joint_velocity[:, : episode.num_arm], episode.info.robot
+    acceleration = np.abs(np.diff(velocity, axis=0)) * episode.info.fps
+    return worst_entry(acceleration / np.array(robot.acceleration_limit), robot.arm_joints, first=1)
 
 
-@check(
-    group="physics",
+@physics_check(
     measures="ratio of position differences to recorded velocities, off 1",
     reads=(
         "/joint_states",
@@ -168,16 +147,13 @@ def velocity_matches_position(episode: CheckedEpisode) -> Measurement | None:
     return Measurement(value=float(off[joint]), detail=f"{episode.info.robot.arm_joints[joint]}: {ratio[joint]:.3f}")
 
 
-@check(
-    group="physics",
+@physics_check(
     measures="EE pose against forward kinematics of the joints",
     unit="m",
     warn=1e-6,
     fail=1e-4,
     reads=(
-        "/ee_pose",
-        "/action/ee_pose",
-        "/command/ee_pose",
+        *EE_TOPICS,
         "/joint_states",
         "/action",
         "/command",
@@ -185,7 +161,7 @@ def velocity_matches_position(episode: CheckedEpisode) -> Measurement | None:
         "info.robot.tcp_link",
     ),
 )
-def forward_kinematics(episode: CheckedEpisode) -> Measurement | None:
+def forward_kinematics(episode: CheckedEpisode) -> Iterator[Found]:
     """Observed, wanted and commanded TCP poses are those of their joints (0.1 m per rad of rotation added)."""
     c, link = episode.columns, episode.info.robot.tcp_link
     rows = (
@@ -193,45 +169,31 @@ def forward_kinematics(episode: CheckedEpisode) -> Measurement | None:
         ("action", c.action_base_from_tcp, episode.kinematics(c.action_joint_target)),
         ("command", c.command_base_from_tcp, episode.kinematics(c.command_joint_target)),
     )
-    found = []
     for name, poses, kinematics in rows:
-        off = displacement(matrices(poses), episode.base_from_link(link, kinematics))
-        if len(off):
-            frame = int(np.argmax(off))
-            found.append(Measurement(value=float(off[frame]), frame=frame, detail=name))
-    return worst(*found)
+        yield worst_frame(displacement(matrices(poses), episode.base_from_link(link, kinematics)), name)
 
 
-@check(
-    group="physics",
+@physics_check(
     measures="deviation of a quaternion's length from 1",
     warn=1e-6,
     fail=1e-3,
     reads=(
-        "/ee_pose",
-        "/action/ee_pose",
-        "/command/ee_pose",
+        *EE_TOPICS,
         "/object/{body}/pose",
         "/camera/{camera}/pose",
     ),
 )
-def unit_quaternions(episode: CheckedEpisode) -> Measurement | None:
+def unit_quaternions(episode: CheckedEpisode) -> Iterator[Found]:
     """Every rotation is one."""
     c = episode.columns
     poses = {"EE": c.base_from_tcp, "action EE": c.action_base_from_tcp, "command EE": c.command_base_from_tcp}
     poses |= {f"object {name}": table for name, table in c.object_poses.items()}
     poses |= {f"camera {name}": table for name, table in c.world_from_camera.items()}
-    found = []
     for name, table in poses.items():
-        off = np.abs(np.linalg.norm(table[:, 3:], axis=1) - 1.0)
-        if len(off):
-            frame = int(np.argmax(off))
-            found.append(Measurement(value=float(off[frame]), frame=frame, detail=name))
-    return worst(*found)
+        yield worst_frame(np.abs(np.linalg.norm(table[:, 3:], axis=1) - 1.0), name)
 
 
-@check(
-    group="physics",
+@physics_check(
     measures="gripper opening against its fingers and its range",
     unit="m",
     warn=1e-6,
@@ -244,30 +206,21 @@ def unit_quaternions(episode: CheckedEpisode) -> Measurement | None:
         "info.robot.gripper.max_width",
     ),
 )
-def gripper_width(episode: CheckedEpisode) -> Measurement | None:
+def gripper_width(episode: CheckedEpisode) -> Iterator[Found]:
     """The opening is that of the finger joints and lies, as its target does, within 0 and the full opening.
 
     A millimetre of overshoot is allowed: the fingers have mass.
     """
     c, robot = episode.columns, episode.info.robot
-    found = []
     fingers = robot.gripper.width(c.joint_position[:, episode.num_arm :])
-    beyond = [np.maximum(np.maximum(-w, w - robot.gripper.max_width) - 1e-3, 0.0) for w in _widths(episode)]
-    rows = ("against the fingers", "range", "range of the action", "range of the command")
-    for detail, off in zip(rows, (np.abs(c.gripper_width - fingers), *beyond), strict=True):
-        if len(off):
-            frame = int(np.argmax(off))
-            found.append(Measurement(value=float(off[frame]), frame=frame, detail=detail))
-    return worst(*found)
+    yield worst_frame(np.abs(c.gripper_width - fingers), "against the fingers")
+    widths = (("", c.gripper_width), (" of the action", c.action_gripper), (" of the command", c.command_gripper))
+    for whose, width in widths:
+        beyond = np.maximum(-width, width - robot.gripper.max_width)
+        yield worst_frame(np.maximum(beyond - 1e-3, 0.0), f"range{whose}")
 
 
-def _widths(episode: CheckedEpisode) -> tuple[Array, Array, Array]:
-    c = episode.columns
-    return c.gripper_width, c.action_gripper, c.command_gripper
-
-
-@check(
-    group="physics",
+@physics_check(
     measures="force that holds the hand against the vertical",
     unit="rad",
     reads=(
@@ -286,7 +239,7 @@ def wrench_holds_the_hand(episode: CheckedEpisode) -> Measurement | None:
     gravity = np.array(episode.info.scene.physics.gravity)
     if c.wrench is None or c.num_frames < 3 or not gravity.any():
         return None
-    hand = episode.world_from_base @ episode.base_from_link(episode.info.robot.hand_link)
+    hand = episode.world_from_link(episode.info.robot.hand_link)
     force = (hand[:, :3, :3] @ c.wrench[:, :3, None])[1:-1, :, 0]
     steady = np.linalg.norm(np.diff(hand[:, :3, 3], 2, axis=0), axis=1) * fps**2 < 0.05 * np.linalg.norm(gravity)
     steady &= c.contact_force[1:-1] == 0
@@ -297,8 +250,7 @@ def wrench_holds_the_hand(episode: CheckedEpisode) -> Measurement | None:
     return Measurement(value=angle, detail=f"{int(steady.sum())} steady frames")
 
 
-@check(
-    group="physics",
+@physics_check(
     measures="distance of the joints from the command before",
     unit="rad",
     reads=(
@@ -310,11 +262,10 @@ def command_tracking(episode: CheckedEpisode) -> Measurement | None:
     """The arm goes where it is sent, rad: catches commands of another episode, of another joint, or made up."""
     c = episode.columns
     off = np.abs(c.joint_position[1:, : episode.num_arm] - c.command_joint_target[:-1])
-    return _worst_joint(episode, off, frame_offset=1)
+    return worst_entry(off, episode.info.robot.arm_joints, first=1)
 
 
-@check(
-    group="physics",
+@physics_check(
     measures="distance between action and executed command",
     unit="rad",
     reads=(
@@ -325,11 +276,10 @@ def command_tracking(episode: CheckedEpisode) -> Measurement | None:
 def action_matches_command(episode: CheckedEpisode) -> Measurement | None:
     """The label differs from what was executed by exploration noise at most, rad."""
     c = episode.columns
-    return _worst_joint(episode, np.abs(c.action_joint_target - c.command_joint_target))
+    return worst_entry(np.abs(c.action_joint_target - c.command_joint_target), episode.info.robot.arm_joints)
 
 
-@check(
-    group="physics",
+@physics_check(
     measures="share of frames in which nothing moves and nothing is asked",
     reads=(
         "/action",

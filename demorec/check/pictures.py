@@ -3,13 +3,23 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.check.base import COLOR_TOPICS, Found, Measurement, NotMeasured, check, worst
-from demorec.check.drawn import PictureComparison
-from demorec.check.episode import CheckedEpisode
+from demorec.check.base import (
+    COLOR_TOPICS,
+    MOTION_TOPICS,
+    PICTURE_TOPICS,
+    Found,
+    Measurement,
+    NotMeasured,
+    picture_check,
+    worst_frame,
+)
+from demorec.check.drawn import PictureComparison, judge_unlike
+from demorec.check.episode import CheckedEpisode, of_each_camera
 from demorec.check.rows import longest_run
 from demorec.geometry import Array
 from demorec.scene.scene import Camera
@@ -23,20 +33,12 @@ _PREDICTED_WEIGHT = 0.5
 """Of the difference of a predicted picture of AV1, which at low qualities leaves whole motions to the next keyframe."""
 
 
-@check(
-    group="pictures",
+@picture_check(
     measures="frames without a picture that decodes",
-    warn=0,
-    needs_pictures=True,
-    reads=(
-        *COLOR_TOPICS,
-        "/camera/{camera}/depth",
-        "/camera/{camera}/segmentation",
-    ),
+    reads=PICTURE_TOPICS,
 )
-def pictures_decode(episode: CheckedEpisode) -> Found:
+def pictures_decode(episode: CheckedEpisode) -> Iterator[Found]:
     """Every camera's video, depth and labels decode to their end, one picture a frame."""
-    found = []
     for camera in episode.cameras:
         for kind in episode.kinds(camera.name):
             summary = episode.pictures(camera, kind)
@@ -45,50 +47,35 @@ def pictures_decode(episode: CheckedEpisode) -> Found:
             if summary.error and missing == 0:
                 missing = 1
             frame = summary.num_pictures if missing else None
-            found.append(Measurement(value=abs(missing), frame=frame, detail=detail))
-    return worst(*found)
+            yield Measurement(value=abs(missing), frame=frame, detail=detail)
 
 
-@check(
-    group="pictures",
+@picture_check(
     measures="pictures that are nearly all black or nearly all white",
-    warn=0,
-    needs_pictures=True,
-    reads=(*COLOR_TOPICS,),
+    reads=COLOR_TOPICS,
 )
-def pictures_exposed(episode: CheckedEpisode) -> Found:
+def pictures_exposed(episode: CheckedEpisode) -> Iterator[Found]:
     """No picture is black or burnt out: 95 % of its pixels darker than 12 or brighter than 250 of 255."""
-    found = []
     for camera in episode.cameras:
         summary = episode.pictures(camera)
         wrong = (summary.dark > 0.95) | (summary.bright > 0.95)
         frame = int(np.argmax(wrong)) if wrong.any() else None
-        found.append(Measurement(value=int(wrong.sum()), frame=frame, detail=f"camera {camera.name}"))
-    return worst(*found)
+        yield Measurement(value=int(wrong.sum()), frame=frame, detail=f"camera {camera.name}")
 
 
-@check(
-    group="pictures",
+@picture_check(
     measures="largest share of a picture that is black or white",
-    needs_pictures=True,
-    reads=(*COLOR_TOPICS,),
+    reads=COLOR_TOPICS,
 )
-def exposure(episode: CheckedEpisode) -> Found:
+def exposure(episode: CheckedEpisode) -> Iterator[Found]:
     """Most of every picture is neither under- nor overexposed."""
-    found = []
     for camera in episode.cameras:
         summary = episode.pictures(camera)
-        share = np.maximum(summary.dark, summary.bright)
-        if len(share):
-            frame = int(np.argmax(share))
-            found.append(Measurement(value=float(share[frame]), frame=frame, detail=f"camera {camera.name}"))
-    return worst(*found)
+        yield worst_frame(np.maximum(summary.dark, summary.bright), f"camera {camera.name}")
 
 
-@check(
-    group="pictures",
+@picture_check(
     measures="difference of the pictures from what the recorded numbers make of them, median of 255",
-    needs_pictures=True,
     reads=(
         *COLOR_TOPICS,
         "info.scene.bodies.rgba",
@@ -96,41 +83,22 @@ def exposure(episode: CheckedEpisode) -> Found:
         "info.scene.light",
     ),
 )
-def pictures_as_drawn(episode: CheckedEpisode) -> Found:
+def pictures_as_drawn(episode: CheckedEpisode) -> Iterator[Found]:
     """The pictures show robot, objects, colours and light as recorded: drawn anew and compared in every frame."""
-    found: list[Found] = []
     for camera in episode.cameras:
-        compared = episode.compared(camera)
-        if isinstance(compared, NotMeasured):
-            found.append(compared)
-            continue
-        found.append(Measurement(value=float(np.median(compared.unlike)), detail=f"camera {camera.name}"))
-    return worst(*found)
+        yield judge_unlike(episode.compared(camera), f"camera {camera.name}")
 
 
-@check(
-    group="pictures",
+@picture_check(
     measures="difference of a single picture from what was recorded at its frame, beyond the usual, of 255",
-    needs_pictures=True,
-    reads=(
-        *COLOR_TOPICS,
-        "/joint_states",
-        "/object/{body}/pose",
-    ),
+    reads=(*COLOR_TOPICS, *MOTION_TOPICS),
 )
-def odd_pictures(episode: CheckedEpisode) -> Found:
+@of_each_camera
+def odd_pictures(episode: CheckedEpisode, camera: Camera, compared: PictureComparison) -> Found:
     """No single picture is another one, torn, blurred, shifted or off in colour."""
-    found: list[Found] = []
-    for camera in episode.cameras:
-        compared = episode.compared(camera)
-        if isinstance(compared, NotMeasured):
-            found.append(compared)
-            continue
-        excess = _excess(compared)
-        excess[~_is_exact(episode, camera)[: len(excess)]] *= _PREDICTED_WEIGHT
-        frame = int(np.argmax(excess))
-        found.append(Measurement(value=float(excess[frame]), frame=frame, detail=f"camera {camera.name}"))
-    return worst(*found)
+    excess = _excess(compared)
+    excess[~_is_exact(episode, camera)[: len(excess)]] *= _PREDICTED_WEIGHT
+    return worst_frame(excess, f"camera {camera.name}")
 
 
 def _excess(compared: PictureComparison) -> Array:
@@ -151,61 +119,43 @@ def _stale(compared: PictureComparison) -> NDArray[np.bool_]:
     return np.asarray(still & (_excess(compared) > STALE_EXCESS))
 
 
-@check(
-    group="pictures",
+@picture_check(
     measures="longest run of unchanged pictures while something moves before the camera, frames",
-    needs_pictures=True,
-    reads=(
-        *COLOR_TOPICS,
-        "/joint_states",
-        "/object/{body}/pose",
-    ),
+    reads=(*COLOR_TOPICS, *MOTION_TOPICS),
 )
-def frozen(episode: CheckedEpisode) -> Found:
+@of_each_camera
+def frozen(episode: CheckedEpisode, camera: Camera, compared: PictureComparison) -> Found:
     """A camera does not stand still while something moves in its view."""
-    return worst(*(_stale_frames(episode, camera, in_runs=True) for camera in episode.cameras))
+    return _stale_frames(camera, compared, *longest_run(_stale(compared)))
 
 
-@check(
-    group="pictures",
+@picture_check(
     measures="pictures that repeat the one before, in the midst of motion",
-    needs_pictures=True,
-    reads=(
-        *COLOR_TOPICS,
-        "/joint_states",
-        "/object/{body}/pose",
-    ),
+    reads=(*COLOR_TOPICS, *MOTION_TOPICS),
 )
-def repeated_pictures(episode: CheckedEpisode) -> Found:
+@of_each_camera
+def repeated_pictures(episode: CheckedEpisode, camera: Camera, compared: PictureComparison) -> Found:
     """No picture was dropped and the one before shown in its place."""
-    return worst(*(_stale_frames(episode, camera, in_runs=False) for camera in episode.cameras))
+    stale = _stale(compared)
+    stale &= _is_exact(episode, camera)[: len(stale)]
+    return _stale_frames(camera, compared, int(stale.sum()), int(np.argmax(stale)))
 
 
-def _stale_frames(episode: CheckedEpisode, camera: Camera, *, in_runs: bool) -> Found:
-    """How many pictures of a camera are stale: the longest run of them, or all."""
-    compared = episode.compared(camera)
-    if isinstance(compared, NotMeasured):
-        return compared
+def _stale_frames(camera: Camera, compared: PictureComparison, count: int, first: int) -> Found:
+    """So many pictures of a camera are stale, of those in which something moves."""
     num_moving = int((compared.motion > MIN_MOTION).sum())
     if not num_moving:
         return NotMeasured(why=f"too little moves before camera {camera.name}")
-    stale = _stale(compared)
-    if not in_runs:
-        stale &= _is_exact(episode, camera)[: len(stale)]
-    value, start = longest_run(stale) if in_runs else (int(stale.sum()), int(np.argmax(stale)))
     detail = f"camera {camera.name}, of {num_moving} frames with motion"
-    return Measurement(value=value, frame=start if value else None, detail=detail)
+    return Measurement(value=count, frame=first if count else None, detail=detail)
 
 
-@check(
-    group="pictures",
+@picture_check(
     measures="likeness of two cameras' pictures (correlation over time)",
-    needs_pictures=True,
-    reads=(*COLOR_TOPICS,),
+    reads=COLOR_TOPICS,
 )
-def distinct_cameras(episode: CheckedEpisode) -> Found:
+def distinct_cameras(episode: CheckedEpisode) -> Iterator[Found]:
     """Two cameras in different places do not show the same pictures."""
-    found = []
     for number, camera in enumerate(episode.cameras):
         for other in episode.cameras[number + 1 :]:
             first, second = episode.pictures(camera).cells, episode.pictures(other).cells
@@ -213,8 +163,7 @@ def distinct_cameras(episode: CheckedEpisode) -> Found:
             if first.shape[1:] != second.shape[1:] or count < 2 or _same_place(episode, camera, other):
                 continue
             value = _correlation(first[:count], second[:count])
-            found.append(Measurement(value=value, detail=f"cameras {camera.name} and {other.name}"))
-    return worst(*found)
+            yield Measurement(value=value, detail=f"cameras {camera.name} and {other.name}")
 
 
 def _same_place(episode: CheckedEpisode, camera: Camera, other: Camera) -> bool:
@@ -232,18 +181,15 @@ def _dot(x: NDArray[np.float32], y: NDArray[np.float32]) -> float:
     return float(np.einsum("i,i->", x, y))  # no BLAS: its threads wait for each other on a busy machine
 
 
-@check(
-    group="pictures",
+@picture_check(
     measures="mean colour of the decoded pictures against the recorded histogram, of 255",
-    needs_pictures=True,
     reads=(
         *COLOR_TOPICS,
         "/camera/{camera}/histogram",
     ),
 )
-def pixel_statistics(episode: CheckedEpisode) -> Found:
+def pixel_statistics(episode: CheckedEpisode) -> Iterator[Found]:
     """The histograms, counted before coding, are those of the pictures: catches swapped channels and other pictures."""
-    found = []
     for camera in episode.cameras:
         decoded = episode.pictures(camera).mean
         if not len(decoded):
@@ -251,12 +197,11 @@ def pixel_statistics(episode: CheckedEpisode) -> Found:
         counted = episode.recording.pixel_statistics(camera.name)
         if counted.num_images != (episode.num_frames + 1) // 2:  # every other picture is counted
             detail = f"camera {camera.name}: {counted.num_images} pictures are counted of {episode.num_frames}"
-            found.append(Measurement(value=math.inf, detail=detail))
+            yield Measurement(value=math.inf, detail=detail)
             continue
         levels = np.arange(256)
         recorded = (counted.counts * levels).sum(axis=1) / np.maximum(counted.counts.sum(axis=1), 1)
         off = np.abs(decoded.mean(axis=0) - recorded)
         channel = int(np.argmax(off))
         detail = f"camera {camera.name}, {('red', 'green', 'blue')[channel]}"
-        found.append(Measurement(value=float(off[channel]), detail=detail))
-    return worst(*found)
+        yield Measurement(value=float(off[channel]), detail=detail)

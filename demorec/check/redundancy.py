@@ -6,15 +6,15 @@ Each form is made again from the other and compared, the moving coordinate frame
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from itertools import pairwise
 
 import numpy as np
 
-from demorec.check.base import Found, Measurement, NotMeasured, check, worst
+from demorec.check.base import PICTURE_TOPICS, Found, Measurement, NotMeasured, alignment_check, file_check, worst_frame
 from demorec.check.episode import CheckedEpisode
 from demorec.check.rows import displacement, matrices
 from demorec.errors import SceneError
-from demorec.geometry import Array
 from demorec.recording import channels, messages, metadata
 from demorec.recording.container import damage_as_recording_error
 from demorec.recording.depth import FORMAT as DEPTH_FORMAT
@@ -25,10 +25,8 @@ from demorec.scene.episode import Event
 from demorec.scene.scene import Camera
 
 
-@check(
-    group="file",
+@file_check(
     measures="messages said once that are not what the metadata make of them",
-    warn=0,
     reads=(
         "/tf_static",
         "/robot_description",
@@ -60,18 +58,15 @@ def latched_messages(episode: CheckedEpisode) -> Found:
     return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{len(expected)} messages")
 
 
-@check(
-    group="file",
+@file_check(
     measures="values of the metadata's summary that its description contradicts",
-    warn=0,
     reads=("metadata demorec.episode", "metadata demorec.outcome"),
 )
 def metadata_agrees(episode: CheckedEpisode) -> Measurement:
     """What the metadata say in short, for people and other tools, is what they say at length."""
-    info, outcome = episode.info, episode.recording.outcome
-    with episode.container() as container:
-        brief = container.metadata(metadata.EPISODE) or {}
-        brief_outcome = container.metadata(metadata.OUTCOME) or {}
+    info, outcome = episode.info, episode.outcome
+    brief = episode.container.metadata(metadata.EPISODE) or {}
+    brief_outcome = episode.container.metadata(metadata.OUTCOME) or {}
     said: dict[str, object] = {
         "task": info.task,
         "instruction": info.instruction,
@@ -86,8 +81,7 @@ def metadata_agrees(episode: CheckedEpisode) -> Measurement:
     return Measurement(value=len(wrong), detail="; ".join(wrong[:3]))
 
 
-@check(
-    group="alignment",
+@alignment_check(
     measures="moving coordinate frames against joints and object poses",
     unit="m",
     warn=1e-6,
@@ -99,7 +93,7 @@ def metadata_agrees(episode: CheckedEpisode) -> Measurement:
         "/robot_description",
     ),
 )
-def moving_frames(episode: CheckedEpisode) -> Found:
+def moving_frames(episode: CheckedEpisode) -> Iterator[Found]:
     """Every frame of /tf is where forward kinematics of the joints, or the object's pose, puts it.
 
     Distances in metres, with 0.1 m per rad of rotation.
@@ -112,24 +106,20 @@ def moving_frames(episode: CheckedEpisode) -> Found:
     with damage_as_recording_error(episode.path):
         rows = layout.decode_rows(block.rows(len(layout.constant)))
     if len(rows) != c.num_frames:
-        return Measurement(value=math.inf, detail=f"{len(rows)} messages for {c.num_frames} frames")
+        yield Measurement(value=math.inf, detail=f"{len(rows)} messages for {c.num_frames} frames")
+        return
     stale = [a != b for a, b in zip(layout.encode(block.time_ns.tolist(), rows), block.messages(), strict=True)]
     if any(stale):
-        return Measurement(value=math.inf, frame=stale.index(True), detail="stamps inside are of another time")
+        yield Measurement(value=math.inf, frame=stale.index(True), detail="stamps inside are of another time")
+        return
     values = rows.reshape(len(rows), -1, 7)
     expected = [episode.recorded_kinematics.parent_from_child(joint) for joint in joints]
     expected += [episode.world_from_object(name) for name in names]
-    found: list[Measurement | None] = []
     for index, (name, poses) in enumerate(zip([*(j.child for j in joints), *names], expected, strict=True)):
-        off = displacement(matrices(values[:, index]), poses)
-        if len(off):
-            frame = int(np.argmax(off))
-            found.append(Measurement(value=float(off[frame]), frame=frame, detail=name))
-    return worst(*found)
+        yield worst_frame(displacement(matrices(values[:, index]), poses), name)
 
 
-@check(
-    group="alignment",
+@alignment_check(
     measures="values that follow from others of the same frame, largest difference",
     warn=1e-9,
     fail=1e-6,
@@ -140,40 +130,24 @@ def moving_frames(episode: CheckedEpisode) -> Found:
         "/joint_states",
     ),
 )
-def derived_values(episode: CheckedEpisode) -> Found:
+def derived_values(episode: CheckedEpisode) -> Iterator[Found]:
     """The velocity of the opening is the sum of the fingers'; nothing is commanded but positions (zeros elsewhere)."""
     n, c = episode.num_arm, episode.columns
-    rows = _values(episode, (channels.GRIPPER, channels.ACTION, channels.COMMAND))
-    expected = {channels.GRIPPER: rows[channels.GRIPPER].copy()}
-    expected[channels.GRIPPER][:, 1] = c.joint_velocity[:, n:].sum(axis=1)
-    for topic in (channels.ACTION, channels.COMMAND):
-        expected[topic] = rows[topic].copy()
-        expected[topic][:, n + 1 :] = 0.0
-    found: list[Measurement | None] = []
-    for topic, values in rows.items():
-        if len(values):
-            off = np.abs(values - expected[topic]).max(axis=1)
-            frame = int(np.argmax(off))
-            found.append(Measurement(value=float(off[frame]), frame=frame, detail=topic))
-    return worst(*found)
-
-
-def _values(episode: CheckedEpisode, topics: tuple[str, ...]) -> dict[str, Array]:
-    """topic -> (T, K) all values of its messages, those that become no column too."""
-    rows = {}
     for stream in frame_streams(episode.info):
-        if stream.topic in topics:
-            with damage_as_recording_error(episode.path):
-                rows[stream.topic] = stream.layout.decode_rows(
-                    episode.block(stream.topic).rows(len(stream.layout.constant))
-                )
-    return rows
+        if stream.topic not in (channels.GRIPPER, channels.ACTION, channels.COMMAND):
+            continue
+        with damage_as_recording_error(episode.path):
+            values = stream.layout.decode_rows(episode.block(stream.topic).rows(len(stream.layout.constant)))
+        expected = values.copy()
+        if stream.topic == channels.GRIPPER:
+            expected[:, 1] = c.joint_velocity[:, n:].sum(axis=1)
+        else:
+            expected[:, n + 1 :] = 0.0
+        yield worst_frame(np.abs(values - expected).max(axis=1), stream.topic)
 
 
-@check(
-    group="file",
+@file_check(
     measures="events that are no log of the changes of phase, or not as they are written",
-    warn=0,
     reads=(
         "/events",
         "/phase",
@@ -199,23 +173,14 @@ def phase_events(episode: CheckedEpisode) -> Measurement:
     return Measurement(value=len(missing) + wrong + again, frame=frame, detail=detail)
 
 
-@check(
-    group="file",
+@file_check(
     measures="picture messages that are not what their coded pictures make of them",
-    warn=0,
-    reads=(
-        "/camera/{camera}/h264",
-        "/camera/{camera}/video",
-        "/camera/{camera}/image/compressed",
-        "/camera/{camera}/depth",
-        "/camera/{camera}/segmentation",
-        "cameras.video.codec",
-    ),
+    reads=(*PICTURE_TOPICS, "cameras.video.codec"),
 )
-def picture_messages(episode: CheckedEpisode) -> Measurement | None:
+def picture_messages(episode: CheckedEpisode) -> Iterator[Found]:
     """/video has the pictures of /h264 byte for byte; every message has its camera's frame, its format and its time."""
-    found = [_picture_messages(episode, camera) for camera in episode.cameras]
-    return worst(*found)
+    for camera in episode.cameras:
+        yield _picture_messages(episode, camera)
 
 
 def _picture_messages(episode: CheckedEpisode, camera: Camera) -> Measurement:
@@ -227,20 +192,19 @@ def _picture_messages(episode: CheckedEpisode, camera: Camera) -> Measurement:
     topics[channels.camera_topic(name, "segmentation")] = messages.PictureMessages(frame_id, LABELS_FORMAT)
     copies: dict[int, bytes] = {}
     wrong, first = 0, None
-    with episode.container() as container:
-        for topic, time_ns, data in container.messages(tuple(topics)):
-            with damage_as_recording_error(episode.path):
-                if codec == "av1" and topic == channels.video_topic(name, codec):
-                    same = data == messages.protobuf_video(time_ns, frame_id, codec, messages.read_protobuf_video(data))
-                elif topic == channels.camera_topic(name, "video"):
-                    same = data == color.compressed_video(time_ns, copies.pop(time_ns, b""))
-                else:
-                    picture = messages.read_compressed_image(data)
-                    same = data == topics[topic].compressed_image(time_ns, picture)
-                    if codec == "h264" and topic == channels.video_topic(name, codec):
-                        copies[time_ns] = picture
-            if not same:
-                wrong += 1
-                first = first if first is not None else int(np.searchsorted(episode.frame_times, time_ns))
+    for topic, time_ns, data in episode.container.messages(tuple(topics)):
+        with damage_as_recording_error(episode.path):
+            if codec == "av1" and topic == channels.video_topic(name, codec):
+                same = data == messages.protobuf_video(time_ns, frame_id, codec, messages.read_protobuf_video(data))
+            elif topic == channels.camera_topic(name, "video"):
+                same = data == color.compressed_video(time_ns, copies.pop(time_ns, b""))
+            else:
+                picture = messages.read_compressed_image(data)
+                same = data == topics[topic].compressed_image(time_ns, picture)
+                if codec == "h264" and topic == channels.video_topic(name, codec):
+                    copies[time_ns] = picture
+        if not same:
+            wrong += 1
+            first = first if first is not None else int(np.searchsorted(episode.frame_times, time_ns))
     wrong += len(copies)
     return Measurement(value=wrong, frame=first, detail=f"camera {name}")

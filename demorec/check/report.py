@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from demorec.check.base import Check, Group, Level, Result, Scope
-from demorec.check.collected import NOT_APPLICABLE, CollectedSubject
+from demorec.check.collected import NOT_APPLICABLE
 from demorec.check.dataset import Dataset
 from demorec.check.episode import CheckedEpisode
 from demorec.check.run import CheckedRun
@@ -58,20 +58,30 @@ class CheckOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SubjectReport:
-    """All results about one recording, run or dataset.
+class Subject:
+    """Something to check.
 
     Attributes:
-        path: What was checked.
+        path: Where it is.
         kind: What it is.
-        results: In the order of the table.
-        is_failed_attempt: As in `Subject`.
+        is_failed_attempt: Whether it is a failed attempt that a run keeps, found there and not named by the user: it
+            is judged apart from what the run made.
     """
 
     path: Path
     kind: Scope
-    results: tuple[Result, ...]
     is_failed_attempt: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class SubjectReport(Subject):
+    """All results about one subject.
+
+    Attributes:
+        results: In the order of the table.
+    """
+
+    results: tuple[Result, ...]
 
     @property
     def level(self) -> Level:
@@ -95,22 +105,6 @@ class SubjectReport:
     def count(self, level: Level) -> int:
         """How many results have a level."""
         return sum(result.level == level for result in self.results)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Subject:
-    """Something to check.
-
-    Attributes:
-        path: Where it is.
-        kind: What it is.
-        is_failed_attempt: Whether it is a failed attempt that a run keeps, found there and not named by the user: it
-            is judged apart from what the run made.
-    """
-
-    path: Path
-    kind: Scope
-    is_failed_attempt: bool = False
 
 
 def find_subjects(paths: Sequence[Path]) -> list[Subject]:
@@ -165,7 +159,10 @@ def check_subject(subject: Subject, options: CheckOptions) -> SubjectReport:
     allow_models(options.allowed)
     checks = options.checks(subject.kind)
     if subject.kind == "recording" and is_collected(subject.path):
-        found = _collected(subject.path, options)
+        with CollectedRecording(subject.path) as recording:
+            gates = ("collected_opens", "collected_readable")
+            found = _run(options.checks("collected"), recording, gates, recording.columns)
+        found += [check.skipped(NOT_APPLICABLE) for check in checks]
     elif subject.kind == "recording":
         with CheckedEpisode(subject.path) as episode:
             found = _run(checks, episode, ("opens", "readable"), lambda: episode.columns)
@@ -173,25 +170,12 @@ def check_subject(subject: Subject, options: CheckOptions) -> SubjectReport:
         found = [check.run(subject.path) for check in options.checks("collected_run")]
         found += [check.skipped(NOT_APPLICABLE) for check in checks]
     elif subject.kind == "run":
-        found = _run(checks, CheckedRun(subject.path), (), None)
+        found = _run(checks, CheckedRun(subject.path), (), lambda: None)
     else:
         dataset = Dataset(subject.path)
         found = _run(checks, dataset, ("dataset_readable",), lambda: dataset.rows)
-    return SubjectReport(
-        path=subject.path,
-        kind=subject.kind,
-        results=tuple(replace(result, detail=_within(subject.path, result.detail)) for result in found),
-        is_failed_attempt=subject.is_failed_attempt,
-    )
-
-
-def _collected(path: Path, options: CheckOptions) -> list[Result]:
-    """The checks of collected episodes; those of simulated ones say that they are not applicable."""
-    checks = options.checks("collected")
-    with CollectedRecording(path) as recording:
-        subject = CollectedSubject(recording)
-        found = _run(checks, subject, ("collected_opens", "collected_readable"), lambda: subject.columns)
-    return found + [check.skipped(NOT_APPLICABLE) for check in options.checks("recording")]
+    results = tuple(replace(result, detail=_within(subject.path, result.detail)) for result in found)
+    return SubjectReport(**vars(subject), results=results)
 
 
 def _within(path: Path, detail: str) -> str:
@@ -199,9 +183,7 @@ def _within(path: Path, detail: str) -> str:
     return detail.removesuffix(f": {path}").replace(f"{path}/", "")
 
 
-def _run(
-    checks: Sequence[Check], subject: object, gates: tuple[str, ...], read: Callable[[], object] | None
-) -> list[Result]:
+def _run(checks: Sequence[Check], subject: object, gates: tuple[str, ...], read: Callable[[], object]) -> list[Result]:
     """Run checks in order; what needs something damaged is skipped rather than failing in the words of the first one.
 
     The checks of file and time look at the file itself and are run as far as it can be opened.
@@ -209,13 +191,12 @@ def _run(
     results: list[Result] = []
     told: set[str] = set()
     unreadable = ""
-    if read is not None:
-        try:
-            read()
-        except Exception as error:
-            if (lack := resource_error(error)) is not None:
-                raise lack from error
-            unreadable = str(error) or "the numbers cannot be read"
+    try:
+        read()
+    except Exception as error:
+        if (lack := resource_error(error)) is not None:
+            raise lack from error
+        unreadable = str(error) or "the numbers cannot be read"
     for check in checks:
         if unreadable and check.group not in _OF_THE_FILE and check.name not in gates:
             results.append(check.blocked())

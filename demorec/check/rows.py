@@ -5,7 +5,7 @@ Written apart from `demorec.scene.kinematics` on purpose: that code made the rec
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -98,6 +98,16 @@ def angle_between(a: Array, b: Array) -> Array:
     # |R - S| (Frobenius) = 2 sqrt(2) sin(angle / 2): exact for small angles, unlike the arc cosine of the trace.
     chord = np.sqrt(((a[:, :3, :3] - b[:, :3, :3]) ** 2).sum(axis=(1, 2)))
     return np.asarray(2 * np.arcsin(np.minimum(chord / (2 * np.sqrt(2)), 1.0)))
+
+
+def finest_lag(lags: Sequence[int], errors: Sequence[float]) -> float:
+    """The lag of the least error: the best of whole lags, and a parabola through it and its neighbours."""
+    best = int(np.argmin(errors))
+    if best in (0, len(errors) - 1):
+        return float(lags[best])
+    low, middle, high = errors[best - 1 : best + 2]
+    bend = low - 2 * middle + high
+    return lags[best] + (0.5 * (low - high) / bend if bend > 0 else 0.0)
 
 
 def longest_run(flags: NDArray[np.bool_]) -> tuple[int, int]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -11,17 +11,17 @@ from typing import Any
 
 import numpy as np
 
-from demorec.check.base import Found, Measurement, NotMeasured, check, worst
-from demorec.check.coverage import infos_by_task, largest_gap, start_vector, twins
+from demorec.check.base import Found, Measurement, NotMeasured, run_check, worst
+from demorec.check.coverage import start_vector, twins, worst_gap
 from demorec.errors import ConfigError, RecordingError, in_words, resource_error
 from demorec.geometry import Array
 from demorec.lerobot.files import read_json
 from demorec.lerobot.paths import INFO_PATH
 from demorec.recording import Recording
+from demorec.runs.run_file import EPISODES, FAILED, RUN_NAME
 from demorec.safety.files import open_regular, read_json_limited
 from demorec.scene.episode import EpisodeInfo, Outcome
 
-RUN_NAME = "run.json"
 _MAX_JSON_BYTES = 2 << 30
 _LINE = {"episode_index": int, "attempt": int, "seed": int, "success": bool, "file": str, "sha256": str}
 """What the line of an attempt says, as far as it is checked."""
@@ -82,7 +82,7 @@ class CheckedRun:
     @property
     def recordings(self) -> list[Path]:
         """Every recording there is, successes first."""
-        return [*sorted((self.path / "episodes").glob("*.mcap")), *sorted((self.path / "failed").glob("*.mcap"))]
+        return [path for folder in (EPISODES, FAILED) for path in sorted((self.path / folder).glob("*.mcap"))]
 
     @cached_property
     def told(self) -> dict[str, Told]:
@@ -103,24 +103,15 @@ class CheckedRun:
         return found
 
     @property
-    def infos(self) -> dict[str, EpisodeInfo]:
-        """File (relative) -> its info, of the recordings that can be read."""
-        return {file: told.info for file, told in self.told.items()}
-
-    @property
     def successes(self) -> list[EpisodeInfo]:
         """Infos of the recordings in episodes/ that were asked for last (others may be there from a larger request)."""
         asked = self.run["num_episodes"]
-        return [
-            info for file, info in self.infos.items() if file.startswith("episodes/") and info.episode_index < asked
-        ]
+        infos = [told.info for file, told in self.told.items() if file.startswith("episodes/")]
+        return [info for info in infos if info.episode_index < asked]
 
 
-@check(
-    group="run",
-    scope="run",
+@run_check(
     measures="files missing, changed since they were made, or not in run.json",
-    warn=0,
     reads=(
         "run.attempts.file",
         "run.attempts.sha256",
@@ -145,11 +136,8 @@ def run_files(run: CheckedRun) -> Measurement:
     return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{len(there)} recordings")
 
 
-@check(
-    group="run",
-    scope="run",
+@run_check(
     measures="recordings whose own account differs from run.json or the run",
-    warn=0,
     reads=(
         "run.attempts.episode_index",
         "run.attempts.attempt",
@@ -211,11 +199,8 @@ def _contradictions(run: CheckedRun, line: dict[str, Any]) -> Iterator[str]:
             yield f"{name} of {file} is {str(value)[:40]!r}, run.json says {str(line[name])[:40]!r}"
 
 
-@check(
-    group="run",
-    scope="run",
+@run_check(
     measures="episodes that have the start or the motion of another",
-    warn=0,
     reads=(
         "info.scene.bodies.world_from_body",
         "info.scene.bodies.shape",
@@ -225,19 +210,15 @@ def _contradictions(run: CheckedRun, line: dict[str, Any]) -> Iterator[str]:
 )
 def run_duplicates(run: CheckedRun) -> Found:
     """Every episode is there once: no two start alike (within a tenth of a millimetre) or move alike."""
-    files = [file for file in run.infos if file.startswith("episodes/")]
+    files = [file for file in run.told if file.startswith("episodes/")]
     if len(files) < 2:
         return None
     config = run.run.get("config", {})
     if config.get("fixed"):
         return NotMeasured(why="--fixed asks for one layout, every episode of which starts alike")
-    starts = [start_vector(run.infos[file].scene) for file in files]
-    motions = [run.told[file].motion for file in files]
-    same_start, start_pair = twins(starts, files, tolerance=1e-4)
-    same_motion, motion_pair = twins(motions, files, tolerance=1e-4)
     return worst(
-        Measurement(value=same_start, detail=start_pair or f"{len(files)} different starts"),
-        Measurement(value=same_motion, detail=motion_pair or f"{len(files)} different motions"),
+        twins([start_vector(run.told[file].info.scene) for file in files], files, "starts"),
+        twins([run.told[file].motion for file in files], files, "motions"),
     )
 
 
@@ -249,9 +230,7 @@ def motion_vector(joint_position: Array) -> Array:
     return np.asarray(joint_position[moments], dtype=np.float64).reshape(-1)
 
 
-@check(
-    group="run",
-    scope="run",
+@run_check(
     measures="largest gap in the range of a randomised quantity, share",
     warn=0.35,
     fail=0.6,
@@ -262,21 +241,13 @@ def motion_vector(joint_position: Array) -> Array:
         "info.scene.goals.onto_from_goal",
     ),
 )
-def run_coverage(run: CheckedRun) -> Measurement | None:
+def run_coverage(run: CheckedRun) -> Found:
     """Start places, yaws, sizes and goals are spread over their ranges (judged from 50 episodes on)."""
     return worst_gap(run.successes)
 
 
-def worst_gap(infos: Sequence[EpisodeInfo]) -> Measurement | None:
-    """The largest gap over all tasks."""
-    return worst(*(largest_gap(group) for group in infos_by_task(infos).values()))
-
-
-@check(
-    group="run",
-    scope="run",
+@run_check(
     measures="episodes that the run's dataset lacks or has too many",
-    warn=0,
     reads=(
         "run.num_episodes",
         "run.attempts.success",

@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from demorec.check.base import Measurement, check
-from demorec.check.dataset import Dataset, Rows
+from demorec.check.base import Measurement, run_check
+from demorec.check.dataset import Dataset, Rows, read_rows
 from demorec.check.run import CheckedRun
 from demorec.errors import ConfigError, DemorecError, RecordingError, in_words, resource_error
 from demorec.export.columns import frame_stride
-from demorec.lerobot.files import read_json, read_table
+from demorec.lerobot.files import read_json
 from demorec.lerobot.options import ExportOptions
 from demorec.lerobot.paths import SIDECAR_DIR, is_dataset
 from demorec.lerobot.prepare import prepare_episode
@@ -49,11 +49,8 @@ class DatasetEpisode:
     told: Mapping[str, Any]
 
 
-@check(
-    group="run",
-    scope="run",
+@run_check(
     measures="episodes of the run's dataset that are not what was recorded",
-    warn=0,
     reads=(
         "observation.state",
         "observation.velocity",
@@ -80,8 +77,7 @@ def run_dataset_content(run: CheckedRun) -> Measurement | None:
 
 def dataset_episodes(dataset: Dataset) -> Iterator[DatasetEpisode]:
     """Every episode that the sidecar knows, in order; ExportError when a file cannot be read."""
-    tables = sorted((dataset.path / SIDECAR_DIR / "episodes").glob("*/*.parquet"))
-    told = [row for path in tables for row in read_table(path, EPISODE_SCHEMA.names).to_pylist()]
+    told = read_rows(dataset.path / SIDECAR_DIR, EPISODE_SCHEMA.names)
     with ExitStack() as stack:
         readers = {
             key: stack.enter_context(closing(PacketReader(dataset.path, dataset.info, key)))

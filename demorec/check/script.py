@@ -12,7 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from demorec.check.base import Found, Measurement, NotMeasured, check
+from demorec.check.base import Found, Measurement, NotMeasured, alignment_check, outcome_check
 from demorec.check.episode import CheckedEpisode
 from demorec.scene.episode import CORRECTED_PHASE, INTERJECTION_EVENT, MISTAKEN_PHASE, POLICY_PHASE
 from demorec.tables import TASKS
@@ -64,13 +64,9 @@ class PhaseStretch:
 
 
 def _stretches(phases: tuple[str, ...]) -> list[PhaseStretch]:
-    found: list[PhaseStretch] = []
-    for frame, phase in enumerate(phases):
-        if found and found[-1].phase == phase:
-            found[-1] = PhaseStretch(phase=phase, first=found[-1].first, last=frame)
-        else:
-            found.append(PhaseStretch(phase=phase, first=frame, last=frame))
-    return found
+    starts = [frame for frame, phase in enumerate(phases) if frame == 0 or phase != phases[frame - 1]]
+    ends = pairwise([*starts, len(phases)])
+    return [PhaseStretch(phase=phases[first], first=first, last=end - 1) for first, end in ends]
 
 
 def _is_scripted(episode: CheckedEpisode) -> NotMeasured | None:
@@ -84,10 +80,8 @@ def _is_scripted(episode: CheckedEpisode) -> NotMeasured | None:
     return None
 
 
-@check(
-    group="alignment",
+@alignment_check(
     measures="frames whose phase says another thing than the gripper's command or the wanted motion",
-    warn=0,
     reads=("/phase", "/action", "/action/ee_pose"),
 )
 def phases_match_motion(episode: CheckedEpisode) -> Found:
@@ -111,10 +105,8 @@ def phases_match_motion(episode: CheckedEpisode) -> Found:
     return Measurement(value=int(wrong.sum()), frame=frame, detail="" if frame is None else f"phase {c.phase[frame]!r}")
 
 
-@check(
-    group="outcome",
+@outcome_check(
     measures="phases out of order, and retries and events that do not fit them",
-    warn=0,
     reads=(
         "/phase",
         "/events",
@@ -145,17 +137,15 @@ def story(episode: CheckedEpisode) -> Found:
     told = [time_ns for time_ns, event in episode.recording.events() if event.name == INTERJECTION_EVENT]
     if [int(episode.frame_times[frame]) for frame in corrected] != told:
         wrong.append(f"{len(told)} interjections at other frames than those where the expert listens ({corrected})")
-    outcome, goals = episode.recording.outcome, episode.info.scene.goals
+    outcome, goals = episode.outcome, episode.info.scene.goals
     if outcome is not None and outcome.success and len(approaches) != len(goals) + outcome.num_retries:
         wrong.append(f"{len(approaches)} approaches for {len(goals)} goals and {outcome.num_retries} retries")
     frame = strange[0][0] if strange else None
     return Measurement(value=len(wrong), frame=frame, detail="; ".join(wrong[:3]) or f"{len(stretches)} phases")
 
 
-@check(
-    group="outcome",
+@outcome_check(
     measures="deliberate misses that are none, or are not said to be one",
-    warn=0,
     reads=(
         "/deliberate_miss",
         "/events",

@@ -143,9 +143,10 @@ class Check:
     def _draw(self, path: Path) -> None:
         from demorec.check.coverage import draw_coverage
 
-        drawn = draw_coverage(list(_infos(self.paths)), path)
+        infos = list(_infos(self.paths))
+        draw_coverage(infos, path)
         if not self.json:
-            say(f"Coverage of {drawn.num_episodes} episode{'' if drawn.num_episodes == 1 else 's'}: {drawn.path}")
+            say(f"Coverage of {counted(len(infos), 'episode')}: {path}")
 
 
 def _infos(paths: Sequence[Path]) -> Iterator[EpisodeInfo]:

@@ -54,7 +54,7 @@ class Good:
     def with_pictures(self, changed: Mapping[tuple[str, ImageKind], Rows]) -> CheckedEpisode:
         """The episode with other pictures; what is drawn of it stays."""
         spoilt = CheckedEpisode(self.episode.path)
-        spoilt._recording = self.episode.recording
+        spoilt.__dict__["recording"] = self.episode.recording
         spoilt.__dict__["columns"] = self.episode.columns
         spoilt.__dict__["_drawn"] = self.episode._drawn
         for key in self.pictures.keys() - changed.keys():

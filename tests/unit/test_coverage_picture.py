@@ -46,8 +46,7 @@ def test_every_axis_is_labelled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         write(self, xy, text, *args, **options)
 
     monkeypatch.setattr(ImageDraw.ImageDraw, "text", text)
-    drawn = draw_coverage(infos, tmp_path / "c.png")
-    assert drawn.num_episodes == 20
+    draw_coverage(infos, tmp_path / "c.png")
     for label in (
         "x (m)",
         "y (m)",
