@@ -56,6 +56,7 @@ def test_every_axis_is_labelled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         "object y (m)",
         "object yaw (rad)",
         "episodes per bin",
+        "20 episodes from above, the robot below: starts (dots), goals (rings)",
     ):
         assert label in written
     assert np.asarray(Image.open(tmp_path / "c.png")).std() > 1
