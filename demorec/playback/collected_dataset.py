@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator, Mapping
-from functools import partial
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +15,7 @@ from demorec.lerobot.layout import AUTOMATIC_FEATURES, DatasetInfo
 from demorec.lerobot.reader import read_tasks
 from demorec.lerobot.robots import DatasetRobot
 from demorec.plain import from_json
-from demorec.playback.collected import PlayedCollected
-from demorec.playback.episode import Curves, Statements, Video
+from demorec.playback.episode import Curves, Depth, PlayedCollected, Statements, Video
 from demorec.recording.collected.transforms import JointPositions
 from demorec.scene.collected import CollectedCamera, CollectedFeature, CollectedInfo, CollectedOutcome, Origin
 
@@ -31,7 +29,7 @@ def collected_of_dataset(
     data: Mapping[str, Array],
     time_ns: NDArray[np.int64],
     videos: Mapping[str, Video],
-    depth: Mapping[str, Callable[[], Iterator[NDArray[np.float32]]]],
+    depth: Mapping[str, Depth],
     robot: DatasetRobot | None,
     statements: Statements,
 ) -> PlayedCollected:
@@ -44,7 +42,7 @@ def collected_of_dataset(
         data: Feature -> (T, D) of the episode's rows.
         time_ns: (T,) of the rows.
         videos: Camera -> coded pictures.
-        depth: Depth camera -> reads (H, W) metres of every row.
+        depth: Depth camera -> reads (time_ns, (H, W) metres) of every row.
         robot: The arm, if it is known.
         statements: What is said of the episode.
 
@@ -91,12 +89,6 @@ def collected_of_dataset(
         joint_position=dict(zip(positions.joints, values, strict=True)),
         curves={name: Curves(time_ns=time_ns, values=data[name], names=parts) for name, parts in names.items()},
         videos=videos,
-        depth={name: partial(_timed, time_ns, read) for name, read in depth.items()},
+        depth=depth,
         statements=statements,
     )
-
-
-def _timed(
-    time_ns: NDArray[np.int64], read: Callable[[], Iterator[NDArray[np.float32]]]
-) -> Iterator[tuple[int, NDArray[np.float32]]]:
-    return zip(time_ns.tolist(), read(), strict=False)

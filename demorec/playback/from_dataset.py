@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
-from itertools import batched, islice
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +22,8 @@ from demorec.lerobot.packets import PACKET_CODECS, episode_distances, episode_pa
 from demorec.lerobot.paths import SIDECAR_DIR
 from demorec.lerobot.reader import EpisodePlace, episode_places
 from demorec.lerobot.robots import DatasetRobot, read_robot
-from demorec.playback.collected import PlayedCollected
 from demorec.playback.collected_dataset import collected_of_dataset
-from demorec.playback.episode import Box, Curves, PlayedEpisode, Video, VideoBatch
+from demorec.playback.episode import Box, Curves, Depth, PlayedCollected, PlayedEpisode, Video, timed
 from demorec.playback.held_objects import held_object_poses
 from demorec.scene.assets import asset_path
 from demorec.scene.episode import EpisodeInfo, Outcome, SuccessCheck, frame_time_ns
@@ -32,8 +31,6 @@ from demorec.scene.features import DEPTH_SUFFIX, ENVIRONMENT_STATE, IMAGE_PREFIX
 from demorec.scene.kinematics import ArmKinematics
 from demorec.scene.urdf import Urdf, check_primitives
 from demorec.scene.validity import read_episode_info
-
-_PICTURES_AT_ONCE = 256
 
 
 def dataset_episodes(root: Path) -> list[int]:
@@ -68,7 +65,7 @@ def _read_episode(root: Path, episode_index: int) -> PlayedEpisode | PlayedColle
     if row["episode_info"] is None:
         data = _data(root, place, columns)
         time_ns = _times(len(data["index"]), described)
-        videos, depth = _videos(root, described, place, time_ns), _depth(root, described, place)
+        videos, depth = _videos(root, described, place, time_ns), _depth(root, described, place, time_ns)
         robot, statements = _robot(root, row), _statements(root, episode_index, described, time_ns)
         return collected_of_dataset(root, row, described, data, time_ns, videos, depth, robot, statements)
     export = dict(read_json(root / SIDECAR_DIR / "export.json"))
@@ -106,7 +103,7 @@ def _read_episode(root: Path, episode_index: int) -> PlayedEpisode | PlayedColle
         phase=_phases(row, num_frames),
         curves=_curves(info, data, base_from_tcp, time_ns, with_targets=export.get("action") == "joint"),
         videos=_videos(root, described, place, time_ns),
-        depth={name.removesuffix(DEPTH_SUFFIX): read for name, read in _depth(root, described, place).items()},
+        depth={name.removesuffix(DEPTH_SUFFIX): read for name, read in _depth(root, described, place, time_ns).items()},
         statements=_statements(root, episode_index, described, time_ns),
         boxes=_boxes(root, described, data["index"][:, 0]),
     )
@@ -266,29 +263,23 @@ def _videos(root: Path, described: DatasetInfo, place: EpisodePlace, time_ns: ND
     for key, feature in described.features.items():
         codec = PACKET_CODECS.get(str((feature.info or {}).get("video.codec")))
         if feature.is_video and codec is not None and not feature.is_depth:
-            batches = partial(_video_batches, root, described, key, place, time_ns)
-            result[key.removeprefix(IMAGE_PREFIX)] = Video(codec=codec, batches=batches)
+            packets = partial(_packets, root, described, key, place, time_ns)
+            result[key.removeprefix(IMAGE_PREFIX)] = Video(codec=codec, packets=packets)
     return result
 
 
-def _video_batches(
+def _packets(
     root: Path, described: DatasetInfo, key: str, place: EpisodePlace, time_ns: NDArray[np.int64]
-) -> Iterator[VideoBatch]:
-    for packets in batched(episode_packets(root, described, key, place), _PICTURES_AT_ONCE):
-        frames = np.array([packet.frame for packet in packets])
-        yield VideoBatch(
-            time_ns=time_ns[np.maximum(frames, 0)],  # those before the episode are decoded with its first frame
-            samples=[packet.data for packet in packets],
-            is_keyframe=np.array([packet.is_keyframe for packet in packets]),
-        )
+) -> Iterator[tuple[int, bytes, bool]]:
+    for packet in episode_packets(root, described, key, place):
+        # Those before the episode are decoded with its first frame.
+        yield int(time_ns[max(packet.frame, 0)]), packet.data, packet.is_keyframe
 
 
-def _depth(
-    root: Path, described: DatasetInfo, place: EpisodePlace
-) -> dict[str, Callable[[], Iterator[NDArray[np.float32]]]]:
-    """Depth feature, without its prefix -> reads (H, W) metres of every frame."""
+def _depth(root: Path, described: DatasetInfo, place: EpisodePlace, time_ns: NDArray[np.int64]) -> dict[str, Depth]:
+    """Depth feature, without its prefix -> reads (time_ns, (H, W) metres) of every frame."""
     return {
-        key.removeprefix(IMAGE_PREFIX): partial(episode_distances, root, described, key, place)
+        key.removeprefix(IMAGE_PREFIX): partial(timed, time_ns, partial(episode_distances, root, described, key, place))
         for key, feature in described.features.items()
         if feature.is_video and feature.is_depth
     }

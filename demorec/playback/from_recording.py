@@ -6,17 +6,14 @@ import hashlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
-from itertools import batched
 from pathlib import Path
 
 import numpy as np
 
-from demorec.playback.episode import Curves, PlayedEpisode, Video, VideoBatch
+from demorec.playback.episode import Curves, PlayedEpisode, Video, timed
 from demorec.recording import Recording
 from demorec.recording.channels import description_topic
 from demorec.scene.episode import EpisodeColumns
-
-_PICTURES_AT_ONCE = 256
 
 
 @contextmanager
@@ -46,10 +43,14 @@ def open_recording(path: Path, *, group: str) -> Iterator[PlayedEpisode]:
             events=tuple(recording.events()),
             curves=_curves(recording, columns),
             videos={
-                name: Video(codec=recording.video_settings(name).codec, batches=partial(_batches, recording, name))
+                name: Video(codec=recording.video_settings(name).codec, packets=partial(_packets, recording, name))
                 for name in recording.cameras
             },
-            depth={name: partial(recording.depth, name) for name in recording.cameras if recording.has_depth(name)},
+            depth={
+                name: partial(timed, columns.time_ns, partial(recording.depth, name))
+                for name in recording.cameras
+                if recording.has_depth(name)
+            },
             segmentation={
                 name: partial(recording.segmentation, name)
                 for name in recording.cameras
@@ -63,13 +64,9 @@ def _body_description(recording: Recording, body: str) -> str | None:
     return recording.description(body) if description_topic(body) in recording.topics else None
 
 
-def _batches(recording: Recording, camera: str) -> Iterator[VideoBatch]:
-    for packets in batched(recording.packets(camera), _PICTURES_AT_ONCE):
-        yield VideoBatch(
-            time_ns=np.array([packet.time_ns for packet in packets], dtype=np.int64),
-            samples=[packet.data for packet in packets],
-            is_keyframe=np.array([packet.is_keyframe for packet in packets]),
-        )
+def _packets(recording: Recording, camera: str) -> Iterator[tuple[int, bytes, bool]]:
+    for packet in recording.packets(camera):
+        yield packet.time_ns, packet.data, packet.is_keyframe
 
 
 def _curves(recording: Recording, columns: EpisodeColumns) -> dict[str, Curves]:

@@ -11,8 +11,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 
-from demorec.playback.collected import PlayedCollected
-from demorec.playback.episode import PlayedEpisode
+from demorec.playback.episode import PlayedCollected, PlayedEpisode
 from demorec.playback.sources import PlaybackSource
 from demorec.scene.episode import Outcome
 from demorec.scene.scene import Scene

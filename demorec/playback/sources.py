@@ -9,8 +9,8 @@ from functools import partial
 from pathlib import Path
 
 from demorec.errors import ConfigError, OptionError
-from demorec.playback.collected import PlayedCollected, open_collected
-from demorec.playback.episode import PlayedEpisode
+from demorec.playback.collected import open_collected
+from demorec.playback.episode import PlayedCollected, PlayedEpisode
 from demorec.playback.from_dataset import dataset_episodes, open_dataset_episode
 from demorec.playback.from_recording import open_recording
 from demorec.recording.opening import is_collected
