@@ -10,9 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 from tyro.conf import Positional
 
+from demorec.cli.check_deep import deep_lines, deep_summary, plain_deep
+from demorec.cli.replay import demonstrations, told
 from demorec.cli.shared.allow import Allow, allowed_modules
 from demorec.cli.shared.output import counted, say, say_json
-from demorec.cli.shared.paths import places_read, refuse_inside
+from demorec.cli.shared.paths import need_paths, places_read, refuse_inside
 from demorec.cli.shared.progress import ProgressBar
 from demorec.errors import ConfigError, OptionError
 from demorec.safety.replacing import PICTURE, check_replaceable
@@ -69,10 +71,7 @@ class Check:
 
     def run(self) -> int:
         """Check and report."""
-        if not self.paths:
-            raise ConfigError(
-                "No path is given: name a recording, a run or a dataset, e.g. demorec check recordings/demo."
-            )
+        need_paths(self.paths, "check")
         if self.replay < 0:
             raise OptionError("replay", f"is {self.replay}, it must be 0 or more.")
         if self.coverage_picture is not None:
@@ -95,22 +94,18 @@ class Check:
                 if not self.json:
                     say(*_lines(report, verbose=self.verbose))
         if self.replay:
-            for replayed in _replays(self.paths, self.replay, allowed):
-                replays.append(replayed)
+            for replayed, is_as_recorded in _replays(self.paths, self.replay, allowed):
+                replays.append((replayed, is_as_recorded))
                 if not self.json:
-                    from demorec.cli.replay import told
-
                     say(told(replayed))
         remade = list(self._remade(subjects, options)) if self.deep else []
         if self.coverage_picture is not None:
             self._draw(self.coverage_picture)
         failed = [report for report in reports if report.is_bad(strict=self.strict)]
-        diverged = [replayed for replayed in replays if not _as_recorded(replayed)]
+        diverged = [replayed for replayed, is_as_recorded in replays if not is_as_recorded]
         different = [report for report in remade if report.level == "fail" or (self.strict and report.level == "warn")]
-        from demorec.cli.check_deep import deep_summary, plain_deep
-
         if self.json:
-            plain = [_plain(report) for report in reports] + [_plain_replay(r) for r in replays]
+            plain = [_plain(report) for report in reports] + [_plain_replay(*replayed) for replayed in replays]
             say_json(plain + [plain_deep(report) for report in remade])
         else:
             summary = _summary(reports, len(failed), len(replays), len(diverged))
@@ -118,7 +113,6 @@ class Check:
         return 1 if failed or diverged or different else 0
 
     def _remade(self, subjects: Sequence[Subject], options: CheckOptions) -> Iterator[DeepReport]:
-        from demorec.cli.check_deep import deep_lines
         from demorec.replay.deep import deep_checks, deep_dataset_checks
 
         paths = [subject.path for subject in subjects if subject.kind == "recording"]
@@ -165,21 +159,14 @@ def _infos(paths: Sequence[Path]) -> Iterator[EpisodeInfo]:
             yield from Dataset(subject.path).infos
 
 
-def _replays(paths: Sequence[Path], count: int, allowed: tuple[str, ...]) -> Iterator[ReplayReport]:
-    from demorec.cli.replay import demonstrations
-    from demorec.replay import ReplayOptions, replay_all
+def _replays(paths: Sequence[Path], count: int, allowed: tuple[str, ...]) -> Iterator[tuple[ReplayReport, bool]]:
+    """Replays, and whether each is as recorded: bit for bit, or for float32 actions of a dataset in its outcome."""
+    from demorec.replay import ReplayOptions, is_as_recorded, replay_all
 
     options = ReplayOptions(allowed=allowed)
     for path in paths:
         found = demonstrations([path], options, limit=count)
-        yield from (report for report, _ in replay_all(found, options))
-
-
-def _as_recorded(report: ReplayReport) -> bool:
-    """Bit for bit, or for float32 actions of a dataset: with the same outcome."""
-    from demorec.replay import is_as_recorded
-
-    return is_as_recorded(report)
+        yield from ((report, is_as_recorded(report)) for report, _ in replay_all(found, options))
 
 
 def _lines(report: SubjectReport, *, verbose: bool) -> list[str]:
@@ -235,13 +222,13 @@ def _plain(report: SubjectReport) -> dict[str, Any]:
     )
 
 
-def _plain_replay(report: ReplayReport) -> dict[str, Any]:
+def _plain_replay(report: ReplayReport, is_as_recorded: bool) -> dict[str, Any]:
     from demorec.plain import to_plain
 
     plain = to_plain(report)
     return {
         "path": plain.pop("name"),
         "kind": "replay",
-        "level": "pass" if _as_recorded(report) else "fail",
+        "level": "pass" if is_as_recorded else "fail",
         "results": [plain],
     }

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 from tyro.conf import Positional
 
 from demorec.cli.shared.output import counted, say, say_json
+from demorec.cli.shared.paths import need_paths
 from demorec.cli.shared.table import aligned, size_in_words
-from demorec.errors import ConfigError, ExportError, RecordingError, in_words, resource_error, without_path
+from demorec.errors import ExportError, RecordingError, in_words, resource_error, without_path
 from demorec.lerobot.paths import INFO_PATH
 from demorec.runs.find import Found, expect
 from demorec.scene.features import IMAGE_PREFIX
@@ -41,10 +42,7 @@ class Info:
 
     def run(self) -> int:
         """Read and print; 1 when something among several paths cannot be read."""
-        if not self.paths:
-            raise ConfigError(
-                "No path is given: name a recording, a run or a dataset, e.g. demorec info recordings/demo."
-            )
+        need_paths(self.paths, "info")
         found = [_describe(path) for path in self.paths]
         if self.json:
             plain = [item for item, _ in found]

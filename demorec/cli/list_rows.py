@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from tyro.conf import Positional
 
 from demorec.cli.shared.output import say, say_json
+from demorec.cli.shared.table import aligned
 from demorec.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -41,10 +42,8 @@ class ListRows:
         rows = [(name, describe(registry, name)) for name in registry.names()]
         if self.json:
             say_json([{"name": name, "summary": summary} for name, summary in rows])
-            return 0
-        width = max(len(name) for name, _ in rows)
-        for name, summary in rows:
-            say(f"{name:<{width}}  {summary}")
+        else:
+            say(*aligned(rows))
         return 0
 
     def _print_coverage(self) -> int:
@@ -56,11 +55,9 @@ class ListRows:
         rows = coverage()
         if self.json:
             say_json([to_plain(row) for row in rows])
-            return 0
-        width = max(len(row.name) for row in rows)
-        for row in rows:
-            told = ", ".join(row.checks) or f"no check: {row.why_not}"
-            say(f"{row.kind:<6}  {row.name:<{width}}  {told}")
+        else:
+            told = ((row.kind, row.name, ", ".join(row.checks) or f"no check: {row.why_not}") for row in rows)
+            say(*aligned(told))
         return 0
 
 

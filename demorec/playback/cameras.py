@@ -35,7 +35,7 @@ def log_cameras(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpis
         if name in episode.videos:
             _send_video(recording, paths.camera(name), episode.time_ns, episode.videos[name])
         if name in depth:
-            _send_depth(recording, paths.depth(name), episode.time_ns, depth[name]())
+            _send_depth(recording, paths.camera(name, "/depth"), episode.time_ns, depth[name]())
 
 
 def _log_calibrations(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisode) -> None:
@@ -105,7 +105,7 @@ def _log_segmentations(recording: rr.RecordingStream, paths: Paths, episode: Pla
     for camera in episode.info.scene.cameras:
         if camera.name not in episode.segmentation:
             continue
-        entity = paths.segmentation(camera.name)
+        entity = paths.camera(camera.name, "/segmentation")
         for batch in batched(timed(episode.time_ns, episode.segmentation[camera.name]), _PICTURES_AT_ONCE):
             pictures = [np.searchsorted(known, values).astype(np.uint16) for _, values in batch]
             height, width = pictures[0].shape

@@ -116,7 +116,7 @@ def _collected_views(episode: PlayedCollected) -> rrb.Container:
     top += [
         rrb.Spatial2DView(origin=paths.camera(camera), contents=["$origin"], name=camera) for camera in episode.videos
     ]
-    top += [rrb.Spatial2DView(origin=paths.depth(camera), name=camera) for camera in episode.depth]
+    top += [rrb.Spatial2DView(origin=paths.camera(camera, "/depth"), name=camera) for camera in episode.depth]
     plots = [
         rrb.TimeSeriesView(
             origin="/",
@@ -137,7 +137,11 @@ def _view_3d(episode: PlayedEpisode, roots: list[Paths], name: str) -> rrb.Spati
     for paths in roots:
         contents.append(f"+ {paths.world}/**")
         for camera in episode.info.scene.cameras:
-            hidden = (paths.depth(camera.name), paths.segmentation(camera.name), paths.boxes(camera.name))
+            hidden = (
+                paths.camera(camera.name, "/depth"),
+                paths.camera(camera.name, "/segmentation"),
+                paths.camera(camera.name, "/boxes"),
+            )
             contents += [f"- {entity}" for entity in hidden]
         for body in episode.info.scene.bodies:
             if max(body.shape.extents) > _FLOOR:
@@ -185,14 +189,16 @@ def _camera_views(episode: PlayedEpisode, paths: Paths) -> list[rrb.View | rrb.C
     for camera in episode.info.scene.cameras:
         tabs: list[rrb.View] = []
         if camera.name in episode.videos:
-            contents = ["$origin", *([paths.boxes(camera.name)] if camera.name in episode.boxes else [])]
+            contents = ["$origin", *([paths.camera(camera.name, "/boxes")] if camera.name in episode.boxes else [])]
             tabs.append(
                 rrb.Spatial2DView(origin=paths.camera(camera.name), contents=contents, name=f"{camera.name} camera")
             )
         if camera.name in episode.depth:
-            tabs.append(rrb.Spatial2DView(origin=paths.depth(camera.name), name=f"{camera.name} depth"))
+            tabs.append(rrb.Spatial2DView(origin=paths.camera(camera.name, "/depth"), name=f"{camera.name} depth"))
         if camera.name in episode.segmentation:
-            tabs.append(rrb.Spatial2DView(origin=paths.segmentation(camera.name), name=f"{camera.name} segments"))
+            tabs.append(
+                rrb.Spatial2DView(origin=paths.camera(camera.name, "/segmentation"), name=f"{camera.name} segments")
+            )
         if tabs:
             views.append(tabs[0] if len(tabs) == 1 else rrb.Tabs(*tabs, active_tab=0))
     if len(views) > 3:

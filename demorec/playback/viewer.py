@@ -8,7 +8,6 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -32,6 +31,12 @@ _NO_DRIVER = ("Failed to create render state", "Failed to get render context")
 _NO_GLYPH = re.compile(r'No glyph for "(?P<character>.+?)" \((?P<code>U\+[0-9A-F]+)\)')
 
 
+def _start_viewer(*arguments: str, **options: Any) -> subprocess.Popen[Any]:
+    """The viewer, which nobody but this machine reaches; `options` are those of `start_program`."""
+    command = [viewer_program(), "--bind", "127.0.0.1", *arguments]
+    return start_program(command, env=viewer_environment(), **options)
+
+
 def show(recordings: Sequence[Path]) -> None:
     """Open a window with .rrd files and wait until it is closed.
 
@@ -44,27 +49,9 @@ def show(recordings: Sequence[Path]) -> None:
             "There is no screen to open a window on: use --screenshot x.png, --web for a browser, or, unless it is an "
             ".rrd file already, --save x.rrd."
         )
-    command = [
-        viewer_program(),
-        "--port",
-        "auto",
-        "--bind",
-        "127.0.0.1",
-        "--hide-welcome-screen",
-        *map(str, recordings),
-    ]
-    code = start_program(command, env=viewer_environment()).wait()
+    code = _start_viewer("--port", "auto", "--hide-welcome-screen", *map(str, recordings)).wait()
     if code:
         raise RecordingError(f"Rerun's viewer ended with exit code {code}.")
-
-
-@dataclass(frozen=True, kw_only=True)
-class ViewerReport:
-    """What a view of the viewer complains about."""
-
-    view: str
-    severity: str
-    message: str
 
 
 def why_it_ended(said: str) -> DemorecError:
@@ -98,14 +85,9 @@ class HeadlessViewer:
         self._recordings = recordings
         # Not a pipe, which would fill up when nobody reads it.
         self._said = tempfile.TemporaryFile(mode="w+", errors="replace")  # noqa: SIM115 (closed by close)
-        self._process = start_program(
-            [
-                viewer_program(), "--headless", "--port", str(self._port), "--bind", "127.0.0.1",
-                "--window-size", f"{width}x{height}", "--hide-welcome-screen", *map(str, recordings),
-            ],
-            env=viewer_environment(),
-            stdout=subprocess.DEVNULL,
-            stderr=self._said,
+        self._process = _start_viewer(
+            "--headless", "--port", str(self._port), "--window-size", f"{width}x{height}", "--hide-welcome-screen",
+            *map(str, recordings), stdout=subprocess.DEVNULL, stderr=self._said,
         )  # fmt: skip
         try:
             self.client = self._connect()
@@ -214,17 +196,9 @@ class HeadlessViewer:
                 return self._picture(view.view_id)
         raise KeyError(name)
 
-    def reports(self) -> list[ViewerReport]:
-        """Every warning and error of a view."""
-        return [
-            ViewerReport(view=view.name, severity=report.severity, message=report.summary)
-            for view in self.client.get_state().views
-            for report in view.reports
-        ]
-
-    def state(self) -> Any:
-        """Recordings, views and time, as Rerun tells them."""
-        return self.client.get_state()
+    def reports(self) -> list[tuple[str, Any]]:
+        """Every warning and error of a view: (its name, what Rerun tells)."""
+        return [(view.name, report) for view in self.client.get_state().views for report in view.reports]
 
 
 def moment(seconds: float | None, end: float) -> float:
@@ -249,9 +223,9 @@ def screenshot(recordings: Sequence[Path], target: Path, *, seconds: float | Non
     """
     with HeadlessViewer(*recordings, width=width, height=height) as viewer:
         viewer.seek(moment(seconds, viewer.end))
-        errors = [report for report in viewer.reports() if report.severity == "error"]
-        if errors:
-            raise RecordingError(f"The view {errors[0].view!r} cannot be drawn: {errors[0].message}.")
+        for view, report in viewer.reports():
+            if report.severity == "error":
+                raise RecordingError(f"The view {view!r} cannot be drawn: {report.summary}.")
         try:
             viewer.save_picture(target)
         except OSError as error:
@@ -270,13 +244,9 @@ def serve_web(recordings: Sequence[Path], *, web_port: int = 0) -> Iterator[tupl
     """
     data_port, web_port = free_port(), web_port or free_port()
     memory = max(1024, 3 * sum(recording.stat().st_size for recording in recordings) // 2**20)
-    process = start_program(
-        [
-            viewer_program(), "--serve-web", "--bind", "127.0.0.1", "--port", str(data_port),
-            "--web-viewer-port", str(web_port), "--server-memory-limit", f"{memory}MiB", *map(str, recordings),
-        ],
-        env=viewer_environment(),
-        stdout=subprocess.DEVNULL,
+    process = _start_viewer(
+        "--serve-web", "--port", str(data_port), "--web-viewer-port", str(web_port), "--server-memory-limit",
+        f"{memory}MiB", *map(str, recordings), stdout=subprocess.DEVNULL,
     )  # fmt: skip
     try:
         page = f"http://127.0.0.1:{web_port}"

@@ -14,6 +14,14 @@ from demorec.safety.replacing import use_as_source
 _PARTS = (EPISODES, FAILED, UNFINISHED)
 
 
+def need_paths(paths: Sequence[Path], command: str) -> None:
+    """Raise ConfigError when no path is given; `command` names one that takes all that can be shown."""
+    if not paths:
+        raise ConfigError(
+            f"No path is given: name a recording, a run or a dataset, e.g. demorec {command} recordings/demo."
+        )
+
+
 def places_read(paths: Sequence[Path]) -> list[Path]:
     """Of recordings, runs and datasets: those files and folders in which a picture may be a part of the data.
 
