@@ -100,7 +100,7 @@ class Check:
                     say(told(replayed))
         remade = list(self._remade(subjects, options)) if self.deep else []
         if self.coverage_picture is not None:
-            self._draw(self.coverage_picture)
+            self._draw(self.coverage_picture, subjects)
         failed = [report for report in reports if report.is_bad(strict=self.strict)]
         diverged = [replayed for replayed, is_as_recorded in replays if not is_as_recorded]
         different = [report for report in remade if report.level == "fail" or (self.strict and report.level == "warn")]
@@ -115,10 +115,7 @@ class Check:
     def _remade(self, subjects: Sequence[Subject], options: CheckOptions) -> Iterator[DeepReport]:
         from demorec.replay.deep import deep_checks, deep_dataset_checks
 
-        paths = [subject.path for subject in subjects if subject.kind == "recording"]
-        runs = [subject.path for subject in subjects if subject.kind == "run"]
-        # The dataset of a run is compared with the run's recordings already.
-        datasets = [s.path for s in subjects if s.kind == "dataset" and s.path.parent not in runs]
+        paths, datasets = _split(subjects)
         found = [deep_checks(paths, workers=options.workers, allowed=options.allowed)]
         found += [deep_dataset_checks(path, allowed=options.allowed) for path in datasets]
         with ProgressBar("making again", total=0 if datasets else len(paths)) as bar:
@@ -134,29 +131,33 @@ class Check:
         check_replaceable(path, PICTURE, overwrite=self.overwrite, sources=places_read(self.paths))
         refuse_inside([path])
 
-    def _draw(self, path: Path) -> None:
+    def _draw(self, path: Path, subjects: Sequence[Subject]) -> None:
         from demorec.check.coverage import draw_coverage
 
-        drawn = draw_coverage(list(_infos(self.paths)), path)
+        drawn = draw_coverage(list(_infos(subjects)), path)
         if not self.json:
-            say(f"Coverage of {drawn.num_episodes} episode{'' if drawn.num_episodes == 1 else 's'}: {drawn.path}")
+            say(f"Coverage of {counted(drawn.num_episodes, 'episode')}: {drawn.path}")
 
 
-def _infos(paths: Sequence[Path]) -> Iterator[EpisodeInfo]:
+def _split(subjects: Sequence[Subject]) -> tuple[list[Path], list[Path]]:
+    """Recordings, and datasets but for those of the runs, which hold the same episodes once more."""
+    runs = [subject.path for subject in subjects if subject.kind == "run"]
+    datasets = [s.path for s in subjects if s.kind == "dataset" and s.path.parent not in runs]
+    return [subject.path for subject in subjects if subject.kind == "recording"], datasets
+
+
+def _infos(subjects: Sequence[Subject]) -> Iterator[EpisodeInfo]:
     """Of every successful episode of runs, every recording, and every episode of datasets."""
     from demorec.check.dataset import Dataset
-    from demorec.check.report import find_subjects
     from demorec.recording import Recording
 
-    # The dataset of a run holds the same episodes once more.
-    subjects = find_subjects(paths)
-    runs = {subject.path for subject in subjects if subject.kind == "run"}
-    for subject in subjects:
-        if subject.kind == "recording" and subject.path.parent.name != "failed":
-            with Recording(subject.path) as recording:
+    recordings, datasets = _split(subjects)
+    for path in recordings:
+        if path.parent.name != "failed":
+            with Recording(path) as recording:
                 yield recording.info
-        elif subject.kind == "dataset" and subject.path.parent not in runs:
-            yield from Dataset(subject.path).infos
+    for path in datasets:
+        yield from Dataset(path).infos
 
 
 def _replays(paths: Sequence[Path], count: int, allowed: tuple[str, ...]) -> Iterator[tuple[ReplayReport, bool]]:

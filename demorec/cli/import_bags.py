@@ -109,22 +109,19 @@ class Import:
 
         self.video.validate()
         result = import_lerobot(self.bags[1], self.out, video=self.video)
-        say(*(f"camera {name}: {told}" for name, told in result.cameras.items()))
-        say(*(f"{name} is left out: {reason}." for name, reason in result.left_out.items()))
-        _say_made(result, self.out)
+        _say_made(result, self.out, [f"{name} is left out: {reason}." for name, reason in result.left_out.items()])
         return 0
 
     def _import_hdf5(self, files: Sequence[Path], mapping: Path, out: Path) -> None:
         from demorec.ingest.hdf5_import import import_hdf5
 
         result = import_hdf5(files, mapping, out, video=self.video)
-        say(*(f"camera {name}: {told}" for name, told in result.cameras.items()))
-        if result.left_out:
-            say(f"The mapping does not name, and so the run does not have: {', '.join(result.left_out)}.")
-        _say_made(result, out)
+        unnamed = f"The mapping does not name, and so the run does not have: {', '.join(result.left_out)}."
+        _say_made(result, out, [unnamed] if result.left_out else [])
 
 
-def _say_made(result: DatasetImport | Hdf5Import, out: Path) -> None:
+def _say_made(result: DatasetImport | Hdf5Import, out: Path, left_out: Sequence[str]) -> None:
+    say(*(f"camera {name}: {told}" for name, told in result.cameras.items()), *left_out)
     if there := result.num_episodes - result.num_new:
         tell(f"{there} of {counted(result.num_episodes, 'episode')} had been imported before.")
     say(f"{counted(result.num_episodes, 'episode')}, {result.num_frames} frames: {out}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,11 +19,14 @@ from demorec.scene.features import IMAGE_PREFIX
 
 if TYPE_CHECKING:
     from demorec.config import GenerateConfig
+    from demorec.recording.collected.summary import CollectedCameraSummary, CollectedSummary, FeatureSummary
     from demorec.recording.summary import RecordingSummary
+    from demorec.runs.collected import CollectedRun
     from demorec.runs.run_file import RunFile
 
 _MOST_PROBLEMS = 5
 """Of a dataset that are told one by one."""
+_SUCCESS_WORDS = {None: "unknown", True: "success", False: "failure"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,11 +75,10 @@ def _recording(path: Path) -> tuple[dict[str, Any], list[str]]:
     from demorec.recording.summary import summarize
 
     if is_collected(path):
-        from demorec.cli.info_collected import collected_lines
         from demorec.recording.collected.summary import summarize_collected
 
         collected = summarize_collected(path)
-        return {"kind": "collected recording", **to_plain(collected)}, collected_lines(collected)
+        return {"kind": "collected recording", **to_plain(collected)}, _collected_lines(collected)
     summary = summarize(path)
     return {"kind": "recording", **to_plain(summary)}, _recording_lines(summary)
 
@@ -111,6 +114,54 @@ def _recording_lines(summary: RecordingSummary) -> list[str]:
     return [*aligned(facts), "", *aligned([("topic", "messages", "type"), *streams])]
 
 
+def _collected_lines(summary: CollectedSummary) -> list[str]:
+    """About one recording."""
+    robot = f"{summary.robot}{' (URDF known)' if summary.has_urdf else ''}"
+    facts = [
+        ("recording", f"{summary.path} ({size_in_words(summary.bytes)}, collected, format {summary.format_version})"),
+        ("instruction", summary.instruction),
+        ("episode", str(summary.episode_index)),
+        ("outcome", _collected_outcome(summary)),
+        (
+            "length",
+            f"{summary.frames} frames, {summary.seconds:.2f} s, {summary.rate:.2f} Hz (nominal {summary.fps} Hz)",
+        ),
+        ("robot", robot),
+        ("origin", " ".join([summary.origin.kind, *(file.name for file in summary.origin.files)])),
+        *((f"feature {feature.name}", ", ".join(_feature(feature))) for feature in summary.features),
+        *((f"camera {camera.name}", ", ".join(_camera(camera))) for camera in summary.cameras),
+        *((f"dropped {what}", str(count)) for what, count in summary.drops.items()),
+        ("digest", summary.digest[:16]),
+        ("made with", ", ".join(f"{name} {version}" for name, version in summary.versions.items()) or "unknown"),
+    ]
+    streams = [(stream.topic, str(stream.messages), stream.type) for stream in summary.streams]
+    return [*aligned(facts), "", *aligned([("topic", "messages", "type"), *streams])]
+
+
+def _collected_outcome(summary: CollectedSummary) -> str:
+    if summary.is_recovered:
+        return "unknown: recovered after a crash"
+    return _SUCCESS_WORDS[summary.success] + (f": {summary.reason}" if summary.reason else "")
+
+
+def _feature(feature: FeatureSummary) -> Iterator[str]:
+    yield f"{len(feature.elements)} {feature.dtype}"
+    yield f"at most {1000 * feature.oldest:.3g} ms old"
+    if feature.source:
+        yield feature.source
+
+
+def _camera(camera: CollectedCameraSummary) -> Iterator[str]:
+    video = camera.video
+    yield f"{video.width}x{video.height} {video.codec}{' as it came' if camera.is_kept else ''}"
+    yield f"{camera.pictures} pictures"
+    yield f"at most {1000 * camera.oldest:.3g} ms old"
+    if camera.frames_without:
+        yield f"{camera.frames_without} frames without"
+    if camera.source:
+        yield camera.source
+
+
 def _outcome(summary: RecordingSummary) -> str:
     if summary.success is None:
         return "unknown: recovered after a crash"
@@ -126,11 +177,9 @@ def _run(path: Path) -> tuple[dict[str, Any], list[str]]:
     from demorec.runs.run_file import load_run_file
 
     if is_collected_run(path):
-        from demorec.cli.info_collected import collected_run_lines
-
         collected = load_collected_run(path)
         plain = {"kind": "collected run", "path": str(path), "digest": collected.digest, **to_plain(collected)}
-        return plain, collected_run_lines(path, collected)
+        return plain, _collected_run_lines(path, collected)
     run = load_run_file(path)
     plain = {
         "kind": "run",
@@ -176,6 +225,34 @@ def _run_lines(path: Path, run: RunFile) -> list[str]:
             attempt.file or "(no scene)",
         )
         for attempt in run.attempts
+    ]
+    return [*aligned(facts), "", *aligned(rows)]
+
+
+def _collected_run_lines(path: Path, run: CollectedRun) -> list[str]:
+    """About a run."""
+    frames = sum(line.num_frames for line in run.episodes)
+    counts = {word: sum(line.success is success for line in run.episodes) for success, word in _SUCCESS_WORDS.items()}
+    told = ", ".join(f"{count} {word}" for word, count in counts.items() if count)
+    facts = [
+        ("run", f"{path} (collected)"),
+        ("robot", run.robot),
+        ("episodes", f"{len(run.episodes)} ({told})"),
+        ("frames", f"{frames} ({frames / run.fps:.1f} s at {run.fps} Hz)"),
+        ("size", size_in_words(sum(line.num_bytes for line in run.episodes))),
+        ("digest", run.digest),
+    ]
+    rows = [("episode", "outcome", "frames", "size", "file", "task")]
+    rows += [
+        (
+            str(line.episode_index),
+            _SUCCESS_WORDS[line.success] + (f": {line.reason}" if line.reason else ""),
+            str(line.num_frames),
+            size_in_words(line.num_bytes),
+            line.file,
+            line.instruction,
+        )
+        for line in run.episodes
     ]
     return [*aligned(facts), "", *aligned(rows)]
 
@@ -254,7 +331,7 @@ def _folder(found: Found) -> tuple[dict[str, Any], list[str]]:
             task, seed = ("(collected)", "") if isinstance(info, CollectedInfo) else (info.task, str(info.root_seed))
             success = None if outcome is None else outcome.success
         items.append({"path": str(file), "task": task, "success": success, "frames": recording.num_frames})
-        word = {None: "unknown" if outcome is not None else "recovered", True: "success", False: "failure"}[success]
+        word = "recovered" if outcome is None else _SUCCESS_WORDS[outcome.success]
         rows.append(
             (
                 str(file.relative_to(path)),

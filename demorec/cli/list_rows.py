@@ -38,7 +38,10 @@ class ListRows:
         """Print one line each."""
         if self.coverage:
             return self._print_coverage()
-        registry, describe = _tables()[self.what]
+        from demorec import tables
+
+        registry: Registry[Any] = getattr(tables, self.what.upper())
+        describe = _DESCRIBED.get(self.what, _own_summary)
         rows = [(name, describe(registry, name)) for name in registry.names()]
         if self.json:
             say_json([{"name": name, "summary": summary} for name, summary in rows])
@@ -61,20 +64,6 @@ class ListRows:
         return 0
 
 
-def _tables() -> Mapping[str, tuple[Registry[Any], Callable[[Registry[Any], str], str]]]:
-    """What to list -> its table, and how a row is told in one line."""
-    from demorec.tables import CAMERAS, CHECKS, EXPORTERS, RENDERERS, ROBOTS, TASKS
-
-    return {
-        "tasks": (TASKS, _own_summary),
-        "cameras": (CAMERAS, _own_summary),
-        "robots": (ROBOTS, _robot),
-        "renderers": (RENDERERS, _first_line_of_module),
-        "exporters": (EXPORTERS, _own_summary),
-        "checks": (CHECKS, _own_summary),
-    }
-
-
 def _own_summary(registry: Registry[Any], name: str) -> str:
     return str(registry.load(name).summary)
 
@@ -87,3 +76,7 @@ def _robot(registry: Registry[Any], name: str) -> str:
 def _first_line_of_module(registry: Registry[Any], name: str) -> str:
     module = importlib.import_module(registry.rows[name].partition(":")[0])
     return (module.__doc__ or "").strip().splitlines()[0]
+
+
+_DESCRIBED: Mapping[str, Callable[[Registry[Any], str], str]] = {"robots": _robot, "renderers": _first_line_of_module}
+"""How a row is told in one line, where it does not tell itself."""

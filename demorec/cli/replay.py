@@ -116,11 +116,8 @@ class Replay:
 
 def _check_out(paths: Sequence[Path], out: Path) -> None:
     """Refuse to write replays into what is replayed, or over each other."""
-    files = [file for path in paths for file in _replayable(path).recordings]
-    names = [file.name for file in files]
-    if len(set(names)) != len(names):
-        raise ConfigError("Two recordings have the same name and would get into each other's way: replay them apart.")
-    refuse_sources(paths, [out / name for name in names] or [out])
+    targets = [out / file.name for path in paths for file in _replayable(path).recordings]
+    refuse_sources(paths, targets or [out], do="replay")
 
 
 def demonstrations(

@@ -8,7 +8,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from demorec.geometry import Array
-from demorec.playback.compare import DIFFERENCES, comparison_paths
+from demorec.playback.compare import DIFFERENCES, A, B
 from demorec.playback.episode import PlayedCollected, PlayedEpisode
 from demorec.playback.paths import Paths
 from demorec.playback.times import FRAMES, SECONDS
@@ -39,7 +39,7 @@ def episode_layout(episode: PlayedEpisode | PlayedCollected, *, is_alone: bool =
 
 def comparison_layout(a: PlayedEpisode, b: PlayedEpisode) -> rrb.Blueprint:
     """The layout of two episodes in one recording: below /a and /b, the same streams over each other."""
-    roots = list(comparison_paths())
+    roots = [A, B]
     pictures: list[rrb.View | rrb.Container] = []
     for name in [name for name in a.videos if name in b.videos]:
         views = [

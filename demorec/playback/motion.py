@@ -8,7 +8,7 @@ import rerun as rr
 from demorec.playback.episode import Curves, PlayedCollected, PlayedEpisode
 from demorec.playback.paths import Paths
 from demorec.playback.style import ASKED, FORCE, MEASURED, SECOND, TARGET, Color, phase_colors, series_colors
-from demorec.playback.times import indexes, seconds_only
+from demorec.playback.times import indexes
 
 _WIDTHS = {"target": 0.7, "gripper target": 1.2}
 
@@ -48,11 +48,10 @@ def log_curves(
             )
         recording.log(entity, lines, static=True)
         on_frame = np.isin(curves.time_ns, episode.time_ns)
-        for chosen, is_frame in ((on_frame, True), (~on_frame, False)):
-            times, values = curves.time_ns[chosen], curves.values[chosen]
-            if len(times):
-                index = indexes(times, episode.time_ns) if is_frame else seconds_only(times)
-                recording.send_columns(entity, index, rr.Scalars.columns(scalars=values))
+        for chosen, frame_times in ((on_frame, episode.time_ns), (~on_frame, None)):
+            if chosen.any():
+                columns = rr.Scalars.columns(scalars=curves.values[chosen])
+                recording.send_columns(entity, indexes(curves.time_ns[chosen], frame_times), columns)
 
 
 def _curve_names(name: str, curves: Curves, label: str, *, is_second: bool) -> list[str]:
@@ -83,21 +82,23 @@ def log_phases(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpiso
     if not colors or set(colors) == {""}:
         return
     recording.log(paths.phase, rr.StateConfiguration(values=list(colors), colors=list(colors.values())), static=True)
-    starts = [i for i, name in enumerate(episode.phase) if i == 0 or name != episode.phase[i - 1]]
-    recording.send_columns(
-        paths.phase,
-        indexes(episode.time_ns[starts], episode.time_ns),
-        rr.StateChange.columns(state=[episode.phase[i] for i in starts]),
-    )
+    starts = _phase_starts(episode)
+    columns = rr.StateChange.columns(state=[episode.phase[i] for i in starts])
+    recording.send_columns(paths.phase, indexes(episode.time_ns[starts], episode.time_ns), columns)
+
+
+def _phase_starts(episode: PlayedEpisode) -> list[int]:
+    """The frames at which the phase is another than before."""
+    return [i for i, name in enumerate(episode.phase) if i == 0 or name != episode.phase[i - 1]]
 
 
 def log_events(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisode) -> None:
     """Changes of phase and what happened, in order."""
     colors = phase_colors(episode.phase)
     rows: list[tuple[int, str, str, Color]] = [
-        (int(episode.time_ns[i]), "INFO", name, colors[name])
-        for i, name in enumerate(episode.phase)
-        if name and (i == 0 or name != episode.phase[i - 1])
+        (int(episode.time_ns[i]), "INFO", episode.phase[i], colors[episode.phase[i]])
+        for i in _phase_starts(episode)
+        if episode.phase[i]
     ]
     rows += [
         (time, _LEVELS[event.level], event.message or event.name, _LEVEL_COLORS[event.level])

@@ -17,9 +17,9 @@ from demorec.lerobot.paths import SIDECAR_DIR
 from demorec.lerobot.reader import EpisodePlace, RowReader, episode_places
 from demorec.lerobot.sidecar import CONFIGS_PATH, EPISODE_SCHEMA
 from demorec.lerobot.stills import pictures_at
-from demorec.report.content import Filmstrip, PhaseSpan, ReportedEpisode
+from demorec.report.content import Components, Filmstrip, PhaseSpan, ReportedEpisode
 from demorec.report.filmstrip import filmstrip
-from demorec.report.recorded import Components, count
+from demorec.report.recorded import count
 from demorec.scene.episode import SuccessCheck
 from demorec.scene.features import ACTION, IMAGE_PREFIX, STATE
 from demorec.scene.validity import read_episode_info

@@ -15,11 +15,11 @@ from demorec.evaluate.statistics import Rate
 from demorec.lerobot.layout import DatasetInfo
 from demorec.plain import to_plain
 from demorec.processes import SPAWN
-from demorec.report.content import CheckSummaries, Distribution, Report, ReportedEpisode, flags_of
+from demorec.report.content import CheckSummaries, Components, Report, ReportedEpisode, flags_of
 from demorec.report.episodes import MOST_SHOWN
 from demorec.report.exported import missing_in, read_episodes, read_story
 from demorec.report.filmstrip import strip_budget
-from demorec.report.recorded import Components, merge, read_recording
+from demorec.report.recorded import merge, read_recording
 from demorec.runs.find import EPISODE_FOLDERS, Found, PathKind, expect, expect_recordings
 from demorec.runs.run_file import RUN_NAME, Attempt, DamagedRunFileError, RunFile, load_run_file
 from demorec.scene.episode import EpisodeInfo
@@ -139,7 +139,8 @@ def _of_recordings(found: Found, options: ReportOptions, advance: Callable[[int,
         kind=_KINDS[found.kind],
         facts=tuple(_facts(found, run, episodes)),
         episodes=tuple(episodes),
-        distributions=_distributions(components, is_ours=True),
+        distributions=components,
+        has_units=True,
         checks=checks if options.checks else None,
         missing=tuple(missing),
         configs=_configs(episodes) if run is None else (to_plain(run.config),),
@@ -227,21 +228,6 @@ def _configs(episodes: Sequence[ReportedEpisode]) -> tuple[Mapping[str, Any], ..
     return tuple(found.values())
 
 
-def _distributions(components: Components, *, is_ours: bool) -> tuple[Distribution, ...]:
-    return tuple(
-        Distribution(feature=feature, name=name, unit=_unit(name) if is_ours else "", histogram=histogram)
-        for (feature, name), histogram in components.items()
-    )
-
-
-def _unit(name: str) -> str:
-    """Of a component as `demorec.scene.features` names it."""
-    part = name.rpartition(".")[2]
-    if part in ("pos", "delta", "rx", "ry", "rz"):
-        return "rad"
-    return "m" if part in ("width", "x", "y", "z", "dx", "dy", "dz") else ""
-
-
 # --------------------------------------------------------------------------------------------------------- datasets
 
 
@@ -275,7 +261,8 @@ def _of_dataset(path: Path, options: ReportOptions, advance: Callable[[int, int]
         kind=_KINDS["dataset"],
         facts=tuple(_dataset_facts(path, info, episodes, len(story.left_out))),
         episodes=tuple(episodes),
-        distributions=_distributions(components, is_ours=bool(story.rows)),
+        distributions=components,
+        has_units=bool(story.rows),
         checks=checks if options.checks else None,
         missing=tuple(missing),
         configs=tuple(story.configs.values()),

@@ -18,7 +18,7 @@ from demorec.errors import ConfigError
 from demorec.evaluate.statistics import Rate
 from demorec.geometry import Array
 from demorec.report.charts import Place, coverage, distribution, floor_map
-from demorec.report.content import CheckSummaries, CheckSummary, Distribution, Report, ReportedEpisode
+from demorec.report.content import CheckSummaries, CheckSummary, Report, ReportedEpisode
 from demorec.report.episodes import anchor, episode_list, measured
 from demorec.report.histogram import Histogram
 from demorec.report.markup import Markup, joined, table, tag
@@ -257,15 +257,15 @@ def _places(members: Sequence[tuple[int, ReportedEpisode, EpisodeInfo]]) -> tupl
 
 
 def _distributions(report: Report) -> Iterator[Markup]:
-    by_name: dict[str, list[Distribution]] = {}
-    for item in report.distributions:
-        if item.histogram.count:
-            by_name.setdefault(item.name, []).append(item)
+    by_name: dict[str, list[tuple[str, Histogram]]] = {}
+    for (feature, name), histogram in report.distributions.items():
+        if histogram.count:
+            by_name.setdefault(name, []).append((_CURVES[feature], histogram))
     figures = []
-    for name, items in by_name.items():
-        series = [(_CURVES[item.feature], item.histogram) for item in items]
-        caption = f"{name} ({items[0].unit})" if items[0].unit else name
-        mean = ", ".join(f"{_CURVES[item.feature]} {item.histogram.mean:.3g}" for item in items)
+    for name, series in by_name.items():
+        unit = _unit(name) if report.has_units else ""
+        caption = f"{name} ({unit})" if unit else name
+        mean = ", ".join(f"{curve} {histogram.mean:.3g}" for curve, histogram in series)
         figures.append(
             tag(
                 "figure",
@@ -280,11 +280,19 @@ def _distributions(report: Report) -> Iterator[Markup]:
         figures.append(tag("figure", caption, distribution([("state", lengths)], "length of episodes")))
     if not figures:
         return
-    odd = sum(item.histogram.not_finite for item in report.distributions)
+    odd = sum(histogram.not_finite for histogram in report.distributions.values())
     if odd:
         yield tag("p", f"{odd:,} values are no finite numbers and are left out.", class_="fail")
     yield tag("p", "Of all frames: the filled area is the state, the line the action; ends are the extremes.")
     yield tag("div", *figures, class_="charts")
+
+
+def _unit(name: str) -> str:
+    """Of a component as `demorec.scene.features` names it."""
+    part = name.rpartition(".")[2]
+    if part in ("pos", "delta", "rx", "ry", "rz"):
+        return "rad"
+    return "m" if part in ("width", "x", "y", "z", "dx", "dy", "dz") else ""
 
 
 _CURVES = {STATE: "state", ACTION: "action"}

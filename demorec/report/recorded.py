@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from demorec.errors import ConfigError, RecordingError, without_path
 from demorec.recording import Recording
-from demorec.report.content import PhaseSpan, ReportedEpisode
+from demorec.report.content import Components, PhaseSpan, ReportedEpisode
 from demorec.report.filmstrip import filmstrip
 from demorec.report.histogram import Histogram
 from demorec.runs.run_file import FAILED
@@ -25,9 +25,6 @@ from demorec.scene.features import (
     observation_names,
     observation_vectors,
 )
-
-Components = dict[tuple[str, str], Histogram]
-"""(feature, name of the component) -> its values over all frames."""
 
 
 def read_recording(path: Path, root: Path, *, camera: str, strip_bytes: int) -> tuple[ReportedEpisode, Components]:
