@@ -74,8 +74,11 @@ class Check:
         need_paths(self.paths, "check")
         if self.replay < 0:
             raise OptionError("replay", f"is {self.replay}, it must be 0 or more.")
-        if self.coverage_picture is not None:
-            self._check_picture(self.coverage_picture)
+        if (picture := self.coverage_picture) is not None:
+            if picture.suffix.lower() != ".png":
+                raise ConfigError(f"--coverage-picture writes a .png file, found the name {picture.name!r}.")
+            check_replaceable(picture, PICTURE, overwrite=self.overwrite, sources=places_read(self.paths))
+            refuse_inside([picture])
         from demorec.check.report import CheckOptions, check_subjects, find_subjects, useful_workers
         from demorec.processes import available_cores
 
@@ -99,8 +102,8 @@ class Check:
                 if not self.json:
                     say(told(replayed))
         remade = list(self._remade(subjects, options)) if self.deep else []
-        if self.coverage_picture is not None:
-            self._draw(self.coverage_picture, subjects)
+        if picture is not None:
+            self._draw(picture, subjects)
         failed = [report for report in reports if report.is_bad(strict=self.strict)]
         diverged = [replayed for replayed, is_as_recorded in replays if not is_as_recorded]
         different = [report for report in remade if report.level == "fail" or (self.strict and report.level == "warn")]
@@ -124,12 +127,6 @@ class Check:
                 if not self.json:
                     say(*deep_lines(report, verbose=self.verbose))
                 yield report
-
-    def _check_picture(self, path: Path) -> None:
-        if path.suffix.lower() != ".png":
-            raise ConfigError(f"--coverage-picture writes a .png file, found the name {path.name!r}.")
-        check_replaceable(path, PICTURE, overwrite=self.overwrite, sources=places_read(self.paths))
-        refuse_inside([path])
 
     def _draw(self, path: Path, subjects: Sequence[Subject]) -> None:
         from demorec.check.coverage import draw_coverage
@@ -170,7 +167,7 @@ def _replays(paths: Sequence[Path], count: int, allowed: tuple[str, ...]) -> Ite
         yield from ((report, is_as_recorded(report)) for report, _ in replay_all(found, options))
 
 
-def _lines(report: SubjectReport, *, verbose: bool) -> list[str]:
+def _lines(report: SubjectReport, *, verbose: bool) -> Iterator[str]:
     words: tuple[tuple[Level, str], ...] = (
         ("pass", "passed"),
         ("warn", "with a warning"),
@@ -182,12 +179,12 @@ def _lines(report: SubjectReport, *, verbose: bool) -> list[str]:
     counts = ", ".join(f"{numbers[level]} {word}" for level, word in words if numbers[level])
     counts = counts or f"none of the chosen checks is about a {report.kind}"
     kind = "failed attempt" if report.is_failed_attempt else report.kind
-    lines = [f"{report.level:<4}  {kind} {report.path}: {counts}"]
-    shown = [r for r in report.results if r.level in ("warn", "fail") or (verbose and not r.is_blocked)]
-    lines += [f"      {_result(result)}" for result in shown]
+    yield f"{report.level:<4}  {kind} {report.path}: {counts}"
+    for result in report.results:
+        if result.level in ("warn", "fail") or (verbose and not result.is_blocked):
+            yield f"      {_result(result)}"
     if blocked:
-        lines.append(f"      {blocked} {'check needs' if blocked == 1 else 'checks need'} what is damaged.")
-    return lines
+        yield f"      {blocked} {'check needs' if blocked == 1 else 'checks need'} what is damaged."
 
 
 def _result(result: Result) -> str:

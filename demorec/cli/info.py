@@ -18,7 +18,6 @@ from demorec.runs.find import Found, expect
 from demorec.scene.features import IMAGE_PREFIX
 
 if TYPE_CHECKING:
-    from demorec.config import GenerateConfig
     from demorec.recording.collected.summary import CollectedCameraSummary, CollectedSummary, FeatureSummary
     from demorec.recording.summary import RecordingSummary
     from demorec.runs.collected import CollectedRun
@@ -60,13 +59,8 @@ class Info:
 def _describe(path: Path) -> tuple[dict[str, Any], list[str]]:
     """Plain data for --json, and the lines for people."""
     found = expect(path, "recording", "run", "dataset", "recordings", "evaluation")
-    if found.kind == "recording":
-        return _recording(path)
-    if found.kind == "run":
-        return _run(path)
-    if found.kind == "dataset":
-        return _dataset(path)
-    return _folder(found)
+    describe = {"recording": _recording, "run": _run, "dataset": _dataset}.get(found.kind)
+    return _folder(found) if describe is None else describe(path)
 
 
 def _recording(path: Path) -> tuple[dict[str, Any], list[str]]:
@@ -192,22 +186,17 @@ def _run(path: Path) -> tuple[dict[str, Any], list[str]]:
     return plain, _run_lines(path, run)
 
 
-def _run_cameras(config: GenerateConfig) -> str:
-    if not config.cameras:
-        return "none"
-    return f"{', '.join(config.cameras)} at {config.width}x{config.height}, {config.video.codec}"
-
-
 def _run_lines(path: Path, run: RunFile) -> list[str]:
     config = run.config
     frames = sum(attempt.num_frames for attempt in run.attempts)
+    cameras = f"{', '.join(config.cameras)} at {config.width}x{config.height}, {config.video.codec}"
     facts = [
         ("run", f"{path} ({'complete' if run.is_complete else 'unfinished'})"),
         ("task", f"{config.task} with {config.robot}, seed {config.seed}"),
         ("episodes", f"{len(run.successes)} of {run.num_episodes}, {counted(len(run.failures), 'failed attempt')}"),
         ("frames", f"{frames} ({frames / config.fps:.1f} s at {config.fps} Hz)"),
         ("size", size_in_words(sum(attempt.num_bytes for attempt in run.attempts))),
-        ("cameras", _run_cameras(config)),
+        ("cameras", cameras if config.cameras else "none"),
         ("digest", run.digest),
     ]
     if run.beyond:

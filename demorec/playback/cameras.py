@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from functools import partial
 from itertools import batched
+from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -35,7 +36,7 @@ def log_cameras(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpis
         if name in episode.videos:
             _send_video(recording, paths.camera(name), episode.time_ns, episode.videos[name])
         if name in depth:
-            _send_depth(recording, paths.camera(name, "/depth"), episode.time_ns, depth[name]())
+            _send_images(recording, paths.camera(name, "/depth"), episode.time_ns, depth[name]())
 
 
 def _log_calibrations(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisode) -> None:
@@ -75,28 +76,24 @@ def _millimetres(read: Depth) -> Iterator[tuple[int, Distances]]:
         yield time_ns, np.rint(metres * 1000).clip(0, 65535).astype(np.uint16)
 
 
-def _send_depth(
+def _send_images(
     recording: rr.RecordingStream,
     entity: str,
     frame_times: NDArray[np.int64],
-    pictures: Iterable[tuple[int, Distances]],
+    images: Iterable[tuple[int, Distances]],
+    kind: type[rr.DepthImage] | type[rr.SegmentationImage] = rr.DepthImage,
 ) -> None:
-    """Distances (H, W), uint16 millimetres or float32 metres, each at its time."""
-    for batch in batched(pictures, _PICTURES_AT_ONCE):
+    """Distances (H, W), uint16 millimetres or float32 metres, or numbers of segments, uint16; each at its time."""
+    for batch in batched(images, _PICTURES_AT_ONCE):
         height, width = batch[0][1].shape
-        is_metres = batch[0][1].dtype == np.float32
-        columns = rr.DepthImage.columns(
-            buffer=[picture.tobytes() for _, picture in batch],
-            format=[_format(width, height, is_float=is_metres)] * len(batch),
-            meter=[1.0 if is_metres else 1000.0] * len(batch),
+        is_float = batch[0][1].dtype == np.float32
+        datatype = rr.ChannelDatatype.F32 if is_float else rr.ChannelDatatype.U16
+        image_format = rr.components.ImageFormat(width=width, height=height, channel_datatype=datatype)
+        unit: dict[str, Any] = {"meter": [1.0 if is_float else 1000.0] * len(batch)} if kind is rr.DepthImage else {}
+        columns = kind.columns(
+            buffer=[image.tobytes() for _, image in batch], format=[image_format] * len(batch), **unit
         )
-        times = np.array([time_ns for time_ns, _ in batch])
-        recording.send_columns(entity, indexes(times, frame_times), columns)
-
-
-def _format(width: int, height: int, *, is_float: bool = False) -> rr.components.ImageFormat:
-    kind = rr.ChannelDatatype.F32 if is_float else rr.ChannelDatatype.U16
-    return rr.components.ImageFormat(width=width, height=height, channel_datatype=kind)
+        recording.send_columns(entity, indexes(np.array([time_ns for time_ns, _ in batch]), frame_times), columns)
 
 
 def _log_segmentations(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisode) -> None:
@@ -105,16 +102,10 @@ def _log_segmentations(recording: rr.RecordingStream, paths: Paths, episode: Pla
     for camera in episode.info.scene.cameras:
         if camera.name not in episode.segmentation:
             continue
+        pictures = timed(episode.time_ns, episode.segmentation[camera.name])
+        numbers = ((time_ns, np.searchsorted(known, values).astype(np.uint16)) for time_ns, values in pictures)
         entity = paths.camera(camera.name, "/segmentation")
-        for batch in batched(timed(episode.time_ns, episode.segmentation[camera.name]), _PICTURES_AT_ONCE):
-            pictures = [np.searchsorted(known, values).astype(np.uint16) for _, values in batch]
-            height, width = pictures[0].shape
-            columns = rr.SegmentationImage.columns(
-                buffer=[picture.tobytes() for picture in pictures],
-                format=[_format(width, height)] * len(pictures),
-            )
-            times = np.array([time_ns for time_ns, _ in batch])
-            recording.send_columns(entity, indexes(times, episode.time_ns), columns)
+        _send_images(recording, entity, episode.time_ns, numbers, rr.SegmentationImage)
     if episode.segmentation:
         names = {number: episode.segment_names[value] for number, value in enumerate(known.tolist()) if number > 0}
         colors = segment_colors(names.values())

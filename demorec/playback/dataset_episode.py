@@ -19,7 +19,7 @@ from demorec.lerobot.language import COLUMNS, spoken_episodes
 from demorec.lerobot.layout import DatasetInfo
 from demorec.lerobot.packets import PACKET_CODECS, episode_distances, episode_packets
 from demorec.lerobot.paths import SIDECAR_DIR
-from demorec.lerobot.reader import EpisodePlace, episode_places
+from demorec.lerobot.reader import episode_places
 from demorec.lerobot.robots import DatasetRobot, read_robot
 from demorec.playback.episode import Box, Depth, Statements, Video, timed
 from demorec.scene.episode import frame_time_ns
@@ -59,13 +59,10 @@ class DatasetEpisode:
             raise RecordingError(f"The dataset has no episode {number}: {root}")
         self.row = rows[0]
         self.described = DatasetInfo.load(root)
-        self._place = self._find_place()
-
-    def _find_place(self) -> EpisodePlace:
-        for place in episode_places(self.root, self.described):
-            if place.episode_index == self.number:
-                return place
-        raise RecordingError(f"The dataset has no episode {self.number} in its own tables: {self.root}")
+        places = [place for place in episode_places(root, self.described) if place.episode_index == number]
+        if not places:
+            raise RecordingError(f"The dataset has no episode {number} in its own tables: {root}")
+        self._place = places[0]
 
     @cached_property
     def data(self) -> dict[str, Array]:

@@ -191,15 +191,9 @@ def _pose_row(values: Any) -> Array:
 
 
 def _outcome(row: dict[str, Any], num_frames: int) -> Outcome:
-    return Outcome(
-        success=row["success"],
-        checks=tuple(SuccessCheck(**check) for check in row["checks"]),
-        failure_phase=row["failure_phase"],
-        failure_reason=row["failure_reason"],
-        num_frames=num_frames,
-        num_retries=row["num_retries"],
-        final_state_digest=row["final_state_digest"],
-    )
+    names = ("success", "failure_phase", "failure_reason", "num_retries", "final_state_digest")
+    checks = tuple(SuccessCheck(**check) for check in row["checks"])
+    return Outcome(num_frames=num_frames, checks=checks, **{name: row[name] for name in names})
 
 
 def _phases(row: dict[str, Any], num_frames: int) -> tuple[str, ...]:

@@ -49,7 +49,9 @@ def _simulated(recording: Recording, known: dict[str, Any]) -> PlayedEpisode:
         info=info,
         outcome=recording.outcome,
         robot_description=recording.description(),
-        body_description=partial(_body_description, recording),
+        body_description=lambda body: (
+            recording.description(body) if description_topic(body) in recording.topics else None
+        ),
         time_ns=columns.time_ns,
         joint_position=columns.joint_position,
         base_from_tcp=columns.base_from_tcp,
@@ -114,10 +116,6 @@ def _shown_at(columns: CollectedColumns, camera: str, time_ns: NDArray[np.int64]
     count = len(columns.picture_stamps[camera])
     places = np.minimum(np.searchsorted(numbers, np.arange(count)), max(len(frames) - 1, 0))
     return time_ns[frames[places]] if len(frames) else np.zeros(count, dtype=np.int64)
-
-
-def _body_description(recording: Recording, body: str) -> str | None:
-    return recording.description(body) if description_topic(body) in recording.topics else None
 
 
 def _video(recording: AnyRecording, camera: str, shown_at: NDArray[np.int64]) -> Video:

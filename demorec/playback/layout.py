@@ -187,18 +187,16 @@ def _eye(episode: PlayedEpisode) -> tuple[Array, Array]:
 def _camera_views(episode: PlayedEpisode, paths: Paths) -> list[rrb.View | rrb.Container]:
     views: list[rrb.View | rrb.Container] = []
     for camera in episode.info.scene.cameras:
+        name = camera.name
+        boxes = [paths.camera(name, "/boxes")] if name in episode.boxes else []
         tabs: list[rrb.View] = []
-        if camera.name in episode.videos:
-            contents = ["$origin", *([paths.camera(camera.name, "/boxes")] if camera.name in episode.boxes else [])]
-            tabs.append(
-                rrb.Spatial2DView(origin=paths.camera(camera.name), contents=contents, name=f"{camera.name} camera")
-            )
-        if camera.name in episode.depth:
-            tabs.append(rrb.Spatial2DView(origin=paths.camera(camera.name, "/depth"), name=f"{camera.name} depth"))
-        if camera.name in episode.segmentation:
-            tabs.append(
-                rrb.Spatial2DView(origin=paths.camera(camera.name, "/segmentation"), name=f"{camera.name} segments")
-            )
+        if name in episode.videos:
+            contents = ["$origin", *boxes]
+            tabs.append(rrb.Spatial2DView(origin=paths.camera(name), contents=contents, name=f"{name} camera"))
+        if name in episode.depth:
+            tabs.append(rrb.Spatial2DView(origin=paths.camera(name, "/depth"), name=f"{name} depth"))
+        if name in episode.segmentation:
+            tabs.append(rrb.Spatial2DView(origin=paths.camera(name, "/segmentation"), name=f"{name} segments"))
         if tabs:
             views.append(tabs[0] if len(tabs) == 1 else rrb.Tabs(*tabs, active_tab=0))
     if len(views) > 3:

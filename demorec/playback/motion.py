@@ -10,6 +10,7 @@ from demorec.playback.paths import Paths
 from demorec.playback.style import ASKED, FORCE, MEASURED, SECOND, TARGET, Color, phase_colors, series_colors
 from demorec.playback.times import indexes
 
+_COLORS = {"gripper": MEASURED, "gripper target": TARGET, "force": FORCE, "target": ASKED}
 _WIDTHS = {"target": 0.7, "gripper target": 1.2}
 
 
@@ -65,15 +66,10 @@ def _curve_names(name: str, curves: Curves, label: str, *, is_second: bool) -> l
 
 
 def _curve_colors(name: str, curves: Curves, *, is_second: bool) -> list[Color]:
+    count = len(curves.names)
     if is_second:
-        return [SECOND if len(curves.names) == 1 else ASKED] * len(curves.names)
-    if name == "gripper":
-        return [MEASURED]
-    if name == "gripper target":
-        return [TARGET]
-    if name == "force":
-        return [FORCE]
-    return [ASKED] * len(curves.names) if name == "target" else series_colors(len(curves.names))
+        return [SECOND if count == 1 else ASKED] * count
+    return [_COLORS[name]] * count if name in _COLORS else series_colors(count)
 
 
 def log_phases(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisode) -> None:

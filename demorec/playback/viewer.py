@@ -7,10 +7,10 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any
 from urllib.parse import quote
 from urllib.request import urlopen
 
@@ -72,7 +72,7 @@ def why_it_ended(said: str) -> DemorecError:
     return RecordingError(f"Rerun's viewer ended by itself: {message or said.strip()[-300:]}")
 
 
-class HeadlessViewer:
+class HeadlessViewer(AbstractContextManager["HeadlessViewer"]):
     """Context manager over a viewer without a screen that shows .rrd or .mcap files, the first one in front.
 
     Raises:
@@ -95,15 +95,14 @@ class HeadlessViewer:
             self.close()
             raise
 
-    def __enter__(self) -> Self:
-        return self
-
     def __exit__(
         self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
     ) -> None:
         try:
-            if isinstance(exc, (OSError, RuntimeError, ValueError)) and self._has_ended():
-                raise self._reason() from exc
+            if isinstance(exc, (OSError, RuntimeError, ValueError)):
+                with suppress(subprocess.TimeoutExpired):  # one that panics has left us before it has said why
+                    self._process.wait(_END_SECONDS)
+                    raise self._reason() from exc
         finally:
             self.close()
 
@@ -111,12 +110,6 @@ class HeadlessViewer:
         """End the viewer; harmless when called twice."""
         end_process(self._process)
         self._said.close()
-
-    def _has_ended(self) -> bool:
-        """Whether the viewer ended by itself; one that panics has left its clients before it has said why."""
-        with suppress(subprocess.TimeoutExpired):
-            self._process.wait(_END_SECONDS)
-        return self._process.poll() is not None
 
     def _reason(self) -> DemorecError:
         """Why the viewer has ended, by what it said."""
@@ -136,18 +129,13 @@ class HeadlessViewer:
                 continue
             loaded = [recording for recording in state.recordings if recording.timelines]
             if not state.loading and len(loaded) >= len(self._recordings):
-                self._bring_to_front(client, loaded)
+                if len(loaded) > 1:  # the viewer shows the one that it loaded last
+                    client.set_location(min(loaded, key=lambda recording: str(recording.store_id)).location)
                 return client
             time.sleep(0.2)
         raise RecordingError(
             f"Rerun's viewer has not loaded the file within {_START_SECONDS:.0f} s: {self._recordings[0]}"
         )
-
-    @staticmethod
-    def _bring_to_front(client: ViewerClient, recordings: Sequence[Any]) -> None:
-        """Show the first recording (by name), since the viewer shows the one that it loaded last."""
-        if len(recordings) > 1:
-            client.set_location(min(recordings, key=lambda recording: str(recording.store_id)).location)
 
     @property
     def end(self) -> float:

@@ -65,8 +65,9 @@ def _read(
             most_bytes=strip_bytes,
         )
     columns = recording.columns()
+    attempt = f", attempt {info.attempt}" if is_failed or info.attempt else ""  # of one that failed, or after one
     episode = ReportedEpisode(
-        name=episode_name(info, is_failed=is_failed),
+        name=f"episode {info.episode_index}{attempt}",
         source=source,
         problem="" if outcome is not None else "A crash cut the recording off; it was recovered.",
         instruction=info.instruction,
@@ -83,12 +84,6 @@ def _read(
         info=info,
     )
     return episode, _components(info, columns)
-
-
-def episode_name(info: EpisodeInfo, *, is_failed: bool) -> str:
-    """ "episode 3", and of an attempt that failed or came after one, which attempt."""
-    attempt = f", attempt {info.attempt}" if is_failed or info.attempt else ""
-    return f"episode {info.episode_index}{attempt}"
 
 
 def phase_spans(phases: Sequence[str]) -> tuple[PhaseSpan, ...]:
