@@ -95,11 +95,8 @@ def run_command(command: type[Command], args: Sequence[str], *, prog: str) -> in
     logging.captureWarnings(True)  # so that Python's warnings, too, come through the formatter
     try:
         return parse_command(command, args, prog=prog).run()
-    except OptionError as error:
-        tell(f"{prog}: {error.of_flag()}")
-        return error.exit_code
     except DemorecError as error:
-        tell(f"{prog}: {error}")
+        tell(f"{prog}: {error.of_flag() if isinstance(error, OptionError) else error}")
         return error.exit_code
     except KeyboardInterrupt:
         tell(f"{prog}: interrupted.")

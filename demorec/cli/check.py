@@ -10,9 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 from tyro.conf import Positional
 
+from demorec.cli.check_deep import deep_lines, deep_summary, plain_deep
+from demorec.cli.replay import demonstrations, told
 from demorec.cli.shared.allow import Allow, allowed_modules
 from demorec.cli.shared.output import counted, say, say_json
-from demorec.cli.shared.paths import places_read, refuse_inside
+from demorec.cli.shared.paths import need_paths, places_read, refuse_inside
 from demorec.cli.shared.progress import ProgressBar
 from demorec.errors import ConfigError, OptionError
 from demorec.safety.replacing import PICTURE, check_replaceable
@@ -69,14 +71,14 @@ class Check:
 
     def run(self) -> int:
         """Check and report."""
-        if not self.paths:
-            raise ConfigError(
-                "No path is given: name a recording, a run or a dataset, e.g. demorec check recordings/demo."
-            )
+        need_paths(self.paths, "check")
         if self.replay < 0:
             raise OptionError("replay", f"is {self.replay}, it must be 0 or more.")
-        if self.coverage_picture is not None:
-            self._check_picture(self.coverage_picture)
+        if (picture := self.coverage_picture) is not None:
+            if picture.suffix.lower() != ".png":
+                raise ConfigError(f"--coverage-picture writes a .png file, found the name {picture.name!r}.")
+            check_replaceable(picture, PICTURE, overwrite=self.overwrite, sources=places_read(self.paths))
+            refuse_inside([picture])
         from demorec.check.report import CheckOptions, check_subjects, find_subjects, useful_workers
         from demorec.processes import available_cores
 
@@ -95,22 +97,18 @@ class Check:
                 if not self.json:
                     say(*_lines(report, verbose=self.verbose))
         if self.replay:
-            for replayed in _replays(self.paths, self.replay, allowed):
-                replays.append(replayed)
+            for replayed, is_as_recorded in _replays(self.paths, self.replay, allowed):
+                replays.append((replayed, is_as_recorded))
                 if not self.json:
-                    from demorec.cli.replay import told
-
                     say(told(replayed))
         remade = list(self._remade(subjects, options)) if self.deep else []
-        if self.coverage_picture is not None:
-            self._draw(self.coverage_picture)
+        if picture is not None:
+            self._draw(picture, subjects)
         failed = [report for report in reports if report.is_bad(strict=self.strict)]
-        diverged = [replayed for replayed in replays if not _as_recorded(replayed)]
+        diverged = [replayed for replayed, is_as_recorded in replays if not is_as_recorded]
         different = [report for report in remade if report.level == "fail" or (self.strict and report.level == "warn")]
-        from demorec.cli.check_deep import deep_summary, plain_deep
-
         if self.json:
-            plain = [_plain(report) for report in reports] + [_plain_replay(r) for r in replays]
+            plain = [_plain(report) for report in reports] + [_plain_replay(*replayed) for replayed in replays]
             say_json(plain + [plain_deep(report) for report in remade])
         else:
             summary = _summary(reports, len(failed), len(replays), len(diverged))
@@ -118,13 +116,9 @@ class Check:
         return 1 if failed or diverged or different else 0
 
     def _remade(self, subjects: Sequence[Subject], options: CheckOptions) -> Iterator[DeepReport]:
-        from demorec.cli.check_deep import deep_lines
         from demorec.replay.deep import deep_checks, deep_dataset_checks
 
-        paths = [subject.path for subject in subjects if subject.kind == "recording"]
-        runs = [subject.path for subject in subjects if subject.kind == "run"]
-        # The dataset of a run is compared with the run's recordings already.
-        datasets = [s.path for s in subjects if s.kind == "dataset" and s.path.parent not in runs]
+        paths, datasets = _split(subjects)
         found = [deep_checks(paths, workers=options.workers, allowed=options.allowed)]
         found += [deep_dataset_checks(path, allowed=options.allowed) for path in datasets]
         with ProgressBar("making again", total=0 if datasets else len(paths)) as bar:
@@ -134,56 +128,47 @@ class Check:
                     say(*deep_lines(report, verbose=self.verbose))
                 yield report
 
-    def _check_picture(self, path: Path) -> None:
-        if path.suffix.lower() != ".png":
-            raise ConfigError(f"--coverage-picture writes a .png file, found the name {path.name!r}.")
-        check_replaceable(path, PICTURE, overwrite=self.overwrite, sources=places_read(self.paths))
-        refuse_inside([path])
-
-    def _draw(self, path: Path) -> None:
+    def _draw(self, path: Path, subjects: Sequence[Subject]) -> None:
         from demorec.check.coverage import draw_coverage
 
-        infos = list(_infos(self.paths))
+        infos = list(_infos(subjects))
         draw_coverage(infos, path)
         if not self.json:
             say(f"Coverage of {counted(len(infos), 'episode')}: {path}")
 
 
-def _infos(paths: Sequence[Path]) -> Iterator[EpisodeInfo]:
+def _split(subjects: Sequence[Subject]) -> tuple[list[Path], list[Path]]:
+    """Recordings, and datasets but for those of the runs, which hold the same episodes once more."""
+    runs = [subject.path for subject in subjects if subject.kind == "run"]
+    datasets = [s.path for s in subjects if s.kind == "dataset" and s.path.parent not in runs]
+    return [subject.path for subject in subjects if subject.kind == "recording"], datasets
+
+
+def _infos(subjects: Sequence[Subject]) -> Iterator[EpisodeInfo]:
     """Of every successful episode of runs, every recording, and every episode of datasets."""
     from demorec.check.dataset import Dataset
-    from demorec.check.report import find_subjects
     from demorec.recording import Recording
 
-    # The dataset of a run holds the same episodes once more.
-    subjects = find_subjects(paths)
-    runs = {subject.path for subject in subjects if subject.kind == "run"}
-    for subject in subjects:
-        if subject.kind == "recording" and subject.path.parent.name != "failed":
-            with Recording(subject.path) as recording:
+    recordings, datasets = _split(subjects)
+    for path in recordings:
+        if path.parent.name != "failed":
+            with Recording(path) as recording:
                 yield recording.info
-        elif subject.kind == "dataset" and subject.path.parent not in runs:
-            yield from Dataset(subject.path).infos
+    for path in datasets:
+        yield from Dataset(path).infos
 
 
-def _replays(paths: Sequence[Path], count: int, allowed: tuple[str, ...]) -> Iterator[ReplayReport]:
-    from demorec.cli.replay import demonstrations
-    from demorec.replay import ReplayOptions, replay_all
+def _replays(paths: Sequence[Path], count: int, allowed: tuple[str, ...]) -> Iterator[tuple[ReplayReport, bool]]:
+    """Replays, and whether each is as recorded: bit for bit, or for float32 actions of a dataset in its outcome."""
+    from demorec.replay import ReplayOptions, is_as_recorded, replay_all
 
     options = ReplayOptions(allowed=allowed)
     for path in paths:
         found = demonstrations([path], options, limit=count)
-        yield from (report for report, _ in replay_all(found, options))
+        yield from ((report, is_as_recorded(report)) for report, _ in replay_all(found, options))
 
 
-def _as_recorded(report: ReplayReport) -> bool:
-    """Bit for bit, or for float32 actions of a dataset: with the same outcome."""
-    from demorec.replay import is_as_recorded
-
-    return is_as_recorded(report)
-
-
-def _lines(report: SubjectReport, *, verbose: bool) -> list[str]:
+def _lines(report: SubjectReport, *, verbose: bool) -> Iterator[str]:
     words: tuple[tuple[Level, str], ...] = (
         ("pass", "passed"),
         ("warn", "with a warning"),
@@ -195,12 +180,12 @@ def _lines(report: SubjectReport, *, verbose: bool) -> list[str]:
     counts = ", ".join(f"{numbers[level]} {word}" for level, word in words if numbers[level])
     counts = counts or f"none of the chosen checks is about a {report.kind}"
     kind = "failed attempt" if report.is_failed_attempt else report.kind
-    lines = [f"{report.level:<4}  {kind} {report.path}: {counts}"]
-    shown = [r for r in report.results if r.level in ("warn", "fail") or (verbose and not r.is_blocked)]
-    lines += [f"      {_result(result)}" for result in shown]
+    yield f"{report.level:<4}  {kind} {report.path}: {counts}"
+    for result in report.results:
+        if result.level in ("warn", "fail") or (verbose and not result.is_blocked):
+            yield f"      {_result(result)}"
     if blocked:
-        lines.append(f"      {blocked} {'check needs' if blocked == 1 else 'checks need'} what is damaged.")
-    return lines
+        yield f"      {blocked} {'check needs' if blocked == 1 else 'checks need'} what is damaged."
 
 
 def _result(result: Result) -> str:
@@ -236,13 +221,13 @@ def _plain(report: SubjectReport) -> dict[str, Any]:
     )
 
 
-def _plain_replay(report: ReplayReport) -> dict[str, Any]:
+def _plain_replay(report: ReplayReport, is_as_recorded: bool) -> dict[str, Any]:
     from demorec.plain import to_plain
 
     plain = to_plain(report)
     return {
         "path": plain.pop("name"),
         "kind": "replay",
-        "level": "pass" if _as_recorded(report) else "fail",
+        "level": "pass" if is_as_recorded else "fail",
         "results": [plain],
     }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -12,9 +12,9 @@ _SHOWN = 12
 """Differences of one recording that are printed: the first ones tell the most."""
 
 
-def deep_lines(report: DeepReport, *, verbose: bool = False) -> list[str]:
+def deep_lines(report: DeepReport, *, verbose: bool = False) -> Iterator[str]:
     """One line about a recording, below it the versions that differ, then what differs, the first frames first."""
-    lines = [f"{report.level:<4}  made again {report.path}: {_verdict(report)}"]
+    yield f"{report.level:<4}  made again {report.path}: {_verdict(report)}"
     details = [*report.versions]
     if report.error:
         details.append(f"It cannot be made again: {report.error}")
@@ -24,7 +24,7 @@ def deep_lines(report: DeepReport, *, verbose: bool = False) -> list[str]:
         details.append(f"and {len(report.differences) - len(shown)} fields more (--verbose shows all)")
     if report.replay:
         details.append(f"Replayed: {report.replay}")
-    return lines + [f"      {detail}" for detail in details]
+    yield from (f"      {detail}" for detail in details)
 
 
 def _verdict(report: DeepReport) -> str:

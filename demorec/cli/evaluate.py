@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -69,27 +71,23 @@ class Evaluate(RolloutFlags):
         return 0
 
 
-def _told(evaluation: Evaluation, out: Path) -> list[str]:
-    from collections import Counter
-
+def _told(evaluation: Evaluation, out: Path) -> Iterator[str]:
     from demorec.evaluate.statistics import cells
 
     settings = evaluation.settings
-    lines = [
-        f"policy        {settings.policy_type} {settings.policy_digest}, action {settings.action}",
-        f"scenes        {settings.config.task}, split {settings.config.split}, seed {settings.config.seed}",
-        f"success       {evaluation.rate} (Wilson 95 %)",
-    ]
+    yield f"policy        {settings.policy_type} {settings.policy_digest}, action {settings.action}"
+    yield f"scenes        {settings.config.task}, split {settings.config.split}, seed {settings.config.seed}"
+    yield f"success       {evaluation.rate} (Wilson 95 %)"
     lengths = sorted(r.num_frames for r in evaluation.rollouts if r.success)
     if lengths:
-        lines.append(f"median length {lengths[len(lengths) // 2] / settings.config.fps:.1f} s of the successes")
+        yield f"median length {lengths[len(lengths) // 2] / settings.config.fps:.1f} s of the successes"
     failures = Counter(f"{r.phase}: {r.reason}" for r in evaluation.rollouts if not r.success)
     for number, (reason, count) in enumerate(failures.most_common()):
-        lines.append(f"{'failures' if number == 0 else '':<13} {count:>4}  {reason}")
-    lines += ["", f"{'by cell':<20} {'range':<20} success (Wilson 95 %)"]
+        yield f"{'failures' if number == 0 else '':<13} {count:>4}  {reason}"
+    yield from ("", f"{'by cell':<20} {'range':<20} success (Wilson 95 %)")
     for cell in cells(evaluation.factors, [r.success for r in evaluation.rollouts]):
-        lines.append(f"{cell.factor:<20} {f'{cell.low:.3f} .. {cell.high:.3f}':<20} {cell.rate}")
-    return [*lines, "", f"recordings    {out / 'episodes'}, {out / 'failed'}"]
+        yield f"{cell.factor:<20} {f'{cell.low:.3f} .. {cell.high:.3f}':<20} {cell.rate}"
+    yield from ("", f"recordings    {out / 'episodes'}, {out / 'failed'}")
 
 
 def _plain(evaluation: Evaluation) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -70,28 +70,27 @@ class Export:
 _TAKEN = "taken with --include-failures"
 
 
-def _told(report: ExportReport) -> list[str]:
+def _told(report: ExportReport) -> Iterator[str]:
     added = f", {report.new_episodes} of them new" if report.new_episodes != report.num_episodes else ""
-    lines = [f"{counted(report.num_episodes, 'episode')}, {report.num_frames} frames{added}: {report.path}"]
+    yield f"{counted(report.num_episodes, 'episode')}, {report.num_frames} frames{added}: {report.path}"
     if report.skipped_failures:
-        lines.append(f"{counted(report.skipped_failures, 'failed attempt')} left out ({_TAKEN}).")
+        yield f"{counted(report.skipped_failures, 'failed attempt')} left out ({_TAKEN})."
     if report.skipped_unknown:
-        lines.append(f"{counted(report.skipped_unknown, 'recording')} of unknown outcome left out ({_TAKEN}).")
+        yield f"{counted(report.skipped_unknown, 'recording')} of unknown outcome left out ({_TAKEN})."
     if report.skipped_unwanted:
-        lines.append(f"{counted(report.skipped_unwanted, 'recording')} left out by --episodes or --corrected-only.")
+        yield f"{counted(report.skipped_unwanted, 'recording')} left out by --episodes or --corrected-only."
     if report.left_out:
-        lines.append(f"Left out, since the dataset does not have them: {', '.join(report.left_out)}.")
+        yield f"Left out, since the dataset does not have them: {', '.join(report.left_out)}."
     if report.depth_left_out:
-        lines.append(f"Distances are left out unless --depth asks for them: camera {', '.join(report.depth_left_out)}.")
+        yield f"Distances are left out unless --depth asks for them: camera {', '.join(report.depth_left_out)}."
     if report.silent:
-        lines.append(f"Nobody said a subtask, so nothing is written of it, in {', '.join(report.silent)}.")
-    lines += [f"Pictures coded anew: camera {what}." for what in report.transcoded]
+        yield f"Nobody said a subtask, so nothing is written of it, in {', '.join(report.silent)}."
+    yield from (f"Pictures coded anew: camera {what}." for what in report.transcoded)
     if report.verified_frames:
-        lines.append(f"Verified: {report.verified_frames} frames read through LeRobot equal the recordings.")
+        yield f"Verified: {report.verified_frames} frames read through LeRobot equal the recordings."
     if report.not_verified:
-        lines.append(f"Not verified: {report.not_verified}")
+        yield f"Not verified: {report.not_verified}"
     if report.digest:
-        lines.append(f"Content digest: {report.digest}")
+        yield f"Content digest: {report.digest}"
     if report.url:
-        lines.append(f"Uploaded to {report.url}")
-    return lines
+        yield f"Uploaded to {report.url}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -18,7 +18,6 @@ from demorec.errors import ConfigError
 from demorec.generate.options import RunOptions, default_out, default_repo_id
 
 if TYPE_CHECKING:
-    from demorec.generate.observer import RunResult
     from demorec.runs.run_file import Attempt
 
 
@@ -85,10 +84,13 @@ class Generate:
         from demorec.generate.interrupts import terminate_as_interrupt
         from demorec.generate.run import generate
 
-        with self._watching(options) as watch, RunProgress(watch=watch) as progress:
-            result = generate(self.episodes, options, progress=progress)
+        with ExitStack() as stack:
+            watch = stack.enter_context(_viewer(options.out)) if self.view else None
+            result = generate(self.episodes, options, progress=stack.enter_context(RunProgress(watch=watch)))
         if result.interrupted:
-            return self._interrupted(result)
+            done = f"{len(result.run.successes)} of {result.run.num_episodes}"
+            tell(f"Interrupted: {done} episodes are complete; the same command goes on: {result.folder}")
+            return 130
         export, report, checked = None, None, None
         with RunProgress() as progress, terminate_as_interrupt():
             if options.export and result.run.successes:
@@ -105,29 +107,11 @@ class Generate:
             tell(f"Not verified: {report.not_verified}")
         return 1 if result.run.given_up or (checked is not None and checked.failures) else 0
 
-    @contextmanager
-    def _watching(self, options: RunOptions) -> Iterator[Callable[[Attempt], None] | None]:
-        """With --view: hands finished attempts to the viewer."""
-        if not self.view:
-            yield None
-            return
-        from demorec.playback.live import LiveViewer
 
-        folder = options.out
-        assert folder is not None
-        with LiveViewer() as viewer:
+@contextmanager
+def _viewer(folder: Path) -> Iterator[Callable[[Attempt], None]]:
+    """A window; what it gives hands finished attempts to it."""
+    from demorec.playback.live import LiveViewer
 
-            def watch(attempt: Attempt) -> None:
-                if attempt.file:
-                    viewer.add(folder / attempt.file)
-
-            yield watch
-
-    @staticmethod
-    def _interrupted(result: RunResult) -> int:
-        done = len(result.run.successes)
-        tell(
-            f"Interrupted: {done} of {result.run.num_episodes} episodes are complete; the same command goes on: "
-            f"{result.folder}"
-        )
-        return 130
+    with LiveViewer() as viewer:
+        yield lambda attempt: viewer.add(folder / attempt.file) if attempt.file else None

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from demorec.cli.shared.output import counted, say, tell
 from demorec.cli.shared.progress import duration
+from demorec.cli.shared.table import aligned
 from demorec.generate.contents import set_aside
 from demorec.generate.estimate import Estimate
 from demorec.generate.observer import RunResult
@@ -125,9 +126,7 @@ def print_result(result: RunResult, export: ExportRecord | None, checked: Closin
         )
         again = f"; {counted(checked.made_again, 'episode')} made again and compared" if checked.made_again else ""
         rows.append(("checks", f"{verdict}, {counted(checked.warnings, 'warning')}{apart}{again}"))
-    width = max(len(name) for name, _ in rows)
-    for name, value in rows:
-        say(f"{name:<{width}}  {value}")
+    say(*aligned(rows))
     if run.successes:
         say("", "Next:", *(f"  {command}" for command in next_commands(result, export)))
     for failure in () if checked is None else checked.failures[:10]:
@@ -210,8 +209,7 @@ def print_estimate(estimate: Estimate, options: RunOptions) -> None:
         ("memory", f"{megabytes(estimate.peak_worker_bytes)} a worker"),
         ("free disk", f"{megabytes(estimate.free_bytes)} at {options.out}"),
     ]
-    for name, value in rows:
-        say(f"{name:<13}  {value}")
+    say(*aligned(rows))
     if estimate.total_bytes > estimate.free_bytes:
         tell("The disk is too small for this run.")
     say("Nothing was kept; leave --dry-run out to generate.")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -59,35 +60,41 @@ class Import:
             raise ConfigError("No bag is given: name one, e.g. demorec import --suggest monday.mcap.")
         if self.bags[0] == _LEROBOT:
             return self._import_dataset()
-        if self.bags[0] == _HDF5:
-            return self._import_hdf5()
+        is_hdf5 = self.bags[0] == _HDF5
+        files = self.bags[1:] if is_hdf5 else self.bags
+        if not files:
+            raise ConfigError(
+                "Name HDF5 files after the word hdf5: demorec import hdf5 demo.hdf5 --mapping demo.toml --out "
+                "runs/demo. A bag of that name is given with its folder."
+            )
         if self.suggest:
-            from demorec.ingest.suggest import suggested_mapping
-
-            say(*suggested_mapping(self.bags[0]))
+            if is_hdf5:
+                from demorec.ingest.hdf5_suggest import suggested_hdf5_mapping as suggested
+            else:
+                from demorec.ingest.suggest import suggested_mapping as suggested
+            say(*suggested(files[0]))
             return 0
         if self.mapping is None or self.out is None:
-            raise ConfigError(
-                f"An import needs --mapping and --out: demorec import --suggest {self.bags[0]} > robot.toml writes a "
-                "mapping."
-            )
+            example = f"hdf5 {files[0]} --suggest > demo.toml" if is_hdf5 else f"--suggest {files[0]} > robot.toml"
+            raise ConfigError(f"An import needs --mapping and --out: demorec import {example} writes a mapping.")
+        self.video.validate()
+        (self._import_hdf5 if is_hdf5 else self._import_bags)(files, self.mapping, self.out)
+        return 0
+
+    def _import_bags(self, bags: Sequence[Path], mapping: Path, out: Path) -> None:
         from demorec.ingest.import_run import import_bags
         from demorec.ingest.report import report_lines
 
-        self.video.validate()
-        result = import_bags(
-            self.bags, self.mapping, self.out, video=self.video, tell=lambda report: say(*report_lines(report), "")
-        )
+        result = import_bags(bags, mapping, out, video=self.video, tell=lambda report: say(*report_lines(report), ""))
         if result.num_new < len(result.reports):
             tell(f"{len(result.reports) - result.num_new} of {len(result.reports)} bags had been imported before.")
         episodes = [episode for report in result.reports for episode in report.episodes]
         made = [episode for episode in episodes if episode.episode_index is not None]
         dropped = f", {len(episodes) - len(made)} dropped" if len(made) < len(episodes) else ""
         findings = sum(len(report.findings) for report in result.reports)
-        say(f"{counted(len(made), 'episode')}, {sum(row.num_frames for row in made)} frames{dropped}: {self.out}")
+        say(f"{counted(len(made), 'episode')}, {sum(row.num_frames for row in made)} frames{dropped}: {out}")
         odd = f"{counted(findings, 'finding')} in the bags, see above and demorec check."
         say(odd if findings else "Nothing odd was found.")
-        return 0
 
     def _import_dataset(self) -> int:
         if len(self.bags) != 2 or self.out is None:
@@ -101,40 +108,19 @@ class Import:
 
         self.video.validate()
         result = import_lerobot(self.bags[1], self.out, video=self.video)
-        say(*(f"camera {name}: {told}" for name, told in result.cameras.items()))
-        say(*(f"{name} is left out: {reason}." for name, reason in result.left_out.items()))
-        _say_made(result, self.out)
+        _say_made(result, self.out, [f"{name} is left out: {reason}." for name, reason in result.left_out.items()])
         return 0
 
-    def _import_hdf5(self) -> int:
-        files = self.bags[1:]
-        if not files:
-            raise ConfigError(
-                "Name HDF5 files after the word hdf5: demorec import hdf5 demo.hdf5 --mapping demo.toml --out "
-                "runs/demo. A bag of that name is given with its folder."
-            )
-        if self.suggest:
-            from demorec.ingest.hdf5_suggest import suggested_hdf5_mapping
-
-            say(*suggested_hdf5_mapping(files[0]))
-            return 0
-        if self.mapping is None or self.out is None:
-            raise ConfigError(
-                f"An import needs --mapping and --out: demorec import hdf5 {files[0]} --suggest > demo.toml writes a "
-                "mapping."
-            )
+    def _import_hdf5(self, files: Sequence[Path], mapping: Path, out: Path) -> None:
         from demorec.ingest.hdf5_import import import_hdf5
 
-        self.video.validate()
-        result = import_hdf5(files, self.mapping, self.out, video=self.video)
-        say(*(f"camera {name}: {told}" for name, told in result.cameras.items()))
-        if result.left_out:
-            say(f"The mapping does not name, and so the run does not have: {', '.join(result.left_out)}.")
-        _say_made(result, self.out)
-        return 0
+        result = import_hdf5(files, mapping, out, video=self.video)
+        unnamed = f"The mapping does not name, and so the run does not have: {', '.join(result.left_out)}."
+        _say_made(result, out, [unnamed] if result.left_out else [])
 
 
-def _say_made(result: FramesImport, out: Path) -> None:
+def _say_made(result: FramesImport, out: Path, left_out: Sequence[str]) -> None:
+    say(*(f"camera {name}: {told}" for name, told in result.cameras.items()), *left_out)
     if there := result.num_episodes - result.num_new:
         tell(f"{there} of {counted(result.num_episodes, 'episode')} had been imported before.")
     say(f"{counted(result.num_episodes, 'episode')}, {result.num_frames} frames: {out}")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
@@ -12,9 +11,6 @@ from demorec.cli.shared.output import say, tell
 from demorec.cli.shared.paths import refuse_inside
 from demorec.errors import check_option
 from demorec.evaluate.moments import TakeOver
-
-if TYPE_CHECKING:
-    from demorec.evaluate.improvement import Round
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,16 +85,14 @@ class Improve:
             takeover=self.takeover,
         )
         improvement = Improvement(plan, self.out, workers=self.workers or available_cores(), tell=tell)
+        rounds = list(improvement.rounds())
         say(
-            *_table(list(improvement.rounds())),
+            f"{'round':>5} {'demonstrations':>15} {'corrected':>10} {'training CPU s':>15}  success (Wilson 95 %)",
+            *(
+                f"{r.number:>5} {r.demonstrations:>15} {r.corrections:>10} {r.cpu_seconds:>15.0f}  {r.rate}"
+                for r in rounds
+            ),
             "",
             f"policy        {self.out / f'round_{self.num_rounds:02d}' / 'train'}",
         )
         return 0
-
-
-def _table(rounds: list[Round]) -> list[str]:
-    lines = [f"{'round':>5} {'demonstrations':>15} {'corrected':>10} {'training CPU s':>15}  success (Wilson 95 %)"]
-    for r in rounds:
-        lines.append(f"{r.number:>5} {r.demonstrations:>15} {r.corrections:>10} {r.cpu_seconds:>15.0f}  {r.rate}")
-    return lines

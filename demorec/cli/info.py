@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,19 +10,22 @@ from typing import TYPE_CHECKING, Any
 from tyro.conf import Positional
 
 from demorec.cli.shared.output import counted, say, say_json
+from demorec.cli.shared.paths import need_paths
 from demorec.cli.shared.table import aligned, size_in_words
-from demorec.errors import ConfigError, ExportError, RecordingError, in_words, resource_error, without_path
+from demorec.errors import ExportError, RecordingError, in_words, resource_error, without_path
 from demorec.lerobot.paths import INFO_PATH
 from demorec.runs.find import Found, expect
 from demorec.scene.features import IMAGE_PREFIX
 
 if TYPE_CHECKING:
-    from demorec.config import GenerateConfig
+    from demorec.recording.collected.summary import CollectedCameraSummary, CollectedSummary, FeatureSummary
     from demorec.recording.summary import RecordingSummary
+    from demorec.runs.collected import CollectedRun
     from demorec.runs.run_file import RunFile
 
 _MOST_PROBLEMS = 5
 """Of a dataset that are told one by one."""
+_SUCCESS_WORDS = {None: "unknown", True: "success", False: "failure"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,10 +45,7 @@ class Info:
 
     def run(self) -> int:
         """Read and print; 1 when something among several paths cannot be read."""
-        if not self.paths:
-            raise ConfigError(
-                "No path is given: name a recording, a run or a dataset, e.g. demorec info recordings/demo."
-            )
+        need_paths(self.paths, "info")
         found = [_describe(path) for path in self.paths]
         if self.json:
             plain = [item for item, _ in found]
@@ -58,13 +59,8 @@ class Info:
 def _describe(path: Path) -> tuple[dict[str, Any], list[str]]:
     """Plain data for --json, and the lines for people."""
     found = expect(path, "recording", "run", "dataset", "recordings", "evaluation")
-    if found.kind == "recording":
-        return _recording(path)
-    if found.kind == "run":
-        return _run(path)
-    if found.kind == "dataset":
-        return _dataset(path)
-    return _folder(found)
+    describe = {"recording": _recording, "run": _run, "dataset": _dataset}.get(found.kind)
+    return _folder(found) if describe is None else describe(path)
 
 
 def _recording(path: Path) -> tuple[dict[str, Any], list[str]]:
@@ -73,11 +69,10 @@ def _recording(path: Path) -> tuple[dict[str, Any], list[str]]:
     from demorec.recording.summary import summarize
 
     if is_collected(path):
-        from demorec.cli.info_collected import collected_lines
         from demorec.recording.collected.summary import summarize_collected
 
         collected = summarize_collected(path)
-        return {"kind": "collected recording", **to_plain(collected)}, collected_lines(collected)
+        return {"kind": "collected recording", **to_plain(collected)}, _collected_lines(collected)
     summary = summarize(path)
     return {"kind": "recording", **to_plain(summary)}, _recording_lines(summary)
 
@@ -113,6 +108,54 @@ def _recording_lines(summary: RecordingSummary) -> list[str]:
     return [*aligned(facts), "", *aligned([("topic", "messages", "type"), *streams])]
 
 
+def _collected_lines(summary: CollectedSummary) -> list[str]:
+    """About one recording."""
+    robot = f"{summary.robot}{' (URDF known)' if summary.has_urdf else ''}"
+    facts = [
+        ("recording", f"{summary.path} ({size_in_words(summary.bytes)}, collected, format {summary.format_version})"),
+        ("instruction", summary.instruction),
+        ("episode", str(summary.episode_index)),
+        ("outcome", _collected_outcome(summary)),
+        (
+            "length",
+            f"{summary.frames} frames, {summary.seconds:.2f} s, {summary.rate:.2f} Hz (nominal {summary.fps} Hz)",
+        ),
+        ("robot", robot),
+        ("origin", " ".join([summary.origin.kind, *(file.name for file in summary.origin.files)])),
+        *((f"feature {feature.name}", ", ".join(_feature(feature))) for feature in summary.features),
+        *((f"camera {camera.name}", ", ".join(_camera(camera))) for camera in summary.cameras),
+        *((f"dropped {what}", str(count)) for what, count in summary.drops.items()),
+        ("digest", summary.digest[:16]),
+        ("made with", ", ".join(f"{name} {version}" for name, version in summary.versions.items()) or "unknown"),
+    ]
+    streams = [(stream.topic, str(stream.messages), stream.type) for stream in summary.streams]
+    return [*aligned(facts), "", *aligned([("topic", "messages", "type"), *streams])]
+
+
+def _collected_outcome(summary: CollectedSummary) -> str:
+    if summary.is_recovered:
+        return "unknown: recovered after a crash"
+    return _SUCCESS_WORDS[summary.success] + (f": {summary.reason}" if summary.reason else "")
+
+
+def _feature(feature: FeatureSummary) -> Iterator[str]:
+    yield f"{len(feature.elements)} {feature.dtype}"
+    yield f"at most {1000 * feature.oldest:.3g} ms old"
+    if feature.source:
+        yield feature.source
+
+
+def _camera(camera: CollectedCameraSummary) -> Iterator[str]:
+    video = camera.video
+    yield f"{video.width}x{video.height} {video.codec}{' as it came' if camera.is_kept else ''}"
+    yield f"{camera.pictures} pictures"
+    yield f"at most {1000 * camera.oldest:.3g} ms old"
+    if camera.frames_without:
+        yield f"{camera.frames_without} frames without"
+    if camera.source:
+        yield camera.source
+
+
 def _outcome(summary: RecordingSummary) -> str:
     if summary.success is None:
         return "unknown: recovered after a crash"
@@ -128,11 +171,9 @@ def _run(path: Path) -> tuple[dict[str, Any], list[str]]:
     from demorec.runs.run_file import load_run_file
 
     if is_collected_run(path):
-        from demorec.cli.info_collected import collected_run_lines
-
         collected = load_collected_run(path)
         plain = {"kind": "collected run", "path": str(path), "digest": collected.digest, **to_plain(collected)}
-        return plain, collected_run_lines(path, collected)
+        return plain, _collected_run_lines(path, collected)
     run = load_run_file(path)
     plain = {
         "kind": "run",
@@ -145,22 +186,17 @@ def _run(path: Path) -> tuple[dict[str, Any], list[str]]:
     return plain, _run_lines(path, run)
 
 
-def _run_cameras(config: GenerateConfig) -> str:
-    if not config.cameras:
-        return "none"
-    return f"{', '.join(config.cameras)} at {config.width}x{config.height}, {config.video.codec}"
-
-
 def _run_lines(path: Path, run: RunFile) -> list[str]:
     config = run.config
     frames = sum(attempt.num_frames for attempt in run.attempts)
+    cameras = f"{', '.join(config.cameras)} at {config.width}x{config.height}, {config.video.codec}"
     facts = [
         ("run", f"{path} ({'complete' if run.is_complete else 'unfinished'})"),
         ("task", f"{config.task} with {config.robot}, seed {config.seed}"),
         ("episodes", f"{len(run.successes)} of {run.num_episodes}, {counted(len(run.failures), 'failed attempt')}"),
         ("frames", f"{frames} ({frames / config.fps:.1f} s at {config.fps} Hz)"),
         ("size", size_in_words(sum(attempt.num_bytes for attempt in run.attempts))),
-        ("cameras", _run_cameras(config)),
+        ("cameras", cameras if config.cameras else "none"),
         ("digest", run.digest),
     ]
     if run.beyond:
@@ -178,6 +214,34 @@ def _run_lines(path: Path, run: RunFile) -> list[str]:
             attempt.file or "(no scene)",
         )
         for attempt in run.attempts
+    ]
+    return [*aligned(facts), "", *aligned(rows)]
+
+
+def _collected_run_lines(path: Path, run: CollectedRun) -> list[str]:
+    """About a run."""
+    frames = sum(line.num_frames for line in run.episodes)
+    counts = {word: sum(line.success is success for line in run.episodes) for success, word in _SUCCESS_WORDS.items()}
+    told = ", ".join(f"{count} {word}" for word, count in counts.items() if count)
+    facts = [
+        ("run", f"{path} (collected)"),
+        ("robot", run.robot),
+        ("episodes", f"{len(run.episodes)} ({told})"),
+        ("frames", f"{frames} ({frames / run.fps:.1f} s at {run.fps} Hz)"),
+        ("size", size_in_words(sum(line.num_bytes for line in run.episodes))),
+        ("digest", run.digest),
+    ]
+    rows = [("episode", "outcome", "frames", "size", "file", "task")]
+    rows += [
+        (
+            str(line.episode_index),
+            _SUCCESS_WORDS[line.success] + (f": {line.reason}" if line.reason else ""),
+            str(line.num_frames),
+            size_in_words(line.num_bytes),
+            line.file,
+            line.instruction,
+        )
+        for line in run.episodes
     ]
     return [*aligned(facts), "", *aligned(rows)]
 
@@ -256,7 +320,7 @@ def _folder(found: Found) -> tuple[dict[str, Any], list[str]]:
             task, seed = ("(collected)", "") if isinstance(info, CollectedInfo) else (info.task, str(info.root_seed))
             success = None if outcome is None else outcome.success
         items.append({"path": str(file), "task": task, "success": success, "frames": recording.num_frames})
-        word = {None: "unknown" if outcome is not None else "recovered", True: "success", False: "failure"}[success]
+        word = "recovered" if outcome is None else _SUCCESS_WORDS[outcome.success]
         rows.append(
             (
                 str(file.relative_to(path)),

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from tyro.conf import Positional
 
 from demorec.cli.shared.output import say, say_json
+from demorec.cli.shared.table import aligned
 from demorec.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -37,14 +38,15 @@ class ListRows:
         """Print one line each."""
         if self.coverage:
             return self._print_coverage()
-        registry, describe = _tables()[self.what]
+        from demorec import tables
+
+        registry: Registry[Any] = getattr(tables, self.what.upper())
+        describe = _DESCRIBED.get(self.what, _own_summary)
         rows = [(name, describe(registry, name)) for name in registry.names()]
         if self.json:
             say_json([{"name": name, "summary": summary} for name, summary in rows])
-            return 0
-        width = max(len(name) for name, _ in rows)
-        for name, summary in rows:
-            say(f"{name:<{width}}  {summary}")
+        else:
+            say(*aligned(rows))
         return 0
 
     def _print_coverage(self) -> int:
@@ -56,26 +58,10 @@ class ListRows:
         rows = coverage()
         if self.json:
             say_json([to_plain(row) for row in rows])
-            return 0
-        width = max(len(row.name) for row in rows)
-        for row in rows:
-            told = ", ".join(row.checks) or f"no check: {row.why_not}"
-            say(f"{row.kind:<6}  {row.name:<{width}}  {told}")
+        else:
+            told = ((row.kind, row.name, ", ".join(row.checks) or f"no check: {row.why_not}") for row in rows)
+            say(*aligned(told))
         return 0
-
-
-def _tables() -> Mapping[str, tuple[Registry[Any], Callable[[Registry[Any], str], str]]]:
-    """What to list -> its table, and how a row is told in one line."""
-    from demorec.tables import CAMERAS, CHECKS, EXPORTERS, RENDERERS, ROBOTS, TASKS
-
-    return {
-        "tasks": (TASKS, _own_summary),
-        "cameras": (CAMERAS, _own_summary),
-        "robots": (ROBOTS, _robot),
-        "renderers": (RENDERERS, _first_line_of_module),
-        "exporters": (EXPORTERS, _own_summary),
-        "checks": (CHECKS, _own_summary),
-    }
 
 
 def _own_summary(registry: Registry[Any], name: str) -> str:
@@ -90,3 +76,7 @@ def _robot(registry: Registry[Any], name: str) -> str:
 def _first_line_of_module(registry: Registry[Any], name: str) -> str:
     module = importlib.import_module(registry.rows[name].partition(":")[0])
     return (module.__doc__ or "").strip().splitlines()[0]
+
+
+_DESCRIBED: Mapping[str, Callable[[Registry[Any], str], str]] = {"robots": _robot, "renderers": _first_line_of_module}
+"""How a row is told in one line, where it does not tell itself."""

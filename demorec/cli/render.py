@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Literal
 from tyro.conf import Positional
 
 from demorec.cli.shared.allow import Allow, allowed_modules
-from demorec.cli.shared.output import say, tell
+from demorec.cli.shared.output import counted, say, tell
 from demorec.cli.shared.paths import refuse_sources
 from demorec.cli.shared.progress import ProgressBar
 from demorec.config import VideoConfig
@@ -95,24 +95,23 @@ class Render:
         if self.workers is not None:
             check_option("workers", self.workers, 1, 1024)
         workers = min(self.workers or available_cores(), len(jobs))
-        done = differing = compared = pictures = kept = 0
+        reports: list[RerenderReport] = []
         try:
             with ProgressBar("rendering", total=len(jobs)) as bar:
                 for report in _rendered(jobs, options, self.overwrite, workers):
                     bar.advance()
-                    done += 1
-                    pictures += report.num_pictures
-                    compared += len(report.compared)
-                    differing += len(report.differing)
-                    kept += report.was_there
+                    reports.append(report)
                     for camera, frame in report.differing.items():
                         say(f"{report.source.name}: camera {camera} differs from the recording at frame {frame}")
         except KeyboardInterrupt:
-            tell(f"Interrupted: {done} of {len(jobs)} recordings are drawn; the same command goes on: {self.out}")
+            tell(
+                f"Interrupted: {len(reports)} of {len(jobs)} recordings are drawn; the same command goes on: {self.out}"
+            )
             return 130
-        if kept:
+        compared, differing = sum(len(r.compared) for r in reports), sum(len(r.differing) for r in reports)
+        if kept := sum(report.was_there for report in reports):
             say(f"{kept} of {len(jobs)} had been drawn before and are kept (--overwrite draws them again).")
-        say(f"{len(jobs)} {'recording' if len(jobs) == 1 else 'recordings'}, {pictures} pictures: {self.out}")
+        say(f"{counted(len(jobs), 'recording')}, {sum(r.num_pictures for r in reports)} pictures: {self.out}")
         if compared:
             say(f"{compared - differing} of {compared} unchanged cameras give the recorded pictures to the bit.")
         return 1 if differing else 0
@@ -161,10 +160,7 @@ def _jobs(paths: Sequence[Path], out: Path) -> list[tuple[Path, Path]]:
         jobs += [(file, out / file.relative_to(path)) for file in sorted(files)]
     if out.suffix == ".mcap" and len(jobs) > 1:
         raise ConfigError(f"{len(jobs)} recordings cannot become one file: name a folder with --out.")
-    targets = [target for _, target in jobs]
-    if len(set(targets)) != len(targets):
-        raise ConfigError("Two recordings have the same name and would get into each other's way: render them apart.")
-    refuse_sources(paths, targets)
+    refuse_sources(paths, [target for _, target in jobs], do="render")
     return jobs
 
 

@@ -13,7 +13,7 @@ from tyro.conf import Positional
 
 from demorec.cli.shared.allow import Allow, allowed_modules
 from demorec.cli.shared.output import say, say_json, tell
-from demorec.cli.shared.paths import refuse_sources
+from demorec.cli.shared.paths import need_paths, refuse_sources
 from demorec.cli.shared.progress import ProgressBar
 from demorec.errors import ConfigError, OptionError
 from demorec.runs.find import EPISODE_FOLDERS, Found, expect, expect_recordings
@@ -67,10 +67,7 @@ class Replay:
 
     def run(self) -> int:
         """Replay and report."""
-        if not self.paths:
-            raise ConfigError(
-                "No path is given: name a recording, a run or a dataset, e.g. demorec replay recordings/demo."
-            )
+        need_paths(self.paths, "replay")
         if self.tolerance < 0:
             raise OptionError("tolerance", f"is {self.tolerance}, it must be 0 or more.")
         from demorec.replay import ReplayOptions, is_as_recorded, replay_all
@@ -119,11 +116,8 @@ class Replay:
 
 def _check_out(paths: Sequence[Path], out: Path) -> None:
     """Refuse to write replays into what is replayed, or over each other."""
-    files = [file for path in paths for file in _replayable(path).recordings]
-    names = [file.name for file in files]
-    if len(set(names)) != len(names):
-        raise ConfigError("Two recordings have the same name and would get into each other's way: replay them apart.")
-    refuse_sources(paths, [out / name for name in names] or [out])
+    targets = [out / file.name for path in paths for file in _replayable(path).recordings]
+    refuse_sources(paths, targets or [out], do="replay")
 
 
 def demonstrations(

@@ -49,7 +49,16 @@ class Report:
 
     def run(self) -> int:
         """Gather, then write."""
-        self._validate()
+        if self.out.suffix.lower() not in (".html", ".htm"):
+            raise ConfigError(f"--out names an .html file, found the name {self.out.name!r}.")
+        check_option("workers", self.workers, 1, 1024)
+        if self.pictures and not self.checks:
+            raise ConfigError("--pictures chooses checks, and --no-checks runs none: leave one of them out.")
+        expect(self.path, "recording", "dataset", *EPISODE_FOLDERS)
+        if not self.out.absolute().parent.is_dir():
+            raise ConfigError(f"--out: there is no folder {self.out.parent}.")
+        check_replaceable(self.out, REPORT, overwrite=self.overwrite, sources=places_read([self.path]))
+        refuse_inside([self.out])
         from demorec.report.gather import ReportOptions, gather
         from demorec.report.page import write_page
 
@@ -65,15 +74,3 @@ class Report:
         size = write_page(report, self.out)
         say(f"{counted(len(report.episodes), 'episode')}, {size / 1e6:.1f} MB: {self.out}")
         return 0
-
-    def _validate(self) -> None:
-        if self.out.suffix.lower() not in (".html", ".htm"):
-            raise ConfigError(f"--out names an .html file, found the name {self.out.name!r}.")
-        check_option("workers", self.workers, 1, 1024)
-        if self.pictures and not self.checks:
-            raise ConfigError("--pictures chooses checks, and --no-checks runs none: leave one of them out.")
-        expect(self.path, "recording", "dataset", *EPISODE_FOLDERS)
-        if not self.out.absolute().parent.is_dir():
-            raise ConfigError(f"--out: there is no folder {self.out.parent}.")
-        check_replaceable(self.out, REPORT, overwrite=self.overwrite, sources=places_read([self.path]))
-        refuse_inside([self.out])

@@ -34,13 +34,11 @@ class Train:
         """Train."""
         from demorec.training.command import train
 
-        def say_what_is_replaced() -> None:
-            tell("demorec train: FastDataset reads in place of LeRobotDataset; all else is lerobot-train.")
-
+        replaced = "demorec train: FastDataset reads in place of LeRobotDataset; all else is lerobot-train."
         train(
             self.others,
             frame_cache_bytes=self.frame_cache_mb << 20,
-            on_replaced=say_what_is_replaced,
+            on_replaced=lambda: tell(replaced),
             expert_only=self.expert_only,
             freeze_encoder=self.freeze_encoder,
         )

@@ -15,6 +15,12 @@ from lerobot.utils.constants import ACTION, OBS_IMAGES
 from demorec.gym_env import DemorecEnv, env_id
 from demorec.scene import features
 
+_AS_THEY_ARE = (
+    "split", "variation", "fps", "renderer", "privileged", "state", "action", "episode_length", "render_mode",
+    "render_camera", "render_width", "render_height",
+)  # fmt: skip
+"""Flags that are arguments of the environment by the same name."""
+
 
 @EnvConfig.register_subclass("demorec")
 @dataclass
@@ -61,23 +67,11 @@ class DemorecEnvConfig(EnvConfig):  # type: ignore[misc]
     @property
     def gym_kwargs(self) -> dict[str, Any]:
         """Arguments of `demorec.gym_env.DemorecEnv` beside the task."""
-        return {
-            "split": self.split,
+        return {name: getattr(self, name) for name in _AS_THEY_ARE} | {
             "seed": self.scene_seed,
-            "variation": self.variation,
-            "fps": self.fps,
             "cameras": tuple(self.cameras),
             "width": self.observation_width,
             "height": self.observation_height,
-            "renderer": self.renderer,
-            "privileged": self.privileged,
-            "state": self.state,
-            "action": self.action,
-            "episode_length": self.episode_length,
-            "render_mode": self.render_mode,
-            "render_camera": self.render_camera,
-            "render_width": self.render_width,
-            "render_height": self.render_height,
         }
 
     def create_envs(

@@ -16,9 +16,9 @@ from demorec.geometry import Array, Pose
 from demorec.playback.episode import PlayedEpisode
 from demorec.playback.meshes import SurfaceMesh, joined, mesh_file, of_trimesh, sphere_mesh, urdf_meshes
 from demorec.playback.paths import Paths
+from demorec.playback.poses import log_pose, send_poses
 from demorec.playback.robot import as_mesh3d
 from demorec.playback.style import GOAL
-from demorec.playback.times import indexes
 from demorec.scene.assets import asset_path
 from demorec.scene.scene import Body, Rgba, Shape, Texture
 from demorec.scene.textures import texture_pixels
@@ -37,7 +37,6 @@ def log_bodies(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpiso
     A body whose model is not installed here, or is another one, is drawn as the recording describes it.
     """
     scene = episode.info.scene
-    times = indexes(episode.time_ns, episode.time_ns)
     for body in scene.bodies:
         entity = paths.body(body.name)
         if tint is not None and body.role in ("support", "fixture"):
@@ -45,20 +44,17 @@ def log_bodies(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpiso
         recording.log(entity, _visible(body, episode, tint), static=True)
         poses = episode.object_poses.get(body.name)
         if poses is not None:
-            columns = rr.Transform3D.columns(translation=poses[:, :3], quaternion=poses[:, 3:])
-            recording.send_columns(entity, times, columns)
+            send_poses(recording, entity, episode.time_ns, poses)
         else:
-            recording.log(entity, _transform(body.world_from_body.vector()), static=True)
+            log_pose(recording, entity, body.world_from_body.vector())
     for name, pose in episode.end_poses.items():
         wire = rr.Boxes3D(sizes=[scene.body(name).shape.extents], colors=[(200, 200, 200)], radii=[-1.0])
-        recording.log(paths.end(name), _transform(pose), wire, static=True)
+        log_pose(recording, paths.end(name), pose)
+        recording.log(paths.end(name), wire, static=True)
     for goal in scene.goals:
         wire = rr.Boxes3D(sizes=[scene.body(goal.object).shape.extents], colors=[GOAL], radii=[-1.5])
-        recording.log(paths.goal(goal.object), _transform(scene.world_from_goal(goal).vector()), wire, static=True)
-
-
-def _transform(pose: Array) -> rr.Transform3D:
-    return rr.Transform3D(translation=pose[:3], quaternion=pose[3:])
+        log_pose(recording, paths.goal(goal.object), scene.world_from_goal(goal).vector())
+        recording.log(paths.goal(goal.object), wire, static=True)
 
 
 def _visible(body: Body, episode: PlayedEpisode, tint: Rgba | None) -> rr.Mesh3D:

@@ -15,6 +15,7 @@ from demorec.playback.times import indexes
 
 _ORANGE = (1.0, 0.62, 0.25, 0.6)
 """Translucent, so that an episode that lies exactly where the other one does hides nothing of it."""
+A, B = Paths("/a"), Paths("/b")
 DIFFERENCES = "/differences"
 
 
@@ -39,8 +40,8 @@ def log_comparison(recording: rr.RecordingStream, a: PlayedEpisode, b: PlayedEpi
             f"The episodes have different robots, {a.info.robot.name} and {b.info.robot.name}: "
             "compare two of the same robot."
         )
-    log_episode(recording, a, root="/a", label="A ")
-    log_episode(recording, b, root="/b", label="B ", tint=_ORANGE)
+    log_episode(recording, a, root=A.root, label="A ")
+    log_episode(recording, b, root=B.root, label="B ", tint=_ORANGE)
     for name, curves in differences(a, b).items():
         entity = f"{DIFFERENCES}/{name}"
         recording.log(entity, rr.SeriesLines(names=list(curves.names), widths=[2.0] * len(curves.names)), static=True)
@@ -66,8 +67,3 @@ def differences(a: PlayedEpisode, b: PlayedEpisode) -> dict[str, Curves]:
 
 def _distance(a: Array, b: Array) -> Array:
     return np.asarray(np.sqrt(((a[:, :3] - b[:, :3]) ** 2).sum(axis=1)))
-
-
-def comparison_paths() -> tuple[Paths, Paths]:
-    """Of A and of B."""
-    return Paths("/a"), Paths("/b")

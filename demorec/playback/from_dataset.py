@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import hashlib
+from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import partial
-from itertools import batched, islice
 from pathlib import Path
 from typing import Any
 
@@ -14,26 +13,23 @@ from numpy.typing import NDArray
 
 from demorec.errors import RecordingError, in_words, resource_error
 from demorec.geometry import Array, Pose
-from demorec.lerobot.boxes import BOXES_DIR, read_boxes
-from demorec.lerobot.files import read_json, read_table
-from demorec.lerobot.language import COLUMNS, spoken_episodes
-from demorec.lerobot.layout import DatasetInfo
-from demorec.lerobot.packets import PACKET_CODECS, episode_distances, episode_packets
+from demorec.lerobot.files import read_json
+from demorec.lerobot.layout import AUTOMATIC_FEATURES, DatasetInfo
 from demorec.lerobot.paths import SIDECAR_DIR
-from demorec.lerobot.reader import EpisodePlace, episode_places
-from demorec.lerobot.robots import DatasetRobot, read_robot
-from demorec.playback.collected import PlayedCollected
-from demorec.playback.collected_dataset import collected_of_dataset
-from demorec.playback.episode import Box, Curves, PlayedEpisode, Video, VideoBatch
+from demorec.lerobot.reader import read_tasks
+from demorec.lerobot.robots import DatasetRobot
+from demorec.plain import from_json
+from demorec.playback.dataset_episode import DatasetEpisode, dataset_rows
+from demorec.playback.episode import Curves, PlayedCollected, PlayedEpisode
 from demorec.playback.held_objects import held_object_poses
+from demorec.recording.collected.transforms import JointPositions
 from demorec.scene.assets import asset_path
-from demorec.scene.episode import EpisodeInfo, Outcome, SuccessCheck, frame_time_ns
-from demorec.scene.features import DEPTH_SUFFIX, ENVIRONMENT_STATE, IMAGE_PREFIX, STATE_KINDS, state_names
+from demorec.scene.collected import CollectedCamera, CollectedFeature, CollectedInfo, CollectedOutcome, Origin
+from demorec.scene.episode import EpisodeInfo, Outcome, SuccessCheck
+from demorec.scene.features import DEPTH_SUFFIX, ENVIRONMENT_STATE, STATE_KINDS, state_names
 from demorec.scene.kinematics import ArmKinematics
 from demorec.scene.urdf import Urdf, check_primitives
 from demorec.scene.validity import read_episode_info
-
-_PICTURES_AT_ONCE = 256
 
 
 def dataset_episodes(root: Path) -> list[int]:
@@ -42,7 +38,7 @@ def dataset_episodes(root: Path) -> list[int]:
     Raises:
         RecordingError: It was not exported by demorec, or is damaged.
     """
-    return [int(row["episode_index"]) for row in _rows(root, f"{SIDECAR_DIR}/episodes", ["episode_index"])]
+    return [int(row["episode_index"]) for row in dataset_rows(root, f"{SIDECAR_DIR}/episodes", ["episode_index"])]
 
 
 @contextmanager
@@ -61,32 +57,27 @@ def open_dataset_episode(root: Path, episode_index: int) -> Iterator[PlayedEpiso
 
 
 def _read_episode(root: Path, episode_index: int) -> PlayedEpisode | PlayedCollected:
-    row = _episode_row(root, episode_index)
-    described = DatasetInfo.load(root)
-    place = _place(root, described, episode_index)
-    columns = [name for name, feature in described.features.items() if feature.is_numeric]
-    if row["episode_info"] is None:
-        data = _data(root, place, columns)
-        time_ns = _times(len(data["index"]), described)
-        videos, depth = _videos(root, described, place, time_ns), _depth(root, described, place)
-        robot, statements = _robot(root, row), _statements(root, episode_index, described, time_ns)
-        return collected_of_dataset(root, row, described, data, time_ns, videos, depth, robot, statements)
+    found = DatasetEpisode(root, episode_index)
+    if found.row["episode_info"] is None:
+        return _collected(found)
+    row, described = found.row, found.described
     export = dict(read_json(root / SIDECAR_DIR / "export.json"))
     info = read_episode_info(row["episode_info"])
     missing = {"observation.state", "action"} - described.features.keys()
     if missing:
         raise RecordingError(f"The dataset has no {' and no '.join(sorted(missing))}, so it cannot be shown: {root}")
-    data = _data(root, place, columns)
+    data = found.data
     num_frames = len(data["action"])
     num_arm = len(info.robot.arm_joints)
     widths = {len(state_names(info.robot, kind)) for kind in STATE_KINDS}
     if not num_frames or data["observation.state"].shape[1] not in widths:
         raise RecordingError(f"The dataset has no rows of episode {episode_index}, or of another robot: {root}")
-    time_ns = _times(num_frames, described)
     state = data["observation.state"]
-    if (robot := _robot(root, row)) is not None:
-        check_primitives(robot.urdf)
-    base_from_tcp = data["observation.ee_pose"] if "observation.ee_pose" in data else _tcp_poses(info, state, robot)
+    if found.robot is not None:
+        check_primitives(found.robot.urdf)
+    base_from_tcp = (
+        data["observation.ee_pose"] if "observation.ee_pose" in data else _tcp_poses(info, state, found.robot)
+    )
     fingers = info.robot.gripper.joint_position(state[:, num_arm])
     ends = {item["name"]: _pose_row(item["world_from_object_end"]) for item in row["objects"]}
     return PlayedEpisode(
@@ -96,71 +87,68 @@ def _read_episode(root: Path, episode_index: int) -> PlayedEpisode | PlayedColle
         source=str(row["source"]),
         info=info,
         outcome=_outcome(row, num_frames),
-        robot_description=None if robot is None else robot.urdf,
-        time_ns=time_ns,
+        robot_description=None if found.robot is None else found.robot.urdf,
+        time_ns=found.time_ns,
         joint_position=np.concatenate([state[:, :num_arm], fingers], axis=1),
         base_from_tcp=base_from_tcp,
         object_poses=_object_poses(info, ends, data, described, base_from_tcp),
         end_poses=ends,
         world_from_camera=_camera_poses(root, episode_index),
         phase=_phases(row, num_frames),
-        curves=_curves(info, data, base_from_tcp, time_ns, with_targets=export.get("action") == "joint"),
-        videos=_videos(root, described, place, time_ns),
-        depth={name.removesuffix(DEPTH_SUFFIX): read for name, read in _depth(root, described, place).items()},
-        statements=_statements(root, episode_index, described, time_ns),
-        boxes=_boxes(root, described, data["index"][:, 0]),
+        curves=_curves(info, data, base_from_tcp, found.time_ns, with_targets=export.get("action") == "joint"),
+        videos=found.videos(),
+        depth={name.removesuffix(DEPTH_SUFFIX): read for name, read in found.depth().items()},
+        statements=found.statements(),
+        boxes=found.boxes(),
     )
 
 
-def _times(num_frames: int, described: DatasetInfo) -> NDArray[np.int64]:
-    """(T,) of the frames, since the first one."""
-    return np.array([frame_time_ns(index, int(described.fps)) for index in range(num_frames)], dtype=np.int64)
-
-
-def _rows(root: Path, table: str, columns: list[str] | None, episode_index: int | None = None) -> list[dict[str, Any]]:
-    files = sorted((root / table).glob("*/*.parquet"))
-    if not files:
-        raise RecordingError(
-            f"The dataset has no {table}: only datasets of demorec can be shown; rerun shows others: {root}"
+def _collected(found: DatasetEpisode) -> PlayedCollected:
+    """An episode as its dataset knows it, at the dataset's rate."""
+    root, row, described, robot = found.root, found.row, found.described, found.robot
+    data, time_ns, videos, depth = found.data, found.time_ns, found.videos(), found.depth()
+    names = {
+        name: described.features[name].names or tuple(str(index) for index in range(values.shape[1]))
+        for name, values in data.items()
+        if name not in AUTOMATIC_FEATURES and name != "next.done"
+    }
+    tasks = read_tasks(root)
+    joints, units = ({}, {}) if robot is None else (robot.record.joints, robot.record.units)
+    features = tuple(
+        CollectedFeature(
+            name=name, dtype="float32", names=parts, joints=joints.get(name, ()), units=units.get(name, ())
         )
-    rows = [row for file in files for row in read_table(file, columns).to_pylist()]
-    return [row for row in rows if episode_index is None or row.get("episode_index") == episode_index]
-
-
-def _episode_row(root: Path, episode_index: int) -> dict[str, Any]:
-    for row in _rows(root, f"{SIDECAR_DIR}/episodes", None, episode_index):
-        return row
-    raise RecordingError(f"The dataset has no episode {episode_index}: {root}")
-
-
-def _place(root: Path, described: DatasetInfo, episode_index: int) -> EpisodePlace:
-    for place in episode_places(root, described):
-        if place.episode_index == episode_index:
-            return place
-    raise RecordingError(f"The dataset has no episode {episode_index} in its own tables: {root}")
-
-
-def _robot(root: Path, row: dict[str, Any]) -> DatasetRobot | None:
-    """The arm of an episode; None in a dataset that does not keep it."""
-    name = row.get("robot_digest")
-    return None if name is None else read_robot(root, str(name))
-
-
-def _data(root: Path, place: EpisodePlace, columns: list[str]) -> dict[str, Array]:
-    rows = _rows(root, "data", columns, place.episode_index)
-    if len(rows) != place.length:
-        raise RecordingError(
-            f"Episode {place.episode_index} of the dataset has {len(rows)} rows, its table of episodes says "
-            f"{place.length}: {root}"
-        )
-    result = {}
-    for name in columns:
-        try:
-            values = np.array([row[name] for row in rows], dtype=np.float64)
-        except (ValueError, TypeError, OverflowError) as error:
-            raise RecordingError(f"The column {name} holds something else than numbers: {root}") from error
-        result[name] = values if values.ndim == 2 else values[:, None]
-    return result
+        for name, parts in names.items()
+    )
+    positions = JointPositions(features)
+    values = positions.of(data).T if positions.joints else ()
+    return PlayedCollected(
+        name=f"episode_{found.number:06d}",
+        group=root.resolve().name,
+        identity=hashlib.sha256(f"{root.resolve()} {found.number}".encode()).hexdigest()[:16],
+        source=str(row["source"]),
+        info=CollectedInfo(
+            episode_index=found.number,
+            instruction=tasks[int(data["task_index"][0, 0])] if len(time_ns) else "",
+            robot=described.robot_type or "",
+            fps=int(described.fps),
+            urdf="" if robot is None else robot.urdf,
+            features=features,
+            cameras=tuple(
+                CollectedCamera(name=camera["name"], width=camera["width"], height=camera["height"])
+                for camera in row["cameras"]
+                if camera["name"] in videos or camera["name"] in depth
+            ),
+            origin=from_json(row["origin"], Origin),
+        ),
+        outcome=CollectedOutcome(success=row["success"], num_frames=len(time_ns), reason=row["failure_reason"]),
+        time_ns=time_ns,
+        joint_position=dict(zip(positions.joints, values, strict=True)),
+        curves={name: Curves(time_ns=time_ns, values=data[name], names=parts) for name, parts in names.items()},
+        videos=videos,
+        depth=depth,
+        statements=found.statements(),
+    )
 
 
 def _tcp_poses(info: EpisodeInfo, state: Array, robot: DatasetRobot | None) -> Array:
@@ -203,15 +191,9 @@ def _pose_row(values: Any) -> Array:
 
 
 def _outcome(row: dict[str, Any], num_frames: int) -> Outcome:
-    return Outcome(
-        success=row["success"],
-        checks=tuple(SuccessCheck(**check) for check in row["checks"]),
-        failure_phase=row["failure_phase"],
-        failure_reason=row["failure_reason"],
-        num_frames=num_frames,
-        num_retries=row["num_retries"],
-        final_state_digest=row["final_state_digest"],
-    )
+    names = ("success", "failure_phase", "failure_reason", "num_retries", "final_state_digest")
+    checks = tuple(SuccessCheck(**check) for check in row["checks"])
+    return Outcome(num_frames=num_frames, checks=checks, **{name: row[name] for name in names})
 
 
 def _phases(row: dict[str, Any], num_frames: int) -> tuple[str, ...]:
@@ -227,7 +209,7 @@ def _camera_poses(root: Path, episode_index: int) -> dict[str, Array]:
     """Camera -> (T, 7) of the cameras that move."""
     if not (root / SIDECAR_DIR / "camera_poses").is_dir():
         return {}
-    rows = _rows(root, f"{SIDECAR_DIR}/camera_poses", None, episode_index)
+    rows = dataset_rows(root, f"{SIDECAR_DIR}/camera_poses", None, episode_index)
     names = [name for name in (rows[0] if rows else {}) if name not in ("episode_index", "frame_index")]
     return {name: np.array([row[name] for row in rows]) for name in names}
 
@@ -258,66 +240,3 @@ def _curves(
     if with_targets:
         result["target"] = curves(action[:, :number], joints)
     return result
-
-
-def _videos(root: Path, described: DatasetInfo, place: EpisodePlace, time_ns: NDArray[np.int64]) -> dict[str, Video]:
-    """Camera -> its coded pictures."""
-    result = {}
-    for key, feature in described.features.items():
-        codec = PACKET_CODECS.get(str((feature.info or {}).get("video.codec")))
-        if feature.is_video and codec is not None and not feature.is_depth:
-            batches = partial(_video_batches, root, described, key, place, time_ns)
-            result[key.removeprefix(IMAGE_PREFIX)] = Video(codec=codec, batches=batches)
-    return result
-
-
-def _video_batches(
-    root: Path, described: DatasetInfo, key: str, place: EpisodePlace, time_ns: NDArray[np.int64]
-) -> Iterator[VideoBatch]:
-    for packets in batched(episode_packets(root, described, key, place), _PICTURES_AT_ONCE):
-        frames = np.array([packet.frame for packet in packets])
-        yield VideoBatch(
-            time_ns=time_ns[np.maximum(frames, 0)],  # those before the episode are decoded with its first frame
-            samples=[packet.data for packet in packets],
-            is_keyframe=np.array([packet.is_keyframe for packet in packets]),
-        )
-
-
-def _depth(
-    root: Path, described: DatasetInfo, place: EpisodePlace
-) -> dict[str, Callable[[], Iterator[NDArray[np.float32]]]]:
-    """Depth feature, without its prefix -> reads (H, W) metres of every frame."""
-    return {
-        key.removeprefix(IMAGE_PREFIX): partial(episode_distances, root, described, key, place)
-        for key, feature in described.features.items()
-        if feature.is_video and feature.is_depth
-    }
-
-
-def _statements(
-    root: Path, episode_index: int, described: DatasetInfo, time_ns: NDArray[np.int64]
-) -> tuple[tuple[int, str, str], ...]:
-    """(time_ns, style, sentence) of what the language columns say of an episode."""
-    if not set(COLUMNS) <= described.features.keys():
-        return ()
-    (episode,) = islice(spoken_episodes(root), episode_index, episode_index + 1)
-    frames = [min(round(row["timestamp"] * described.fps), len(time_ns) - 1) for row in episode.persistent]
-    return tuple(
-        (int(time_ns[frame]), str(row["style"]), str(row["content"]))
-        for frame, row in zip(frames, episode.persistent, strict=True)
-    )
-
-
-def _boxes(root: Path, described: DatasetInfo, index: Array) -> dict[str, dict[int, list[tuple[str, Box]]]]:
-    """Camera -> frame -> what it sees, of a dataset with boxes beside it; `index` (T,) is that of the rows."""
-    frame_of = {int(value): frame for frame, value in enumerate(index.tolist())}
-    found: dict[str, dict[int, list[tuple[str, Box]]]] = {}
-    for key in described.video_keys:
-        path = root / BOXES_DIR / f"{key}.json"
-        if not path.exists():
-            continue
-        seen = found.setdefault(key.removeprefix(IMAGE_PREFIX), {})
-        for item in read_boxes(path):
-            if item.index in frame_of:
-                seen.setdefault(frame_of[item.index], []).append((item.object, item.box))
-    return found

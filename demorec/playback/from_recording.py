@@ -1,4 +1,4 @@
-"""Episodes out of recordings."""
+"""Episodes out of recordings, of simulated and of collected ones."""
 
 from __future__ import annotations
 
@@ -6,70 +6,126 @@ import hashlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
-from itertools import batched
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from demorec.playback.episode import Curves, PlayedEpisode, Video, VideoBatch
-from demorec.recording import Recording
+from demorec.playback.episode import Curves, PlayedCollected, PlayedEpisode, Video, timed
+from demorec.recording import AnyRecording, CollectedRecording, Recording, open_recording
 from demorec.recording.channels import description_topic
+from demorec.recording.collected.transforms import JointPositions
+from demorec.runs.run_file import EPISODES, FAILED
+from demorec.scene.collected import NO_PICTURE, CollectedColumns
 from demorec.scene.episode import EpisodeColumns
-
-_PICTURES_AT_ONCE = 256
 
 
 @contextmanager
-def open_recording(path: Path, *, group: str) -> Iterator[PlayedEpisode]:
+def open_recorded(path: Path) -> Iterator[PlayedEpisode | PlayedCollected]:
     """The episode of a recording; its pictures can be read until the context is left.
 
     Raises:
         RecordingError: It cannot be read.
     """
-    with Recording(path) as recording:
-        info, columns = recording.info, recording.columns()
-        yield PlayedEpisode(
-            name=path.name.removesuffix(".mcap"),
-            group=group,
-            identity=hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:16],
-            source=path.name,
-            info=info,
-            outcome=recording.outcome,
-            robot_description=recording.description(),
-            body_description=partial(_body_description, recording),
-            time_ns=columns.time_ns,
-            joint_position=columns.joint_position,
-            base_from_tcp=columns.base_from_tcp,
-            object_poses=columns.object_poses,
-            world_from_camera=columns.world_from_camera,
-            phase=columns.phase,
-            events=tuple(recording.events()),
-            curves=_curves(recording, columns),
-            videos={
-                name: Video(codec=recording.video_settings(name).codec, batches=partial(_batches, recording, name))
-                for name in recording.cameras
-            },
-            depth={name: partial(recording.depth, name) for name in recording.cameras if recording.has_depth(name)},
-            segmentation={
-                name: partial(recording.segmentation, name)
-                for name in recording.cameras
-                if recording.has_segmentation(name)
-            },
-            segment_names=recording.segment_names(),
-        )
+    folder = path.resolve().parent
+    known = {
+        "name": path.name.removesuffix(".mcap"),
+        "group": folder.parent.name if folder.name in (EPISODES, FAILED) else folder.name,
+        "identity": hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:16],
+        "source": path.name,
+    }
+    with open_recording(path) as recording:
+        if isinstance(recording, CollectedRecording):
+            yield _collected(recording, known)
+        else:
+            yield _simulated(recording, known)
 
 
-def _body_description(recording: Recording, body: str) -> str | None:
-    return recording.description(body) if description_topic(body) in recording.topics else None
+def _simulated(recording: Recording, known: dict[str, Any]) -> PlayedEpisode:
+    info, columns = recording.info, recording.columns()
+    return PlayedEpisode(
+        **known,
+        info=info,
+        outcome=recording.outcome,
+        robot_description=recording.description(),
+        body_description=lambda body: (
+            recording.description(body) if description_topic(body) in recording.topics else None
+        ),
+        time_ns=columns.time_ns,
+        joint_position=columns.joint_position,
+        base_from_tcp=columns.base_from_tcp,
+        object_poses=columns.object_poses,
+        world_from_camera=columns.world_from_camera,
+        phase=columns.phase,
+        events=tuple(recording.events()),
+        curves=_curves(recording, columns),
+        videos={name: _video(recording, name, columns.time_ns) for name in recording.cameras},
+        depth={
+            name: partial(timed, columns.time_ns, partial(recording.depth, name))
+            for name in recording.cameras
+            if recording.has_depth(name)
+        },
+        segmentation={
+            name: partial(recording.segmentation, name)
+            for name in recording.cameras
+            if recording.has_segmentation(name)
+        },
+        segment_names=recording.segment_names(),
+    )
 
 
-def _batches(recording: Recording, camera: str) -> Iterator[VideoBatch]:
-    for packets in batched(recording.packets(camera), _PICTURES_AT_ONCE):
-        yield VideoBatch(
-            time_ns=np.array([packet.time_ns for packet in packets], dtype=np.int64),
-            samples=[packet.data for packet in packets],
-            is_keyframe=np.array([packet.is_keyframe for packet in packets]),
-        )
+def _collected(recording: CollectedRecording, known: dict[str, Any]) -> PlayedCollected:
+    info, columns = recording.info, recording.columns()
+    time_ns = columns.time_ns - (columns.time_ns[0] if columns.num_frames else 0)
+    positions = JointPositions(info.features)
+    values = positions.of(columns.features) if positions.joints else np.zeros((len(time_ns), 0))
+    return PlayedCollected(
+        **known,
+        info=info,
+        outcome=recording.outcome,
+        time_ns=time_ns,
+        joint_position=dict(zip(positions.joints, values.T, strict=True)),
+        curves={
+            feature.name: Curves(
+                time_ns=time_ns, values=columns.features[feature.name].astype(np.float64), names=feature.names
+            )
+            for feature in info.features
+        },
+        videos={
+            camera: _video(recording, camera, _shown_at(columns, camera, time_ns))
+            for camera in recording.cameras
+            if len(columns.picture_stamps[camera])
+        },
+        depth={
+            camera: partial(timed, _shown_at(columns, camera, time_ns), partial(recording.distances, camera))
+            for camera in recording.depth_cameras
+            if len(columns.picture_stamps[camera])
+        },
+        statements=tuple((int(time_ns[frame]), "subtask", text) for frame, text in recording.subtasks),
+    )
+
+
+def _shown_at(columns: CollectedColumns, camera: str, time_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(P,) when each picture of a camera is shown: with the first frame that holds it, or the next one after it.
+
+    Not at its own stamp, which may be of another clock.
+    """
+    frames = np.flatnonzero(columns.pictures[camera] != NO_PICTURE)
+    numbers = np.maximum.accumulate(columns.pictures[camera][frames])
+    count = len(columns.picture_stamps[camera])
+    places = np.minimum(np.searchsorted(numbers, np.arange(count)), max(len(frames) - 1, 0))
+    return time_ns[frames[places]] if len(frames) else np.zeros(count, dtype=np.int64)
+
+
+def _video(recording: AnyRecording, camera: str, shown_at: NDArray[np.int64]) -> Video:
+    """The coded pictures of a camera, each at its time (P,)."""
+
+    def packets() -> Iterator[tuple[int, bytes, bool]]:
+        for packet in recording.packets(camera):
+            yield int(shown_at[packet.frame_index]), packet.data, packet.is_keyframe
+
+    return Video(codec=recording.video_settings(camera).codec, packets=packets)
 
 
 def _curves(recording: Recording, columns: EpisodeColumns) -> dict[str, Curves]:

@@ -7,15 +7,16 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
-from demorec.playback.collected import PlayedCollected
-from demorec.playback.episode import PlayedEpisode
+from demorec.playback.episode import PlayedCollected, PlayedEpisode
 from demorec.playback.sources import PlaybackSource
-from demorec.scene.episode import Outcome
-from demorec.scene.scene import Scene
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 BOX = "□"
 DRAWABLE = (
@@ -65,61 +66,42 @@ class DrawableText:
     def episode(self, episode: PlayedEpisode | PlayedCollected) -> PlayedEpisode | PlayedCollected:
         """The same with drawable text."""
         if isinstance(episode, PlayedCollected):
-            told = replace(episode.info, instruction=self.sentence(episode.info.instruction))
-            return replace(episode, name=self.sentence(episode.name), group=self.sentence(episode.group), info=told)
-        info = episode.info
-        bodies = {self.name(body.name): body.name for body in info.scene.bodies}
-        return replace(
+            told = self._spelt(episode.info, sentences=("instruction",))
+            return self._spelt(episode, sentences=("name", "group"), info=told)
+        scene, outcome = episode.info.scene, episode.outcome
+        bodies = {self.name(body.name): body.name for body in scene.bodies}
+        scene = replace(
+            scene,
+            bodies=tuple(self._spelt(body, names=("name",)) for body in scene.bodies),
+            goals=tuple(self._spelt(goal, names=("object", "onto")) for goal in scene.goals),
+            cameras=tuple(self._spelt(camera, names=("name",)) for camera in scene.cameras),
+        )
+        if outcome is not None:
+            checks = tuple(self._spelt(check, sentences=("name", "unit")) for check in outcome.checks)
+            outcome = self._spelt(outcome, sentences=("failure_phase", "failure_reason"), checks=checks)
+        return self._spelt(
             episode,
-            name=self.sentence(episode.name),
-            group=self.sentence(episode.group),
-            info=replace(
-                info,
-                task=self.sentence(info.task),
-                instruction=self.sentence(info.instruction),
-                origin=self.sentence(info.origin),
-                scene=self._scene(info.scene),
-            ),
-            outcome=None if episode.outcome is None else self._outcome(episode.outcome),
+            sentences=("name", "group"),
+            names=("object_poses", "end_poses", "world_from_camera", "phase", "videos", "depth", "segmentation"),
+            info=self._spelt(episode.info, sentences=("task", "instruction", "origin"), scene=scene),
+            outcome=outcome,
             body_description=lambda body: episode.body_description(bodies[body]),
-            object_poses=self._keys(episode.object_poses),
-            end_poses=self._keys(episode.end_poses),
-            world_from_camera=self._keys(episode.world_from_camera),
-            phase=tuple(self.name(phase) for phase in episode.phase),
-            events=tuple(
-                (time_ns, replace(event, name=self.sentence(event.name), message=self.sentence(event.message)))
-                for time_ns, event in episode.events
-            ),
-            curves={
-                name: replace(curves, names=tuple(self.name(curve) for curve in curves.names))
-                for name, curves in episode.curves.items()
-            },
-            videos=self._keys(episode.videos),
-            depth=self._keys(episode.depth),
-            segmentation=self._keys(episode.segmentation),
+            events=tuple((time, self._spelt(event, sentences=("name", "message"))) for time, event in episode.events),
+            curves={name: self._spelt(curves, names=("names",)) for name, curves in episode.curves.items()},
             segment_names={number: self.name(name) for number, name in episode.segment_names.items()},
         )
 
-    def _keys[V](self, values: Mapping[str, V]) -> dict[str, V]:
-        return {self.name(key): value for key, value in values.items()}
-
-    def _scene(self, scene: Scene) -> Scene:
-        return replace(
-            scene,
-            bodies=tuple(replace(body, name=self.name(body.name)) for body in scene.bodies),
-            goals=tuple(
-                replace(goal, object=self.name(goal.object), onto=self.name(goal.onto)) for goal in scene.goals
-            ),
-            cameras=tuple(replace(camera, name=self.name(camera.name)) for camera in scene.cameras),
-        )
-
-    def _outcome(self, outcome: Outcome) -> Outcome:
-        return replace(
-            outcome,
-            failure_phase=self.sentence(outcome.failure_phase),
-            failure_reason=self.sentence(outcome.failure_reason),
-            checks=tuple(
-                replace(check, name=self.sentence(check.name), unit=self.sentence(check.unit))
-                for check in outcome.checks
-            ),
-        )
+    def _spelt[T: DataclassInstance](
+        self, value: T, *, sentences: Sequence[str] = (), names: Sequence[str] = (), **others: object
+    ) -> T:
+        """A dataclass with drawable text in some of its fields: sentences, and names, tuples or keys of names."""
+        spelt: dict[str, Any] = {field: self.sentence(getattr(value, field)) for field in sentences}
+        for field in names:
+            held = getattr(value, field)
+            if isinstance(held, str):
+                spelt[field] = self.name(held)
+            elif isinstance(held, tuple):
+                spelt[field] = tuple(map(self.name, held))
+            else:
+                spelt[field] = {self.name(key): item for key, item in held.items()}
+        return replace(value, **spelt, **others)

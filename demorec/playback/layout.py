@@ -8,9 +8,8 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from demorec.geometry import Array
-from demorec.playback.collected import PlayedCollected, collected_layout
-from demorec.playback.compare import DIFFERENCES, comparison_paths
-from demorec.playback.episode import PlayedEpisode
+from demorec.playback.compare import DIFFERENCES, A, B
+from demorec.playback.episode import PlayedCollected, PlayedEpisode
 from demorec.playback.paths import Paths
 from demorec.playback.times import FRAMES, SECONDS
 
@@ -22,7 +21,7 @@ _FLOOR = 3.0
 def episode_layout(episode: PlayedEpisode | PlayedCollected, *, is_alone: bool = False) -> rrb.Blueprint:
     """The layout of one episode, or of all that have its streams; one that is alone needs no list of episodes."""
     if isinstance(episode, PlayedCollected):
-        return collected_layout(episode, is_alone=is_alone)
+        return _panels(_collected_views(episode), episode.info.fps, is_alone=is_alone)
     paths = Paths()
     return _blueprint(
         episode,
@@ -32,8 +31,7 @@ def episode_layout(episode: PlayedEpisode | PlayedCollected, *, is_alone: bool =
         curves=_curve_views([paths], episode),
         states=[rrb.StateTimelineView(origin=paths.phase, name="phases")] if any(episode.phase) else [],
         texts=[
-            *([rrb.TextDocumentView(origin=paths.words, name="in words")] if episode.statements else []),
-            rrb.TextDocumentView(origin=paths.summary, name="episode"),
+            *_pages(episode),
             rrb.TextLogView(origin=paths.events, name="events"),
         ],
     )
@@ -41,7 +39,7 @@ def episode_layout(episode: PlayedEpisode | PlayedCollected, *, is_alone: bool =
 
 def comparison_layout(a: PlayedEpisode, b: PlayedEpisode) -> rrb.Blueprint:
     """The layout of two episodes in one recording: below /a and /b, the same streams over each other."""
-    roots = list(comparison_paths())
+    roots = [A, B]
     pictures: list[rrb.View | rrb.Container] = []
     for name in [name for name in a.videos if name in b.videos]:
         views = [
@@ -89,9 +87,13 @@ def _blueprint(
     parts, shares = [top, bottom], [5.0, 2.6]
     if states:
         parts, shares = [top, *states, bottom], [4.6, 0.95 if more_curves is None else 1.4, 2.9]
+    return _panels(rrb.Vertical(*parts, row_shares=shares), episode.info.fps, is_alone=is_alone)
+
+
+def _panels(views: rrb.Container, fps: int, *, is_alone: bool) -> rrb.Blueprint:
     return rrb.Blueprint(
-        rrb.Vertical(*parts, row_shares=shares),
-        rrb.TimePanel(state="collapsed", timeline=SECONDS, fps=float(episode.info.fps), loop_mode="all"),
+        views,
+        rrb.TimePanel(state="collapsed", timeline=SECONDS, fps=float(fps), loop_mode="all"),
         rrb.BlueprintPanel(state="collapsed" if is_alone else "expanded"),
         rrb.SelectionPanel(state="hidden"),
         auto_layout=False,
@@ -99,12 +101,47 @@ def _blueprint(
     )
 
 
+def _pages(episode: PlayedEpisode | PlayedCollected) -> list[rrb.View]:
+    """What is said of the episode, if anything is, and the episode in words."""
+    pages = [rrb.TextDocumentView(origin=Paths().words, name="in words")] if episode.statements else []
+    return [*pages, rrb.TextDocumentView(origin=Paths().summary, name="episode")]
+
+
+def _collected_views(episode: PlayedCollected) -> rrb.Container:
+    """The robot, if it is known, beside the cameras; the features below."""
+    paths = Paths()
+    top: list[rrb.View | rrb.Container] = []
+    if episode.info.urdf:
+        top.append(rrb.Spatial3DView(origin="/", contents=[f"+ {paths.robot}/**"], name=episode.info.robot))
+    top += [
+        rrb.Spatial2DView(origin=paths.camera(camera), contents=["$origin"], name=camera) for camera in episode.videos
+    ]
+    top += [rrb.Spatial2DView(origin=paths.camera(camera, "/depth"), name=camera) for camera in episode.depth]
+    plots = [
+        rrb.TimeSeriesView(
+            origin="/",
+            contents=[paths.curves(name)],
+            name=name,
+            plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop),
+        )
+        for name in episode.curves
+    ]
+    # Without pictures above there is room for texts one below the other.
+    texts = _pages(episode) if top else [rrb.Vertical(*_pages(episode))]
+    bottom = rrb.Horizontal(*plots, *texts, column_shares=[1.6] * len(plots) + [1.0] * len(texts))
+    return rrb.Vertical(rrb.Horizontal(*top), bottom, row_shares=[5.0, 3.0]) if top else bottom
+
+
 def _view_3d(episode: PlayedEpisode, roots: list[Paths], name: str) -> rrb.Spatial3DView:
     contents = []
     for paths in roots:
         contents.append(f"+ {paths.world}/**")
         for camera in episode.info.scene.cameras:
-            hidden = (paths.depth(camera.name), paths.segmentation(camera.name), paths.boxes(camera.name))
+            hidden = (
+                paths.camera(camera.name, "/depth"),
+                paths.camera(camera.name, "/segmentation"),
+                paths.camera(camera.name, "/boxes"),
+            )
             contents += [f"- {entity}" for entity in hidden]
         for body in episode.info.scene.bodies:
             if max(body.shape.extents) > _FLOOR:
@@ -150,16 +187,16 @@ def _eye(episode: PlayedEpisode) -> tuple[Array, Array]:
 def _camera_views(episode: PlayedEpisode, paths: Paths) -> list[rrb.View | rrb.Container]:
     views: list[rrb.View | rrb.Container] = []
     for camera in episode.info.scene.cameras:
+        name = camera.name
+        boxes = [paths.camera(name, "/boxes")] if name in episode.boxes else []
         tabs: list[rrb.View] = []
-        if camera.name in episode.videos:
-            contents = ["$origin", *([paths.boxes(camera.name)] if camera.name in episode.boxes else [])]
-            tabs.append(
-                rrb.Spatial2DView(origin=paths.camera(camera.name), contents=contents, name=f"{camera.name} camera")
-            )
-        if camera.name in episode.depth:
-            tabs.append(rrb.Spatial2DView(origin=paths.depth(camera.name), name=f"{camera.name} depth"))
-        if camera.name in episode.segmentation:
-            tabs.append(rrb.Spatial2DView(origin=paths.segmentation(camera.name), name=f"{camera.name} segments"))
+        if name in episode.videos:
+            contents = ["$origin", *boxes]
+            tabs.append(rrb.Spatial2DView(origin=paths.camera(name), contents=contents, name=f"{name} camera"))
+        if name in episode.depth:
+            tabs.append(rrb.Spatial2DView(origin=paths.camera(name, "/depth"), name=f"{name} depth"))
+        if name in episode.segmentation:
+            tabs.append(rrb.Spatial2DView(origin=paths.camera(name, "/segmentation"), name=f"{name} segments"))
         if tabs:
             views.append(tabs[0] if len(tabs) == 1 else rrb.Tabs(*tabs, active_tab=0))
     if len(views) > 3:

@@ -11,9 +11,9 @@ import queue
 import subprocess
 import sys
 import threading
+from contextlib import AbstractContextManager
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 from demorec.errors import ConfigError, DemorecError
 from demorec.playback.programs import free_port, has_display, viewer_environment, viewer_program
@@ -23,7 +23,7 @@ _NICENESS = 15
 _END_SECONDS = 60.0
 
 
-class LiveViewer:
+class LiveViewer(AbstractContextManager["LiveViewer"]):
     """Context manager over a window to which finished episodes can be added; the window stays open afterwards.
 
     Args:
@@ -60,12 +60,7 @@ class LiveViewer:
         self._feeder = threading.Thread(target=self._feed, daemon=True)
         self._feeder.start()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *exc: object) -> None:
         self.close()
 
     def add(self, recording: Path) -> None:

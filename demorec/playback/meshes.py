@@ -111,7 +111,13 @@ def _shape_mesh(shape: UrdfShape, folder: Path | None) -> SurfaceMesh | None:
     scale: NDArray[np.float64] = np.ones(3)
     match shape.kind:
         case "mesh":
-            mesh, scale = mesh_file(_mesh_path(folder, shape.file)), np.array(shape.size)
+            if folder is None:
+                raise RecordingError(f"The robot's mesh {shape.file!r} is named by its URDF, but is not kept with it")
+            try:
+                path = mesh_path(folder, shape.file)
+            except DemorecError as error:
+                raise RecordingError(str(error)) from error
+            mesh, scale = mesh_file(path), np.array(shape.size)
         case "box":
             mesh = of_trimesh(trimesh.creation.box(extents=shape.size))
         case "sphere":
@@ -126,15 +132,6 @@ def _shape_mesh(shape: UrdfShape, folder: Path | None) -> SurfaceMesh | None:
 def sphere_mesh(radius: float) -> SurfaceMesh:
     """A ball."""
     return of_trimesh(trimesh.creation.icosphere(subdivisions=3, radius=radius))
-
-
-def _mesh_path(folder: Path | None, name: str) -> Path:
-    if folder is not None:
-        try:
-            return mesh_path(folder, name)
-        except DemorecError as error:
-            raise RecordingError(str(error)) from error
-    raise RecordingError(f"The robot's mesh {name!r} is named by its URDF, but is not kept with it")
 
 
 @functools.lru_cache(maxsize=64)

@@ -5,13 +5,12 @@ from __future__ import annotations
 import numpy as np
 import rerun as rr
 
-from demorec.geometry import Array
-from demorec.playback.episode import Curves, PlayedEpisode
+from demorec.playback.episode import Curves, PlayedCollected, PlayedEpisode
 from demorec.playback.paths import Paths
 from demorec.playback.style import ASKED, FORCE, MEASURED, SECOND, TARGET, Color, phase_colors, series_colors
-from demorec.playback.times import indexes, seconds_only
-from demorec.scene.episode import Event
+from demorec.playback.times import indexes
 
+_COLORS = {"gripper": MEASURED, "gripper target": TARGET, "force": FORCE, "target": ASKED}
 _WIDTHS = {"target": 0.7, "gripper target": 1.2}
 
 
@@ -30,30 +29,30 @@ def log_ee_path(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpis
 
 
 def log_curves(
-    recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisode, label: str = "", *, is_second: bool = False
+    recording: rr.RecordingStream,
+    paths: Paths,
+    episode: PlayedEpisode | PlayedCollected,
+    label: str = "",
+    *,
+    is_second: bool = False,
 ) -> None:
     """All plots; `label` goes before the names of the curves, a second episode's have other colours."""
     for name, curves in episode.curves.items():
         entity = paths.curves(name)
-        recording.log(
-            entity,
-            rr.SeriesLines(
+        if isinstance(episode, PlayedCollected):
+            lines = rr.SeriesLines(names=list(curves.names), colors=series_colors(len(curves.names)))
+        else:
+            lines = rr.SeriesLines(
                 names=_curve_names(name, curves, label, is_second=is_second),
                 colors=_curve_colors(name, curves, is_second=is_second),
                 widths=[0.7 if is_second and len(curves.names) > 1 else _WIDTHS.get(name, 2.0)] * len(curves.names),
-            ),
-            static=True,
-        )
+            )
+        recording.log(entity, lines, static=True)
         on_frame = np.isin(curves.time_ns, episode.time_ns)
-        for chosen, is_frame in ((on_frame, True), (~on_frame, False)):
-            times, values = curves.time_ns[chosen], curves.values[chosen]
-            if len(times):
-                index = indexes(times, episode.time_ns) if is_frame else seconds_only(times)
-                recording.send_columns(entity, index, _scalars(values))
-
-
-def _scalars(values: Array) -> rr.ComponentColumnList:
-    return rr.Scalars.columns(scalars=values)
+        for chosen, frame_times in ((on_frame, episode.time_ns), (~on_frame, None)):
+            if chosen.any():
+                columns = rr.Scalars.columns(scalars=curves.values[chosen])
+                recording.send_columns(entity, indexes(curves.time_ns[chosen], frame_times), columns)
 
 
 def _curve_names(name: str, curves: Curves, label: str, *, is_second: bool) -> list[str]:
@@ -67,15 +66,10 @@ def _curve_names(name: str, curves: Curves, label: str, *, is_second: bool) -> l
 
 
 def _curve_colors(name: str, curves: Curves, *, is_second: bool) -> list[Color]:
+    count = len(curves.names)
     if is_second:
-        return [SECOND if len(curves.names) == 1 else ASKED] * len(curves.names)
-    if name == "gripper":
-        return [MEASURED]
-    if name == "gripper target":
-        return [TARGET]
-    if name == "force":
-        return [FORCE]
-    return [ASKED] * len(curves.names) if name == "target" else series_colors(len(curves.names))
+        return [SECOND if count == 1 else ASKED] * count
+    return [_COLORS[name]] * count if name in _COLORS else series_colors(count)
 
 
 def log_phases(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisode) -> None:
@@ -84,23 +78,28 @@ def log_phases(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpiso
     if not colors or set(colors) == {""}:
         return
     recording.log(paths.phase, rr.StateConfiguration(values=list(colors), colors=list(colors.values())), static=True)
-    starts = [i for i, name in enumerate(episode.phase) if i == 0 or name != episode.phase[i - 1]]
-    recording.send_columns(
-        paths.phase,
-        indexes(episode.time_ns[starts], episode.time_ns),
-        rr.StateChange.columns(state=[episode.phase[i] for i in starts]),
-    )
+    starts = _phase_starts(episode)
+    columns = rr.StateChange.columns(state=[episode.phase[i] for i in starts])
+    recording.send_columns(paths.phase, indexes(episode.time_ns[starts], episode.time_ns), columns)
+
+
+def _phase_starts(episode: PlayedEpisode) -> list[int]:
+    """The frames at which the phase is another than before."""
+    return [i for i, name in enumerate(episode.phase) if i == 0 or name != episode.phase[i - 1]]
 
 
 def log_events(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisode) -> None:
     """Changes of phase and what happened, in order."""
     colors = phase_colors(episode.phase)
     rows: list[tuple[int, str, str, Color]] = [
-        (int(episode.time_ns[i]), "INFO", name, colors[name])
-        for i, name in enumerate(episode.phase)
-        if name and (i == 0 or name != episode.phase[i - 1])
+        (int(episode.time_ns[i]), "INFO", episode.phase[i], colors[episode.phase[i]])
+        for i in _phase_starts(episode)
+        if episode.phase[i]
     ]
-    rows += [(time, _LEVELS[event.level], _text(event), _LEVEL_COLORS[event.level]) for time, event in episode.events]
+    rows += [
+        (time, _LEVELS[event.level], event.message or event.name, _LEVEL_COLORS[event.level])
+        for time, event in episode.events
+    ]
     if episode.outcome is not None and episode.num_frames:
         end = int(episode.time_ns[-1])
         level, color = ("INFO", (60, 230, 120)) if episode.outcome.success else ("ERROR", (255, 80, 80))
@@ -116,7 +115,3 @@ def log_events(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpiso
 
 _LEVELS = {"info": "INFO", "warning": "WARN", "error": "ERROR"}
 _LEVEL_COLORS: dict[str, Color] = {"info": (200, 200, 200), "warning": (255, 200, 60), "error": (255, 80, 80)}
-
-
-def _text(event: Event) -> str:
-    return event.message or event.name

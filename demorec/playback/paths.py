@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 
 @dataclass(frozen=True)
@@ -38,17 +39,9 @@ class Paths:
         """Where an object ended; not below the goal, whose transform would act on it too."""
         return f"{self.world}/ends/{name}"
 
-    def camera(self, name: str) -> str:
-        """A camera: its pose, its pinhole and its pictures."""
-        return f"{self.world}/cameras/{name}"
-
-    def depth(self, name: str) -> str:
-        """Depth pictures of a camera."""
-        return f"{self.camera(name)}/depth"
-
-    def segmentation(self, name: str) -> str:
-        """Segmentation pictures of a camera."""
-        return f"{self.camera(name)}/segmentation"
+    def camera(self, name: str, more: Literal["", "/depth", "/segmentation", "/boxes"] = "") -> str:
+        """A camera: its pose, its pinhole and its pictures; or more pictures of it, or boxes around what it sees."""
+        return f"{self.world}/cameras/{name}{more}"
 
     def curves(self, name: str) -> str:
         """Numbers over time."""
@@ -63,10 +56,6 @@ class Paths:
     def events(self) -> str:
         """What happened, as a log."""
         return f"{self.root}/events"
-
-    def boxes(self, name: str) -> str:
-        """Boxes around what a camera sees."""
-        return f"{self.camera(name)}/boxes"
 
     @property
     def words(self) -> str:

@@ -8,14 +8,13 @@ from collections.abc import Mapping
 
 import numpy as np
 import rerun as rr
-from numpy.typing import NDArray
 
 from demorec.errors import DemorecError, as_reason
 from demorec.geometry import Array, Pose, quat_multiply
-from demorec.playback.episode import PlayedEpisode
-from demorec.playback.meshes import SurfaceMesh, urdf_meshes
+from demorec.playback.episode import PlayedCollected, PlayedEpisode
+from demorec.playback.meshes import SurfaceMesh, skeleton_meshes, urdf_meshes
 from demorec.playback.paths import Paths
-from demorec.playback.times import indexes
+from demorec.playback.poses import log_pose, send_poses
 from demorec.scene.assets import asset_path
 from demorec.scene.scene import Rgba
 from demorec.scene.urdf import Urdf, UrdfJoint
@@ -26,55 +25,52 @@ _SAME_PLACE = 1e-3
 """How far joints of the installed model may be from those of the recorded description, metres."""
 
 
-def log_robot(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisode, tint: Rgba | None = None) -> None:
+def log_robot(
+    recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisode | PlayedCollected, tint: Rgba | None = None
+) -> None:
     """Meshes of all links below `paths.robot`, nested as the links are, and how the joints move them.
+
+    Joints whose positions are not known stay at 0; a robot without a description is not shown.
 
     Raises:
         RecordingError: A mesh of the robot's model cannot be read.
     """
-    placement = episode.info.scene.robot
-    urdf, meshes = robot_model(episode.info.robot.urdf, placement.scale, episode.robot_description)
-    positions = dict(zip(episode.info.robot.joint_names, episode.joint_position.T, strict=True))
-    base = placement.world_from_base
-    log_model(recording, paths, urdf, meshes, positions, base=base, time_ns=episode.time_ns, tint=tint)
-
-
-def log_model(
-    recording: rr.RecordingStream,
-    paths: Paths,
-    urdf: Urdf,
-    meshes: Mapping[str, SurfaceMesh],
-    positions: Mapping[str, Array],
-    *,
-    base: Pose,
-    time_ns: NDArray[np.int64],
-    tint: Rgba | None = None,
-) -> None:
-    """The same of a model whose joints have known positions (T,) at `time_ns` (T,); the others stay at 0."""
+    positions: Mapping[str, Array]
+    if isinstance(episode, PlayedCollected):
+        if not episode.info.urdf:
+            return
+        urdf, base, positions = Urdf.parse(episode.info.urdf), Pose(), episode.joint_position
+        meshes = _collected_meshes(episode.info.urdf, urdf)
+    else:
+        placement = episode.info.scene.robot
+        urdf, meshes = robot_model(episode.info.robot.urdf, placement.scale, episode.robot_description)
+        positions = dict(zip(episode.info.robot.joint_names, episode.joint_position.T, strict=True))
+        base = placement.world_from_base
     entities = {urdf.root: f"{paths.robot}/{urdf.root}"}
     waiting = list(urdf.joints)
     while waiting:
         for joint in [joint for joint in waiting if joint.parent in entities]:
             entities[joint.child] = f"{entities[joint.parent]}/{joint.child}"
             waiting.remove(joint)
-    _log_pose(recording, entities[urdf.root], base.position, base.quat_xyzw)
-    times = indexes(time_ns, time_ns)
+    log_pose(recording, entities[urdf.root], base.vector())
     for joint in urdf.joints:
         entity = entities[joint.child]
         if joint.kind == "fixed" or joint.name not in positions:
-            fixed = joint.parent_from_joint
-            _log_pose(recording, entity, fixed.position, fixed.quat_xyzw)
+            log_pose(recording, entity, joint.parent_from_joint.vector())
         else:
-            translation, quaternion = joint_columns(joint, positions[joint.name])
-            recording.send_columns(
-                entity, times, rr.Transform3D.columns(translation=translation, quaternion=quaternion)
-            )
+            poses = np.concatenate(joint_columns(joint, positions[joint.name]), axis=1)
+            send_poses(recording, entity, episode.time_ns, poses)
     for link, mesh in meshes.items():
         recording.log(entities[link], as_mesh3d(mesh, tint), static=True)
 
 
-def _log_pose(recording: rr.RecordingStream, entity: str, position: Array, quat_xyzw: Array) -> None:
-    recording.log(entity, rr.Transform3D(translation=position, quaternion=quat_xyzw), static=True)
+def _collected_meshes(text: str, urdf: Urdf) -> Mapping[str, SurfaceMesh]:
+    """Link -> what it looks like; rods between the joints where the URDF names files that are not here."""
+    try:
+        return urdf_meshes(text, None)
+    except (DemorecError, OSError, ValueError) as error:
+        log.warning("The robot is drawn as rods between its joints, since %s.", as_reason(error))
+        return skeleton_meshes(urdf)
 
 
 def as_mesh3d(mesh: SurfaceMesh, tint: Rgba | None = None) -> rr.Mesh3D:

@@ -9,8 +9,8 @@ from pathlib import Path
 import rerun as rr
 
 from demorec.errors import ConfigError, RecordingError
-from demorec.playback.collected import PlayedCollected
 from demorec.playback.compare import log_comparison, new_comparison
+from demorec.playback.episode import PlayedCollected
 from demorec.playback.layout import comparison_layout, episode_layout
 from demorec.playback.scene import log_episode, new_recording
 from demorec.playback.sources import PlaybackSource

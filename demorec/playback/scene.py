@@ -8,13 +8,7 @@ import rerun as rr
 
 from demorec.playback.bodies import log_bodies
 from demorec.playback.cameras import log_cameras
-from demorec.playback.collected import (
-    PlayedCollected,
-    collected_application,
-    log_collected,
-    new_collected_recording,
-)
-from demorec.playback.episode import PlayedEpisode
+from demorec.playback.episode import PlayedCollected, PlayedEpisode
 from demorec.playback.motion import log_curves, log_ee_path, log_events, log_phases
 from demorec.playback.paths import Paths
 from demorec.playback.robot import log_robot
@@ -36,27 +30,23 @@ def log_episode(
     Raises:
         DemorecError: The source is damaged, or a model is neither installed nor recorded.
     """
-    if isinstance(episode, PlayedCollected):
-        log_collected(recording, episode)
-        return
     paths = Paths(root)
     recording.log(paths.world, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     log_robot(recording, paths, episode, tint)
-    log_bodies(recording, paths, episode, tint)
     log_cameras(recording, paths, episode)
-    log_ee_path(recording, paths, episode)
     log_curves(recording, paths, episode, label, is_second=tint is not None)
-    log_phases(recording, paths, episode)
-    log_events(recording, paths, episode)
+    if isinstance(episode, PlayedEpisode):
+        log_bodies(recording, paths, episode, tint)
+        log_ee_path(recording, paths, episode)
+        log_phases(recording, paths, episode)
+        log_events(recording, paths, episode)
+        log_boxes(recording, paths, episode)
     log_words(recording, paths, episode.statements, episode.time_ns)
-    log_boxes(recording, paths, episode)
     recording.log(paths.summary, rr.TextDocument(summary(episode), media_type="text/markdown"), static=True)
 
 
 def new_recording(episode: PlayedEpisode | PlayedCollected) -> rr.RecordingStream:
     """An empty Rerun recording with the episode's name and properties."""
-    if isinstance(episode, PlayedCollected):
-        return new_collected_recording(episode)
     recording = rr.RecordingStream(application_id(episode), recording_id=f"{episode.name}-{episode.identity}")
     recording.send_recording_name(entry(episode))
     recording.send_property("episode", rr.AnyValues(**properties(episode)))
@@ -66,7 +56,7 @@ def new_recording(episode: PlayedEpisode | PlayedCollected) -> rr.RecordingStrea
 def application_id(episode: PlayedEpisode | PlayedCollected) -> str:
     """The group in the viewer's list: episodes of one group, task and set of cameras share a layout."""
     if isinstance(episode, PlayedCollected):
-        return collected_application(episode)
-    cameras = "-".join(camera.name for camera in episode.info.scene.cameras)
-    words = (episode.group, episode.info.task, cameras)
-    return "-".join(re.sub(r"[^A-Za-z0-9_]+", "-", word).strip("-") for word in words if word)
+        words = [camera.name for camera in episode.info.cameras]
+    else:
+        words = [episode.info.task, "-".join(camera.name for camera in episode.info.scene.cameras)]
+    return "-".join(re.sub(r"[^A-Za-z0-9_]+", "-", word).strip("-") for word in (episode.group, *words) if word)

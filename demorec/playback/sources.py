@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 from demorec.errors import ConfigError, OptionError
-from demorec.playback.collected import PlayedCollected, open_collected
-from demorec.playback.episode import PlayedEpisode
+from demorec.playback.episode import PlayedCollected, PlayedEpisode
 from demorec.playback.from_dataset import dataset_episodes, open_dataset_episode
-from demorec.playback.from_recording import open_recording
-from demorec.recording.opening import is_collected
+from demorec.playback.from_recording import open_recorded
 from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings
 
 
@@ -53,23 +51,7 @@ def _sources(path: Path, include_failures: bool) -> list[PlaybackSource]:
     if not files and found.failed:
         raise ConfigError(f"The folder holds failed attempts only, which --include-failures shows: {path}")
     expect_recordings(found, files)
-    return [_recording(file) for file in files]
-
-
-def _recording(path: Path) -> PlaybackSource:
-    return PlaybackSource(name=str(path), open=partial(_open, path, group=_group(path)))
-
-
-@contextmanager
-def _open(path: Path, *, group: str) -> Iterator[PlayedEpisode | PlayedCollected]:
-    with (open_collected if is_collected(path) else open_recording)(path, group=group) as episode:
-        yield episode
-
-
-def _group(path: Path) -> str:
-    """The run's name, or that of the folder."""
-    folder = path.resolve().parent
-    return folder.parent.name if folder.name in ("episodes", "failed") else folder.name
+    return [PlaybackSource(name=str(file), open=partial(open_recorded, file)) for file in files]
 
 
 def select(sources: Sequence[PlaybackSource], episodes: str) -> list[PlaybackSource]:

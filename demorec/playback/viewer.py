@@ -7,11 +7,10 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any
 from urllib.parse import quote
 from urllib.request import urlopen
 
@@ -32,6 +31,12 @@ _NO_DRIVER = ("Failed to create render state", "Failed to get render context")
 _NO_GLYPH = re.compile(r'No glyph for "(?P<character>.+?)" \((?P<code>U\+[0-9A-F]+)\)')
 
 
+def _start_viewer(*arguments: str, **options: Any) -> subprocess.Popen[Any]:
+    """The viewer, which nobody but this machine reaches; `options` are those of `start_program`."""
+    command = [viewer_program(), "--bind", "127.0.0.1", *arguments]
+    return start_program(command, env=viewer_environment(), **options)
+
+
 def show(recordings: Sequence[Path]) -> None:
     """Open a window with .rrd files and wait until it is closed.
 
@@ -44,27 +49,9 @@ def show(recordings: Sequence[Path]) -> None:
             "There is no screen to open a window on: use --screenshot x.png, --web for a browser, or, unless it is an "
             ".rrd file already, --save x.rrd."
         )
-    command = [
-        viewer_program(),
-        "--port",
-        "auto",
-        "--bind",
-        "127.0.0.1",
-        "--hide-welcome-screen",
-        *map(str, recordings),
-    ]
-    code = start_program(command, env=viewer_environment()).wait()
+    code = _start_viewer("--port", "auto", "--hide-welcome-screen", *map(str, recordings)).wait()
     if code:
         raise RecordingError(f"Rerun's viewer ended with exit code {code}.")
-
-
-@dataclass(frozen=True, kw_only=True)
-class ViewerReport:
-    """What a view of the viewer complains about."""
-
-    view: str
-    severity: str
-    message: str
 
 
 def why_it_ended(said: str) -> DemorecError:
@@ -85,7 +72,7 @@ def why_it_ended(said: str) -> DemorecError:
     return RecordingError(f"Rerun's viewer ended by itself: {message or said.strip()[-300:]}")
 
 
-class HeadlessViewer:
+class HeadlessViewer(AbstractContextManager["HeadlessViewer"]):
     """Context manager over a viewer without a screen that shows .rrd or .mcap files, the first one in front.
 
     Raises:
@@ -98,14 +85,9 @@ class HeadlessViewer:
         self._recordings = recordings
         # Not a pipe, which would fill up when nobody reads it.
         self._said = tempfile.TemporaryFile(mode="w+", errors="replace")  # noqa: SIM115 (closed by close)
-        self._process = start_program(
-            [
-                viewer_program(), "--headless", "--port", str(self._port), "--bind", "127.0.0.1",
-                "--window-size", f"{width}x{height}", "--hide-welcome-screen", *map(str, recordings),
-            ],
-            env=viewer_environment(),
-            stdout=subprocess.DEVNULL,
-            stderr=self._said,
+        self._process = _start_viewer(
+            "--headless", "--port", str(self._port), "--window-size", f"{width}x{height}", "--hide-welcome-screen",
+            *map(str, recordings), stdout=subprocess.DEVNULL, stderr=self._said,
         )  # fmt: skip
         try:
             self.client = self._connect()
@@ -113,15 +95,14 @@ class HeadlessViewer:
             self.close()
             raise
 
-    def __enter__(self) -> Self:
-        return self
-
     def __exit__(
         self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
     ) -> None:
         try:
-            if isinstance(exc, (OSError, RuntimeError, ValueError)) and self._has_ended():
-                raise self._reason() from exc
+            if isinstance(exc, (OSError, RuntimeError, ValueError)):
+                with suppress(subprocess.TimeoutExpired):  # one that panics has left us before it has said why
+                    self._process.wait(_END_SECONDS)
+                    raise self._reason() from exc
         finally:
             self.close()
 
@@ -129,12 +110,6 @@ class HeadlessViewer:
         """End the viewer; harmless when called twice."""
         end_process(self._process)
         self._said.close()
-
-    def _has_ended(self) -> bool:
-        """Whether the viewer ended by itself; one that panics has left its clients before it has said why."""
-        with suppress(subprocess.TimeoutExpired):
-            self._process.wait(_END_SECONDS)
-        return self._process.poll() is not None
 
     def _reason(self) -> DemorecError:
         """Why the viewer has ended, by what it said."""
@@ -154,18 +129,13 @@ class HeadlessViewer:
                 continue
             loaded = [recording for recording in state.recordings if recording.timelines]
             if not state.loading and len(loaded) >= len(self._recordings):
-                self._bring_to_front(client, loaded)
+                if len(loaded) > 1:  # the viewer shows the one that it loaded last
+                    client.set_location(min(loaded, key=lambda recording: str(recording.store_id)).location)
                 return client
             time.sleep(0.2)
         raise RecordingError(
             f"Rerun's viewer has not loaded the file within {_START_SECONDS:.0f} s: {self._recordings[0]}"
         )
-
-    @staticmethod
-    def _bring_to_front(client: ViewerClient, recordings: Sequence[Any]) -> None:
-        """Show the first recording (by name), since the viewer shows the one that it loaded last."""
-        if len(recordings) > 1:
-            client.set_location(min(recordings, key=lambda recording: str(recording.store_id)).location)
 
     @property
     def end(self) -> float:
@@ -214,17 +184,9 @@ class HeadlessViewer:
                 return self._picture(view.view_id)
         raise KeyError(name)
 
-    def reports(self) -> list[ViewerReport]:
-        """Every warning and error of a view."""
-        return [
-            ViewerReport(view=view.name, severity=report.severity, message=report.summary)
-            for view in self.client.get_state().views
-            for report in view.reports
-        ]
-
-    def state(self) -> Any:
-        """Recordings, views and time, as Rerun tells them."""
-        return self.client.get_state()
+    def reports(self) -> list[tuple[str, Any]]:
+        """Every warning and error of a view: (its name, what Rerun tells)."""
+        return [(view.name, report) for view in self.client.get_state().views for report in view.reports]
 
 
 def moment(seconds: float | None, end: float) -> float:
@@ -249,9 +211,9 @@ def screenshot(recordings: Sequence[Path], target: Path, *, seconds: float | Non
     """
     with HeadlessViewer(*recordings, width=width, height=height) as viewer:
         viewer.seek(moment(seconds, viewer.end))
-        errors = [report for report in viewer.reports() if report.severity == "error"]
-        if errors:
-            raise RecordingError(f"The view {errors[0].view!r} cannot be drawn: {errors[0].message}.")
+        for view, report in viewer.reports():
+            if report.severity == "error":
+                raise RecordingError(f"The view {view!r} cannot be drawn: {report.summary}.")
         try:
             viewer.save_picture(target)
         except OSError as error:
@@ -270,13 +232,9 @@ def serve_web(recordings: Sequence[Path], *, web_port: int = 0) -> Iterator[tupl
     """
     data_port, web_port = free_port(), web_port or free_port()
     memory = max(1024, 3 * sum(recording.stat().st_size for recording in recordings) // 2**20)
-    process = start_program(
-        [
-            viewer_program(), "--serve-web", "--bind", "127.0.0.1", "--port", str(data_port),
-            "--web-viewer-port", str(web_port), "--server-memory-limit", f"{memory}MiB", *map(str, recordings),
-        ],
-        env=viewer_environment(),
-        stdout=subprocess.DEVNULL,
+    process = _start_viewer(
+        "--serve-web", "--port", str(data_port), "--web-viewer-port", str(web_port), "--server-memory-limit",
+        f"{memory}MiB", *map(str, recordings), stdout=subprocess.DEVNULL,
     )  # fmt: skip
     try:
         page = f"http://127.0.0.1:{web_port}"

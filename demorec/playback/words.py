@@ -42,7 +42,7 @@ def log_boxes(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisod
         flat = [item for items in seen for item in items]
         if not flat:
             continue
-        recording.log(paths.boxes(camera), rr.Boxes2D.from_fields(show_labels=False), static=True)
+        recording.log(paths.camera(camera, "/boxes"), rr.Boxes2D.from_fields(show_labels=False), static=True)
         columns = rr.Boxes2D.columns(
             half_sizes=[(width / 2, height / 2) for _, (_, _, width, height) in flat],
             centers=[(x + width / 2, y + height / 2) for _, (x, y, width, height) in flat],
@@ -51,5 +51,5 @@ def log_boxes(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisod
         )
         lengths = [len(items) for items in seen]
         recording.send_columns(
-            paths.boxes(camera), indexes(episode.time_ns, episode.time_ns), columns.partition(lengths)
+            paths.camera(camera, "/boxes"), indexes(episode.time_ns, episode.time_ns), columns.partition(lengths)
         )

@@ -101,14 +101,8 @@ class ReportedEpisode:
         return f"{reason} in phase {self.failure_phase}" if self.failure_phase else reason
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Distribution:
-    """One component of a feature over all frames: `feature` is "action", `name` that of the component."""
-
-    feature: str
-    name: str
-    unit: str
-    histogram: Histogram
+Components = dict[tuple[str, str], Histogram]
+"""(feature, name of the component) -> its values over all frames."""
 
 
 @dataclass(kw_only=True)
@@ -161,6 +155,7 @@ class Report:
         facts: (name, value) of the summary.
         episodes: Every attempt, in order.
         distributions: Of actions and states.
+        has_units: Whether their components have the names, and so the units, that we give them.
         checks: None when no checks were run.
         missing: Sentences about what the source does not tell.
         configs: Resolved configurations.
@@ -170,7 +165,8 @@ class Report:
     kind: str
     facts: tuple[tuple[str, str], ...]
     episodes: tuple[ReportedEpisode, ...]
-    distributions: tuple[Distribution, ...]
+    distributions: Components
+    has_units: bool
     checks: CheckSummaries | None
     missing: tuple[str, ...]
     configs: tuple[Mapping[str, Any], ...]

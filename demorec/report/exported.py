@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from demorec.errors import ConfigError, ExportError, in_words, without_path
@@ -18,10 +17,9 @@ from demorec.lerobot.paths import SIDECAR_DIR
 from demorec.lerobot.reader import EpisodePlace, RowReader, episode_places
 from demorec.lerobot.sidecar import CONFIGS_PATH, EPISODE_SCHEMA
 from demorec.lerobot.stills import pictures_at
-from demorec.report.content import Filmstrip, PhaseSpan, ReportedEpisode
+from demorec.report.content import Components, Filmstrip, PhaseSpan, ReportedEpisode
 from demorec.report.filmstrip import filmstrip
-from demorec.report.histogram import Histogram
-from demorec.report.recorded import Components, ReadEpisode
+from demorec.report.recorded import count
 from demorec.scene.episode import SuccessCheck
 from demorec.scene.features import ACTION, IMAGE_PREFIX, STATE
 from demorec.scene.validity import read_episode_info
@@ -58,13 +56,17 @@ def read_story(root: Path) -> DatasetStory:
     Raises:
         ExportError: It is damaged.
     """
-    episodes, attempts = ((root / SIDECAR_DIR / name).glob("*/*.parquet") for name in ("episodes", "attempts"))
-    rows = [
-        row for file in sorted(episodes) for row in read_table(file, _OF_AN_EPISODE, schema=EPISODE_SCHEMA).to_pylist()
-    ]
-    seen = [
-        row for file in sorted(attempts) for row in read_table(file, _OF_AN_ATTEMPT, schema=ATTEMPT_SCHEMA).to_pylist()
-    ]
+    rows, seen = (
+        [
+            row
+            for file in sorted((root / SIDECAR_DIR / name).glob("*/*.parquet"))
+            for row in read_table(file, columns, schema=schema).to_pylist()
+        ]
+        for name, columns, schema in (
+            ("episodes", _OF_AN_EPISODE, EPISODE_SCHEMA),
+            ("attempts", _OF_AN_ATTEMPT, ATTEMPT_SCHEMA),
+        )
+    )
     try:
         configs = read_json(root / CONFIGS_PATH) if rows else {}
     except (OSError, ValueError) as error:
@@ -94,8 +96,8 @@ def camera_key(info: DatasetInfo, camera: str, root: Path) -> str | None:
 
 def read_episodes(
     root: Path, info: DatasetInfo, story: DatasetStory, *, camera: str, strip_bytes: int, stride: int
-) -> Iterator[ReadEpisode]:
-    """Every episode in order, then the attempts that the sidecar tells of and that are not in the dataset.
+) -> Iterator[tuple[ReportedEpisode, Components]]:
+    """Every episode in order, its numbers counted, then the attempts that are in the sidecar and not in the dataset.
 
     Args:
         root: The dataset's folder.
@@ -122,11 +124,9 @@ def read_episodes(
         if key is not None and number % stride == 0:
             strip, problem = _strip(root, info, key, place, strip_bytes)
         episode = _episode(place, info.fps, columns, story.rows.get(place.episode_index))
-        yield ReadEpisode(
-            episode=replace(episode, filmstrip=strip, problem=problem), components=_components(root, info, columns)
-        )
+        yield replace(episode, filmstrip=strip, problem=problem), _components(root, info, columns)
     for row in story.left_out:
-        yield ReadEpisode(episode=_left_out(row))
+        yield _left_out(row), {}
 
 
 def _strip(
@@ -149,35 +149,19 @@ def _episode(
     place: EpisodePlace, fps: int, columns: Mapping[str, NDArray[Any]], row: Mapping[str, Any] | None
 ) -> ReportedEpisode:
     name = f"episode {place.episode_index}"
+    known = ReportedEpisode(name=name, instruction=", ".join(place.tasks), num_frames=place.length, fps=fps)
     if row is None:
-        success = bool(columns[SUCCESS][-1, 0]) if len(columns.get(SUCCESS, ())) else None
-        return ReportedEpisode(
-            name=name,
-            instruction=", ".join(place.tasks),
-            success=success,
-            num_frames=place.length,
-            fps=fps,
-        )
+        return replace(known, success=bool(columns[SUCCESS][-1, 0]) if len(columns.get(SUCCESS, ())) else None)
     if row["episode_info"] is None:  # collected: there is no scene, no seed and no phase
-        return ReportedEpisode(
-            name=name,
-            source=str(row["source"]),
-            instruction=", ".join(place.tasks),
-            success=row["success"],
-            failure_reason=str(row["failure_reason"]),
-            num_frames=place.length,
-            fps=fps,
-        )
+        source, reason = str(row["source"]), str(row["failure_reason"])
+        return replace(known, source=source, success=row["success"], failure_reason=reason)
     try:
-        return ReportedEpisode(
-            name=name,
+        return replace(
+            known,
             source=row["source"],
-            instruction=", ".join(place.tasks),
             success=row["success"],
             failure_phase=row["failure_phase"],
             failure_reason=row["failure_reason"],
-            num_frames=place.length,
-            fps=fps,
             num_retries=row["num_retries"],
             seed=row["root_seed"],
             phases=tuple(PhaseSpan(name=p["name"], first=p["from"], end=p["to"]) for p in row["phases"]),
@@ -207,9 +191,9 @@ def _components(root: Path, info: DatasetInfo, columns: Mapping[str, NDArray[Any
         if values.dtype.kind not in "fiub":
             raise ExportError(f"The column {feature} holds something else than numbers: {root}")
         names = info.features[feature].names or ()
-        for number in range(min(values.shape[1], _MOST_COMPONENTS)):
-            name = names[number] if len(names) == values.shape[1] else f"component {number}"
-            found.setdefault((feature, name), Histogram()).add(np.asarray(values[:, number]))
+        if len(names) != values.shape[1]:
+            names = tuple(f"component {number}" for number in range(values.shape[1]))
+        count(found, feature, names[:_MOST_COMPONENTS], values)
     return found
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +15,11 @@ from demorec.evaluate.statistics import Rate
 from demorec.lerobot.layout import DatasetInfo
 from demorec.plain import to_plain
 from demorec.processes import SPAWN
-from demorec.report.content import CheckSummaries, Distribution, Report, ReportedEpisode, flags_of
+from demorec.report.content import CheckSummaries, Components, Report, ReportedEpisode, flags_of
 from demorec.report.episodes import MOST_SHOWN
 from demorec.report.exported import missing_in, read_episodes, read_story
 from demorec.report.filmstrip import strip_budget
-from demorec.report.recorded import Components, ReadEpisode, merge, read_recording
+from demorec.report.recorded import merge, read_recording
 from demorec.runs.find import EPISODE_FOLDERS, Found, PathKind, expect, expect_recordings
 from demorec.runs.run_file import RUN_NAME, Attempt, DamagedRunFileError, RunFile, load_run_file
 from demorec.scene.episode import EpisodeInfo
@@ -77,36 +78,26 @@ def gather(path: Path, options: ReportOptions, advance: Callable[[int, int], Non
     return _of_recordings(found, options, advance)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Job:
-    """A recording that any process may read and check."""
-
-    subject: Subject
-    root: Path
-    options: ReportOptions
-    strip_bytes: int
+_Done = tuple[ReportedEpisode, Components, SubjectReport | None]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Done:
-    read: ReadEpisode
-    checked: SubjectReport | None
+def _do(root: Path, options: ReportOptions, subject: Subject, strip_bytes: int) -> _Done:
+    """Read and check a recording, in any process."""
+    checked = check_subject(subject, options.of_checks) if options.checks else None
+    episode, components = read_recording(subject.path, root, camera=options.camera, strip_bytes=strip_bytes)
+    return replace(episode, flags=() if checked is None else flags_of(checked)), components, checked
 
 
-def _do(job: _Job) -> _Done:
-    checked = check_subject(job.subject, job.options.of_checks) if job.options.checks else None
-    read = read_recording(job.subject.path, job.root, camera=job.options.camera, strip_bytes=job.strip_bytes)
-    flags = () if checked is None else flags_of(checked)
-    return _Done(read=replace(read, episode=replace(read.episode, flags=flags)), checked=checked)
-
-
-def _all_done(jobs: Sequence[_Job], workers: int) -> Iterator[_Done]:
-    if workers == 1 or len(jobs) < 2:
-        yield from map(_do, jobs)
+def _all_done(
+    root: Path, options: ReportOptions, subjects: Sequence[Subject], strip_bytes: Sequence[int]
+) -> Iterator[_Done]:
+    do = partial(_do, root, options)
+    if options.workers == 1 or len(subjects) < 2:
+        yield from map(do, subjects, strip_bytes)
         return
     # Spawned: forked children would share decoders and libraries in the middle of something.
-    with ProcessPoolExecutor(max_workers=min(workers, len(jobs)), mp_context=SPAWN) as pool:
-        yield from pool.map(_do, jobs)
+    with ProcessPoolExecutor(max_workers=min(options.workers, len(subjects)), mp_context=SPAWN) as pool:
+        yield from pool.map(do, subjects, strip_bytes)
 
 
 def _of_recordings(found: Found, options: ReportOptions, advance: Callable[[int, int], None]) -> Report:
@@ -121,28 +112,20 @@ def _of_recordings(found: Found, options: ReportOptions, advance: Callable[[int,
     if not subjects:
         expect_recordings(found, ())
     stride = -(-len(subjects) // MOST_SHOWN)
-    strip_bytes = strip_budget(min(len(subjects), MOST_SHOWN))
-    jobs = [
-        _Job(
-            subject=subject,
-            root=found.path,
-            options=options,
-            strip_bytes=0 if number % stride and not subject.is_failed_attempt else strip_bytes,
-        )
-        for number, subject in enumerate(subjects)
-    ]
+    budget = strip_budget(min(len(subjects), MOST_SHOWN))
+    strips = [0 if number % stride and not s.is_failed_attempt else budget for number, s in enumerate(subjects)]
     wholes = [s for s in find_subjects([found.path]) if s.kind != "recording"] if options.checks else []
     checks = CheckSummaries()
-    total = len(jobs) + len(wholes)
+    total = len(subjects) + len(wholes)
     episodes: list[ReportedEpisode] = []
     components: Components = {}
-    for number, done in enumerate(_all_done(jobs, options.workers), 1):
-        episodes.append(done.read.episode)
-        merge(components, done.read.components.items())
-        if done.checked is not None:
-            checks.add(done.checked.judged, done.read.episode.name)
-        advance(number, total)
-    for number, subject in enumerate(wholes, len(jobs) + 1):
+    for episode, counted, checked in _all_done(found.path, options, subjects, strips):
+        episodes.append(episode)
+        merge(components, counted)
+        if checked is not None:
+            checks.add(checked.judged, episode.name)
+        advance(len(episodes), total)
+    for number, subject in enumerate(wholes, len(subjects) + 1):
         checks.add(check_subject(subject, options.of_checks).results, f"the {subject.kind}")
         advance(number, total)
     if run is not None:
@@ -156,7 +139,8 @@ def _of_recordings(found: Found, options: ReportOptions, advance: Callable[[int,
         kind=_KINDS[found.kind],
         facts=tuple(_facts(found, run, episodes)),
         episodes=tuple(episodes),
-        distributions=_distributions(components, is_ours=True),
+        distributions=components,
+        has_units=True,
         checks=checks if options.checks else None,
         missing=tuple(missing),
         configs=_configs(episodes) if run is None else (to_plain(run.config),),
@@ -244,21 +228,6 @@ def _configs(episodes: Sequence[ReportedEpisode]) -> tuple[Mapping[str, Any], ..
     return tuple(found.values())
 
 
-def _distributions(components: Components, *, is_ours: bool) -> tuple[Distribution, ...]:
-    return tuple(
-        Distribution(feature=feature, name=name, unit=_unit(name) if is_ours else "", histogram=histogram)
-        for (feature, name), histogram in components.items()
-    )
-
-
-def _unit(name: str) -> str:
-    """Of a component as `demorec.scene.features` names it."""
-    part = name.rpartition(".")[2]
-    if part in ("pos", "delta", "rx", "ry", "rz"):
-        return "rad"
-    return "m" if part in ("width", "x", "y", "z", "dx", "dy", "dz") else ""
-
-
 # --------------------------------------------------------------------------------------------------------- datasets
 
 
@@ -269,7 +238,7 @@ def _of_dataset(path: Path, options: ReportOptions, advance: Callable[[int, int]
     count = max(info.total_episodes, 1)
     components: Components = {}
     episodes: list[ReportedEpisode] = []
-    for read in read_episodes(
+    for episode, counted in read_episodes(
         path,
         info,
         story,
@@ -277,8 +246,8 @@ def _of_dataset(path: Path, options: ReportOptions, advance: Callable[[int, int]
         strip_bytes=strip_budget(min(count, MOST_SHOWN)),
         stride=-(-count // MOST_SHOWN),
     ):
-        episodes.append(read.episode)
-        merge(components, read.components.items())
+        episodes.append(episode)
+        merge(components, counted)
         advance(len(episodes), info.total_episodes + len(story.left_out) + options.checks)
     checks = CheckSummaries()
     if options.checks:
@@ -292,7 +261,8 @@ def _of_dataset(path: Path, options: ReportOptions, advance: Callable[[int, int]
         kind=_KINDS["dataset"],
         facts=tuple(_dataset_facts(path, info, episodes, len(story.left_out))),
         episodes=tuple(episodes),
-        distributions=_distributions(components, is_ours=bool(story.rows)),
+        distributions=components,
+        has_units=bool(story.rows),
         checks=checks if options.checks else None,
         missing=tuple(missing),
         configs=tuple(story.configs.values()),

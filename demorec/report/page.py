@@ -18,11 +18,12 @@ from demorec.errors import ConfigError
 from demorec.evaluate.statistics import Rate
 from demorec.geometry import Array
 from demorec.report.charts import Place, coverage, distribution, floor_map
-from demorec.report.content import CheckSummaries, CheckSummary, Distribution, Report, ReportedEpisode
+from demorec.report.content import CheckSummaries, CheckSummary, Report, ReportedEpisode
 from demorec.report.episodes import anchor, episode_list, measured
 from demorec.report.histogram import Histogram
 from demorec.report.markup import Markup, joined, table, tag
 from demorec.safety.replacing import REPORT, REPORT_MARK, written_whole
+from demorec.scene.episode import EpisodeInfo
 from demorec.scene.features import ACTION, STATE
 
 _NAMED = 5
@@ -189,23 +190,22 @@ def _check_row(name: str, summary: CheckSummary) -> tuple[object, ...]:
 
 
 def _coverage(episodes: Sequence[ReportedEpisode]) -> Iterator[Markup]:
-    numbered = [(number, episode) for number, episode in enumerate(episodes) if episode.info is not None]
-    by_task: dict[str, list[tuple[int, ReportedEpisode]]] = {}
-    for number, episode in numbered:
+    by_task: dict[str, list[tuple[int, ReportedEpisode, EpisodeInfo]]] = {}
+    for number, episode in enumerate(episodes):
         if episode.info is not None:
-            by_task.setdefault(episode.info.task, []).append((number, episode))
+            by_task.setdefault(episode.info.task, []).append((number, episode, episode.info))
     for task, members in by_task.items():
         if len(by_task) > 1:
             yield tag("h3", task)
         yield from _task_coverage(members)
 
 
-def _task_coverage(members: Sequence[tuple[int, ReportedEpisode]]) -> Iterator[Markup]:
-    infos = [episode.info for _, episode in members if episode.info is not None]
-    failed = np.array([episode.success is False for _, episode in members])
+def _task_coverage(members: Sequence[tuple[int, ReportedEpisode, EpisodeInfo]]) -> Iterator[Markup]:
+    infos = [info for _, _, info in members]
+    failed = np.array([episode.success is False for _, episode, _ in members])
     starts, goals = _places(members[:: max(1, -(-len(members) // _MOST_POINTS))])
     left = tag("div", floor_map(starts, goals)) if starts else None
-    legend = tag(
+    yield tag(
         "div",
         tag("span", "dots: where objects start, in their colour"),
         tag("span", "rings: goals"),
@@ -213,7 +213,6 @@ def _task_coverage(members: Sequence[tuple[int, ReportedEpisode]]) -> Iterator[M
         tag("span", f"bars: attempts in each part of the range, failures in red, {int(failed.sum())} in all"),
         class_="legend",
     )
-    yield legend
     scenes = [_covered(with_unit(name), values, failed) for name, values in randomised(infos).items()]
     if not scenes:
         scenes = [tag("p", "Nothing in the scenes was drawn from a range, or there are too few episodes to show one.")]
@@ -230,13 +229,11 @@ def _covered(name: str, values: Array, failed: NDArray[np.bool_]) -> Markup:
     return tag("figure", tag("figcaption", name), coverage(values, failed, name))
 
 
-def _places(members: Sequence[tuple[int, ReportedEpisode]]) -> tuple[list[Place], list[Place]]:
+def _places(members: Sequence[tuple[int, ReportedEpisode, EpisodeInfo]]) -> tuple[list[Place], list[Place]]:
     starts: list[Place] = []
     goals: list[Place] = []
-    for number, episode in members:
-        if episode.info is None:
-            continue
-        scene = episode.info.scene
+    for number, episode, info in members:
+        scene = info.scene
         for goal in scene.goals:
             body = scene.body(goal.object)
             for places, position in (
@@ -260,15 +257,15 @@ def _places(members: Sequence[tuple[int, ReportedEpisode]]) -> tuple[list[Place]
 
 
 def _distributions(report: Report) -> Iterator[Markup]:
-    by_name: dict[str, list[Distribution]] = {}
-    for item in report.distributions:
-        if item.histogram.count:
-            by_name.setdefault(item.name, []).append(item)
+    by_name: dict[str, list[tuple[str, Histogram]]] = {}
+    for (feature, name), histogram in report.distributions.items():
+        if histogram.count:
+            by_name.setdefault(name, []).append((_CURVES[feature], histogram))
     figures = []
-    for name, items in by_name.items():
-        series = [(_CURVES[item.feature], item.histogram) for item in items]
-        caption = f"{name} ({items[0].unit})" if items[0].unit else name
-        mean = ", ".join(f"{_CURVES[item.feature]} {item.histogram.mean:.3g}" for item in items)
+    for name, series in by_name.items():
+        unit = _unit(name) if report.has_units else ""
+        caption = f"{name} ({unit})" if unit else name
+        mean = ", ".join(f"{curve} {histogram.mean:.3g}" for curve, histogram in series)
         figures.append(
             tag(
                 "figure",
@@ -283,11 +280,19 @@ def _distributions(report: Report) -> Iterator[Markup]:
         figures.append(tag("figure", caption, distribution([("state", lengths)], "length of episodes")))
     if not figures:
         return
-    odd = sum(item.histogram.not_finite for item in report.distributions)
+    odd = sum(histogram.not_finite for histogram in report.distributions.values())
     if odd:
         yield tag("p", f"{odd:,} values are no finite numbers and are left out.", class_="fail")
     yield tag("p", "Of all frames: the filled area is the state, the line the action; ends are the extremes.")
     yield tag("div", *figures, class_="charts")
+
+
+def _unit(name: str) -> str:
+    """Of a component as `demorec.scene.features` names it."""
+    part = name.rpartition(".")[2]
+    if part in ("pos", "delta", "rx", "ry", "rz"):
+        return "rad"
+    return "m" if part in ("width", "x", "y", "z", "dx", "dy", "dz") else ""
 
 
 _CURVES = {STATE: "state", ACTION: "action"}

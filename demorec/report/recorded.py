@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
 from itertools import groupby
 from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
 
 from demorec.errors import ConfigError, RecordingError, without_path
 from demorec.recording import Recording
-from demorec.report.content import PhaseSpan, ReportedEpisode
+from demorec.report.content import Components, PhaseSpan, ReportedEpisode
 from demorec.report.filmstrip import filmstrip
 from demorec.report.histogram import Histogram
 from demorec.runs.run_file import FAILED
@@ -24,20 +26,9 @@ from demorec.scene.features import (
     observation_vectors,
 )
 
-Components = dict[tuple[str, str], Histogram]
-"""(feature, name of the component) -> its values over all frames."""
 
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class ReadEpisode:
-    """An episode and the numbers of its frames, counted."""
-
-    episode: ReportedEpisode
-    components: Components = field(default_factory=dict)
-
-
-def read_recording(path: Path, root: Path, *, camera: str, strip_bytes: int) -> ReadEpisode:
-    """What a recording holds; one that is damaged is told as such.
+def read_recording(path: Path, root: Path, *, camera: str, strip_bytes: int) -> tuple[ReportedEpisode, Components]:
+    """What a recording holds and the numbers of its frames, counted; one that is damaged is told as such.
 
     Args:
         path: The file.
@@ -54,11 +45,12 @@ def read_recording(path: Path, root: Path, *, camera: str, strip_bytes: int) -> 
         with Recording(path) as recording:
             return _read(recording, source, is_failed=is_failed, camera=camera, strip_bytes=strip_bytes)
     except RecordingError as error:
-        problem = without_path(error, path)
-        return ReadEpisode(episode=ReportedEpisode(name=path.stem, source=source, problem=problem))
+        return ReportedEpisode(name=path.stem, source=source, problem=without_path(error, path)), {}
 
 
-def _read(recording: Recording, source: str, *, is_failed: bool, camera: str, strip_bytes: int) -> ReadEpisode:
+def _read(
+    recording: Recording, source: str, *, is_failed: bool, camera: str, strip_bytes: int
+) -> tuple[ReportedEpisode, Components]:
     info, outcome = recording.info, recording.outcome
     if camera and camera not in recording.cameras:
         there = ", ".join(recording.cameras) or "none"
@@ -73,8 +65,9 @@ def _read(recording: Recording, source: str, *, is_failed: bool, camera: str, st
             most_bytes=strip_bytes,
         )
     columns = recording.columns()
+    attempt = f", attempt {info.attempt}" if is_failed or info.attempt else ""  # of one that failed, or after one
     episode = ReportedEpisode(
-        name=episode_name(info, is_failed=is_failed),
+        name=f"episode {info.episode_index}{attempt}",
         source=source,
         problem="" if outcome is not None else "A crash cut the recording off; it was recovered.",
         instruction=info.instruction,
@@ -90,13 +83,7 @@ def _read(recording: Recording, source: str, *, is_failed: bool, camera: str, st
         filmstrip=strip,
         info=info,
     )
-    return ReadEpisode(episode=episode, components=_components(info, columns))
-
-
-def episode_name(info: EpisodeInfo, *, is_failed: bool) -> str:
-    """ "episode 3", and of an attempt that failed or came after one, which attempt."""
-    attempt = f", attempt {info.attempt}" if is_failed or info.attempt else ""
-    return f"episode {info.episode_index}{attempt}"
+    return episode, _components(info, columns)
 
 
 def phase_spans(phases: Sequence[str]) -> tuple[PhaseSpan, ...]:
@@ -120,12 +107,17 @@ def _components(info: EpisodeInfo, columns: EpisodeColumns) -> Components:
         (STATE, observation_names(info.robot, info.scene)[STATE], state),
         (ACTION, action_names(info.robot, "joint"), action),
     ):
-        for number, name in enumerate(names):
-            found.setdefault((feature, name), Histogram()).add(values[:, number])
+        count(found, feature, names, values)
     return found
 
 
-def merge(into: Components, found: Iterable[tuple[tuple[str, str], Histogram]]) -> None:
+def count(into: Components, feature: str, names: Iterable[str], values: NDArray[Any]) -> None:
+    """Count the components of a feature (T, D), those that have names."""
+    for name, column in zip(names, values.T, strict=False):
+        into.setdefault((feature, name), Histogram()).add(column)
+
+
+def merge(into: Components, found: Components) -> None:
     """Add what one episode counted to what all have."""
-    for key, histogram in found:
+    for key, histogram in found.items():
         into.setdefault(key, Histogram()).merge(histogram)

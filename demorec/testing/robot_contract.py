@@ -7,8 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from demorec.config import EpisodePlan, GenerateConfig
-from demorec.loop import Episode, ScriptAgent, Session, make_world, prepare
+from demorec.loop import Episode, make_world, prepare
 from demorec.plain import from_json, to_json
 from demorec.safety.user_modules import modules_of
 from demorec.scene.assets import allow_models, asset_path
@@ -17,6 +16,7 @@ from demorec.scene.urdf import Urdf
 from demorec.sim.arm import arm_kinematics
 from demorec.tables import load_robot
 from demorec.tasks.grasping import hand_down
+from demorec.testing.task_contract import plan_of, run_expert
 
 
 class RobotContract:
@@ -103,12 +103,7 @@ class RobotContract:
 
     def test_it_picks_and_places(self) -> None:
         """One episode of pick_place succeeds."""
-        episode = self._episode()
-        with make_world(episode.info) as world:
-            session = Session.of_episode(world, episode)
-            for _ in session.run(ScriptAgent(episode)):
-                pass
-        outcome = session.outcome
+        _, outcome = run_expert("pick_place", self.robot, self.seed, 0)
         assert outcome.success, f"{outcome.failure_reason} in phase {outcome.failure_phase}"
 
     def _spec(self) -> RobotSpec:
@@ -117,6 +112,4 @@ class RobotContract:
         return load_robot(self.robot, allowed)
 
     def _episode(self) -> Episode:
-        config = GenerateConfig(robot=self.robot, seed=self.seed, cameras=())
-        config.validate()
-        return prepare(EpisodePlan(config=config, episode_index=0))
+        return prepare(plan_of("pick_place", self.robot, self.seed, 0))

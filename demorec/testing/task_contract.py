@@ -93,7 +93,7 @@ class TaskContract:
 
     def test_the_expert_succeeds(self) -> None:
         """Strictly, at the first try, in most episodes."""
-        outcomes = [_run(self.task, self.robot, self.seed, index)[1] for index in range(self.num_episodes)]
+        outcomes = [run_expert(self.task, self.robot, self.seed, index)[1] for index in range(self.num_episodes)]
         failed = [
             f"{index}: {outcome.failure_reason} in phase {outcome.failure_phase}"
             for index, outcome in enumerate(outcomes)
@@ -105,7 +105,7 @@ class TaskContract:
     def test_commands_stay_within_the_limits_of_the_robot(self) -> None:
         """Joint positions and velocities that the expert asks for, and the opening of the gripper."""
         robot = self._episode(0).info.robot
-        frames, _ = _run(self.task, self.robot, self.seed, 0)
+        frames, _ = run_expert(self.task, self.robot, self.seed, 0)
         targets = np.array([frame.action.joint_target for frame in frames])
         widths = np.array([frame.action.gripper_target for frame in frames])
         speeds = np.abs(np.diff(targets, axis=0)) * self._episode(0).info.fps
@@ -119,7 +119,7 @@ class TaskContract:
 
     def test_an_episode_repeats_to_the_bit(self) -> None:
         """The script draws nothing of its own and leaves nothing behind: in a used world all is as in a fresh one."""
-        frames, outcome = _run(self.task, self.robot, self.seed, 0)
+        frames, outcome = run_expert(self.task, self.robot, self.seed, 0)
         episode = self._episode(0)
         with make_world(episode.info) as world:
             session = Session.of_episode(world, episode)
@@ -136,7 +136,7 @@ class TaskContract:
 
     def test_its_recording_passes_every_check_and_replays_to_the_bit(self, tmp_path: Path) -> None:
         """`demorec check` finds no fault, and the recorded commands do the task again."""
-        frames, outcome = _run(self.task, self.robot, self.seed, 0)
+        frames, outcome = run_expert(self.task, self.robot, self.seed, 0)
         path, allowed = tmp_path / "episode_000000.mcap", modules_of([self.task, self.robot])
         with EpisodeWriter(path, self._episode(0).info) as writer:
             for frame in frames:
@@ -151,10 +151,11 @@ class TaskContract:
         assert replayed.success == outcome.success, "the replay ends otherwise"
 
     def _episode(self, index: int, *, attempt: int = 0) -> Episode:
-        return prepare(replace(_plan(self.task, self.robot, self.seed, index), attempt=attempt))
+        return prepare(replace(plan_of(self.task, self.robot, self.seed, index), attempt=attempt))
 
 
-def _plan(task: str, robot: str, seed: int, index: int) -> EpisodePlan:
+def plan_of(task: str, robot: str, seed: int, index: int) -> EpisodePlan:
+    """An episode's plan, without pictures."""
     config = GenerateConfig(task=task, robot=robot, seed=seed, cameras=())
     config.validate()
     return EpisodePlan(config=config, episode_index=index)
@@ -162,9 +163,9 @@ def _plan(task: str, robot: str, seed: int, index: int) -> EpisodePlan:
 
 # The tests of a class come one after the other: what one has simulated, the next ones need not.
 @lru_cache(maxsize=16)
-def _run(task: str, robot: str, seed: int, index: int) -> tuple[tuple[Frame, ...], Outcome]:
+def run_expert(task: str, robot: str, seed: int, index: int) -> tuple[tuple[Frame, ...], Outcome]:
     """All frames of an episode, and its outcome."""
-    episode = prepare(_plan(task, robot, seed, index))
+    episode = prepare(plan_of(task, robot, seed, index))
     with make_world(episode.info) as world:
         session = Session.of_episode(world, episode)
         frames = tuple(session.run(ScriptAgent(episode)))

@@ -145,7 +145,7 @@ def test_the_viewer_shows_a_run(run_folder: Path, tmp_path: Path) -> None:
     with HeadlessViewer(*files) as viewer:
         viewer.seek(1.0)
         _check_views(viewer)
-        state = viewer.state()
+        state = viewer.client.get_state()
         assert len(state.recordings) == 2
         assert {recording.current_time for recording in state.recordings} == {1_000_000_000}
         before = pixels(viewer.view_picture("front camera"))
@@ -222,9 +222,9 @@ def test_episodes_arrive_while_the_viewer_is_open(
         with LiveViewer(viewer.client.url) as live:
             live.add(second)
         deadline = time.monotonic() + 120
-        while len(viewer.state().recordings) < 2 and time.monotonic() < deadline:
+        while len(viewer.client.get_state().recordings) < 2 and time.monotonic() < deadline:
             time.sleep(0.2)
-        names = [recording.store_id for recording in viewer.state().recordings]
+        names = [recording.store_id for recording in viewer.client.get_state().recordings]
     assert len(names) == 2
     assert any("episode_000001" in name for name in names)
 

@@ -21,7 +21,7 @@ from support.export import export
 from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.errors import ConfigError
 from demorec.lerobot.depth import quantised
-from demorec.playback.collected import PlayedCollected
+from demorec.playback.episode import PlayedCollected
 from demorec.playback.from_dataset import open_dataset_episode
 from demorec.playback.sources import find_episodes
 from demorec.recording import CollectedRecording

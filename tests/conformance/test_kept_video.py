@@ -180,8 +180,7 @@ def test_playback_has_what_the_first_frames_are_decoded_from(expected: list[Pict
             shown = [_pixels(frame) for frame in container.decode(video=0)]
         assert_equal([shown[len(packets) - place.length :]], [pictures])
         with open_dataset_episode(dataset, place.episode_index) as episode:
-            batches = list(episode.videos["high"].batches())
-        times = np.concatenate([batch.time_ns for batch in batches])
+            times = np.array([time_ns for time_ns, _, _ in episode.videos["high"].packets()])
         assert len(times) == len(packets)
         lead = len(packets) - place.length
         assert times[: lead + 1].tolist() == [episode.time_ns[0]] * (lead + 1)

@@ -5,13 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 from support.collected import TOP, WRIST, make_collected, write_collected
 
 from demorec.errors import ConfigError
-from demorec.playback.collected import PlayedCollected
+from demorec.playback.episode import PlayedCollected
 from demorec.playback.save import save, save_comparison
 from demorec.playback.sources import find_episodes
 
@@ -33,7 +32,7 @@ def test_an_episode_is_shown_from_its_first_frame_on(tmp_path: Path) -> None:
         assert set(episode.joint_position) == {"shoulder", "elbow"}
         expected = [float(frame.samples["observation.state"].vector[1]) for frame in given.frames]
         assert episode.joint_position["elbow"].tolist() == expected
-        shown = np.concatenate([batch.time_ns for batch in episode.videos["wrist"].batches()]).tolist()
+        shown = [time_ns for time_ns, _, _ in episode.videos["wrist"].packets()]
         assert shown == times[1::2]  # each with the first frame that holds it
 
 

@@ -23,8 +23,7 @@ from demorec.errors import ExportError, MissingDependencyError
 from demorec.lerobot.robots import RobotRecord, portable_urdf, read_robot
 from demorec.plain import digest, from_json, to_json
 from demorec.playback import robot as played_robot
-from demorec.playback.collected import PlayedCollected
-from demorec.playback.episode import PlayedEpisode
+from demorec.playback.episode import PlayedCollected, PlayedEpisode
 from demorec.playback.from_dataset import open_dataset_episode
 from demorec.playback.save import save
 from demorec.playback.sources import find_episodes

@@ -91,12 +91,14 @@ def test_depth_is_shown_in_metres_as_the_recordings_have_it(tmp_path: Path) -> N
     export(run, tmp_path / "d", depth=True)
     with open_dataset_episode(tmp_path / "d", 1) as episode:  # the second in its file
         assert isinstance(episode, PlayedEpisode)
-        shown = np.array(list(episode.depth["front"]()))
-        (pictures,) = episode.videos["front"].batches()
+        times, pictures = zip(*episode.depth["front"](), strict=True)
+        shown = np.array(pictures)
+        assert list(times) == episode.time_ns.tolist()
+        packets = list(episode.videos["front"].packets())
     with Recording(run / "episodes" / "episode_000001.mcap") as recording:
         measured = np.array(list(recording.depth("front")))
     assert shown.shape == measured.shape
-    assert len(pictures.samples) == 4
+    assert len(packets) == 4
     assert (measured == 0).any()  # the sky
     np.testing.assert_array_equal(shown == 0, measured == 0)
     np.testing.assert_allclose(shown, measured, atol=1.5e-3)
@@ -119,7 +121,7 @@ def test_codes_of_depth_mean_what_the_datasets_metadata_say(tmp_path: Path) -> N
     info.write_text(json.dumps(written))
     with open_dataset_episode(tmp_path / "d", 0) as episode:
         assert isinstance(episode, PlayedEpisode)
-        shown = list(episode.depth["front"]())[2]
+        _, shown = list(episode.depth["front"]())[2]
     with Recording(tmp_path / "e.mcap") as recording:
         measured = list(recording.depth("front"))[2]
     low, high = np.log(3.51), np.log(13.5)
@@ -150,7 +152,7 @@ def test_what_info_says_of_a_video_must_be_true_of_it(tmp_path: Path) -> None:
         with pytest.raises(ExportError, match=f"it has {width}x{height} pixels, and meta/info.json says 9x8"):
             list(episode.depth["front"]())
         with pytest.raises(ExportError, match=r"its codec is h264, and meta/info\.json says av1"):
-            list(episode.videos["front"].batches())
+            list(episode.videos["front"].packets())
 
 
 def test_an_episode_of_another_length_than_its_rows_is_one_sentence(dataset: Path, tmp_path: Path) -> None:

@@ -106,7 +106,7 @@ def test_the_viewer_draws_every_drawable_character(tmp_path: Path) -> None:
     with HeadlessViewer(tmp_path / "x.rrd") as viewer:
         viewer.seek(0.0)
         viewer.save_picture(tmp_path / "x.png")
-        assert len(viewer.state().views) >= 3  # text, log and states
+        assert len(viewer.client.get_state().views) >= 3  # text, log and states
     assert (tmp_path / "x.png").stat().st_size > 10_000
 
 

@@ -159,9 +159,9 @@ def test_the_camera_is_chosen(run: Path, dataset: Path, capsys: pytest.CaptureFi
 def test_a_dataset_tells_the_same_as_its_run(run: Path, dataset: Path) -> None:
     ours, theirs = gathered(run), gathered(dataset)
     of_run = {
-        (d.feature, d.name): (d.histogram.exponent, d.histogram.bins) for d in gathered(run / "episodes").distributions
+        key: (histogram.exponent, histogram.bins) for key, histogram in gathered(run / "episodes").distributions.items()
     }
-    assert {(d.feature, d.name): (d.histogram.exponent, d.histogram.bins) for d in theirs.distributions} == of_run
+    assert {key: (found.exponent, found.bins) for key, found in theirs.distributions.items()} == of_run
     assert [e.success for e in theirs.episodes] == [e.success for e in ours.episodes]
     assert [e.phases for e in theirs.episodes[:3]] == [e.phases for e in ours.episodes[:3]]
     assert theirs.episodes[3].failure == ours.episodes[3].failure

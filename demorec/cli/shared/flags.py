@@ -167,33 +167,19 @@ def _default(field: dataclasses.Field[Any], instance: Any) -> Any:
 
 @FLAG_TYPES.primitive_rule
 def _optional_value(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
-    """`--workers INT` with auto for None, where tyro would show `--workers {None}|INT`."""
+    """`--workers INT` and `--codec {auto,h264,av1}` with auto for None, where tyro would show `{None}|INT`."""
     kind = _kind_beside_none(info.type)
-    if kind not in (int, float, str, Path):
+    choices = ("auto", *get_args(kind)) if get_origin(kind) is Literal else None
+    if choices is None and kind not in (int, float, str, Path):
         return None
+    value_of = kind if choices is None else str
     return PrimitiveConstructorSpec(
         nargs=1,
-        metavar=kind.__name__.upper(),
-        instance_from_str=lambda words: None if words[0] == "auto" else kind(words[0]),
-        is_instance=lambda value: value is None or isinstance(value, kind),
-        str_from_instance=lambda value: ["auto" if value is None else str(value)],
-    )
-
-
-@FLAG_TYPES.primitive_rule
-def _optional_choice(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
-    """`--codec {auto,h264,av1}` with auto for None, where tyro would show `--codec {None,h264,av1}`."""
-    kind = _kind_beside_none(info.type)
-    if get_origin(kind) is not Literal:
-        return None
-    choices = ("auto", *get_args(kind))
-    return PrimitiveConstructorSpec(
-        nargs=1,
-        metavar=f"{{{','.join(choices)}}}",
+        metavar=f"{{{','.join(choices)}}}" if choices else kind.__name__.upper(),
         choices=choices,
-        instance_from_str=lambda words: None if words[0] == "auto" else words[0],
-        is_instance=lambda value: value is None or value in choices,
-        str_from_instance=lambda value: ["auto" if value is None else value],
+        instance_from_str=lambda words: None if words[0] == "auto" else value_of(words[0]),
+        is_instance=lambda value: value is None or (value in choices if choices else isinstance(value, kind)),
+        str_from_instance=lambda value: ["auto" if value is None else str(value)],
     )
 
 

@@ -14,6 +14,14 @@ from demorec.safety.replacing import use_as_source
 _PARTS = (EPISODES, FAILED, UNFINISHED)
 
 
+def need_paths(paths: Sequence[Path], command: str) -> None:
+    """Raise ConfigError when no path is given; `command` names one that takes all that can be shown."""
+    if not paths:
+        raise ConfigError(
+            f"No path is given: name a recording, a run or a dataset, e.g. demorec {command} recordings/demo."
+        )
+
+
 def places_read(paths: Sequence[Path]) -> list[Path]:
     """Of recordings, runs and datasets: those files and folders in which a picture may be a part of the data.
 
@@ -22,14 +30,19 @@ def places_read(paths: Sequence[Path]) -> list[Path]:
     return [path / DATASET if find(path).kind in EPISODE_FOLDERS else path for path in paths]
 
 
-def refuse_sources(paths: Sequence[Path], targets: Sequence[Path]) -> None:
+def refuse_sources(paths: Sequence[Path], targets: Sequence[Path], *, do: str) -> None:
     """Raise ConfigError when a recording that is to be made would lie in, or replace, what the same command reads.
+
+    So it is when one would replace another.
 
     Args:
         paths: As the user named them: recordings, runs, folders of recordings, datasets. A run counts as a whole,
             also where only one of its recordings is named.
         targets: Of the new recordings.
+        do: What is done with each: "render".
     """
+    if len(set(targets)) != len(targets):
+        raise ConfigError(f"Two recordings have the same name and would get into each other's way: {do} them apart.")
     sources = [run_of(path) or path for path in paths]
     for target in targets:
         reason = use_as_source(target.resolve(), sources)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Self
+from contextlib import AbstractContextManager
+from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
@@ -22,7 +23,7 @@ _LONGEST_S = 300.0
 """Longest time without a line while something ends: in a run of days, a share takes hours."""
 
 
-class ProgressBar:
+class ProgressBar(AbstractContextManager["ProgressBar"]):
     """Counts what is done of one job; a context manager.
 
     On a terminal a bar. Elsewhere a line after ten seconds and then for every 5 % of the whole, but neither more often
@@ -56,9 +57,6 @@ class ProgressBar:
         self._bar: tqdm[Any] | None = None
         if watched:
             self._bar = tqdm(desc=title, total=total, initial=done, unit=unit, dynamic_ncols=True)
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *exc: object) -> None:
         self.close()
@@ -110,7 +108,7 @@ class ProgressBar:
         return ", ".join(parts)
 
 
-class RunProgress:
+class RunProgress(AbstractContextManager["RunProgress"]):
     """How a run goes (`demorec.generate.observer.RunObserver`), one bar after another; a context manager.
 
     `watch` is called with every attempt that has ended.
@@ -121,9 +119,6 @@ class RunProgress:
         self._bar: ProgressBar | None = None
         self._title = ""
         self._failed = 0
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *exc: object) -> None:
         if self._bar is not None:
