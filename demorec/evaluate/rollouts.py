@@ -193,21 +193,15 @@ def evaluate(
     due = [
         EpisodePlan(config=settings.config, episode_index=index) for index in range(num_episodes) if index not in done
     ]
-    rollouts = list(evaluation.rollouts)
     with LocalExecutor(MAKE_ROLLOUT, out, workers=workers, recycle_after=1000) as executor:
-        waiting = list(reversed(due))
-        while waiting or executor.pending:
-            while waiting and executor.has_room:
-                executor.submit(waiting.pop())
-            for report in executor.wait(1.0):
-                if isinstance(report, Raised):
-                    raise DemorecError(f"Episode {report.plan.episode_index}: {report.kind}: {report.message}")
-                if isinstance(report, Lost):
-                    raise DemorecError(f"Episode {report.plan.episode_index} was lost: {report.reason}.")
-                rollouts.append(report.attempt)
-                evaluation = _with(evaluation, rollouts)
-                _save(evaluation, out)
-                progress(evaluation)
+        for report in executor.carry_out(due):
+            if isinstance(report, Raised):
+                raise DemorecError(f"Episode {report.plan.episode_index}: {report.kind}: {report.message}")
+            if isinstance(report, Lost):
+                raise DemorecError(f"Episode {report.plan.episode_index} was lost: {report.reason}.")
+            evaluation = _with(evaluation, [*evaluation.rollouts, report.attempt])
+            _save(evaluation, out)
+            progress(evaluation)
     return _with(evaluation, [r for r in evaluation.rollouts if r.episode_index < num_episodes])
 
 

@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from demorec.config import EpisodePlan, GenerateConfig
-from demorec.errors import ConfigError, GenerationError
-from demorec.generate.executor import MAKE_EPISODE, Made, Raised
+from demorec.errors import GenerationError
+from demorec.generate.executor import MAKE_EPISODE, Lost, Made, Raised
 from demorec.generate.local import LocalExecutor
 from demorec.generate.options import RunOptions
 from demorec.lerobot import ExportOptions, export_lerobot
@@ -106,19 +106,13 @@ def estimate(config: GenerateConfig, options: RunOptions, *, maker: str = MAKE_E
 def _make(maker: str, folder: Path, plans: list[EpisodePlan], workers: int) -> list[Made]:
     """Carry out plans, in order of their ends."""
     made: list[Made] = []
-    todo = list(reversed(plans))
     with LocalExecutor(maker, folder, workers=workers, recycle_after=len(plans)) as executor:
-        while todo or executor.pending:
-            while todo and executor.has_room:
-                executor.submit(todo.pop())
-            for report in executor.wait(0.2):
-                if isinstance(report, Made):
-                    made.append(report)
-                elif isinstance(report, Raised):
-                    wrong = ConfigError if report.exit_code == ConfigError.exit_code else GenerationError
-                    raise wrong(f"The pilot episode cannot be made: {report.message}")
-                else:
-                    raise GenerationError(f"The pilot episode cannot be made: {report.reason}.")
+        for report in executor.carry_out(plans):
+            if isinstance(report, Raised):
+                raise report.error(f"The pilot episode cannot be made: {report.message}")
+            if isinstance(report, Lost):
+                raise GenerationError(f"The pilot episode cannot be made: {report.reason}.")
+            made.append(report)
     return made
 
 

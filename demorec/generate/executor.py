@@ -5,15 +5,16 @@ from __future__ import annotations
 import errno
 import importlib
 import traceback
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, Self
 
 import psutil
 
 from demorec.config import EpisodePlan
-from demorec.errors import DemorecError, error_chain
+from demorec.errors import ConfigError, DemorecError, GenerationError, error_chain
 from demorec.runs.run_file import Attempt
 
 Maker = Callable[[EpisodePlan, Path], Attempt]
@@ -25,6 +26,7 @@ MAKE_EPISODE = "demorec.generate.worker:make_episode"
 _THREAD_SETTINGS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 SINGLE_THREADED = dict.fromkeys(_THREAD_SETTINGS, "1")
 """Environment of a worker: a worker is one core, so that N workers take N cores and not N times N threads."""
+_POLL_S = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,6 +53,10 @@ class Raised:
     errno: int | None
     exit_code: int
 
+    def error(self, sentence: str) -> DemorecError:
+        """What the driver raises for it."""
+        return (ConfigError if self.exit_code == ConfigError.exit_code else GenerationError)(sentence)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Lost:
@@ -64,7 +70,7 @@ Report = Made | Raised | Lost
 
 
 class Executor(Protocol):
-    """Carries out plans in other processes."""
+    """Carries out plans in other processes; a context manager, which is closed at its end."""
 
     @property
     def workers(self) -> int:
@@ -90,9 +96,19 @@ class Executor(Protocol):
     def close(self) -> None:
         """End every worker, whatever it does; harmless when called twice."""
 
-    def __enter__(self) -> Executor: ...
+    def __enter__(self) -> Self:
+        return self
 
-    def __exit__(self, *exc: object) -> None: ...
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def carry_out(self, plans: Iterable[EpisodePlan]) -> Iterator[Report]:
+        """Begin plans in their order, as many at a time as there is room for; gives reports in that of their ends."""
+        waiting = deque(plans)
+        while waiting or self.pending:
+            while waiting and self.has_room:
+                self.submit(waiting.popleft())
+            yield from self.wait(_POLL_S)
 
 
 def attempt_episode(maker: str, plan: EpisodePlan, folder: Path) -> Made | Raised:

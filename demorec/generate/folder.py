@@ -211,10 +211,6 @@ def _would_replace(path: Path) -> bool:
     return any(not part.is_dir() or any(files_below(part)) for part in parts)
 
 
-def _holds_a_run(path: Path) -> bool:
-    return (path / RUN_NAME).exists() or bool(recordings_of(path))
-
-
 def _begin_or_continue(path: Path, asked: RunFile, *, progress: RunObserver, inspect: Inspector) -> RunFolder:
     """Bring the folder and its run.json to what is known now."""
     run, damage = _known_run(path, asked, inspect=inspect)
@@ -226,10 +222,10 @@ def _begin_or_continue(path: Path, asked: RunFile, *, progress: RunObserver, ins
     with _told_as_unusable(path):
         for name in (EPISODES, FAILED, UNFINISHED):
             (path / name).mkdir(exist_ok=True)
-        found = survey(path, run, inspect=inspect, progress=progress.verifying)
-    for file, reason in found.set_aside.items():
+        attempts, set_aside = survey(path, run, inspect=inspect, progress=progress.verifying)
+    for file, reason in set_aside.items():
         progress.says(f"{file} was moved to {UNFINISHED}/: {reason}.")
-    run = run.with_attempts(found.attempts)
+    run = run.with_attempts(attempts)
     if run.beyond:
         more = len({line.episode_index for line in run.beyond})
         progress.says(
@@ -308,7 +304,7 @@ def _told_as_unusable(path: Path) -> Iterator[None]:
 
 
 def _refuse_strangers(path: Path) -> None:
-    if not path.is_dir() or _holds_a_run(path):
+    if not path.is_dir() or (path / RUN_NAME).exists() or recordings_of(path):
         return
     strangers = sorted(p.name for p in path.iterdir() if p.name not in (*PARTS, LOCK_NAME, f"{RUN_NAME}.part"))
     if strangers:

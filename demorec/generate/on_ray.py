@@ -17,7 +17,7 @@ from typing import Any
 
 from demorec.config import EpisodePlan
 from demorec.errors import ConfigError, GenerationError, MissingDependencyError, in_words
-from demorec.generate.executor import SINGLE_THREADED, Lost, Report, attempt_episode
+from demorec.generate.executor import SINGLE_THREADED, Executor, Lost, Report, attempt_episode
 from demorec.processes import available_cores
 from demorec.runs.run_file import RUN_NAME
 
@@ -36,7 +36,7 @@ _RECOUNT_S = 5.0
 """How often the cluster is asked for its size."""
 
 
-class RayExecutor:
+class RayExecutor(Executor):
     """Attempts as Ray tasks on the cluster of `connected`.
 
     Bounded in flight by the size of the cluster, which may change while the run works.
@@ -142,12 +142,6 @@ class RayExecutor:
         for reference in self._pending:
             ray.cancel(reference, force=True)
         self._pending.clear()
-
-    def __enter__(self) -> RayExecutor:
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        self.close()
 
 
 def _attempt(maker: str, plan: EpisodePlan, folder: str) -> Report:

@@ -27,31 +27,28 @@ class Schedule:
         self._versions = run.versions
         self._known = {(a.episode_index, a.attempt): a.success for a in run.attempts}
         self._success = {a.episode_index: a.attempt for a in run.successes}
-        self._again: deque[EpisodePlan] = deque()
         self._episodes = iter(range(run.num_episodes) if episodes is None else episodes)
-        self._upcoming: deque[EpisodePlan] = deque()
+        self._waiting: deque[EpisodePlan] = deque()
 
     def take(self) -> EpisodePlan | None:
         """The next attempt, or None when none is due now (one may be after another has failed)."""
-        if self._again:
-            return self._again.popleft()
-        while not self._upcoming:
+        while not self._waiting:
             index = next(self._episodes, None)
             if index is None:
                 return None
-            self._upcoming.extend(self._due(index))
-        return self._upcoming.popleft()
+            self._waiting.extend(self._due(index))
+        return self._waiting.popleft()
 
     def give_back(self, plan: EpisodePlan) -> None:
         """This attempt was not carried out: it comes next."""
-        self._again.appendleft(plan)
+        self._waiting.appendleft(plan)
 
     def report(self, attempt: Attempt) -> None:
         """An attempt has ended; after a failure the next one is due, up to the bound."""
         index = attempt.episode_index
         self._known[index, attempt.attempt] = attempt.success
         if not attempt.success and index not in self._success:
-            self._again.extend(self._due(index))
+            self._waiting.extend(self._due(index))
 
     def _due(self, index: int) -> Iterator[EpisodePlan]:
         """Attempts that must be made now: the first unknown one, or those missing before a known success."""

@@ -18,7 +18,7 @@ from demorec.generate.executor import MAKE_EPISODE, Executor, Lost, Made, Raised
 from demorec.generate.folder import RunFolder, open_run
 from demorec.generate.interrupts import catch_interrupts
 from demorec.generate.local import LocalExecutor
-from demorec.generate.observer import NoProgress, RunObserver, RunResult
+from demorec.generate.observer import RunObserver, RunResult
 from demorec.generate.options import RunOptions
 from demorec.generate.plan import Schedule
 from demorec.generate.survey import Inspector
@@ -69,8 +69,10 @@ def generate(
         GenerationError: The run cannot go on; everything finished is kept.
         KeyboardInterrupt: At the second Ctrl-C.
     """
-    progress = progress or NoProgress()
-    _refuse_impossible(config, options)
+    from demorec.loop import load_task
+
+    progress = progress or RunObserver()
+    load_task(config)  # which raises what the first worker would raise, before anything is written
     with ExitStack() as stack:
         if options.executor == "ray":
             from demorec.generate.on_ray import connected
@@ -95,13 +97,6 @@ def generate(
             raise
         folder.end_session("interrupted" if interrupted else "ended")
         return folder.result(interrupted=interrupted)
-
-
-def _refuse_impossible(config: GenerateConfig, options: RunOptions) -> None:
-    """Raise what the first worker would raise, before anything is written."""
-    from demorec.loop import load_task
-
-    load_task(config)
 
 
 def make_executor(options: RunOptions, folder: Path, run: RunFile, maker: str) -> Executor:
@@ -150,7 +145,7 @@ class _Driver:
                     self._executor.submit(plan)
                 if not self._executor.pending:
                     return False
-                self._handle_next(_POLL_S)
+                self._handle_next()
             self._progress.says(
                 f"Interrupted: the current episodes may end within {GRACE_S:.0f} s (Ctrl-C again ends at once)."
             )
@@ -166,8 +161,8 @@ class _Driver:
                 if isinstance(report, Made):
                     self._made(report)
 
-    def _handle_next(self, timeout_s: float) -> None:
-        for report in self._executor.wait(timeout_s):
+    def _handle_next(self) -> None:
+        for report in self._executor.wait(_POLL_S):
             if isinstance(report, Made):
                 self._made(report)
             elif isinstance(report, Lost):
@@ -203,8 +198,7 @@ class _Driver:
             self._again(report.plan, report.message.rstrip(".") or report.kind, _advice(report.errno))
             return
         if report.exit_code:
-            wrong = ConfigError if report.exit_code == ConfigError.exit_code else GenerationError
-            raise wrong(
+            raise report.error(
                 f"Episode {report.plan.episode_index} cannot be made: {report.message.rstrip('.')}. {self._folder.kept}"
             )
         place = self._folder.path / UNFINISHED / f"error_episode_{report.plan.episode_index:06d}.txt"

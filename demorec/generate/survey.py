@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 from demorec.errors import DemorecError, in_words, resource_error, without_path
@@ -27,19 +27,6 @@ Inspector = Callable[[Path], Inspected]
 """Reads all of a recording; DemorecError or OSError when it is none."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Survey:
-    """What a folder holds of a run.
-
-    Attributes:
-        attempts: Those whose recordings are there and sound, and those that failed without one.
-        set_aside: file -> why it was moved to unfinished/.
-    """
-
-    attempts: tuple[Attempt, ...]
-    set_aside: Mapping[str, str]
-
-
 def recordings_of(folder: Path) -> list[Path]:
     """Everything in episodes/ and failed/ that is named as a recording, whatever it is."""
     return sorted(path for place in (EPISODES, FAILED) for path in (folder / place).glob("*.mcap"))
@@ -51,10 +38,14 @@ def survey(
     *,
     inspect: Inspector = inspect_recording,
     progress: Callable[[int, int], None] = lambda done, total: None,
-) -> Survey:
+) -> tuple[list[Attempt], dict[str, str]]:
     """Verify every recording of a folder against run.json, or read it in full where run.json does not know it.
 
     What is damaged, unfinished, of another run or no file at all is moved to unfinished/; nothing is deleted.
+
+    Returns:
+        The attempts whose recordings are there and sound, and those that failed without one; and file -> why it was
+        moved to unfinished/.
 
     Raises:
         ResourceError: This machine cannot read one of them now; nothing is moved for that.
@@ -78,7 +69,7 @@ def survey(
             set_aside[file] = without_path(error, path) if isinstance(error, DemorecError) else in_words(error)
             _set_aside(path, folder)
         progress(number + 1, len(files))
-    return Survey(attempts=tuple(kept), set_aside=set_aside)
+    return kept, set_aside
 
 
 def _adopt(path: Path, run: RunFile, inspect: Inspector) -> Attempt:

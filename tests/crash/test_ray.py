@@ -18,7 +18,7 @@ from support.generate import Remembers, expected_attempts, inspect, run_fake
 from demorec.config import GenerateConfig
 from demorec.errors import ConfigError, GenerationError
 from demorec.generate import on_ray
-from demorec.generate.observer import NoProgress, RunResult
+from demorec.generate.observer import RunObserver, RunResult
 from demorec.generate.options import RunOptions
 from demorec.generate.run import generate
 
@@ -28,7 +28,7 @@ REAL = GenerateConfig(seed=5, cameras=("wrist",), width=32, height=32)
 NUM_REAL = 20
 
 
-def run_on_ray(out: Path, *, maker: str, progress: NoProgress | None = None, **options: Any) -> RunResult:
+def run_on_ray(out: Path, *, maker: str, progress: RunObserver | None = None, **options: Any) -> RunResult:
     return generate(
         GenerateConfig(cameras=()),
         RunOptions(out=out, num_episodes=NUM_EPISODES, executor="ray", **options),

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Self
 from tqdm import tqdm
 
 from demorec.cli.shared.output import counted, tell
+from demorec.generate.observer import RunObserver
 
 if TYPE_CHECKING:
     from demorec.runs.run_file import Attempt, RunFile
@@ -110,8 +111,8 @@ class ProgressBar:
         return ", ".join(parts)
 
 
-class RunProgress:
-    """How a run goes (`demorec.generate.observer.RunObserver`), one bar after another; a context manager.
+class RunProgress(RunObserver):
+    """How a run goes, one bar after another; a context manager.
 
     `watch` is called with every attempt that has ended.
     """
