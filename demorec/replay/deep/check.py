@@ -5,8 +5,8 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import suppress
-from dataclasses import dataclass
+from contextlib import closing, suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -66,30 +66,22 @@ def deep_check(path: Path, workshop: Workshop, allowed: Sequence[str] = ()) -> D
     Raises:
         ResourceError: This machine cannot do it, which says nothing about the recording.
     """
-    versions: tuple[str, ...] = ()
-    num_frames, is_derived = 0, False
+    report = DeepReport(path=path)
     try:
         with tempfile.TemporaryDirectory(prefix="demorec-deep-") as folder, Recording(path) as recording:
-            info, num_frames, is_derived = recording.info, recording.num_frames, bool(recording.info.origin)
+            info = recording.info
             versions = version_differences(info.versions, versions_here(info, allowed))
+            report = replace(report, versions=versions, num_frames=recording.num_frames, is_derived=bool(info.origin))
             again = Path(folder) / "again.mcap"
             remake(recording, again, workshop, allowed)
             differences = tuple(_differences(recording, again, workshop, allowed))
-            replayed = ""
-            if not is_derived and any(not d.is_coding and d.field != "picture" for d in differences):
-                replayed = _replayed(recording, workshop, allowed)
+            if not report.is_derived and any(not d.is_coding and d.field != "picture" for d in differences):
+                report = replace(report, replay=_replayed(recording, workshop, allowed))
+            return replace(report, differences=differences)
     except DemorecError as error:
         if (lack := resource_error(error)) is not None:
             raise lack from error
-        return DeepReport(path=path, versions=versions, error=str(error), num_frames=num_frames, is_derived=is_derived)
-    return DeepReport(
-        path=path,
-        versions=versions,
-        differences=differences,
-        replay=replayed,
-        num_frames=num_frames,
-        is_derived=is_derived,
-    )
+        return replace(report, error=str(error))
 
 
 def versions_here(info: EpisodeInfo, allowed: Sequence[str]) -> Mapping[str, str]:
@@ -131,12 +123,9 @@ def _replayed(recording: Recording, workshop: Workshop, allowed: Sequence[str]) 
 def deep_checks(paths: Sequence[Path], *, workers: int = 1, allowed: Sequence[str] = ()) -> Iterator[DeepReport]:
     """One report for each recording, in order."""
     if workers == 1 or len(paths) < 2:
-        workshop = Workshop()
-        try:
+        with closing(Workshop()) as workshop:
             for path in paths:
                 yield deep_check(path, workshop, allowed)
-        finally:
-            workshop.close()
         return
     with ProcessPoolExecutor(max_workers=min(workers, len(paths)), mp_context=SPAWN) as pool:
         yield from pool.map(_deep_check_here, paths, [tuple(allowed)] * len(paths))
