@@ -219,8 +219,7 @@ def load_evaluation(folder: Path) -> Evaluation:
 
 def make_rollout(plan: EpisodePlan, folder: Path) -> Attempt:
     """Run the policy once and record it; the work of a worker (see `demorec.generate.executor.Maker`)."""
-    env, policy, world = _stage.set(folder)
-    settings = _stage.settings
+    settings, env, policy, world = _stage(folder)
     observation, _ = env.reset(seed=plan.episode_index)
     info = replace(env.info, origin=f"rollout of {settings.policy_type} {settings.policy_digest}")
     if settings.takeover is not None:
@@ -265,36 +264,19 @@ def make_rollout(plan: EpisodePlan, folder: Path) -> Attempt:
     )
 
 
-class _Stage:
-    """The environment, the policy and the world for rehearsals of this process, kept from one rollout to the next."""
-
-    def __init__(self) -> None:
-        self._folder: Path | None = None
-        self._made: tuple[DemorecEnv, Policy, World | None] | None = None
-        self.settings: Settings
-
-    def set(self, folder: Path) -> tuple[DemorecEnv, Policy, World | None]:
-        """Those of the evaluation in `folder`."""
-        if self._made is None or self._folder != folder:
-            if self._made is not None:
-                self._made[0].close()
-                if self._made[2] is not None:
-                    self._made[2].close()
-            self.settings = load_evaluation(folder).settings
-            env = DemorecEnv(
-                config=self.settings.config,
-                action=self.settings.action,
-                privileged=self.settings.privileged,
-                state=self.settings.state,
-                episode_length=self.settings.episode_length,
-            )
-            policy = Policy(find_checkpoint(Path(self.settings.policy)), action_steps=self.settings.action_steps)
-            world = None if self.settings.takeover is None else make_world(env.info)
-            self._folder, self._made = folder, (env, policy, world)
-        return self._made
-
-
-_stage = _Stage()
+@functools.lru_cache(maxsize=1)  # a worker is of one evaluation
+def _stage(folder: Path) -> tuple[Settings, DemorecEnv, Policy, World | None]:
+    """What decides, the environment, the policy and the world for rehearsals, kept from one rollout to the next."""
+    settings = load_evaluation(folder).settings
+    env = DemorecEnv(
+        config=settings.config,
+        action=settings.action,
+        privileged=settings.privileged,
+        state=settings.state,
+        episode_length=settings.episode_length,
+    )
+    policy = Policy(find_checkpoint(Path(settings.policy)), action_steps=settings.action_steps)
+    return settings, env, policy, None if settings.takeover is None else make_world(env.info)
 
 
 def _open(settings: Settings, out: Path, *, overwrite: bool) -> Evaluation:

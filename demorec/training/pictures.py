@@ -11,7 +11,7 @@ from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from threading import Lock
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,16 +24,6 @@ from demorec.training.video_file import VideoFile
 _PYAV_NAMES = ("pyav", "video_reader")
 """LeRobot's names of the decoder; the second is an old one."""
 _OPEN_FILES = 64
-
-
-class Decoder(Protocol):
-    """Finds and decodes frames of a video file by their number in it."""
-
-    def numbers(self, times_s: NDArray[np.float64]) -> NDArray[np.int64]:
-        """The frames that lie at these times."""
-
-    def decode(self, numbers: Sequence[int]) -> Iterator[tuple[int, DecodedFrame]]:
-        """The frames of these numbers, which ascend."""
 
 
 class PictureReader:
@@ -87,7 +77,9 @@ class PictureReader:
         chosen = np.take_along_axis(numbers, nearest, 1)
         return [torch.stack([frames[n].picture for n in row]) for row in chosen.tolist()]
 
-    def _frames(self, path: str, decoder: Decoder, numbers: Sequence[int]) -> dict[int, DecodedFrame]:
+    def _frames(
+        self, path: str, decoder: VideoFile | _TorchcodecFile, numbers: Sequence[int]
+    ) -> dict[int, DecodedFrame]:
         held = {number: self._cache.get(path, number) for number in numbers}
         frames = {number: frame for number, frame in held.items() if frame is not None}
         for number, frame in decoder.decode([number for number in numbers if number not in frames]):
@@ -95,7 +87,7 @@ class PictureReader:
             self._cache.put(path, number, frame)
         return frames
 
-    def _decoder(self, path: str, is_depth: bool) -> Decoder:
+    def _decoder(self, path: str, is_depth: bool) -> VideoFile | _TorchcodecFile:
         if self._backend == "torchcodec" and not is_depth:  # which reads no depth, as LeRobot has it
             return _TorchcodecFile(self._torchcodec.get_decoder(path))
         if self._backend not in _PYAV_NAMES and not is_depth:
@@ -110,7 +102,7 @@ class PictureReader:
 
 
 class _TorchcodecFile:
-    """A decoder of torchcodec, opened as LeRobot opens it."""
+    """A decoder of torchcodec, opened as LeRobot opens it, with the methods of `VideoFile`."""
 
     def __init__(self, decoder: Any) -> None:
         self._decoder = decoder
