@@ -29,7 +29,7 @@ from demorec.evaluate.turns import Turns
 from demorec.generate.contents import foreign_recordings
 from demorec.generate.executor import Lost, Raised
 from demorec.generate.local import LocalExecutor
-from demorec.generate.plan import plain_differences
+from demorec.generate.plan import differences
 from demorec.gym_env import DemorecEnv
 from demorec.loop import make_world, prepare
 from demorec.plain import from_plain, to_plain
@@ -37,7 +37,6 @@ from demorec.recording import EpisodeWriter
 from demorec.runs.find import EVALUATION_NAME
 from demorec.runs.run_file import EPISODES, FAILED, Attempt
 from demorec.safety.files import replace_text
-from demorec.safety.own_versions import version_differences
 from demorec.safety.replacing import (
     ReplaceableKind,
     check_replaceable,
@@ -298,11 +297,9 @@ def _begin_or_continue(settings: Settings, out: Path) -> Evaluation:
     evaluation = Evaluation(settings=settings, versions=versions)
     if (out / EVALUATION_NAME).is_file():
         evaluation = load_evaluation(out)
-        lines = [
-            *plain_differences(_deciding(evaluation.settings), _deciding(settings)),
-            *(version_differences(evaluation.versions, versions) if evaluation.versions else ()),
-        ]
-        if lines:
+        here_versions = versions if evaluation.versions else {}
+        there, here = _deciding(evaluation.settings), _deciding(settings)
+        if lines := differences(there, evaluation.versions, here, here_versions):
             advice = "choose another --out" + ("" if obstacle(out, EVALUATION) else " or --overwrite")
             raise ConfigError(f"Another evaluation is in this folder ({'; '.join(lines)}): {advice}: {out}")
         kept = [r for r in evaluation.rollouts if (out / r.file).is_file()]

@@ -130,6 +130,4 @@ def _added_to_dataset(recordings: Sequence[Path], folder: Path) -> int:
 def _existing(path: Path) -> Path:
     """The nearest folder above a path that exists."""
     path = path.absolute()
-    while not path.exists():
-        path = path.parent
-    return path
+    return next(place for place in (path, *path.parents) if place.exists())

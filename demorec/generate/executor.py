@@ -7,6 +7,7 @@ import importlib
 import traceback
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, Self
@@ -79,6 +80,7 @@ class Executor(Protocol):
     @property
     def has_room(self) -> bool:
         """Whether `submit` may be called; bounds what is in flight."""
+        return self.pending < self.workers
 
     @property
     def pending(self) -> int:
@@ -134,10 +136,8 @@ def attempt_episode(maker: str, plan: EpisodePlan, folder: Path) -> Made | Raise
 
 def peak_memory() -> int:
     """Largest resident size of this process so far, bytes (the present one where the system does not keep it)."""
-    try:
+    with suppress(OSError):
         for line in Path("/proc/self/status").read_text().splitlines():
             if line.startswith("VmHWM:"):
                 return int(line.split()[1]) * 1024
-    except OSError:
-        pass
     return int(psutil.Process().memory_info().rss)

@@ -63,11 +63,6 @@ class LocalExecutor(Executor):
         return self._num_workers
 
     @property
-    def has_room(self) -> bool:
-        """Whether a worker is idle or yet to be started."""
-        return self.pending < self._num_workers
-
-    @property
     def pending(self) -> int:
         """Busy workers."""
         return sum(worker.plan is not None for worker in self._live)

@@ -178,14 +178,11 @@ def connected(address: str, workers: int | None) -> Iterator[None]:
 
 def _connect(address: str, cores: int) -> None:
     options: dict[str, Any] = {"logging_level": logging.ERROR, "log_to_driver": False}
+    if address == "local":
+        options |= {"num_cpus": cores, "object_store_memory": _STORE_BYTES, "include_dashboard": False}
     _knock(address)
     try:
-        if address == "local":
-            ray.init(
-                address="local", num_cpus=cores, object_store_memory=_STORE_BYTES, include_dashboard=False, **options
-            )
-        else:
-            ray.init(address=address, **options)
+        ray.init(address=address, **options)
     except Exception as error:  # Ray raises a bare Exception when a node of its own does not come up in time
         ray.shutdown()
         place = "on this machine cannot be started" if address == "local" else f"at {address!r} cannot be reached"

@@ -6,8 +6,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
-from demorec.config import EpisodePlan, GenerateConfig
-from demorec.plain import to_plain
+from demorec.config import EpisodePlan
 from demorec.runs.run_file import Attempt, RunFile
 from demorec.safety.own_versions import version_differences
 
@@ -63,12 +62,14 @@ class Schedule:
         return EpisodePlan(config=self._config, episode_index=index, attempt=number, versions=self._versions)
 
 
-def differences(before: RunFile, config: GenerateConfig, versions: Mapping[str, str]) -> tuple[str, ...]:
-    """One line for each value of config and versions in which a run differs from what is asked now."""
-    return (
-        *plain_differences(to_plain(before.config), to_plain(config)),
-        *version_differences(before.versions, versions),
-    )
+def differences(
+    there: Mapping[str, Any],
+    there_versions: Mapping[str, str],
+    here: Mapping[str, Any],
+    here_versions: Mapping[str, str],
+) -> tuple[str, ...]:
+    """One line for each value in which two configs, as plain data, and their versions differ."""
+    return (*plain_differences(there, here), *version_differences(there_versions, here_versions))
 
 
 def plain_differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> tuple[str, ...]:

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from demorec.errors import DemorecError, in_words, resource_error, without_path
-from demorec.generate.plan import plain_differences
+from demorec.generate.plan import differences
 from demorec.plain import to_plain
 from demorec.runs.recordings import Inspected, inspect_recording
 from demorec.runs.run_file import (
@@ -21,7 +21,6 @@ from demorec.runs.run_file import (
     sha256_of,
     sync_folder,
 )
-from demorec.safety.own_versions import version_differences
 
 Inspector = Callable[[Path], Inspected]
 """Reads all of a recording; DemorecError or OSError when it is none."""
@@ -79,11 +78,7 @@ def _adopt(path: Path, run: RunFile, inspect: Inspector) -> Attempt:
     name = recording_name(line.episode_index, line.attempt, success=line.success)
     if (path.parent.name, path.name) != (place, name):
         raise DemorecError(f"it holds episode {line.episode_index}, attempt {line.attempt}")
-    different = (
-        *plain_differences(found.config, to_plain(run.config)),
-        *version_differences(found.versions, run.versions),
-    )
-    if different:
+    if different := differences(found.config, found.versions, to_plain(run.config), run.versions):
         raise DemorecError(f"it is of another run ({'; '.join(different)})")
     return replace(line, file=f"{place}/{name}")
 

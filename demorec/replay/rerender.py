@@ -173,8 +173,8 @@ def new_view(info: EpisodeInfo, options: RerenderOptions) -> SceneView:
             root_seed=options.looks, episode_index=info.episode_index, attempt=info.attempt, purpose="looks"
         )
         scene = vary_looks(scene, resolve("full", Ranges()), rng)
-    kept = {name: error for name, error in old.true_from_recorded.items() if name in names and name in recorded}
-    kept = {name: error for name, error in kept.items() if name not in options.free_cameras}
+    of_recording = set(names) - options.free_cameras.keys()
+    kept = {name: error for name, error in old.true_from_recorded.items() if name in of_recording}
     return SceneView(scene=scene, true_cameras=tuple(true_cameras), true_from_recorded=kept)
 
 
@@ -222,13 +222,8 @@ def view_painter(renderer: Renderer, view: SceneView, config: Mapping[str, Any])
 def drawing_config(info: EpisodeInfo, options: RerenderOptions) -> dict[str, Any]:
     """The recording's config with what the options change about the pictures."""
     config = dict(info.config)
-    changes = {
-        "renderer": options.renderer,
-        "antialias": options.antialias,
-        "depth": options.depth,
-        "segmentation": options.segmentation,
-        "width": options.width,
-        "height": options.height,
+    same_names = ("renderer", "antialias", "depth", "segmentation", "width", "height")
+    changes = {name: getattr(options, name) for name in same_names} | {
         "video": {**config.get("video", {}), **options.video} if options.video else None,
         "cameras": None if options.cameras is None else list(options.cameras),
     }
