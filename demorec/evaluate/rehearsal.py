@@ -79,16 +79,12 @@ class Rehearsal:
         shifts = np.linalg.norm(self._wanted[window] - command.base_from_tcp_target.position, axis=1)
         nearest = int(shifts.argmin())
         there = self._actions[self._reached + nearest].base_from_tcp_target
+        here = observation.object_poses
+        objects = (np.linalg.norm(way[self._reached] - here[name].position) for name, way in self._objects.items())
         return Distance(
             tcp=float(shifts[nearest]),
             angle=angle_between(there, command.base_from_tcp_target),
-            objects=max(
-                (
-                    float(np.linalg.norm(way[self._reached] - observation.object_poses[name].position))
-                    for name, way in self._objects.items()
-                ),
-                default=0.0,
-            ),
+            objects=float(max(objects, default=0.0)),
         )
 
 

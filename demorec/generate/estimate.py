@@ -73,28 +73,23 @@ def estimate(config: GenerateConfig, options: RunOptions, *, maker: str = MAKE_E
     """
     assert options.out is not None
     workers = options.workers or available_cores()
-    blind = replace(config, cameras=())
     with tempfile.TemporaryDirectory(prefix="demorec-pilot-") as temporary:
         folder = Path(temporary)
         for name in (EPISODES, FAILED, UNFINISHED):
             (folder / name).mkdir()
-        measured = _make(maker, folder, [EpisodePlan(config=config, episode_index=i) for i in range(_MEASURED)], 1)
-        tried = _make(
-            maker,
-            folder,
-            [EpisodePlan(config=blind, episode_index=i) for i in range(min(_TRIED, options.num_episodes))],
-            min(workers, available_cores()),
-        )
+        measured = _make(maker, folder, config, _MEASURED, workers=1)
+        count = min(_TRIED, options.num_episodes)
+        tried = _make(maker, folder, replace(config, cameras=()), count, workers=min(workers, available_cores()))
         recordings = [folder / report.attempt.file for report in measured if report.attempt.file]
         dataset_bytes = _added_to_dataset(recordings, folder) if options.export else 0
-    seconds = dict(measured[-1].attempt.seconds)
+    last = measured[-1].attempt
     return Estimate(
         attempts=len(tried),
         successes=sum(report.attempt.success for report in tried),
-        num_frames=measured[-1].attempt.num_frames,
-        cpu_seconds=seconds,
+        num_frames=last.num_frames,
+        cpu_seconds=dict(last.seconds),
         start_seconds=measured[0].attempt.seconds.get(STARTING, 0.0),
-        num_bytes=measured[-1].attempt.num_bytes,
+        num_bytes=last.num_bytes,
         dataset_bytes=dataset_bytes,
         peak_worker_bytes=max(report.peak_bytes for report in measured),
         num_episodes=options.num_episodes,
@@ -103,10 +98,11 @@ def estimate(config: GenerateConfig, options: RunOptions, *, maker: str = MAKE_E
     )
 
 
-def _make(maker: str, folder: Path, plans: list[EpisodePlan], workers: int) -> list[Made]:
-    """Carry out plans, in order of their ends."""
+def _make(maker: str, folder: Path, config: GenerateConfig, count: int, *, workers: int) -> list[Made]:
+    """The first episodes, in order of their ends."""
     made: list[Made] = []
-    with LocalExecutor(maker, folder, workers=workers, recycle_after=len(plans)) as executor:
+    plans = [EpisodePlan(config=config, episode_index=index) for index in range(count)]
+    with LocalExecutor(maker, folder, workers=workers, recycle_after=count) as executor:
         for report in executor.carry_out(plans):
             if isinstance(report, Raised):
                 raise report.error(f"The pilot episode cannot be made: {report.message}")

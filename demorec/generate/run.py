@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import errno
 import time
+from collections import Counter
 from collections.abc import Iterable
 from contextlib import ExitStack
 from pathlib import Path
@@ -33,6 +34,7 @@ GRACE_S = 3.0
 """How long current episodes may go on after the first Ctrl-C."""
 _POLL_S = 0.2
 _MORE_MEMORY = "try fewer --workers or a machine with more memory"
+_SOUND_STORAGE = "see whether the storage of the output folder is sound, then run the same command again"
 _REFUSED = {
     errno.ENOSPC: "the disk is full",
     errno.EDQUOT: "the quota is used up",
@@ -104,27 +106,10 @@ def make_executor(options: RunOptions, folder: Path, run: RunFile, maker: str) -
     if options.executor == "ray":
         from demorec.generate.on_ray import RayExecutor
 
-        return RayExecutor(
-            maker,
-            folder,
-            workers=options.workers,
-            cpus_per_worker=options.cpus_per_worker,
-            gpus_per_worker=options.gpus_per_worker,
-            recycle_after=options.recycle_after,
-        )
+        return RayExecutor(maker, folder, options)
     missing = run.num_episodes - len(run.successes)
-    return LocalExecutor(
-        maker,
-        folder,
-        workers=max(1, min(options.workers or available_cores(), missing)),
-        recycle_after=options.recycle_after,
-    )
-
-
-def _advice(number: int) -> str:
-    if number == errno.ENOMEM:
-        return _MORE_MEMORY
-    return "see whether the storage of the output folder is sound, then run the same command again"
+    workers = max(1, min(options.workers or available_cores(), missing))
+    return LocalExecutor(maker, folder, workers=workers, recycle_after=options.recycle_after)
 
 
 class _Driver:
@@ -135,7 +120,7 @@ class _Driver:
         self._schedule = schedule
         self._executor = executor
         self._progress = progress
-        self._losses: dict[tuple[int, int], int] = {}
+        self._losses: Counter[tuple[int, int]] = Counter()
 
     def work(self) -> bool:
         """Until nothing is due any more; returns whether the user has interrupted it."""
@@ -177,7 +162,7 @@ class _Driver:
 
     def _again(self, plan: EpisodePlan, reason: str, advice: str) -> None:
         key = (plan.episode_index, plan.attempt)
-        self._losses[key] = self._losses.get(key, 0) + 1
+        self._losses[key] += 1
         self._folder.lost_workers += 1
         if self._losses[key] >= MAX_LOSSES:
             raise GenerationError(
@@ -195,7 +180,8 @@ class _Driver:
                 f"command again. {self._folder.kept}"
             )
         if report.errno is not None and report.exit_code != ConfigError.exit_code:
-            self._again(report.plan, report.message.rstrip(".") or report.kind, _advice(report.errno))
+            advice = _MORE_MEMORY if report.errno == errno.ENOMEM else _SOUND_STORAGE
+            self._again(report.plan, report.message.rstrip(".") or report.kind, advice)
             return
         if report.exit_code:
             raise report.error(

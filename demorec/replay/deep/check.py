@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -55,12 +56,16 @@ class DeepReport:
         return "warn" if self.versions or self.differences else "pass"
 
 
-def deep_check(path: Path, workshop: Workshop, allowed: Sequence[str] = ()) -> DeepReport:
+_workshop = Workshop()
+"""Of this process."""
+
+
+def deep_check(path: Path, workshop: Workshop = _workshop, allowed: Sequence[str] = ()) -> DeepReport:
     """Make a recording again and compare everything.
 
     Args:
         path: The recording.
-        workshop: Gives world and renderer.
+        workshop: Gives world and renderer; by default one that stays warm for as long as the process lives.
         allowed: The user's own modules that may be imported for what the recording names.
 
     Raises:
@@ -128,12 +133,4 @@ def deep_checks(paths: Sequence[Path], *, workers: int = 1, allowed: Sequence[st
                 yield deep_check(path, workshop, allowed)
         return
     with ProcessPoolExecutor(max_workers=min(workers, len(paths)), mp_context=SPAWN) as pool:
-        yield from pool.map(_deep_check_here, paths, [tuple(allowed)] * len(paths))
-
-
-_workshop = Workshop()
-"""Of a process of the pool."""
-
-
-def _deep_check_here(path: Path, allowed: tuple[str, ...]) -> DeepReport:
-    return deep_check(path, _workshop, allowed)
+        yield from pool.map(partial(deep_check, allowed=tuple(allowed)), paths)
