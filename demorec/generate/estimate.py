@@ -82,7 +82,7 @@ def estimate(config: GenerateConfig, options: RunOptions, *, maker: str = MAKE_E
         tried = _make(maker, folder, replace(config, cameras=()), count, workers=min(workers, available_cores()))
         recordings = [folder / report.attempt.file for report in measured if report.attempt.file]
         dataset_bytes = _added_to_dataset(recordings, folder) if options.export else 0
-    last = measured[-1].attempt
+    last, out = measured[-1].attempt, options.out.absolute()
     return Estimate(
         attempts=len(tried),
         successes=sum(report.attempt.success for report in tried),
@@ -94,7 +94,7 @@ def estimate(config: GenerateConfig, options: RunOptions, *, maker: str = MAKE_E
         peak_worker_bytes=max(report.peak_bytes for report in measured),
         num_episodes=options.num_episodes,
         workers=workers,
-        free_bytes=shutil.disk_usage(_existing(options.out)).free,
+        free_bytes=shutil.disk_usage(next(place for place in (out, *out.parents) if place.exists())).free,
     )
 
 
@@ -121,9 +121,3 @@ def _added_to_dataset(recordings: Sequence[Path], folder: Path) -> int:
         export_lerobot(recordings[:count], dataset, options)
         sizes.append(sum(path.stat().st_size for path in dataset.rglob("*") if path.is_file()))
     return max(0, sizes[-1] - sizes[-2])
-
-
-def _existing(path: Path) -> Path:
-    """The nearest folder above a path that exists."""
-    path = path.absolute()
-    return next(place for place in (path, *path.parents) if place.exists())

@@ -64,11 +64,6 @@ class AnotherRunError(ConfigError):
         differences, advice, path = self.args
         return f"The output folder holds another run ({differences}): {advice}: {path}"
 
-    def advising(self, advice: str) -> AnotherRunError:
-        """The same with other advice, for a command with other options."""
-        differences, _, path = self.args
-        return AnotherRunError(differences, advice, path)
-
 
 class RunFolder:
     """An opened run. Lines are saved at intervals: one that a crash loses is read back from its recording.

@@ -22,8 +22,7 @@ class Schedule:
     """
 
     def __init__(self, run: RunFile, *, episodes: Iterable[int] | None = None) -> None:
-        self._config = run.config
-        self._versions = run.versions
+        self._run = run
         self._known = {(a.episode_index, a.attempt): a.success for a in run.attempts}
         self._success = {a.episode_index: a.attempt for a in run.successes}
         self._episodes = iter(range(run.num_episodes) if episodes is None else episodes)
@@ -52,14 +51,12 @@ class Schedule:
     def _due(self, index: int) -> Iterator[EpisodePlan]:
         """Attempts that must be made now: the first unknown one, or those missing before a known success."""
         success = self._success.get(index)
-        for number in range(self._config.max_attempts if success is None else success):
+        config, versions = self._run.config, self._run.versions
+        for number in range(config.max_attempts if success is None else success):
             if (index, number) not in self._known:
-                yield self._plan(index, number)
+                yield EpisodePlan(config=config, episode_index=index, attempt=number, versions=versions)
                 if success is None:
                     return
-
-    def _plan(self, index: int, number: int) -> EpisodePlan:
-        return EpisodePlan(config=self._config, episode_index=index, attempt=number, versions=self._versions)
 
 
 def differences(

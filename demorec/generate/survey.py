@@ -66,7 +66,8 @@ def survey(
             if (lack := resource_error(error, path)) is not None:
                 raise lack from error
             set_aside[file] = without_path(error, path) if isinstance(error, DemorecError) else in_words(error)
-            _set_aside(path, folder)
+            path.rename(free_name(folder / UNFINISHED / path.name))
+            sync_folder(path.parent)
         progress(number + 1, len(files))
     return kept, set_aside
 
@@ -81,8 +82,3 @@ def _adopt(path: Path, run: RunFile, inspect: Inspector) -> Attempt:
     if different := differences(found.config, found.versions, to_plain(run.config), run.versions):
         raise DemorecError(f"it is of another run ({'; '.join(different)})")
     return replace(line, file=f"{place}/{name}")
-
-
-def _set_aside(path: Path, folder: Path) -> None:
-    path.rename(free_name(folder / UNFINISHED / path.name))
-    sync_folder(path.parent)
