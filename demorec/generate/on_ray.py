@@ -160,16 +160,9 @@ def connected(address: str, workers: int | None) -> Iterator[None]:
     if ray.is_initialized():
         yield
         return
-    _connect(address, workers or available_cores())
-    try:
-        yield
-    finally:
-        ray.shutdown()
-
-
-def _connect(address: str, cores: int) -> None:
     options: dict[str, Any] = {"logging_level": logging.ERROR, "log_to_driver": False}
     if address == "local":
+        cores = workers or available_cores()
         options |= {"num_cpus": cores, "object_store_memory": _STORE_BYTES, "include_dashboard": False}
     _knock(address)
     try:
@@ -178,6 +171,10 @@ def _connect(address: str, cores: int) -> None:
         ray.shutdown()
         place = "on this machine cannot be started" if address == "local" else f"at {address!r} cannot be reached"
         raise ConfigError(f"The Ray cluster {place}: {_last_line(error)}") from error
+    try:
+        yield
+    finally:
+        ray.shutdown()
 
 
 def _knock(address: str) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 from demorec.errors import DemorecError, in_words, resource_error, without_path
 from demorec.generate.plan import differences
 from demorec.plain import to_plain
-from demorec.runs.recordings import Inspected, inspect_recording
+from demorec.runs.recordings import Inspected
 from demorec.runs.run_file import (
     EPISODES,
     FAILED,
@@ -32,11 +32,7 @@ def recordings_of(folder: Path) -> list[Path]:
 
 
 def survey(
-    folder: Path,
-    run: RunFile,
-    *,
-    inspect: Inspector = inspect_recording,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    folder: Path, run: RunFile, *, inspect: Inspector, progress: Callable[[int, int], None]
 ) -> tuple[list[Attempt], dict[str, str]]:
     """Verify every recording of a folder against run.json, or read it in full where run.json does not know it.
 
