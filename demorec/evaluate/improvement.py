@@ -160,7 +160,9 @@ class Improvement:
         folder.mkdir(exist_ok=True)
         if number > 0:
             self._tell(f"round {number}: the expert corrects the policy of round {number - 1}")
-            self._correct(number)
+            before, plan = self.policy(number - 1), self._plan
+            new = replace(self._config, seed=self._config.seed + plan.seed + number)  # scenes that no round had
+            self._act(before, new, self._corrections(number), plan.num_episodes, plan.takeover)
         dataset = self._dataset(number)
         self._tell(f"round {number}: training, {folder / LOG_NAME} tells how it goes")
         seconds = self._train(number, dataset)
@@ -184,13 +186,6 @@ class Improvement:
         own = tuple(name for name in config.cameras if ":" in name)  # the others are named by the policy itself
         settings = settings_for(policy, replace(config, cameras=own), action=self._plan.action)
         return evaluate(replace(settings, takeover=takeover), out, num_episodes=count, workers=self._workers)
-
-    def _correct(self, number: int) -> None:
-        """The policy of the round before acts and is corrected, in scenes that no round had."""
-        config = replace(self._config, seed=self._config.seed + self._plan.seed + number)
-        self._act(
-            self.policy(number - 1), config, self._corrections(number), self._plan.num_episodes, self._plan.takeover
-        )
 
     def _corrections(self, number: int) -> Path:
         return self._folder(number) / "corrections"

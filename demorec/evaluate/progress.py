@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 from demorec.gym_env import Situation
-from demorec.scene.episode import SuccessCheck
 from demorec.scene.scene import Goal, Scene
 from demorec.sim.world import World
 from demorec.tasks.success import goal_pose
@@ -45,11 +44,8 @@ class EvaluationObserver:
 
     def failure(self, situation: Situation) -> tuple[str, str]:
         """Phase and reason of a failure: the name of the first condition that does not hold, or "time_limit"."""
-        return PHASES[min(self._stage, default=0)], _first_failed(situation.checks)
-
-
-def _first_failed(checks: tuple[SuccessCheck, ...]) -> str:
-    return next((check.name for check in checks if not check.passed), "time_limit")
+        reason = next((check.name for check in situation.checks if not check.passed), "time_limit")
+        return PHASES[min(self._stage, default=0)], reason
 
 
 def factors_of(scene: Scene) -> dict[str, float]:

@@ -7,7 +7,6 @@ a policy's commands are compared with the part of that way that it has reached.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -24,21 +23,6 @@ _AHEAD_SECONDS = 1.0
 """How far ahead on the expert's way a policy may be from one frame to the next."""
 _SAME_PLACE = 0.001
 """Metres within which two places of the way are one; the later one counts, since the expert also waits."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Distance:
-    """How far a policy is from the expert.
-
-    Attributes:
-        tcp: Metres from the TCP that it commands to the nearest one that the expert commands within the next second.
-        angle: Radians between the directions of the hand there.
-        objects: Metres from the objects to where the expert has them at the same place of its way, the largest.
-    """
-
-    tcp: float
-    angle: float
-    objects: float
 
 
 class Rehearsal:
@@ -70,8 +54,14 @@ class Rehearsal:
         self._ahead = max(1, round(_AHEAD_SECONDS * episode.info.fps))
         self._reached = 0
 
-    def distance(self, observation: Observation, command: Action) -> Distance:
-        """How far a policy is that commands this now; to be asked once a frame, since the way is followed forward."""
+    def distance(self, observation: Observation, command: Action) -> tuple[float, float, float]:
+        """How far a policy is that commands this now; to be asked once a frame, since the way is followed forward.
+
+        Returns:
+            Metres from the TCP that it commands to the nearest one that the expert commands within the next second;
+            radians between the directions of the hand there; and metres from the objects to where the expert has them
+            at the same place of its way, the largest.
+        """
         window = slice(self._reached, self._reached + self._ahead)
         off = np.abs(self._places[window] - _place(observation)).sum(axis=1)
         self._reached += int(np.flatnonzero(off < off.min() + _SAME_PLACE)[-1])
@@ -79,17 +69,10 @@ class Rehearsal:
         shifts = np.linalg.norm(self._wanted[window] - command.base_from_tcp_target.position, axis=1)
         nearest = int(shifts.argmin())
         there = self._actions[self._reached + nearest].base_from_tcp_target
-        return Distance(
-            tcp=float(shifts[nearest]),
-            angle=angle_between(there, command.base_from_tcp_target),
-            objects=max(
-                (
-                    float(np.linalg.norm(way[self._reached] - observation.object_poses[name].position))
-                    for name, way in self._objects.items()
-                ),
-                default=0.0,
-            ),
-        )
+        here = observation.object_poses
+        objects = (np.linalg.norm(way[self._reached] - here[name].position) for name, way in self._objects.items())
+        angle = angle_between(there, command.base_from_tcp_target)
+        return float(shifts[nearest]), angle, float(max(objects, default=0.0))
 
 
 def _steps(world: World, episode: Episode, *, is_start: bool) -> Iterator[Step]:

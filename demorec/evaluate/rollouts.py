@@ -29,7 +29,7 @@ from demorec.evaluate.turns import Turns
 from demorec.generate.contents import foreign_recordings
 from demorec.generate.executor import Lost, Raised
 from demorec.generate.local import LocalExecutor
-from demorec.generate.plan import plain_differences
+from demorec.generate.plan import differences
 from demorec.gym_env import DemorecEnv
 from demorec.loop import make_world, prepare
 from demorec.plain import from_plain, to_plain
@@ -37,7 +37,6 @@ from demorec.recording import EpisodeWriter
 from demorec.runs.find import EVALUATION_NAME
 from demorec.runs.run_file import EPISODES, FAILED, Attempt
 from demorec.safety.files import replace_text
-from demorec.safety.own_versions import version_differences
 from demorec.safety.replacing import (
     ReplaceableKind,
     check_replaceable,
@@ -193,21 +192,15 @@ def evaluate(
     due = [
         EpisodePlan(config=settings.config, episode_index=index) for index in range(num_episodes) if index not in done
     ]
-    rollouts = list(evaluation.rollouts)
     with LocalExecutor(MAKE_ROLLOUT, out, workers=workers, recycle_after=1000) as executor:
-        waiting = list(reversed(due))
-        while waiting or executor.pending:
-            while waiting and executor.has_room:
-                executor.submit(waiting.pop())
-            for report in executor.wait(1.0):
-                if isinstance(report, Raised):
-                    raise DemorecError(f"Episode {report.plan.episode_index}: {report.kind}: {report.message}")
-                if isinstance(report, Lost):
-                    raise DemorecError(f"Episode {report.plan.episode_index} was lost: {report.reason}.")
-                rollouts.append(report.attempt)
-                evaluation = _with(evaluation, rollouts)
-                _save(evaluation, out)
-                progress(evaluation)
+        for report in executor.carry_out(due):
+            if isinstance(report, Raised):
+                raise DemorecError(f"Episode {report.plan.episode_index}: {report.kind}: {report.message}")
+            if isinstance(report, Lost):
+                raise DemorecError(f"Episode {report.plan.episode_index} was lost: {report.reason}.")
+            evaluation = _with(evaluation, [*evaluation.rollouts, report.attempt])
+            _save(evaluation, out)
+            progress(evaluation)
     return _with(evaluation, [r for r in evaluation.rollouts if r.episode_index < num_episodes])
 
 
@@ -225,8 +218,7 @@ def load_evaluation(folder: Path) -> Evaluation:
 
 def make_rollout(plan: EpisodePlan, folder: Path) -> Attempt:
     """Run the policy once and record it; the work of a worker (see `demorec.generate.executor.Maker`)."""
-    env, policy, world = _stage.set(folder)
-    settings = _stage.settings
+    settings, env, policy, world = _stage(folder)
     observation, _ = env.reset(seed=plan.episode_index)
     info = replace(env.info, origin=f"rollout of {settings.policy_type} {settings.policy_digest}")
     if settings.takeover is not None:
@@ -271,36 +263,19 @@ def make_rollout(plan: EpisodePlan, folder: Path) -> Attempt:
     )
 
 
-class _Stage:
-    """The environment, the policy and the world for rehearsals of this process, kept from one rollout to the next."""
-
-    def __init__(self) -> None:
-        self._folder: Path | None = None
-        self._made: tuple[DemorecEnv, Policy, World | None] | None = None
-        self.settings: Settings
-
-    def set(self, folder: Path) -> tuple[DemorecEnv, Policy, World | None]:
-        """Those of the evaluation in `folder`."""
-        if self._made is None or self._folder != folder:
-            if self._made is not None:
-                self._made[0].close()
-                if self._made[2] is not None:
-                    self._made[2].close()
-            self.settings = load_evaluation(folder).settings
-            env = DemorecEnv(
-                config=self.settings.config,
-                action=self.settings.action,
-                privileged=self.settings.privileged,
-                state=self.settings.state,
-                episode_length=self.settings.episode_length,
-            )
-            policy = Policy(find_checkpoint(Path(self.settings.policy)), action_steps=self.settings.action_steps)
-            world = None if self.settings.takeover is None else make_world(env.info)
-            self._folder, self._made = folder, (env, policy, world)
-        return self._made
-
-
-_stage = _Stage()
+@functools.lru_cache(maxsize=1)  # a worker is of one evaluation
+def _stage(folder: Path) -> tuple[Settings, DemorecEnv, Policy, World | None]:
+    """What decides, the environment, the policy and the world for rehearsals, kept from one rollout to the next."""
+    settings = load_evaluation(folder).settings
+    env = DemorecEnv(
+        config=settings.config,
+        action=settings.action,
+        privileged=settings.privileged,
+        state=settings.state,
+        episode_length=settings.episode_length,
+    )
+    policy = Policy(find_checkpoint(Path(settings.policy)), action_steps=settings.action_steps)
+    return settings, env, policy, None if settings.takeover is None else make_world(env.info)
 
 
 def _open(settings: Settings, out: Path, *, overwrite: bool) -> Evaluation:
@@ -322,11 +297,9 @@ def _begin_or_continue(settings: Settings, out: Path) -> Evaluation:
     evaluation = Evaluation(settings=settings, versions=versions)
     if (out / EVALUATION_NAME).is_file():
         evaluation = load_evaluation(out)
-        lines = [
-            *plain_differences(_deciding(evaluation.settings), _deciding(settings)),
-            *(version_differences(evaluation.versions, versions) if evaluation.versions else ()),
-        ]
-        if lines:
+        here_versions = versions if evaluation.versions else {}
+        there, here = _deciding(evaluation.settings), _deciding(settings)
+        if lines := differences(there, evaluation.versions, here, here_versions):
             advice = "choose another --out" + ("" if obstacle(out, EVALUATION) else " or --overwrite")
             raise ConfigError(f"Another evaluation is in this folder ({'; '.join(lines)}): {advice}: {out}")
         kept = [r for r in evaluation.rollouts if (out / r.file).is_file()]

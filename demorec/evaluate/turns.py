@@ -5,14 +5,22 @@ from __future__ import annotations
 from collections.abc import Generator, Iterator
 from typing import Any
 
-from demorec.evaluate.correction import HAND_BACK_EVENT, Correction, correcting_behaviour, is_back
+from demorec.evaluate.correction import begin_correction, correcting_behaviour
 from demorec.evaluate.moments import TakeOver
 from demorec.evaluate.policy import Policy
 from demorec.evaluate.watch import Watch
-from demorec.gym_env import DemorecEnv
+from demorec.gym_env import SUCCESS_FRAMES, DemorecEnv
 from demorec.loop.agents import Decision
-from demorec.scene.episode import POLICY_PHASE, Action, Event, Frame
+from demorec.loop.noise import ActionNoise
+from demorec.scene.episode import HALT_PHASE, POLICY_PHASE, Action, Event, Frame
 from demorec.sim.world import World
+from demorec.tasks.recovery import TAKE_OVER
+from demorec.tasks.script import Step
+from demorec.tasks.skills import Expert, GaveUp
+
+HAND_BACK_EVENT = "hand_back"
+_RECOVERY = (HALT_PHASE, TAKE_OVER, "recover", "perceive")
+"""Phases in which the expert is not yet back where demonstrations go."""
 
 
 class Turns:
@@ -43,7 +51,7 @@ class Turns:
         rehearsal_world: World | None = None,
     ) -> None:
         self.success = False
-        self.gave_up = "", ""
+        self.gave_up = self._trouble = "", ""
         self.num_retries = 0
         self._env, self._policy, self._observation, self._seed = env, policy, observation, seed
         self._hands_back = rules is not None and rules.hand_back
@@ -82,17 +90,32 @@ class Turns:
 
     def _expert_acts(self, reason: str) -> Generator[Frame, None, bool]:
         """Returns whether the policy shall act again."""
-        correction = Correction(env=self._env, reason=reason, behaviour=self._behaviour, rng=self._noise_rng)
-        retries = self.num_retries
-        for decision in correction.decisions():
-            if self._hands_back and is_back(decision) and self._watch and not self._watch.is_over(self._env.situation):
+        world, behaviour, retries = self._env.world, self._behaviour, self.num_retries
+        expert = begin_correction(world, behaviour, reason)
+        noise = ActionNoise(world, sigma=behaviour.action_noise, rng=self._noise_rng, fps=world.fps)
+        for step in self._steps(expert):
+            command = noise.command(step)
+            is_back = step.phase not in _RECOVERY
+            if self._hands_back and is_back and self._watch and not self._watch.is_over(self._env.situation):
                 return True
-            yield self._step(decision)
-            self.num_retries = retries + correction.num_retries
+            yield self._step(Decision(action=step.action, command=command, phase=step.phase, events=step.events))
+            self.num_retries = retries + expert.num_retries
             if self.success:
                 return False
-        self.gave_up = correction.gave_up
+        self.gave_up = self._trouble
         return False
+
+    def _steps(self, expert: Expert) -> Iterator[Step]:
+        """Until the task is done or given up; then a few that hold."""
+        self._trouble = "", ""
+        try:
+            yield from self._env.episode.task.resume(expert)
+        except GaveUp as error:
+            self._trouble = error.phase, error.reason
+            yield expert.step()  # which carries the events that say why
+            return
+        for _ in range(SUCCESS_FRAMES):
+            yield expert.step()
 
     def _step(self, decision: Decision) -> Frame:
         self._observation, _, self.success, self._is_out_of_time, _ = self._env.act(decision)

@@ -71,9 +71,10 @@ class Watch:
     def _stray(self, situation: Situation, command: Action) -> str:
         if self._rehearsal is None:
             return ""
-        limits, found = self._rules, self._rehearsal.distance(situation.observation, command)
-        if 0.0 < limits.stray_metres < found.objects:
+        limits = self._rules
+        tcp, angle, objects = self._rehearsal.distance(situation.observation, command)
+        if 0.0 < limits.stray_metres < objects:
             return "an object is astray"
-        is_astray = 0.0 < limits.stray_metres < found.tcp or 0.0 < limits.stray_radians < found.angle
+        is_astray = 0.0 < limits.stray_metres < tcp or 0.0 < limits.stray_radians < angle
         self._astray = self._astray + 1 if is_astray else 0
         return "the policy strays" if self._astray >= self._max_astray else ""

@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from demorec.config import EpisodePlan, GenerateConfig
-from demorec.errors import ConfigError, GenerationError
-from demorec.generate.executor import MAKE_EPISODE, Made, Raised
+from demorec.errors import GenerationError
+from demorec.generate.executor import MAKE_EPISODE, Lost, Made, Raised
 from demorec.generate.local import LocalExecutor
 from demorec.generate.options import RunOptions
 from demorec.lerobot import ExportOptions, export_lerobot
@@ -73,52 +73,42 @@ def estimate(config: GenerateConfig, options: RunOptions, *, maker: str = MAKE_E
     """
     assert options.out is not None
     workers = options.workers or available_cores()
-    blind = replace(config, cameras=())
     with tempfile.TemporaryDirectory(prefix="demorec-pilot-") as temporary:
         folder = Path(temporary)
         for name in (EPISODES, FAILED, UNFINISHED):
             (folder / name).mkdir()
-        measured = _make(maker, folder, [EpisodePlan(config=config, episode_index=i) for i in range(_MEASURED)], 1)
-        tried = _make(
-            maker,
-            folder,
-            [EpisodePlan(config=blind, episode_index=i) for i in range(min(_TRIED, options.num_episodes))],
-            min(workers, available_cores()),
-        )
+        measured = _make(maker, folder, config, _MEASURED, workers=1)
+        count = min(_TRIED, options.num_episodes)
+        tried = _make(maker, folder, replace(config, cameras=()), count, workers=min(workers, available_cores()))
         recordings = [folder / report.attempt.file for report in measured if report.attempt.file]
         dataset_bytes = _added_to_dataset(recordings, folder) if options.export else 0
-    seconds = dict(measured[-1].attempt.seconds)
+    last, out = measured[-1].attempt, options.out.absolute()
     return Estimate(
         attempts=len(tried),
         successes=sum(report.attempt.success for report in tried),
-        num_frames=measured[-1].attempt.num_frames,
-        cpu_seconds=seconds,
+        num_frames=last.num_frames,
+        cpu_seconds=dict(last.seconds),
         start_seconds=measured[0].attempt.seconds.get(STARTING, 0.0),
-        num_bytes=measured[-1].attempt.num_bytes,
+        num_bytes=last.num_bytes,
         dataset_bytes=dataset_bytes,
         peak_worker_bytes=max(report.peak_bytes for report in measured),
         num_episodes=options.num_episodes,
         workers=workers,
-        free_bytes=shutil.disk_usage(_existing(options.out)).free,
+        free_bytes=shutil.disk_usage(next(place for place in (out, *out.parents) if place.exists())).free,
     )
 
 
-def _make(maker: str, folder: Path, plans: list[EpisodePlan], workers: int) -> list[Made]:
-    """Carry out plans, in order of their ends."""
+def _make(maker: str, folder: Path, config: GenerateConfig, count: int, *, workers: int) -> list[Made]:
+    """The first episodes, in order of their ends."""
     made: list[Made] = []
-    todo = list(reversed(plans))
-    with LocalExecutor(maker, folder, workers=workers, recycle_after=len(plans)) as executor:
-        while todo or executor.pending:
-            while todo and executor.has_room:
-                executor.submit(todo.pop())
-            for report in executor.wait(0.2):
-                if isinstance(report, Made):
-                    made.append(report)
-                elif isinstance(report, Raised):
-                    wrong = ConfigError if report.exit_code == ConfigError.exit_code else GenerationError
-                    raise wrong(f"The pilot episode cannot be made: {report.message}")
-                else:
-                    raise GenerationError(f"The pilot episode cannot be made: {report.reason}.")
+    plans = [EpisodePlan(config=config, episode_index=index) for index in range(count)]
+    with LocalExecutor(maker, folder, workers=workers, recycle_after=count) as executor:
+        for report in executor.carry_out(plans):
+            if isinstance(report, Raised):
+                raise report.error(f"The pilot episode cannot be made: {report.message}")
+            if isinstance(report, Lost):
+                raise GenerationError(f"The pilot episode cannot be made: {report.reason}.")
+            made.append(report)
     return made
 
 
@@ -131,11 +121,3 @@ def _added_to_dataset(recordings: Sequence[Path], folder: Path) -> int:
         export_lerobot(recordings[:count], dataset, options)
         sizes.append(sum(path.stat().st_size for path in dataset.rglob("*") if path.is_file()))
     return max(0, sizes[-1] - sizes[-2])
-
-
-def _existing(path: Path) -> Path:
-    """The nearest folder above a path that exists."""
-    path = path.absolute()
-    while not path.exists():
-        path = path.parent
-    return path

@@ -5,15 +5,17 @@ from __future__ import annotations
 import errno
 import importlib
 import traceback
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, Self
 
 import psutil
 
 from demorec.config import EpisodePlan
-from demorec.errors import DemorecError, error_chain
+from demorec.errors import ConfigError, DemorecError, GenerationError, error_chain
 from demorec.runs.run_file import Attempt
 
 Maker = Callable[[EpisodePlan, Path], Attempt]
@@ -25,6 +27,7 @@ MAKE_EPISODE = "demorec.generate.worker:make_episode"
 _THREAD_SETTINGS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 SINGLE_THREADED = dict.fromkeys(_THREAD_SETTINGS, "1")
 """Environment of a worker: a worker is one core, so that N workers take N cores and not N times N threads."""
+_POLL_S = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,6 +54,10 @@ class Raised:
     errno: int | None
     exit_code: int
 
+    def error(self, sentence: str) -> DemorecError:
+        """What the driver raises for it."""
+        return (ConfigError if self.exit_code == ConfigError.exit_code else GenerationError)(sentence)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Lost:
@@ -64,7 +71,7 @@ Report = Made | Raised | Lost
 
 
 class Executor(Protocol):
-    """Carries out plans in other processes."""
+    """Carries out plans in other processes; a context manager, which is closed at its end."""
 
     @property
     def workers(self) -> int:
@@ -73,6 +80,7 @@ class Executor(Protocol):
     @property
     def has_room(self) -> bool:
         """Whether `submit` may be called; bounds what is in flight."""
+        return self.pending < self.workers
 
     @property
     def pending(self) -> int:
@@ -90,9 +98,19 @@ class Executor(Protocol):
     def close(self) -> None:
         """End every worker, whatever it does; harmless when called twice."""
 
-    def __enter__(self) -> Executor: ...
+    def __enter__(self) -> Self:
+        return self
 
-    def __exit__(self, *exc: object) -> None: ...
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def carry_out(self, plans: Iterable[EpisodePlan]) -> Iterator[Report]:
+        """Begin plans in their order, as many at a time as there is room for; gives reports in that of their ends."""
+        waiting = deque(plans)
+        while waiting or self.pending:
+            while waiting and self.has_room:
+                self.submit(waiting.popleft())
+            yield from self.wait(_POLL_S)
 
 
 def attempt_episode(maker: str, plan: EpisodePlan, folder: Path) -> Made | Raised:
@@ -118,10 +136,8 @@ def attempt_episode(maker: str, plan: EpisodePlan, folder: Path) -> Made | Raise
 
 def peak_memory() -> int:
     """Largest resident size of this process so far, bytes (the present one where the system does not keep it)."""
-    try:
+    with suppress(OSError):
         for line in Path("/proc/self/status").read_text().splitlines():
             if line.startswith("VmHWM:"):
                 return int(line.split()[1]) * 1024
-    except OSError:
-        pass
     return int(psutil.Process().memory_info().rss)

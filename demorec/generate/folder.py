@@ -7,7 +7,7 @@ import platform
 import sys
 import time
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -20,6 +20,7 @@ from demorec.generate.observer import RunObserver, RunResult
 from demorec.generate.options import RunOptions
 from demorec.generate.plan import differences
 from demorec.generate.survey import Inspector, recordings_of, survey
+from demorec.plain import from_plain, to_plain
 from demorec.processes import available_cores
 from demorec.runs.lock import LOCK_NAME, run_lock
 from demorec.runs.run_file import (
@@ -63,11 +64,6 @@ class AnotherRunError(ConfigError):
         differences, advice, path = self.args
         return f"The output folder holds another run ({differences}): {advice}: {path}"
 
-    def advising(self, advice: str) -> AnotherRunError:
-        """The same with other advice, for a command with other options."""
-        differences, _, path = self.args
-        return AnotherRunError(differences, advice, path)
-
 
 class RunFolder:
     """An opened run. Lines are saved at intervals: one that a crash loses is read back from its recording.
@@ -85,6 +81,7 @@ class RunFolder:
         self._attempts = {(a.episode_index, a.attempt): a for a in run.known}
         self._made: list[Attempt] = []
         self._peak_worker_bytes = 0
+        self._earlier = run.sessions
         self._session = RunSession(started=_now(), machine=machine())
         self._has_session = False
         self._started = time.monotonic()
@@ -130,10 +127,7 @@ class RunFolder:
             peak_worker_bytes=self._peak_worker_bytes,
             peak_driver_bytes=peak_memory(),
         )
-        sessions = self.run.sessions
-        if self._has_session:
-            earlier = sessions[:-1] if sessions and sessions[-1].started == self._session.started else sessions
-            sessions = (*earlier, self._session)
+        sessions = (*self._earlier, self._session) if self._has_session else self._earlier
         self.run = replace(self.run, sessions=sessions).with_attempts(self._attempts.values())
         try:
             save_run_file(self.run, self.path)
@@ -211,10 +205,6 @@ def _would_replace(path: Path) -> bool:
     return any(not part.is_dir() or any(files_below(part)) for part in parts)
 
 
-def _holds_a_run(path: Path) -> bool:
-    return (path / RUN_NAME).exists() or bool(recordings_of(path))
-
-
 def _begin_or_continue(path: Path, asked: RunFile, *, progress: RunObserver, inspect: Inspector) -> RunFolder:
     """Bring the folder and its run.json to what is known now."""
     run, damage = _known_run(path, asked, inspect=inspect)
@@ -226,10 +216,10 @@ def _begin_or_continue(path: Path, asked: RunFile, *, progress: RunObserver, ins
     with _told_as_unusable(path):
         for name in (EPISODES, FAILED, UNFINISHED):
             (path / name).mkdir(exist_ok=True)
-        found = survey(path, run, inspect=inspect, progress=progress.verifying)
-    for file, reason in found.set_aside.items():
+        attempts, set_aside = survey(path, run, inspect=inspect, progress=progress.verifying)
+    for file, reason in set_aside.items():
         progress.says(f"{file} was moved to {UNFINISHED}/: {reason}.")
-    run = run.with_attempts(found.attempts)
+    run = run.with_attempts(attempts)
     if run.beyond:
         more = len({line.episode_index for line in run.beyond})
         progress.says(
@@ -270,7 +260,7 @@ def _known_run(path: Path, asked: RunFile, *, inspect: Inspector) -> tuple[RunFi
     recordings = recordings_of(path)
     if run is asked and recordings:
         run = _run_of_recordings(recordings, asked, inspect)
-    different = differences(run, asked.config, asked.versions)
+    different = differences(to_plain(run.config), run.versions, to_plain(asked.config), asked.versions)
     if different and not recordings and not any(line.file for line in run.known):
         return asked, damage
     if different:
@@ -283,8 +273,6 @@ def _known_run(path: Path, asked: RunFile, *, inspect: Inspector) -> tuple[RunFi
 
 def _run_of_recordings(recordings: Iterable[Path], asked: RunFile, inspect: Inspector) -> RunFile:
     """The run that the first readable recording belongs to; the survey looks at each of them."""
-    from demorec.plain import from_plain
-
     for file in recordings:
         try:
             found = inspect(file)
@@ -308,7 +296,7 @@ def _told_as_unusable(path: Path) -> Iterator[None]:
 
 
 def _refuse_strangers(path: Path) -> None:
-    if not path.is_dir() or _holds_a_run(path):
+    if not path.is_dir() or (path / RUN_NAME).exists() or recordings_of(path):
         return
     strangers = sorted(p.name for p in path.iterdir() if p.name not in (*PARTS, LOCK_NAME, f"{RUN_NAME}.part"))
     if strangers:
@@ -322,10 +310,8 @@ def _now() -> str:
 
 
 def _processor() -> str:
-    try:
+    with suppress(OSError):
         for line in Path("/proc/cpuinfo").read_text().splitlines():
             if line.startswith("model name"):
                 return line.split(":", 1)[1].strip()
-    except OSError:
-        pass
     return platform.processor() or platform.machine()

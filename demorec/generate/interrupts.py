@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from types import FrameType
 
 
@@ -24,31 +24,26 @@ class Interrupts:
 
 @contextmanager
 def catch_interrupts() -> Iterator[Interrupts]:
-    """Catch SIGINT and SIGTERM inside; leaves them alone outside the main thread, where Python cannot catch them."""
+    """Catch SIGINT and SIGTERM inside."""
     interrupts = Interrupts()
-    if threading.current_thread() is not threading.main_thread():
+    with _handled(interrupts.handle, signal.SIGINT, signal.SIGTERM):
         yield interrupts
-        return
-    before = {number: signal.signal(number, interrupts.handle) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield interrupts
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+
+
+def terminate_as_interrupt() -> AbstractContextManager[None]:
+    """Inside, SIGTERM raises KeyboardInterrupt as Ctrl-C does, so that every `finally` runs."""
+    return _handled(signal.default_int_handler, signal.SIGTERM)
 
 
 @contextmanager
-def terminate_as_interrupt() -> Iterator[None]:
-    """Inside, SIGTERM raises KeyboardInterrupt as Ctrl-C does, so that every `finally` runs."""
+def _handled(handler: Callable[[int, FrameType | None], None], *numbers: signal.Signals) -> Iterator[None]:
+    """Handle signals like this inside; leaves them alone outside the main thread, where Python cannot catch them."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-
-    def raise_interrupt(number: int, frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, raise_interrupt)
+    before = {number: signal.signal(number, handler) for number in numbers}
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, usual in before.items():
+            signal.signal(number, usual)

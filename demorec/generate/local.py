@@ -19,7 +19,7 @@ from pathlib import Path
 from types import FrameType
 
 from demorec.config import EpisodePlan
-from demorec.generate.executor import SINGLE_THREADED, Lost, Report, attempt_episode
+from demorec.generate.executor import SINGLE_THREADED, Executor, Lost, Report, attempt_episode
 from demorec.processes import SPAWN
 
 _OF_THE_GROUP = frozenset({signal.SIGINT, signal.SIGTERM})
@@ -39,7 +39,7 @@ class _Worker:
     given: int = 0
 
 
-class LocalExecutor:
+class LocalExecutor(Executor):
     """A fixed number of worker processes, started when they are needed, replaced when they die or have grown old.
 
     Args:
@@ -61,11 +61,6 @@ class LocalExecutor:
     def workers(self) -> int:
         """Number of processes."""
         return self._num_workers
-
-    @property
-    def has_room(self) -> bool:
-        """Whether a worker is idle or yet to be started."""
-        return self.pending < self._num_workers
 
     @property
     def pending(self) -> int:
@@ -123,12 +118,6 @@ class LocalExecutor:
             worker.pipe.close()
         self._live.clear()
         self._retired.clear()
-
-    def __enter__(self) -> LocalExecutor:
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        self.close()
 
     def _start(self) -> _Worker:
         ours, theirs = SPAWN.Pipe()

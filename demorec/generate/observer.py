@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 from demorec.runs.run_file import Attempt, RunFile, RunSession
 
 
-class RunObserver(Protocol):
-    """Told how a run goes; every method does nothing by default in `NoProgress`."""
+class RunObserver:
+    """Told how a run goes; does nothing itself."""
 
     def verifying(self, done: int, total: int) -> None:
         """Recordings of an earlier session are being verified."""
@@ -23,22 +22,6 @@ class RunObserver(Protocol):
 
     def says(self, message: str) -> None:
         """Something that a person should know."""
-
-
-class NoProgress:
-    """Says nothing."""
-
-    def verifying(self, done: int, total: int) -> None:
-        """Nothing."""
-
-    def started(self, run: RunFile, workers: int) -> None:
-        """Nothing."""
-
-    def ended(self, attempt: Attempt) -> None:
-        """Nothing."""
-
-    def says(self, message: str) -> None:
-        """Nothing."""
 
 
 @dataclass(frozen=True, kw_only=True)

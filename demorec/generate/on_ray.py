@@ -17,7 +17,8 @@ from typing import Any
 
 from demorec.config import EpisodePlan
 from demorec.errors import ConfigError, GenerationError, MissingDependencyError, in_words
-from demorec.generate.executor import SINGLE_THREADED, Lost, Report, attempt_episode
+from demorec.generate.executor import SINGLE_THREADED, Executor, Lost, Report, attempt_episode
+from demorec.generate.options import RunOptions
 from demorec.processes import available_cores
 from demorec.runs.run_file import RUN_NAME
 
@@ -36,7 +37,7 @@ _RECOUNT_S = 5.0
 """How often the cluster is asked for its size."""
 
 
-class RayExecutor:
+class RayExecutor(Executor):
     """Attempts as Ray tasks on the cluster of `connected`.
 
     Bounded in flight by the size of the cluster, which may change while the run works.
@@ -44,35 +45,26 @@ class RayExecutor:
     Args:
         maker: What a worker does with a plan, as "module:function".
         folder: Of the run; the workers must see it under the same path.
-        workers: Attempts at the same time; None: as many as the cluster has room for.
-        cpus_per_worker, gpus_per_worker: That each attempt reserves.
-        recycle_after: Attempts after which Ray replaces a worker process.
+        options: How many attempts at the same time, what each of them reserves, and after how many of them Ray replaces
+            a worker process.
 
     Raises:
         ConfigError: The cluster has no room for a worker.
     """
 
-    def __init__(
-        self,
-        maker: str,
-        folder: Path,
-        *,
-        workers: int | None,
-        cpus_per_worker: float,
-        gpus_per_worker: float,
-        recycle_after: int,
-    ) -> None:
+    def __init__(self, maker: str, folder: Path, options: RunOptions) -> None:
         self._maker = maker
         self._folder = str(folder)
-        self._asked = workers
-        self._needs = {"CPU": cpus_per_worker, "GPU": gpus_per_worker}
+        self._asked = options.workers
+        cpus, gpus = options.cpus_per_worker, options.gpus_per_worker
+        self._needs = {"CPU": cpus, "GPU": gpus}
         self._pending: dict[Any, EpisodePlan] = {}
         self._counted_at = -1e9
         self._size = 0
         self._task = ray.remote(
-            num_cpus=cpus_per_worker,
-            num_gpus=gpus_per_worker,
-            max_calls=recycle_after,
+            num_cpus=cpus,
+            num_gpus=gpus,
+            max_calls=options.recycle_after,
             max_retries=0,
             runtime_env={"env_vars": SINGLE_THREADED},
         )(_attempt)
@@ -81,8 +73,7 @@ class RayExecutor:
             self.close()
             raise ConfigError(
                 f"The Ray cluster has {have.get('CPU', 0):g} CPUs and {have.get('GPU', 0):g} GPUs, too few for one "
-                f"worker with {cpus_per_worker:g} CPUs and {gpus_per_worker:g} GPUs: lower --cpus-per-worker or "
-                "--gpus-per-worker."
+                f"worker with {cpus:g} CPUs and {gpus:g} GPUs: lower --cpus-per-worker or --gpus-per-worker."
             )
 
     @property
@@ -143,12 +134,6 @@ class RayExecutor:
             ray.cancel(reference, force=True)
         self._pending.clear()
 
-    def __enter__(self) -> RayExecutor:
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        self.close()
-
 
 def _attempt(maker: str, plan: EpisodePlan, folder: str) -> Report:
     """What runs on a node."""
@@ -175,27 +160,21 @@ def connected(address: str, workers: int | None) -> Iterator[None]:
     if ray.is_initialized():
         yield
         return
-    _connect(address, workers or available_cores())
-    try:
-        yield
-    finally:
-        ray.shutdown()
-
-
-def _connect(address: str, cores: int) -> None:
     options: dict[str, Any] = {"logging_level": logging.ERROR, "log_to_driver": False}
+    if address == "local":
+        cores = workers or available_cores()
+        options |= {"num_cpus": cores, "object_store_memory": _STORE_BYTES, "include_dashboard": False}
     _knock(address)
     try:
-        if address == "local":
-            ray.init(
-                address="local", num_cpus=cores, object_store_memory=_STORE_BYTES, include_dashboard=False, **options
-            )
-        else:
-            ray.init(address=address, **options)
+        ray.init(address=address, **options)
     except Exception as error:  # Ray raises a bare Exception when a node of its own does not come up in time
         ray.shutdown()
         place = "on this machine cannot be started" if address == "local" else f"at {address!r} cannot be reached"
         raise ConfigError(f"The Ray cluster {place}: {_last_line(error)}") from error
+    try:
+        yield
+    finally:
+        ray.shutdown()
 
 
 def _knock(address: str) -> None:

@@ -48,18 +48,10 @@ class RunOptions:
         check_option("recycle_after", self.recycle_after, 1, 1_000_000)
         check_option("cpus_per_worker", self.cpus_per_worker, 0.01, 1024)
         check_option("gpus_per_worker", self.gpus_per_worker, 0, 64)
-        if self.executor == "local":
-            given = [
-                name
-                for name, value, default in (
-                    ("--address", self.address, "local"),
-                    ("--cpus-per-worker", self.cpus_per_worker, 1.0),
-                    ("--gpus-per-worker", self.gpus_per_worker, 0.0),
-                )
-                if value != default
-            ]
-            if given:
-                raise ConfigError(f"{given[0]} is for Ray: add --executor ray, or leave it out.")
+        for name in ("address", "cpus_per_worker", "gpus_per_worker"):
+            if self.executor == "local" and getattr(self, name) != getattr(RunOptions, name):
+                flag = f"--{name.replace('_', '-')}"
+                raise ConfigError(f"{flag} is for Ray: add --executor ray, or leave it out.")
         if self.repo_id is not None:
             check_repo_id(self.repo_id)
             if not self.export:

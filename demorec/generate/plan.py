@@ -6,8 +6,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
-from demorec.config import EpisodePlan, GenerateConfig
-from demorec.plain import to_plain
+from demorec.config import EpisodePlan
 from demorec.runs.run_file import Attempt, RunFile
 from demorec.safety.own_versions import version_differences
 
@@ -23,55 +22,51 @@ class Schedule:
     """
 
     def __init__(self, run: RunFile, *, episodes: Iterable[int] | None = None) -> None:
-        self._config = run.config
-        self._versions = run.versions
+        self._run = run
         self._known = {(a.episode_index, a.attempt): a.success for a in run.attempts}
         self._success = {a.episode_index: a.attempt for a in run.successes}
-        self._again: deque[EpisodePlan] = deque()
         self._episodes = iter(range(run.num_episodes) if episodes is None else episodes)
-        self._upcoming: deque[EpisodePlan] = deque()
+        self._waiting: deque[EpisodePlan] = deque()
 
     def take(self) -> EpisodePlan | None:
         """The next attempt, or None when none is due now (one may be after another has failed)."""
-        if self._again:
-            return self._again.popleft()
-        while not self._upcoming:
+        while not self._waiting:
             index = next(self._episodes, None)
             if index is None:
                 return None
-            self._upcoming.extend(self._due(index))
-        return self._upcoming.popleft()
+            self._waiting.extend(self._due(index))
+        return self._waiting.popleft()
 
     def give_back(self, plan: EpisodePlan) -> None:
         """This attempt was not carried out: it comes next."""
-        self._again.appendleft(plan)
+        self._waiting.appendleft(plan)
 
     def report(self, attempt: Attempt) -> None:
         """An attempt has ended; after a failure the next one is due, up to the bound."""
         index = attempt.episode_index
         self._known[index, attempt.attempt] = attempt.success
         if not attempt.success and index not in self._success:
-            self._again.extend(self._due(index))
+            self._waiting.extend(self._due(index))
 
     def _due(self, index: int) -> Iterator[EpisodePlan]:
         """Attempts that must be made now: the first unknown one, or those missing before a known success."""
         success = self._success.get(index)
-        for number in range(self._config.max_attempts if success is None else success):
+        config, versions = self._run.config, self._run.versions
+        for number in range(config.max_attempts if success is None else success):
             if (index, number) not in self._known:
-                yield self._plan(index, number)
+                yield EpisodePlan(config=config, episode_index=index, attempt=number, versions=versions)
                 if success is None:
                     return
 
-    def _plan(self, index: int, number: int) -> EpisodePlan:
-        return EpisodePlan(config=self._config, episode_index=index, attempt=number, versions=self._versions)
 
-
-def differences(before: RunFile, config: GenerateConfig, versions: Mapping[str, str]) -> tuple[str, ...]:
-    """One line for each value of config and versions in which a run differs from what is asked now."""
-    return (
-        *plain_differences(to_plain(before.config), to_plain(config)),
-        *version_differences(before.versions, versions),
-    )
+def differences(
+    there: Mapping[str, Any],
+    there_versions: Mapping[str, str],
+    here: Mapping[str, Any],
+    here_versions: Mapping[str, str],
+) -> tuple[str, ...]:
+    """One line for each value in which two configs, as plain data, and their versions differ."""
+    return (*plain_differences(there, here), *version_differences(there_versions, here_versions))
 
 
 def plain_differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> tuple[str, ...]:

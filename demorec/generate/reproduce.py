@@ -103,7 +103,8 @@ def reproduce(
     try:
         result = generate(original.config, replace(options, num_episodes=original.num_episodes), progress=progress)
     except AnotherRunError as error:
-        raise error.advising("choose another --out") from error
+        differences, _, path = error.args
+        raise AnotherRunError(differences, "choose another --out", path) from error
     if result.interrupted:
         return result
     if original.export is None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import errno
 import time
+from collections import Counter
 from collections.abc import Iterable
 from contextlib import ExitStack
 from pathlib import Path
@@ -18,7 +19,7 @@ from demorec.generate.executor import MAKE_EPISODE, Executor, Lost, Made, Raised
 from demorec.generate.folder import RunFolder, open_run
 from demorec.generate.interrupts import catch_interrupts
 from demorec.generate.local import LocalExecutor
-from demorec.generate.observer import NoProgress, RunObserver, RunResult
+from demorec.generate.observer import RunObserver, RunResult
 from demorec.generate.options import RunOptions
 from demorec.generate.plan import Schedule
 from demorec.generate.survey import Inspector
@@ -33,6 +34,7 @@ GRACE_S = 3.0
 """How long current episodes may go on after the first Ctrl-C."""
 _POLL_S = 0.2
 _MORE_MEMORY = "try fewer --workers or a machine with more memory"
+_SOUND_STORAGE = "see whether the storage of the output folder is sound, then run the same command again"
 _REFUSED = {
     errno.ENOSPC: "the disk is full",
     errno.EDQUOT: "the quota is used up",
@@ -69,8 +71,10 @@ def generate(
         GenerationError: The run cannot go on; everything finished is kept.
         KeyboardInterrupt: At the second Ctrl-C.
     """
-    progress = progress or NoProgress()
-    _refuse_impossible(config, options)
+    from demorec.loop import load_task
+
+    progress = progress or RunObserver()
+    load_task(config)  # which raises what the first worker would raise, before anything is written
     with ExitStack() as stack:
         if options.executor == "ray":
             from demorec.generate.on_ray import connected
@@ -97,39 +101,15 @@ def generate(
         return folder.result(interrupted=interrupted)
 
 
-def _refuse_impossible(config: GenerateConfig, options: RunOptions) -> None:
-    """Raise what the first worker would raise, before anything is written."""
-    from demorec.loop import load_task
-
-    load_task(config)
-
-
 def make_executor(options: RunOptions, folder: Path, run: RunFile, maker: str) -> Executor:
     """The executor that the options name; a context manager."""
     if options.executor == "ray":
         from demorec.generate.on_ray import RayExecutor
 
-        return RayExecutor(
-            maker,
-            folder,
-            workers=options.workers,
-            cpus_per_worker=options.cpus_per_worker,
-            gpus_per_worker=options.gpus_per_worker,
-            recycle_after=options.recycle_after,
-        )
+        return RayExecutor(maker, folder, options)
     missing = run.num_episodes - len(run.successes)
-    return LocalExecutor(
-        maker,
-        folder,
-        workers=max(1, min(options.workers or available_cores(), missing)),
-        recycle_after=options.recycle_after,
-    )
-
-
-def _advice(number: int) -> str:
-    if number == errno.ENOMEM:
-        return _MORE_MEMORY
-    return "see whether the storage of the output folder is sound, then run the same command again"
+    workers = max(1, min(options.workers or available_cores(), missing))
+    return LocalExecutor(maker, folder, workers=workers, recycle_after=options.recycle_after)
 
 
 class _Driver:
@@ -140,7 +120,7 @@ class _Driver:
         self._schedule = schedule
         self._executor = executor
         self._progress = progress
-        self._losses: dict[tuple[int, int], int] = {}
+        self._losses: Counter[tuple[int, int]] = Counter()
 
     def work(self) -> bool:
         """Until nothing is due any more; returns whether the user has interrupted it."""
@@ -150,7 +130,7 @@ class _Driver:
                     self._executor.submit(plan)
                 if not self._executor.pending:
                     return False
-                self._handle_next(_POLL_S)
+                self._handle_next()
             self._progress.says(
                 f"Interrupted: the current episodes may end within {GRACE_S:.0f} s (Ctrl-C again ends at once)."
             )
@@ -166,8 +146,8 @@ class _Driver:
                 if isinstance(report, Made):
                     self._made(report)
 
-    def _handle_next(self, timeout_s: float) -> None:
-        for report in self._executor.wait(timeout_s):
+    def _handle_next(self) -> None:
+        for report in self._executor.wait(_POLL_S):
             if isinstance(report, Made):
                 self._made(report)
             elif isinstance(report, Lost):
@@ -182,7 +162,7 @@ class _Driver:
 
     def _again(self, plan: EpisodePlan, reason: str, advice: str) -> None:
         key = (plan.episode_index, plan.attempt)
-        self._losses[key] = self._losses.get(key, 0) + 1
+        self._losses[key] += 1
         self._folder.lost_workers += 1
         if self._losses[key] >= MAX_LOSSES:
             raise GenerationError(
@@ -200,11 +180,11 @@ class _Driver:
                 f"command again. {self._folder.kept}"
             )
         if report.errno is not None and report.exit_code != ConfigError.exit_code:
-            self._again(report.plan, report.message.rstrip(".") or report.kind, _advice(report.errno))
+            advice = _MORE_MEMORY if report.errno == errno.ENOMEM else _SOUND_STORAGE
+            self._again(report.plan, report.message.rstrip(".") or report.kind, advice)
             return
         if report.exit_code:
-            wrong = ConfigError if report.exit_code == ConfigError.exit_code else GenerationError
-            raise wrong(
+            raise report.error(
                 f"Episode {report.plan.episode_index} cannot be made: {report.message.rstrip('.')}. {self._folder.kept}"
             )
         place = self._folder.path / UNFINISHED / f"error_episode_{report.plan.episode_index:06d}.txt"

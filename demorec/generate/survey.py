@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 from demorec.errors import DemorecError, in_words, resource_error, without_path
-from demorec.generate.plan import plain_differences
+from demorec.generate.plan import differences
 from demorec.plain import to_plain
-from demorec.runs.recordings import Inspected, inspect_recording
+from demorec.runs.recordings import Inspected
 from demorec.runs.run_file import (
     EPISODES,
     FAILED,
@@ -21,23 +21,9 @@ from demorec.runs.run_file import (
     sha256_of,
     sync_folder,
 )
-from demorec.safety.own_versions import version_differences
 
 Inspector = Callable[[Path], Inspected]
 """Reads all of a recording; DemorecError or OSError when it is none."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Survey:
-    """What a folder holds of a run.
-
-    Attributes:
-        attempts: Those whose recordings are there and sound, and those that failed without one.
-        set_aside: file -> why it was moved to unfinished/.
-    """
-
-    attempts: tuple[Attempt, ...]
-    set_aside: Mapping[str, str]
 
 
 def recordings_of(folder: Path) -> list[Path]:
@@ -46,15 +32,15 @@ def recordings_of(folder: Path) -> list[Path]:
 
 
 def survey(
-    folder: Path,
-    run: RunFile,
-    *,
-    inspect: Inspector = inspect_recording,
-    progress: Callable[[int, int], None] = lambda done, total: None,
-) -> Survey:
+    folder: Path, run: RunFile, *, inspect: Inspector, progress: Callable[[int, int], None]
+) -> tuple[list[Attempt], dict[str, str]]:
     """Verify every recording of a folder against run.json, or read it in full where run.json does not know it.
 
     What is damaged, unfinished, of another run or no file at all is moved to unfinished/; nothing is deleted.
+
+    Returns:
+        The attempts whose recordings are there and sound, and those that failed without one; and file -> why it was
+        moved to unfinished/.
 
     Raises:
         ResourceError: This machine cannot read one of them now; nothing is moved for that.
@@ -76,9 +62,10 @@ def survey(
             if (lack := resource_error(error, path)) is not None:
                 raise lack from error
             set_aside[file] = without_path(error, path) if isinstance(error, DemorecError) else in_words(error)
-            _set_aside(path, folder)
+            path.rename(free_name(folder / UNFINISHED / path.name))
+            sync_folder(path.parent)
         progress(number + 1, len(files))
-    return Survey(attempts=tuple(kept), set_aside=set_aside)
+    return kept, set_aside
 
 
 def _adopt(path: Path, run: RunFile, inspect: Inspector) -> Attempt:
@@ -88,15 +75,6 @@ def _adopt(path: Path, run: RunFile, inspect: Inspector) -> Attempt:
     name = recording_name(line.episode_index, line.attempt, success=line.success)
     if (path.parent.name, path.name) != (place, name):
         raise DemorecError(f"it holds episode {line.episode_index}, attempt {line.attempt}")
-    different = (
-        *plain_differences(found.config, to_plain(run.config)),
-        *version_differences(found.versions, run.versions),
-    )
-    if different:
+    if different := differences(found.config, found.versions, to_plain(run.config), run.versions):
         raise DemorecError(f"it is of another run ({'; '.join(different)})")
     return replace(line, file=f"{place}/{name}")
-
-
-def _set_aside(path: Path, folder: Path) -> None:
-    path.rename(free_name(folder / UNFINISHED / path.name))
-    sync_folder(path.parent)

@@ -13,18 +13,17 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
+from typing import Any
 
 from demorec.config import EpisodePlan
 from demorec.errors import ConfigError, SceneError
-from demorec.geometry import Array
 from demorec.loop import ScriptAgent, Session, Workshop, prepare
 from demorec.recording import EpisodeWriter
-from demorec.render import Renderer, RenderSetup
 from demorec.runs.recordings import inspect_recording
 from demorec.runs.run_file import EPISODES, FAILED, STARTING, UNFINISHED, Attempt, recording_name, sync_folder
 from demorec.safety.own_versions import version_differences
-from demorec.scene.episode import CameraImages, Frame, Outcome
 
 SIMULATION, RENDERING, RECORDING = "simulation", "rendering", "recording"
 STAGES = (SIMULATION, RENDERING, RECORDING)
@@ -63,9 +62,10 @@ def _record(plan: EpisodePlan, path: Path, clock: _Stopwatch) -> None:
     episode = prepare(plan)
     _check_versions(plan, episode.info.versions)
     world, renderer = _workshop.equip(episode.info)
-    session = Session.of_episode(world, episode, _TimedRenderer(renderer, clock) if renderer else None)
+    timed: Any = _Timed(renderer, clock, RENDERING) if renderer else None
+    session = Session.of_episode(world, episode, timed)
     with EpisodeWriter(path, episode.info, video=plan.config.video) as writer:
-        recording = _TimedWriter(writer, clock)
+        recording = _Timed(writer, clock, RECORDING)
         for frame in session.run(ScriptAgent(episode)):
             recording.write(frame)
         recording.finish(session.outcome)
@@ -115,59 +115,24 @@ class _Stopwatch:
         return before
 
 
-class _TimedRenderer:
-    """A renderer whose CPU seconds are counted."""
+class _Timed:
+    """A renderer or writer whose methods count for a stage."""
 
-    def __init__(self, renderer: Renderer, clock: _Stopwatch) -> None:
-        self._renderer = renderer
-        self._clock = clock
+    def __init__(self, timed: object, clock: _Stopwatch, stage: str) -> None:
+        self._timed, self._counted = timed, clock.stage(stage)
 
-    def setup(self, setup: RenderSetup) -> None:
-        with self._clock.stage(RENDERING):
-            self._renderer.setup(setup)
-
-    def render(self, poses: Array) -> dict[str, CameraImages]:
-        with self._clock.stage(RENDERING):
-            return self._renderer.render(poses)
-
-    def close(self) -> None:
-        """Left to the workshop, which owns the renderer."""
-
-    def __enter__(self) -> Renderer:
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        self.close()
-
-
-class _TimedWriter:
-    """A writer whose CPU seconds are counted."""
-
-    def __init__(self, writer: EpisodeWriter, clock: _Stopwatch) -> None:
-        self._writer = writer
-        self._clock = clock
-
-    def write(self, frame: Frame) -> None:
-        with self._clock.stage(RECORDING):
-            self._writer.write(frame)
-
-    def finish(self, outcome: Outcome) -> None:
-        with self._clock.stage(RECORDING):
-            self._writer.finish(outcome)
+    def __getattr__(self, name: str) -> Any:
+        return self._counted(getattr(self._timed, name))
 
 
 @contextmanager
 def _scratch_folder(folder: Path) -> Iterator[Path]:
     """A folder that no other attempt uses; taken away when it is empty in the end."""
-    base = f"{platform.node()}-{os.getpid()}"
-    number = 0
-    while True:
-        scratch = folder / UNFINISHED / f"{base}-{number}"
-        try:
+    for number in count():
+        scratch = folder / UNFINISHED / f"{platform.node()}-{os.getpid()}-{number}"
+        with suppress(FileExistsError):  # left by a dead process of the same number
             scratch.mkdir()
             break
-        except FileExistsError:  # left by a dead process of the same number
-            number += 1
     try:
         yield scratch
     finally:

@@ -186,4 +186,4 @@ def make_renderer(info: EpisodeInfo) -> AbstractContextManager[Renderer | None]:
     """
     if not info.scene.cameras:
         return nullcontext(None)
-    return RENDERERS.load(str(info.config["renderer"]))()
+    return RENDERERS.load(str(info.config.get("renderer", "raster")))()

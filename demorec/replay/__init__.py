@@ -6,8 +6,7 @@ answers how robust a demonstration is (a lower command rate, noise, delay) and w
 float32 actions of any kind, still does the task.
 """
 
-from demorec.replay.datasets import dataset_demonstrations
-from demorec.replay.demonstration import Demonstration, ReplayOptions, open_file
+from demorec.replay.demonstration import Demonstration, ReplayOptions, dataset_demonstrations, open_file
 from demorec.replay.drive import ReplayReport, is_as_recorded
 from demorec.replay.many import replay_all
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain, repeat
 
 import numpy as np
 
@@ -151,9 +152,9 @@ class DemonstrationAgent:
 
     def decide(self, world: World) -> Iterator[Decision]:
         """See `demorec.loop.Agent`; label, phase and events are those of the recorded frame, if there is one."""
-        recorded = self._demonstration.recorded
-        for step, command in enumerate(self._sent(world)):
-            yield _labelled(command, recorded[step]) if step < len(recorded) else _unlabelled(command)
+        recorded = chain(self._demonstration.recorded, repeat(None))
+        for command in self._sent(world):
+            yield _decision(command, next(recorded))
 
     def _sent(self, world: World) -> Iterator[Action]:
         d, options = self._demonstration, self._options
@@ -182,7 +183,9 @@ class DemonstrationAgent:
         return ("replay", failed[0]) if failed else ("", "")
 
 
-def _labelled(command: Action, recorded: Frame) -> Decision:
+def _decision(command: Action, recorded: Frame | None) -> Decision:
+    if recorded is None:
+        return Decision(action=command, command=command)
     return Decision(
         action=recorded.action,
         command=command,
@@ -190,10 +193,6 @@ def _labelled(command: Action, recorded: Frame) -> Decision:
         events=recorded.events,
         is_deliberate_miss=recorded.is_deliberate_miss,
     )
-
-
-def _unlabelled(command: Action) -> Decision:
-    return Decision(action=command, command=command)
 
 
 def _noisy(command: Action, world: World, noise: Array) -> Action:
@@ -209,15 +208,14 @@ def _noisy(command: Action, world: World, noise: Array) -> Action:
 def _placed(session: Session, d: Demonstration) -> Iterator[Frame]:
     """The recorded states one after the other, without physics."""
     session.reset()
-    for step in range(d.num_steps):
+    for step, recorded in zip(range(d.num_steps), chain(d.recorded, repeat(None)), strict=False):
         session.place(
             step,
             joint_position=d.joint_position[step],
             object_poses={name: pose_of(poses[step]) for name, poses in d.object_poses.items()},
         )
-        recorded = d.recorded[step] if step < len(d.recorded) else None
-        hold = session.world.hold()
-        yield session.frame(_unlabelled(hold) if recorded is None else _labelled(recorded.command, recorded))
+        command = session.world.hold() if recorded is None else recorded.command
+        yield session.frame(_decision(command, recorded))
 
 
 def _recorded_outcome(d: Demonstration, world: World) -> Outcome:

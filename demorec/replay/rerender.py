@@ -173,8 +173,8 @@ def new_view(info: EpisodeInfo, options: RerenderOptions) -> SceneView:
             root_seed=options.looks, episode_index=info.episode_index, attempt=info.attempt, purpose="looks"
         )
         scene = vary_looks(scene, resolve("full", Ranges()), rng)
-    kept = {name: error for name, error in old.true_from_recorded.items() if name in names and name in recorded}
-    kept = {name: error for name, error in kept.items() if name not in options.free_cameras}
+    of_recording = set(names) - options.free_cameras.keys()
+    kept = {name: error for name, error in old.true_from_recorded.items() if name in of_recording}
     return SceneView(scene=scene, true_cameras=tuple(true_cameras), true_from_recorded=kept)
 
 
@@ -222,13 +222,8 @@ def view_painter(renderer: Renderer, view: SceneView, config: Mapping[str, Any])
 def drawing_config(info: EpisodeInfo, options: RerenderOptions) -> dict[str, Any]:
     """The recording's config with what the options change about the pictures."""
     config = dict(info.config)
-    changes = {
-        "renderer": options.renderer,
-        "antialias": options.antialias,
-        "depth": options.depth,
-        "segmentation": options.segmentation,
-        "width": options.width,
-        "height": options.height,
+    same_names = ("renderer", "antialias", "depth", "segmentation", "width", "height")
+    changes = {name: getattr(options, name) for name in same_names} | {
         "video": {**config.get("video", {}), **options.video} if options.video else None,
         "cameras": None if options.cameras is None else list(options.cameras),
     }
@@ -294,14 +289,14 @@ def rerender(
                     world.frame = frame.frame_index
                     writer.write(replace(frame, images=painter.images()))
                 writer.finish(_outcome(recording))
-        compared, differing = _compare(recording, out, options)
+        compared = _compare(recording, out, options)
     return RerenderReport(
         source=source,
         path=out,
         num_frames=columns.num_frames,
         num_pictures=columns.num_frames * len(view.scene.cameras),
-        compared=compared,
-        differing=differing,
+        compared=tuple(compared),
+        differing={name: frame for name, frame in compared.items() if frame is not None},
         was_there=was_there,
     )
 
@@ -331,24 +326,23 @@ def _outcome(recording: Recording) -> Outcome:
     )
 
 
-def _compare(recording: Recording, out: Path, options: RerenderOptions) -> tuple[tuple[str, ...], dict[str, int]]:
-    """The packets of the cameras that were to stay as they were: equal pictures give equal packets."""
+def _compare(recording: Recording, out: Path, options: RerenderOptions) -> dict[str, int | None]:
+    """The packets of the cameras that were to stay as they were: equal pictures give equal packets.
+
+    Returns:
+        Camera -> first frame whose packet differs, or None.
+    """
+    found: dict[str, int | None] = {}
     if options.looks is not None:
-        return (), {}
-    compared, differing = [], {}
+        return found
     with Recording(out) as new:
-        renderer = (recording.info.config.get("renderer"), recording.info.config.get("antialias", True))
-        if renderer != (new.info.config.get("renderer"), new.info.config.get("antialias", True)):
-            return (), {}
+        how, how_now = ((c.get("renderer"), c.get("antialias", True)) for c in (recording.info.config, new.info.config))
+        if how != how_now:
+            return found
         before = {camera.name: camera for camera in recording.info.scene.cameras}
         for camera in new.info.scene.cameras:
-            if before.get(camera.name) != camera or new.video_settings(camera.name) != recording.video_settings(
-                camera.name
-            ):
-                continue
-            compared.append(camera.name)
-            pairs = zip(recording.packets(camera.name), new.packets(camera.name), strict=True)
-            first = next((a.frame_index for a, b in pairs if a.data != b.data), None)
-            if first is not None:
-                differing[camera.name] = first
-    return tuple(compared), differing
+            name = camera.name
+            if before.get(name) == camera and new.video_settings(name) == recording.video_settings(name):
+                pairs = zip(recording.packets(name), new.packets(name), strict=True)
+                found[name] = next((a.frame_index for a, b in pairs if a.data != b.data), None)
+    return found

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -51,12 +51,10 @@ def train(
     with (
         _reading_fast(frame_cache_bytes, on_replaced, expert_only=expert_only, is_frozen=freeze_encoder),
         _freezing(frame_cache_bytes) if freeze_encoder else nullcontext(),
-        _called_as(PROGRAM, arguments),
+        _called_with(arguments),
     ):
         try:
             lerobot_train.main()
-        except SystemExit as ended:  # its parser exits with 1 for some wrong requests and with 2 for others
-            raise SystemExit(2 if ended.code else 0) from None
         except Exception as error:  # whatever a foreign program raises
             if isinstance(error, DemorecError) or resource_error(error) is not None:
                 raise
@@ -88,25 +86,21 @@ def training_config(arguments: Sequence[str]) -> Any:
         from lerobot.policies import factory  # noqa: F401  # which registers the policies' types
     except ImportError as error:
         raise MissingDependencyError("Training", error.name or "lerobot", "pip install 'demorec[train]'") from error
-    with _called_as(PROGRAM, arguments):
+    with _called_with(arguments):
         try:
             return draccus.parse(TrainPipelineConfig, args=list(arguments))
-        except SystemExit as ended:
-            raise SystemExit(2 if ended.code else 0) from None
         except Exception as error:  # whatever a foreign parser raises
             raise ConfigError(f"{PROGRAM} does not take these settings ({type(error).__name__}: {error}).") from error
 
 
-@contextmanager
 def _reading_fast(
     frame_cache_bytes: int, on_replaced: Callable[[], None], *, expert_only: bool, is_frozen: bool
-) -> Iterator[None]:
+) -> AbstractContextManager[None]:
     """LeRobot's factory of datasets makes `FastDataset`s meanwhile."""
     from lerobot.datasets import factory
 
     from demorec.training.dataset import FastDataset
 
-    original = factory.LeRobotDataset
     is_told = False
 
     def open_dataset(*args: Any, **kwargs: Any) -> FastDataset:
@@ -121,15 +115,10 @@ def _reading_fast(
             is_told = True
         return FastDataset(*args, frame_cache_bytes=frame_cache_bytes, expert_only=expert_only, **kwargs)
 
-    factory.LeRobotDataset = open_dataset
-    try:
-        yield
-    finally:
-        factory.LeRobotDataset = original
+    return _replaced(factory, "LeRobotDataset", open_dataset)
 
 
-@contextmanager
-def _freezing(limit_bytes: int) -> Iterator[None]:
+def _freezing(limit_bytes: int) -> AbstractContextManager[None]:
     """Policies that lerobot-train makes have a frozen encoder meanwhile."""
     from lerobot.scripts import lerobot_train
 
@@ -142,19 +131,25 @@ def _freezing(limit_bytes: int) -> Iterator[None]:
         freeze_encoder(policy, num_frames=kwargs["ds_meta"].total_frames, limit_bytes=limit_bytes)
         return policy
 
-    lerobot_train.make_policy = frozen
-    try:
-        yield
-    finally:
-        lerobot_train.make_policy = make_policy
+    return _replaced(lerobot_train, "make_policy", frozen)
 
 
 @contextmanager
-def _called_as(program: str, arguments: Sequence[str]) -> Iterator[None]:
-    """The command line that LeRobot's parser looks at, here and there, by itself."""
-    before = sys.argv
-    sys.argv = [program, *arguments]
+def _called_with(arguments: Sequence[str]) -> Iterator[None]:
+    """The command line that LeRobot's parser looks at, here and there, by itself; it exits with 0 or 2."""
+    try:
+        with _replaced(sys, "argv", [PROGRAM, *arguments]):
+            yield
+    except SystemExit as ended:  # its parser exits with 1 for some wrong requests and with 2 for others
+        raise SystemExit(2 if ended.code else 0) from None
+
+
+@contextmanager
+def _replaced(owner: Any, name: str, value: Any) -> Iterator[None]:
+    """Another value of an attribute meanwhile."""
+    before = getattr(owner, name)
+    setattr(owner, name, value)
     try:
         yield
     finally:
-        sys.argv = before
+        setattr(owner, name, before)

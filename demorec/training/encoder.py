@@ -51,16 +51,21 @@ class KeyframeEncoder(nn.Module):  # type: ignore[misc]
             pictures: Of each camera, (B, 3, H, W), normalised.
             state: (B, S), normalised.
         """
-        seen = [self._pooled(same_size, pictures) for same_size in _by_size(pictures)]
-        of_camera = dict(pair for part in seen for pair in part)
-        encodings = [of_camera[camera] for camera in range(len(pictures))]
+        encodings = self._encodings(pictures)
         together: torch.Tensor = self.together(torch.cat([*encodings, state], dim=1))
         return together, [head(encoding) for head, encoding in zip(self.by_camera, encodings, strict=True)]
 
-    def _pooled(self, cameras: Sequence[int], pictures: Sequence[torch.Tensor]) -> list[tuple[int, torch.Tensor]]:
-        stacked = torch.cat([pictures[camera] for camera in cameras]).contiguous(memory_format=torch.channels_last)
-        maps = self.backbone(stacked)[_FEATURES].mean((2, 3))
-        return list(zip(cameras, maps.chunk(len(cameras)), strict=True))
+    def _encodings(self, pictures: Sequence[torch.Tensor]) -> list[torch.Tensor]:
+        """Of each camera; those whose pictures are of one size go through the network together."""
+        sizes: dict[torch.Size, list[int]] = {}
+        for camera, picture in enumerate(pictures):
+            sizes.setdefault(picture.shape[2:], []).append(camera)
+        found: dict[int, torch.Tensor] = {}
+        for cameras in sizes.values():
+            stacked = torch.cat([pictures[camera] for camera in cameras]).contiguous(memory_format=torch.channels_last)
+            maps = self.backbone(stacked)[_FEATURES].mean((2, 3))
+            found |= zip(cameras, maps.chunk(len(cameras)), strict=True)
+        return [found[camera] for camera in range(len(pictures))]
 
     def weights(self) -> dict[str, torch.Tensor]:
         """Of the ResNet, as ACT's own with frozen normalisation takes them."""
@@ -75,11 +80,3 @@ def loss_of(told: tuple[torch.Tensor, list[torch.Tensor]], targets: torch.Tensor
     for one in by_camera:
         loss = loss + _BY_CAMERA_WEIGHT * nn.functional.l1_loss(one, targets)
     return loss
-
-
-def _by_size(pictures: Sequence[torch.Tensor]) -> list[list[int]]:
-    """Cameras whose pictures are of one size, so that they can go through the network together."""
-    sizes: dict[torch.Size, list[int]] = {}
-    for camera, picture in enumerate(pictures):
-        sizes.setdefault(picture.shape[2:], []).append(camera)
-    return list(sizes.values())

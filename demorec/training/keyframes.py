@@ -73,20 +73,15 @@ def keyframe_targets(
     for k in range(NUM_KEYFRAMES):
         then = keyframes[:, k]
         offset = xyz[then] - xyz
-        in_hand = np.stack(
-            [
-                np.cos(yaw) * offset[:, 0] + np.sin(yaw) * offset[:, 1],
-                np.cos(yaw) * offset[:, 1] - np.sin(yaw) * offset[:, 0],
-            ],
-            axis=1,
-        )
+        x_in_hand = np.cos(yaw) * offset[:, 0] + np.sin(yaw) * offset[:, 1]
+        y_in_hand = np.cos(yaw) * offset[:, 1] - np.sin(yaw) * offset[:, 0]
         for axis, name in enumerate("xyz"):
             columns[f"keyframe_{k}.{name}"] = xyz[then, axis]
             columns[f"keyframe_{k}.from_tcp.{name}"] = offset[:, axis]
             columns[f"keyframe_{k}.from_tcp.near_{name}"] = near_field(offset[:, axis])
-        for axis, name in enumerate("xy"):
-            columns[f"keyframe_{k}.from_tcp.hand_{name}"] = in_hand[:, axis]
-            columns[f"keyframe_{k}.from_tcp.near_hand_{name}"] = near_field(in_hand[:, axis])
+        for name, in_hand in (("x", x_in_hand), ("y", y_in_hand)):
+            columns[f"keyframe_{k}.from_tcp.hand_{name}"] = in_hand
+            columns[f"keyframe_{k}.from_tcp.near_hand_{name}"] = near_field(in_hand)
         for name, angle in (("yaw", yaw[then]), ("from_tcp.yaw", yaw[then] - yaw)):
             columns[f"keyframe_{k}.{name}.sin2"] = np.sin(2 * angle)  # two fingers: half a turn is the same
             columns[f"keyframe_{k}.{name}.cos2"] = np.cos(2 * angle)

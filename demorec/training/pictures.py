@@ -11,29 +11,49 @@ from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from threading import Lock
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
 from lerobot.datasets.video_utils import FrameTimestampError, VideoDecoderCache
 from numpy.typing import NDArray
 
-from demorec.training.frame_cache import DecodedFrame, FrameCache
-from demorec.training.video_file import VideoFile
+from demorec.training.video_file import DecodedFrame, VideoFile
 
 _PYAV_NAMES = ("pyav", "video_reader")
 """LeRobot's names of the decoder; the second is an old one."""
 _OPEN_FILES = 64
 
 
-class Decoder(Protocol):
-    """Finds and decodes frames of a video file by their number in it."""
+class FrameCache:
+    """Decoded frames within a limit of bytes; forgets those that have not been wanted for the longest time."""
 
-    def numbers(self, times_s: NDArray[np.float64]) -> NDArray[np.int64]:
-        """The frames that lie at these times."""
+    def __init__(self, limit_bytes: int) -> None:
+        self._limit = limit_bytes
+        self._held = 0
+        self._frames: OrderedDict[tuple[str, int], DecodedFrame] = OrderedDict()
 
-    def decode(self, numbers: Sequence[int]) -> Iterator[tuple[int, DecodedFrame]]:
-        """The frames of these numbers, which ascend."""
+    @property
+    def num_bytes(self) -> int:
+        """Of the pictures that are held."""
+        return self._held
+
+    def get(self, path: str, number: int) -> DecodedFrame | None:
+        """A frame of a file by its number there; None when it is not held."""
+        frame = self._frames.get((path, number))
+        if frame is not None:
+            self._frames.move_to_end((path, number))
+        return frame
+
+    def put(self, path: str, number: int, frame: DecodedFrame) -> None:
+        """Hold a frame that is not held yet; its picture must own its memory, and nobody may change it."""
+        if frame.picture.nbytes > self._limit:
+            return
+        self._frames[path, number] = frame
+        self._held += frame.picture.nbytes
+        while self._held > self._limit:
+            _, forgotten = self._frames.popitem(last=False)
+            self._held -= forgotten.picture.nbytes
 
 
 class PictureReader:
@@ -87,7 +107,9 @@ class PictureReader:
         chosen = np.take_along_axis(numbers, nearest, 1)
         return [torch.stack([frames[n].picture for n in row]) for row in chosen.tolist()]
 
-    def _frames(self, path: str, decoder: Decoder, numbers: Sequence[int]) -> dict[int, DecodedFrame]:
+    def _frames(
+        self, path: str, decoder: VideoFile | _TorchcodecFile, numbers: Sequence[int]
+    ) -> dict[int, DecodedFrame]:
         held = {number: self._cache.get(path, number) for number in numbers}
         frames = {number: frame for number, frame in held.items() if frame is not None}
         for number, frame in decoder.decode([number for number in numbers if number not in frames]):
@@ -95,7 +117,7 @@ class PictureReader:
             self._cache.put(path, number, frame)
         return frames
 
-    def _decoder(self, path: str, is_depth: bool) -> Decoder:
+    def _decoder(self, path: str, is_depth: bool) -> VideoFile | _TorchcodecFile:
         if self._backend == "torchcodec" and not is_depth:  # which reads no depth, as LeRobot has it
             return _TorchcodecFile(self._torchcodec.get_decoder(path))
         if self._backend not in _PYAV_NAMES and not is_depth:
@@ -110,7 +132,7 @@ class PictureReader:
 
 
 class _TorchcodecFile:
-    """A decoder of torchcodec, opened as LeRobot opens it."""
+    """A decoder of torchcodec, opened as LeRobot opens it, with the methods of `VideoFile`."""
 
     def __init__(self, decoder: Any) -> None:
         self._decoder = decoder

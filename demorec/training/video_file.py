@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
+from typing import NamedTuple
 
 import av
 import numpy as np
@@ -13,7 +14,12 @@ from av.video.reformatter import VideoReformatter
 from lerobot.datasets.video_utils import FrameTimestampError
 from numpy.typing import NDArray
 
-from demorec.training.frame_cache import DecodedFrame
+
+class DecodedFrame(NamedTuple):
+    """A picture and the time in its file, in seconds: (C, H, W), uint8 colours or uint16 codes of depth."""
+
+    picture: torch.Tensor
+    time_s: float
 
 
 class VideoFile:

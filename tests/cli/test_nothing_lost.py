@@ -24,7 +24,7 @@ from demorec.config import GenerateConfig
 from demorec.errors import ConfigError, DemorecError
 from demorec.evaluate.rollouts import Settings, _open
 from demorec.generate import reproduce as reproducing
-from demorec.generate.observer import NoProgress
+from demorec.generate.observer import RunObserver
 from demorec.generate.options import RunOptions
 from demorec.lerobot import ExportOptions
 from demorec.runs.find import EVALUATION_NAME
@@ -575,7 +575,7 @@ def test_reproduce_leaves_another_dataset_alone(place: Path, monkeypatch: pytest
     monkeypatch.setattr(reproducing, "generate", lambda *arguments, **options: result)
     options = RunOptions(out=copy)
     with pytest.raises(ConfigError, match="choose another --out"):
-        reproducing.reproduce(place / "dataset", options, progress=NoProgress())
+        reproducing.reproduce(place / "dataset", options, progress=RunObserver())
     assert files_of(copy) == before
 
 

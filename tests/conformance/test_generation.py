@@ -13,7 +13,7 @@ from support.export import without_verification
 from demorec.cli import generate_dataset_main, main
 from demorec.config import EpisodePlan, GenerateConfig, deciding_versions
 from demorec.generate.export_step import export_run
-from demorec.generate.observer import NoProgress, RunResult
+from demorec.generate.observer import RunObserver, RunResult
 from demorec.generate.options import RunOptions
 from demorec.generate.run import generate
 from demorec.lerobot import ExportOptions, dataset_digest, export_lerobot
@@ -27,7 +27,7 @@ NUM_EPISODES = 3
 
 def make(out: Path, *, workers: int, episodes: list[int] | None = None, num_episodes: int = NUM_EPISODES) -> RunResult:
     options = RunOptions(out=out, num_episodes=num_episodes, workers=workers)
-    return generate(CONFIG, options, progress=NoProgress(), episodes=episodes)
+    return generate(CONFIG, options, progress=RunObserver(), episodes=episodes)
 
 
 @pytest.fixture

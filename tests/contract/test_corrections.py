@@ -79,7 +79,7 @@ def roll_out(folder: Path, policy: Any, rules: TakeOver, *, action: ActionKind) 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(rollouts, "Policy", lambda *args, **kwargs: policy)
         patch.setattr(rollouts, "find_checkpoint", lambda path: path)
-        patch.setattr(rollouts, "_stage", rollouts._Stage())
+        rollouts._stage.cache_clear()
         attempt = make_rollout(EpisodePlan(config=settings.config, episode_index=3), folder)
     return attempt, folder / attempt.file
 

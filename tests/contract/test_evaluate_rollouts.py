@@ -43,7 +43,7 @@ def test_a_rollout_is_recorded_as_it_was_and_replays_to_the_bit(
     policy = Waving()
     monkeypatch.setattr(rollouts, "Policy", lambda *_, **__: policy)
     monkeypatch.setattr(rollouts, "find_checkpoint", lambda path: path)
-    monkeypatch.setattr(rollouts, "_stage", rollouts._Stage())
+    rollouts._stage.cache_clear()
     settings = Settings(
         policy="p",
         policy_type="waving",

@@ -18,7 +18,7 @@ from support.generate import Remembers, expected_attempts, inspect, run_fake
 from demorec.config import GenerateConfig
 from demorec.errors import ConfigError, GenerationError
 from demorec.generate import on_ray
-from demorec.generate.observer import NoProgress, RunResult
+from demorec.generate.observer import RunObserver, RunResult
 from demorec.generate.options import RunOptions
 from demorec.generate.run import generate
 
@@ -28,7 +28,7 @@ REAL = GenerateConfig(seed=5, cameras=("wrist",), width=32, height=32)
 NUM_REAL = 20
 
 
-def run_on_ray(out: Path, *, maker: str, progress: NoProgress | None = None, **options: Any) -> RunResult:
+def run_on_ray(out: Path, *, maker: str, progress: RunObserver | None = None, **options: Any) -> RunResult:
     return generate(
         GenerateConfig(cameras=()),
         RunOptions(out=out, num_episodes=NUM_EPISODES, executor="ray", **options),
@@ -206,7 +206,7 @@ def test_too_large_workers_are_refused(tmp_path: Path, cluster: object) -> None:
 @pytest.mark.parametrize("address", ["127.0.0.1:1", "nowhere.invalid:6379", "127.0.0.1:99999"])
 def test_an_unreachable_cluster_is_told_at_once(tmp_path: Path, address: str) -> None:
     with pytest.raises(ConfigError, match=r"cannot be reached .* give the address that `ray start --head` has printed"):
-        on_ray._connect(address, 1)
+        on_ray._knock(address)
 
 
 def test_an_unreachable_cluster_leaves_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

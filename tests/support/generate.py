@@ -12,7 +12,7 @@ from pathlib import Path
 from demorec.config import GenerateConfig
 from demorec.errors import DemorecError
 from demorec.generate import run as running
-from demorec.generate.observer import NoProgress, RunResult
+from demorec.generate.observer import RunObserver, RunResult
 from demorec.generate.options import RunOptions
 from demorec.generate.run import generate
 from demorec.runs.recordings import Inspected
@@ -31,7 +31,7 @@ def inspect(path: Path) -> Inspected:
         raise DemorecError("it is no recording") from error
 
 
-class Remembers(NoProgress):
+class Remembers(RunObserver):
     """Keeps what it was told."""
 
     def __init__(self) -> None:
@@ -41,7 +41,7 @@ class Remembers(NoProgress):
         self.said.append(message)
 
 
-class Tells(NoProgress):
+class Tells(RunObserver):
     """Prints what it is told."""
 
     def says(self, message: str) -> None:
@@ -58,7 +58,7 @@ def run_fake(
     recycle_after: int = 500,
     overwrite: bool = False,
     export: bool = True,
-    progress: NoProgress | None = None,
+    progress: RunObserver | None = None,
     episodes: list[int] | None = None,
 ) -> RunResult:
     """A run of stand-in recordings."""

@@ -36,10 +36,10 @@ def test_the_size_is_about_that_of_the_run(
     run = make_run(tmp_path / "run", LENGTHS, cameras=cameras)
     files = sorted((run / "episodes").glob("*.mcap"))
 
-    def make(maker: str, folder: Path, plans: list[EpisodePlan], workers: int) -> list[Made]:
-        for file in files[: len(plans)]:
+    def make(maker: str, folder: Path, config: GenerateConfig, count: int, *, workers: int) -> list[Made]:
+        for file in files[:count]:
             (folder / "episodes" / file.name).write_bytes(file.read_bytes())
-        return [made(folder / "episodes" / file.name, folder) for file in files[: len(plans)]]
+        return [made(folder / "episodes" / file.name, folder) for file in files[:count]]
 
     monkeypatch.setattr(estimating, "_make", make)
     options = RunOptions(out=tmp_path / "new", num_episodes=len(LENGTHS), export=exports)

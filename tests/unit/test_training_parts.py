@@ -92,7 +92,8 @@ def test_lists_that_differ_between_chunks_are_left_to_lerobot() -> None:
 def test_the_cache_stays_within_its_limit_and_keeps_the_latest(sizes: list[int], limit: int) -> None:
     import torch
 
-    from demorec.training.frame_cache import DecodedFrame, FrameCache
+    from demorec.training.pictures import FrameCache
+    from demorec.training.video_file import DecodedFrame
 
     cache = FrameCache(limit)
     for number, size in enumerate(sizes):
@@ -107,7 +108,8 @@ def test_the_cache_stays_within_its_limit_and_keeps_the_latest(sizes: list[int],
 def test_what_was_wanted_lately_is_kept() -> None:
     import torch
 
-    from demorec.training.frame_cache import DecodedFrame, FrameCache
+    from demorec.training.pictures import FrameCache
+    from demorec.training.video_file import DecodedFrame
 
     cache = FrameCache(20)
     for number in (0, 1):

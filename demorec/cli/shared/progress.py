@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from tqdm import tqdm
 
 from demorec.cli.shared.output import counted, tell
+from demorec.generate.observer import RunObserver
 
 if TYPE_CHECKING:
     from demorec.runs.run_file import Attempt, RunFile
@@ -108,8 +109,8 @@ class ProgressBar(AbstractContextManager["ProgressBar"]):
         return ", ".join(parts)
 
 
-class RunProgress(AbstractContextManager["RunProgress"]):
-    """How a run goes (`demorec.generate.observer.RunObserver`), one bar after another; a context manager.
+class RunProgress(RunObserver, AbstractContextManager["RunProgress"]):
+    """How a run goes, one bar after another; a context manager.
 
     `watch` is called with every attempt that has ended.
     """

@@ -5,8 +5,9 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import suppress
-from dataclasses import dataclass
+from contextlib import closing, suppress
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -55,41 +56,37 @@ class DeepReport:
         return "warn" if self.versions or self.differences else "pass"
 
 
-def deep_check(path: Path, workshop: Workshop, allowed: Sequence[str] = ()) -> DeepReport:
+_workshop = Workshop()
+"""Of this process."""
+
+
+def deep_check(path: Path, workshop: Workshop = _workshop, allowed: Sequence[str] = ()) -> DeepReport:
     """Make a recording again and compare everything.
 
     Args:
         path: The recording.
-        workshop: Gives world and renderer.
+        workshop: Gives world and renderer; by default one that stays warm for as long as the process lives.
         allowed: The user's own modules that may be imported for what the recording names.
 
     Raises:
         ResourceError: This machine cannot do it, which says nothing about the recording.
     """
-    versions: tuple[str, ...] = ()
-    num_frames, is_derived = 0, False
+    report = DeepReport(path=path)
     try:
         with tempfile.TemporaryDirectory(prefix="demorec-deep-") as folder, Recording(path) as recording:
-            info, num_frames, is_derived = recording.info, recording.num_frames, bool(recording.info.origin)
+            info = recording.info
             versions = version_differences(info.versions, versions_here(info, allowed))
+            report = replace(report, versions=versions, num_frames=recording.num_frames, is_derived=bool(info.origin))
             again = Path(folder) / "again.mcap"
             remake(recording, again, workshop, allowed)
             differences = tuple(_differences(recording, again, workshop, allowed))
-            replayed = ""
-            if not is_derived and any(not d.is_coding and d.field != "picture" for d in differences):
-                replayed = _replayed(recording, workshop, allowed)
+            if not report.is_derived and any(not d.is_coding and d.field != "picture" for d in differences):
+                report = replace(report, replay=_replayed(recording, workshop, allowed))
+            return replace(report, differences=differences)
     except DemorecError as error:
         if (lack := resource_error(error)) is not None:
             raise lack from error
-        return DeepReport(path=path, versions=versions, error=str(error), num_frames=num_frames, is_derived=is_derived)
-    return DeepReport(
-        path=path,
-        versions=versions,
-        differences=differences,
-        replay=replayed,
-        num_frames=num_frames,
-        is_derived=is_derived,
-    )
+        return replace(report, error=str(error))
 
 
 def versions_here(info: EpisodeInfo, allowed: Sequence[str]) -> Mapping[str, str]:
@@ -131,20 +128,9 @@ def _replayed(recording: Recording, workshop: Workshop, allowed: Sequence[str]) 
 def deep_checks(paths: Sequence[Path], *, workers: int = 1, allowed: Sequence[str] = ()) -> Iterator[DeepReport]:
     """One report for each recording, in order."""
     if workers == 1 or len(paths) < 2:
-        workshop = Workshop()
-        try:
+        with closing(Workshop()) as workshop:
             for path in paths:
                 yield deep_check(path, workshop, allowed)
-        finally:
-            workshop.close()
         return
     with ProcessPoolExecutor(max_workers=min(workers, len(paths)), mp_context=SPAWN) as pool:
-        yield from pool.map(_deep_check_here, paths, [tuple(allowed)] * len(paths))
-
-
-_workshop = Workshop()
-"""Of a process of the pool."""
-
-
-def _deep_check_here(path: Path, allowed: tuple[str, ...]) -> DeepReport:
-    return deep_check(path, _workshop, allowed)
+        yield from pool.map(partial(deep_check, allowed=tuple(allowed)), paths)

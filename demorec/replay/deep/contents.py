@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator, Mapping
+from contextlib import closing
 from dataclasses import dataclass, field
 from itertools import zip_longest
 from pathlib import Path
@@ -53,8 +54,8 @@ class Contents:
     @classmethod
     def of(cls, path: Path) -> Contents:
         """Read all of a file; RecordingError when it is damaged."""
-        container, found = Container(path), cls()
-        try:
+        found = cls()
+        with closing(Container(path)) as container:
             for name in container.metadata_names:
                 found.metadata[name] = container.metadata(name) or {}
             for name in container.attachment_names:
@@ -72,8 +73,6 @@ class Contents:
                 }
             for topic, time_ns, data in container.messages(list(container.channels)):
                 found.messages[topic].setdefault(time_ns, []).append(data)
-        finally:
-            container.close()
         return found
 
     def cut_off(self, other: Contents) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from demorec.check.dataset import Dataset
@@ -51,7 +52,7 @@ def _report(
     allowed: Sequence[str],
 ) -> DeepReport:
     versions = version_differences(info.versions, versions_here(info, allowed))
-    num_frames = len(episode.rows["index"])
+    report = DeepReport(path=name, versions=versions, num_frames=len(episode.rows["index"]))
     try:
         if info.origin:
             raise ConfigError(f"Its recording was derived ({info.origin}), and a dataset does not hold its commands.")
@@ -65,5 +66,5 @@ def _report(
     except DemorecError as error:
         if (lack := resource_error(error)) is not None:
             raise lack from error
-        return DeepReport(path=name, versions=versions, error=str(error), num_frames=num_frames)
-    return DeepReport(path=name, versions=versions, differences=found, num_frames=num_frames)
+        return replace(report, error=str(error))
+    return replace(report, differences=found)

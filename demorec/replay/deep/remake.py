@@ -14,11 +14,11 @@ from demorec.recording import EpisodeWriter, Recording
 from demorec.render import Renderer
 from demorec.render.painter import Painter
 from demorec.replay.demonstration import ReplayOptions, open_demonstration
-from demorec.replay.drive import DemonstrationAgent
+from demorec.replay.drive import replay
 from demorec.replay.rerender import recorded_view, view_painter
 from demorec.scene.assets import allow_models
 from demorec.scene.episode import EpisodeInfo
-from demorec.tables import RENDERERS, TASKS
+from demorec.tables import RENDERERS
 
 
 def recorded_config(info: EpisodeInfo, allowed: Collection[str]) -> GenerateConfig:
@@ -28,10 +28,7 @@ def recorded_config(info: EpisodeInfo, allowed: Collection[str]) -> GenerateConf
         ConfigError: It is none.
         NotAllowedError: It names something of a module that is not among those `allowed`.
     """
-    try:
-        config = from_plain(info.config, GenerateConfig)
-    except ValueError as error:
-        raise ConfigError(f"The recorded config is none of this version ({error}).") from error
+    config = _recorded(info.config, GenerateConfig)
     config.check_names(allowed)
     config.validate()
     return config
@@ -78,14 +75,10 @@ def _send_again(recording: Recording, path: Path, workshop: Workshop, allowed: S
     demonstration = open_demonstration(recording, options)
     info = replace(recording.info, config_digest=digest(recording.info.config))
     RENDERERS.check_name(str(info.config.get("renderer", "raster")))
-    task = TASKS.load(info.task, allowed)()
     world, renderer = workshop.equip(info)
-    session = Session(world, info.scene, task, painter=recorded_painter(info, renderer, allowed))
-    agent = DemonstrationAgent(demonstration, options)
-    with EpisodeWriter(path, info, video=_video(info)) as writer:
-        for frame in session.run(agent):
-            writer.write(frame)
-        outcome = session.outcome
+    painter = recorded_painter(info, renderer, allowed)
+    with EpisodeWriter(path, info, video=_recorded(info.config.get("video", {}), VideoConfig)) as writer:
+        _, outcome = replay(demonstration, world, options, painter=painter, sink=writer.write)
         if recording.outcome is not None:  # why it failed, and after how many tries, no replay can tell
             told = recording.outcome
             outcome = replace(
@@ -98,9 +91,10 @@ def _send_again(recording: Recording, path: Path, workshop: Workshop, allowed: S
         writer.finish(outcome)
 
 
-def _video(info: EpisodeInfo) -> VideoConfig:
+def _recorded[T](config: object, kind: type[T]) -> T:
+    """The recorded config, or a part of it."""
     try:
-        return from_plain(info.config.get("video", {}), VideoConfig)
+        return from_plain(config, kind)
     except ValueError as error:
         raise ConfigError(f"The recorded config is none of this version ({error}).") from error
 
