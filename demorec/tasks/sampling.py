@@ -12,7 +12,6 @@ import numpy as np
 
 from demorec.errors import SceneError
 from demorec.geometry import Array
-from demorec.scene.scene import Vector3
 from demorec.scene.variation import PRESETS, Ranges
 from demorec.seeding import generator
 
@@ -175,11 +174,6 @@ def _latin_hypercube(root_seed: int, cube: int, block: int) -> Array:
     return np.asarray(qmc.LatinHypercube(d=STRATIFIED_NUMBERS, seed=rng).random(block), dtype=np.float64)
 
 
-def at(point: tuple[float, float], z: float) -> Vector3:
-    """A point on the table as (x, y, z)."""
-    return (point[0], point[1], z)
-
-
-def wording(rng: np.random.Generator, *templates: str, **words: str) -> str:
+def wording(rng: np.random.Generator, *templates: str, **words: object) -> str:
     """One of several wordings of an instruction, filled in."""
     return templates[int(rng.integers(len(templates)))].format(**words)

@@ -144,10 +144,7 @@ class Tutorial(Task):
         world = expert.world
         goal = world.scene.goals[0]
         expert.phase = "open"
-        open_width = expert.open_width
-        yield from expert.set_gripper(
-            open_width, max_seconds=1.0, done=lambda: world.arm.gripper_width() > open_width - 0.002
-        )
+        yield from expert.open_gripper(max_seconds=1.0)
         grasp = expert.reachable_grasp(goal.object, above_by=ABOVE_CUBE)
         expert.phase = "above_cube"
         yield from expert.move(raised(grasp, ABOVE_CUBE), speed=0.6, free=True)
@@ -163,7 +160,7 @@ class Tutorial(Task):
         expert.phase = "release"
         # For a while: at the moment of landing the cube can be as slow as at rest.
         rests = lasting(lambda: self._rests(world), steps=max(1, round(REST_SECONDS * world.fps)))
-        yield from expert.set_gripper(open_width, max_seconds=MAX_FALL_SECONDS, done=rests)
+        yield from expert.set_gripper(expert.open_width, max_seconds=MAX_FALL_SECONDS, done=rests)
 
     def evaluate(self, world: World) -> tuple[SuccessCheck, ...]:
         """The cube lies on the table."""
