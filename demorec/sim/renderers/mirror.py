@@ -21,6 +21,7 @@ from demorec.geometry import Array, Pose
 from demorec.render import RenderSetup, Visual, first_rows
 from demorec.scene.scene import Texture
 from demorec.scene.textures import texture_pixels
+from demorec.sim.bodies import shape_arguments
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,18 +88,8 @@ class SceneMirror:
 
 def _add(client: Any, visual: Visual, texture: int | None) -> int:
     """A body of one visual shape; returns its index."""
-    geometry: dict[str, Any] = {"rgbaColor": visual.rgba}
-    match visual.kind:
-        case "mesh":
-            geometry |= {"shapeType": client.GEOM_MESH, "fileName": visual.file, "meshScale": visual.size}
-        case "box":
-            geometry |= {"shapeType": client.GEOM_BOX, "halfExtents": [v / 2 for v in visual.size]}
-        case "sphere":
-            geometry |= {"shapeType": client.GEOM_SPHERE, "radius": visual.size[0]}
-        case "cylinder" | "capsule":
-            kind = client.GEOM_CYLINDER if visual.kind == "cylinder" else client.GEOM_CAPSULE
-            geometry |= {"shapeType": kind, "radius": visual.size[0], "length": visual.size[1]}
-    index = int(client.createMultiBody(0, -1, client.createVisualShape(**geometry)))
+    geometry = shape_arguments(client, visual.kind, visual.size, visual.file)
+    index = int(client.createMultiBody(0, -1, client.createVisualShape(**geometry, rgbaColor=visual.rgba)))
     if texture is not None:
         client.changeVisualShape(index, -1, textureUniqueId=texture)
     return index
