@@ -22,12 +22,13 @@ from numpy.typing import NDArray
 from demorec.config import EpisodePlan, GenerateConfig
 from demorec.errors import ConfigError, SceneError
 from demorec.loop import Decision, Episode, Session, Workshop, prepare
-from demorec.loop.actions import ActionDecoder, action_bounds, check_action_kind, check_state_kind
+from demorec.loop.actions import ACTION_KINDS, ActionDecoder, action_bounds
+from demorec.registry import check_choice
 from demorec.render.painter import Painter
 from demorec.render.warm import WarmRenderer
 from demorec.scene import features
 from demorec.scene.episode import POLICY_PHASE, Action, CameraImages, EpisodeInfo, Frame, Observation, SuccessCheck
-from demorec.scene.features import ActionKind, ObservationRows, StateKind
+from demorec.scene.features import STATE_KINDS, ActionKind, ObservationRows, StateKind
 from demorec.scene.scene import Scene
 from demorec.scene.variation import Preset
 from demorec.sim.world import World
@@ -148,13 +149,12 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
                 renderer=renderer or GenerateConfig.renderer,
             )
         config.validate()
-        check_action_kind(action)
-        self._state_kind: StateKind = check_state_kind(state)
+        self._action_kind = check_choice("action", action, ACTION_KINDS)
+        self._state_kind = check_choice("state", state, STATE_KINDS)
         if render_mode not in (None, "rgb_array"):
             raise ConfigError(f"render_mode is {render_mode!r}, allowed are None and 'rgb_array'.")
         self.config, self.render_mode = config, render_mode
         self.metadata = {**type(self).metadata, "render_fps": config.fps}
-        self._action_kind: ActionKind = action
         self._render_size = (render_width, render_height)
         self._render_camera = render_camera
         self.episode = prepare(EpisodePlan(config=config, episode_index=0))

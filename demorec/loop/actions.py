@@ -7,12 +7,10 @@ from typing import get_args
 
 import numpy as np
 
-from demorec.errors import ConfigError
 from demorec.geometry import Array, Pose, wrap_angle
-from demorec.registry import nearest_match
 from demorec.scene import features
 from demorec.scene.episode import Action
-from demorec.scene.features import STATE_KINDS, ActionKind, StateKind
+from demorec.scene.features import ActionKind
 from demorec.scene.robot import RobotSpec
 from demorec.sim.world import World
 
@@ -20,24 +18,6 @@ ACTION_KINDS: tuple[ActionKind, ...] = get_args(ActionKind)
 
 NULL_GAIN = 0.05
 """Pull of the elbow towards where the expert has it, when a policy commands poses."""
-
-
-def check_action_kind(name: str) -> ActionKind:
-    """Return `name`; ConfigError unless it is a kind of action."""
-    for kind in ACTION_KINDS:
-        if kind == name:
-            return kind
-    raise ConfigError(
-        f"Unknown action {name!r}.{nearest_match(name, ACTION_KINDS)} Allowed: {', '.join(ACTION_KINDS)}."
-    )
-
-
-def check_state_kind(name: str) -> StateKind:
-    """Return `name`; ConfigError unless it is a kind of observation.state."""
-    for kind in STATE_KINDS:
-        if kind == name:
-            return kind
-    raise ConfigError(f"Unknown state {name!r}.{nearest_match(name, STATE_KINDS)} Allowed: {', '.join(STATE_KINDS)}.")
 
 
 def action_bounds(robot: RobotSpec, kind: ActionKind, *, fps: int) -> tuple[Array, Array]:

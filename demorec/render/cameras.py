@@ -28,7 +28,7 @@ class CameraPreset:
     """
 
     summary: str
-    mount: Literal["world", "tcp"]
+    mount: Literal["world", "tcp"] = "world"
     eye: Vector3
     target: Vector3
     up: Vector3 = (0.0, 0.0, 1.0)
@@ -53,7 +53,6 @@ class CameraPreset:
 
 FRONT = CameraPreset(
     summary="in front of the table, looking at the arm: sees the whole workspace",
-    mount="world",
     eye=(1.45, 0.0, 0.95),
     target=(0.40, 0.0, 0.19),
     fov_y=math.radians(44.0),
@@ -61,7 +60,6 @@ FRONT = CameraPreset(
 
 TOP = CameraPreset(
     summary="above the table, looking down, the arm comes from below: sees where things stand",
-    mount="world",
     eye=(0.5, 0.0, 1.25),
     target=(0.5, 0.0, 0.0),
     up=(1.0, 0.0, 0.0),
@@ -72,7 +70,6 @@ TOP = CameraPreset(
 # (demorec.tasks.sampling.WORKSPACE) fills pictures of 7 to 5: 11 mm a pixel at 56 x 40.
 WORKSPACE = CameraPreset(
     summary="from in front and above, close: sees the objects, the fingers and little else, for small pictures",
-    mount="world",
     eye=(1.05, 0.0, 1.0),
     target=(0.49, 0.0, 0.03),
     fov_y=math.radians(22.5),

@@ -44,7 +44,6 @@ class World:
         self.joint_samples: tuple[JointSample, ...] = ()
         """Of the last control step, both ends left out."""
         self._sample_joints = sample_joints
-        self._closed = False
         self._scene: Scene | None = None
         self._shape_rows: ShapeRows = ()
         self._visuals: tuple[VisualBody, ...] = ()
@@ -57,9 +56,7 @@ class World:
 
     def close(self) -> None:
         """Free the client; harmless when called twice."""
-        if not self._closed:
-            self._closed = True
-            self.client.disconnect()
+        self.client.disconnect()
 
     @property
     def scene(self) -> Scene:

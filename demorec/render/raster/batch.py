@@ -40,11 +40,6 @@ class Geometry:
     num_vertices: int
     faces: NDArray[np.int32]
 
-    @property
-    def capacity(self) -> int:
-        """How many vertices there is room for."""
-        return len(self.vertices) // layout.BLOCK * layout.LANES
-
 
 def merge(attributes: Sequence[Floats], faces: Sequence[NDArray[np.integer]], *, spare: int = 0) -> Geometry:
     """Merge meshes given by vertex attributes (v, up to 8: position, normal, u, v) and vertex numbers (f, 3)."""
@@ -77,7 +72,7 @@ def caster_geometry(instances: Sequence[Instance], levels: Sequence[int | None],
     """Positions only, for the shadow map; those that cast none have no faces."""
     points, faces = [], []
     for instance, level, does in zip(instances, levels, casts, strict=True):
-        piece = instance.caster(level) if does else None
+        piece = instance.model.caster(level) if does else None
         points.append(np.zeros((0, 3)) if piece is None else piece.points * instance.scale)
         faces.append(np.zeros((0, 3), dtype=np.int64) if piece is None else piece.point_faces)
     return merge(points, faces)
