@@ -136,31 +136,26 @@ def observation_vectors(
 
 
 def _environment_names(robot: RobotSpec, scene: Scene) -> Iterable[str]:
-    yield from (f"tcp.{axis}" for axis in _POSITION)
-    yield from ("tcp.yaw.sin", "tcp.yaw.cos")
+    yield from (*_axes("tcp."), "tcp.yaw.sin", "tcp.yaw.cos")
     for label, goal in _labelled_goals(scene):
-        n = scene.body(goal.object).yaw_symmetry
-        yield from (f"{label}.{axis}" for axis in _POSITION)
-        yield from (f"{label}.size.{axis}" for axis in _POSITION)
-        yield from (f"{label}.from_tcp.{axis}" for axis in _POSITION)
-        yield from (f"{label}.from_tcp.hand_{axis}" for axis in _POSITION)
+        n, wanted = scene.body(goal.object).yaw_symmetry, f"{label}.goal"
+        yield from _axes(f"{label}.", f"{label}.size.", f"{label}.from_tcp.", f"{label}.from_tcp.hand_")
         if n:
             yield from _yaw_names(f"{label}.yaw", n)
             yield from _yaw_names(f"{label}.from_tcp.yaw", n)
-        yield from (f"{label}.goal.{axis}" for axis in _POSITION)
-        yield from (f"{label}.goal.size.{axis}" for axis in _POSITION)
-        yield from (f"{label}.goal.from_tcp.{axis}" for axis in _POSITION)
-        yield from (f"{label}.goal.from_tcp.hand_{axis}" for axis in _POSITION)
-        yield from (f"{label}.from_tcp.near_{axis}" for axis in _POSITION)
-        yield from (f"{label}.goal.from_tcp.near_{axis}" for axis in _POSITION)
-        yield from (f"{label}.goal.from_{goal.object}.near_{axis}" for axis in _POSITION)
+        yield from _axes(f"{wanted}.", f"{wanted}.size.", f"{wanted}.from_tcp.", f"{wanted}.from_tcp.hand_")
+        yield from _axes(f"{label}.from_tcp.near_", f"{wanted}.from_tcp.near_", f"{wanted}.from_{goal.object}.near_")
         if goal.yaw_symmetry:
-            yield from _yaw_names(f"{label}.goal.yaw", goal.yaw_symmetry)
-            yield from _yaw_names(f"{label}.goal.from_{goal.object}.yaw", goal.yaw_symmetry)
+            yield from _yaw_names(f"{wanted}.yaw", goal.yaw_symmetry)
+            yield from _yaw_names(f"{wanted}.from_{goal.object}.yaw", goal.yaw_symmetry)
     yield from (f"{joint}.vel" for joint in robot.arm_joints)
     yield "gripper.vel"
     for body in scene.movable:
         yield from (f"{body.name}.pose.{axis}" for axis in _POSE)
+
+
+def _axes(*prefixes: str) -> Iterable[str]:
+    return (f"{prefix}{axis}" for prefix in prefixes for axis in _POSITION)
 
 
 def _yaw_names(prefix: str, n: int) -> tuple[str, str]:

@@ -150,20 +150,16 @@ def stratified_point(
     """
     if method == "random":
         return ()
-    if method == "sobol":
-        return tuple(float(v) for v in _sobol(root_seed, episode_index))
-    cube, row = divmod(episode_index, block)
-    return tuple(float(v) for v in _latin_hypercube(root_seed, cube, block)[row])
-
-
-def _sobol(root_seed: int, index: int) -> Array:
+    if method == "lhs":
+        cube, row = divmod(episode_index, block)
+        return tuple(_latin_hypercube(root_seed, cube, block)[row].tolist())
     from scipy.stats import qmc
 
     rng = generator(root_seed=root_seed, episode_index=0, attempt=0, purpose="sampling")
     sequence = qmc.Sobol(d=STRATIFIED_NUMBERS, scramble=True, seed=rng)
-    if index:
-        sequence.fast_forward(index)
-    return np.asarray(sequence.random(1)[0], dtype=np.float64)
+    if episode_index:
+        sequence.fast_forward(episode_index)
+    return tuple(sequence.random(1)[0].tolist())
 
 
 @functools.lru_cache(maxsize=4)

@@ -108,8 +108,8 @@ def make_batch(instances: Sequence[Instance], levels: Sequence[int | None], *, s
     """
     attributes: list[Floats] = []
     faces: list[NDArray[np.integer]] = []
-    tables: list[NDArray[np.int32]] = []
-    colors: list[Floats] = []
+    tables = [np.zeros((0, 4), dtype=np.int32)]
+    colors: list[Floats] = [np.zeros((0, 4))]
     pictures: list[Picture] = []
     rows: dict[int, int] = {}
     num_groups = 0
@@ -138,8 +138,8 @@ def make_batch(instances: Sequence[Instance], levels: Sequence[int | None], *, s
     texels, mips = textures.pack(pictures)
     return Batch(
         geometry=merge(attributes, faces, spare=SPARE_VERTICES),
-        face_table=np.concatenate(tables) if tables else np.zeros((0, 4), dtype=np.int32),
-        face_color=np.ascontiguousarray(np.concatenate(colors) if colors else np.zeros((0, 4)), dtype=np.float32),
+        face_table=np.concatenate(tables),
+        face_color=np.concatenate(colors).astype(np.float32),
         texels=texels,
         mips=mips,
     )
