@@ -57,7 +57,7 @@ class ActionDecoder:
     def __init__(self, world: World, kind: ActionKind, *, is_limited: bool = True) -> None:
         self.num_unreachable = 0
         self._is_limited = is_limited
-        self._robot, self._kinematics, self._kind = world.robot, world.arm.kinematics, kind
+        self._robot, self._arm, self._kinematics, self._kind = world.robot, world.arm, world.arm.kinematics, kind
         self._max_step = np.array(world.robot.velocity_limit) / world.fps
         self._joint_target: Array = world.arm.target.copy()
         self._tcp_target: Pose = world.observe().base_from_tcp
@@ -71,9 +71,7 @@ class ActionDecoder:
             wanted = np.clip(wanted, self._joint_target - self._max_step, self._joint_target + self._max_step)
             gripper = float(np.clip(gripper, 0.0, self._robot.gripper.max_width))
         self._joint_target = wanted
-        self._given = Action(
-            joint_target=wanted, gripper_target=gripper, base_from_tcp_target=self._kinematics.forward(wanted)
-        )
+        self._given = self._arm.action(wanted, gripper)
         return self._given
 
     def follow(self, command: Action) -> None:

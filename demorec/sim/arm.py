@@ -111,6 +111,11 @@ class Arm:
         for joint, position in zip(self._arm + self._fingers, joint_position.tolist(), strict=True):
             self._client.resetJointState(self.body, joint, position)
 
+    def action(self, joint_target: Array, gripper_target: float) -> Action:
+        """The action with these targets, rad and metres; its pose is where they bring the TCP."""
+        pose = self.kinematics.forward(joint_target)
+        return Action(joint_target=joint_target, gripper_target=gripper_target, base_from_tcp_target=pose)
+
     def command(self, action: Action) -> None:
         """Begin a control step: the gripper's motors are set for all of it."""
         gripper = self.spec.gripper

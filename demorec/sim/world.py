@@ -103,12 +103,7 @@ class World:
 
     def hold(self) -> Action:
         """The command that keeps the present targets."""
-        q = self.arm.target.copy()
-        return Action(
-            joint_target=q,
-            gripper_target=self.arm.gripper_target,
-            base_from_tcp_target=self.arm.kinematics.forward(q),
-        )
+        return self.arm.action(self.arm.target.copy(), self.arm.gripper_target)
 
     def apply(self, command: Action) -> None:
         """Advance by one control step; the joint targets move linearly from the last command to this one."""

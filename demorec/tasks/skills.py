@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from demorec.geometry import Array, Pose, wrap_angle
-from demorec.scene.episode import Action, Event
+from demorec.scene.episode import Event
 from demorec.scene.motion import MotionLimits, plan_straight
 from demorec.scene.scene import Goal, yaw_of
 from demorec.sim.world import World
@@ -115,11 +115,7 @@ class Expert:
         """The control step that holds the present targets."""
         events, self._events = tuple(self._events), []
         return Step(
-            action=Action(
-                joint_target=self.joint_target.copy(),
-                gripper_target=self.gripper_target,
-                base_from_tcp_target=self.arm.forward(self.joint_target),
-            ),
+            action=self.world.arm.action(self.joint_target.copy(), self.gripper_target),
             phase=self.phase,
             noise_allowed=self._free and self.tcp().position[2] > self._clear_height,
             events=events,
@@ -156,6 +152,7 @@ class Expert:
         *,
         speed: float,
         free: bool = False,
+        clear_height: float = -math.inf,
         settle: bool = True,
         until: Callable[[], bool] | None = None,
     ) -> Iterator[Step]:
@@ -165,13 +162,14 @@ class Expert:
             world_from_tcp: Where to.
             speed: Peak speed, m/s; multiplied by the behaviour's speed.
             free: Whether exploration noise is allowed.
+            clear_height: Height of the TCP, metres, above which it is.
             settle: Whether to wait, for a fraction of a second, until the joints have caught up.
             until: Stop as soon as this holds.
 
         Raises:
             GaveUp: The arm cannot follow this line.
         """
-        self._free = free
+        self._free, self._clear_height = free, clear_height
         path = plan_straight(
             self.arm,
             start=self.joint_target,
@@ -287,7 +285,6 @@ class Expert:
 
         self.phase = "approach"
         self.gripper_target = self.open_width
-        self._clear_height = -math.inf
         if not (is_begun and self.is_above(grasp)):
             yield from self.move(raised(grasp, above_by), speed=FREE_SPEED, free=True)
         self.phase = "descend"
@@ -357,10 +354,9 @@ class Expert:
         yield from self.open_gripper(max_seconds=1.0)
         self.phase = "retreat"
         here = self.tcp_target()
-        self._clear_height = here.position[2] + 0.07
         away = raised(here, max(0.1, self.behaviour.approach_height))
-        yield from self.move(away, speed=LIFT_SPEED, free=True, settle=False)
-        self._clear_height = -math.inf
+        clear_height = float(here.position[2]) + 0.07
+        yield from self.move(away, speed=LIFT_SPEED, free=True, clear_height=clear_height, settle=False)
         self.phase = "verify"
         failed = [check.name for check in placement_checks(world, goal) if not check.passed]
         if failed:
@@ -393,9 +389,8 @@ class Expert:
         self.phase = "recover"
         self.joint_target = self.world.arm.arm_position()
         yield from self.open_gripper(max_seconds=0.3)
-        self._clear_height = self.tcp().position[2] + 0.07
-        yield from self.move(world_from_tcp, speed=0.4, free=True)
-        self._clear_height = -math.inf
+        clear_height = float(self.tcp().position[2]) + 0.07
+        yield from self.move(world_from_tcp, speed=0.4, free=True, clear_height=clear_height)
 
     def _grasps(self, name: str) -> list[Pose]:
         """Grasp poses `world_from_tcp` with the behaviour's errors, the yaw nearest to the hand's present one first."""

@@ -30,7 +30,6 @@ class ClientRenderer:
 
     def __init__(self) -> None:
         self._client: Any = None
-        self._setup: RenderSetup | None = None
         self._mirror: SceneMirror | None = None
 
     def _connect(self) -> Any:
@@ -51,7 +50,7 @@ class ClientRenderer:
         """Free the client; harmless when called twice."""
         if self._client is not None:
             self._disconnect(self._client)
-        self._client = self._setup = self._mirror = None
+        self._client = self._mirror = None
 
     def setup(self, setup: RenderSetup) -> None:
         """Take over a scene.
@@ -63,18 +62,17 @@ class ClientRenderer:
         if self._client is None:
             self._client = self._connect()
             _require_numpy(self._client)
-        self._setup = setup
         self._mirror = SceneMirror(self._client, setup)
 
     def render(self, poses: Array) -> dict[str, CameraImages]:
         """Camera name -> images, with poses (n, 7) as of `Renderer.render`; RuntimeError without a scene."""
-        if self._setup is None or self._mirror is None:
+        if self._mirror is None:
             raise RuntimeError("the renderer has no scene: call setup first")
         self._mirror.follow(poses)
-        return {camera.name: self._draw(self._setup, self._mirror, camera, poses) for camera in self._setup.cameras}
+        return {camera.name: self._draw(self._mirror, camera, poses) for camera in self._mirror.setup.cameras}
 
-    def _draw(self, setup: RenderSetup, mirror: SceneMirror, camera: Camera, poses: Array) -> CameraImages:
-        client = self._client
+    def _draw(self, mirror: SceneMirror, camera: Camera, poses: Array) -> CameraImages:
+        client, setup = self._client, mirror.setup
         pose = world_from_camera(setup, camera, poses)
         light = setup.light
         _, _, rgba, depth, segmentation = client.getCameraImage(

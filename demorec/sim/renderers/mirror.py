@@ -30,11 +30,15 @@ class SceneMirror:
         client: The client that is filled; emptied first.
         setup: The scene.
 
+    Attributes:
+        setup: As given.
+
     Raises:
         RenderError: PyBullet cannot load one of the shapes.
     """
 
     def __init__(self, client: Any, setup: RenderSetup) -> None:
+        self.setup = setup
         self._client = client
         client.resetSimulation()
         # By the number of a shape's body in the client: the row of its pose and its pose there; its number in pictures.
