@@ -228,15 +228,7 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
                 "observation space: leave privileged out and use cameras."
             )
         world, renderer = self._workshop.equip(info)
-        painter = None
-        if renderer is not None:
-            painter = Painter(
-                renderer,
-                self.episode.cameras,
-                true_from_recorded=self.episode.true_from_recorded,
-                antialias=self.config.antialias,
-            )
-        session = Session(world, info.scene, self.episode.task, painter=painter)
+        session = Session.of_episode(world, self.episode, renderer, only_color=True)
         session.reset()
         self._session = session
         self._viewer, self._held = None, 0

@@ -6,9 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-import numpy as np
-
-from demorec.geometry import Pose, look_at
+from demorec.geometry import look_at
 from demorec.scene.robot import RobotSpec
 from demorec.scene.scene import Camera, Vector3
 
@@ -43,12 +41,8 @@ class CameraPreset:
             height=height,
             fov_y=max(self.fov_y, 2.0 * math.atan(math.tan(self.fov_x / 2.0) * height / width)),
             mount=self.mount if self.mount == "world" else robot.tcp_link,
-            mount_from_camera=self.mount_from_camera(),
+            mount_from_camera=look_at(self.eye, self.target, self.up),
         )
-
-    def mount_from_camera(self) -> Pose:
-        """Pose in the mount's frame, OpenCV axes."""
-        return look_at(np.array(self.eye), np.array(self.target), np.array(self.up))
 
 
 FRONT = CameraPreset(
