@@ -110,8 +110,7 @@ def make_batch(instances: Sequence[Instance], levels: Sequence[int | None], *, s
     faces: list[NDArray[np.integer]] = []
     tables = [np.zeros((0, 4), dtype=np.int32)]
     colors: list[Floats] = [np.zeros((0, 4))]
-    pictures: list[Picture] = []
-    rows: dict[int, int] = {}
+    pictures: dict[int, tuple[int, Picture]] = {}
     num_groups = 0
     for instance, level in zip(instances, levels, strict=True):
         piece = instance.piece(level)
@@ -128,14 +127,12 @@ def make_batch(instances: Sequence[Instance], levels: Sequence[int | None], *, s
         if instance.texture is None:
             color[:, :3] *= 255
         else:
-            if id(instance.texture) not in rows:
-                rows[id(instance.texture)] = len(pictures)
-                pictures.append(instance.texture)
-            table[:, layout.FACE_TEXTURE] = rows[id(instance.texture)]
+            row, _ = pictures.setdefault(id(instance.texture), (len(pictures), instance.texture))
+            table[:, layout.FACE_TEXTURE] = row
         color[:, layout.FACE_SPECULAR] = 255 * specular if n > SPECULAR_FACES else 0
         tables.append(table)
         colors.append(color)
-    texels, mips = textures.pack(pictures)
+    texels, mips = textures.pack([picture for _, picture in pictures.values()])
     return Batch(
         geometry=merge(attributes, faces, spare=SPARE_VERTICES),
         face_table=np.concatenate(tables),

@@ -17,8 +17,8 @@ PLANE_EXTENT = 100.0
 """Half the side of the square that stands for an infinite plane, metres."""
 
 
-def box(size: tuple[float, float, float]) -> RasterMesh:
-    """A box of full extents `size` around the origin, the texture once on each side."""
+def box(*size: float) -> RasterMesh:
+    """A box of three full extents around the origin, the texture once on each side."""
     corners = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
     points: list[Floats] = []
     normals: list[Floats] = []

@@ -136,15 +136,10 @@ class ModelStore:
         """A box (x, y, z), sphere (radius), cylinder or capsule (radius, length), or plane ()."""
         place = (name, *size)
         if place not in self._models:
-            if name in ("box", "plane"):
-                mesh = coarse = primitives.plane() if name == "plane" else primitives.box((size[0], size[1], size[2]))
-            else:
-                make: Any = {
-                    "sphere": primitives.sphere,
-                    "cylinder": primitives.cylinder,
-                    "capsule": primitives.capsule,
-                }[name]
-                mesh, coarse = make(*size), make(*size, segments=primitives.COARSE_SEGMENTS)
+            make: Any = getattr(primitives, name)
+            mesh = coarse = make(*size)
+            if name not in ("box", "plane"):  # which have no curves
+                coarse = make(*size, segments=primitives.COARSE_SEGMENTS)
             self._models[place] = Model(key=repr(place), mesh=mesh, coarse=coarse)
         return self._models[place]
 
