@@ -148,7 +148,7 @@ class GenerateConfig:
         Raises:
             ConfigError: The first impossible value, with what is allowed.
         """
-        from demorec.registry import nearest_match
+        from demorec.registry import check_choice
         from demorec.tables import camera_name
 
         self.check_names(self.modules)
@@ -173,11 +173,7 @@ class GenerateConfig:
                 )
         if self.width * self.height > MAX_PIXELS:
             raise ConfigError(f"{self.width}x{self.height} is over {MAX_PIXELS} pixels a picture.")
-        if self.variation not in PRESET_NAMES:
-            raise ConfigError(
-                f"Unknown variation {self.variation!r}.{nearest_match(self.variation, PRESET_NAMES)} "
-                f"Allowed: {', '.join(PRESET_NAMES)}."
-            )
+        check_choice("variation", self.variation, PRESET_NAMES)
         self.ranges.validate()
         check_option("sampling_block", self.sampling_block, 2, 100_000)
         check_option("max_attempts", self.max_attempts, 1, 100)

@@ -92,12 +92,8 @@ _LACKS = {
 }
 
 
-_LINKER_WORDS = {
-    "failed to map segment": errno.ENOMEM,
-    os.strerror(errno.ENOMEM): errno.ENOMEM,
-    os.strerror(errno.EMFILE): errno.EMFILE,
-    os.strerror(errno.ENFILE): errno.ENFILE,
-}
+_LINKER_WORDS = {"failed to map segment": errno.ENOMEM}
+_LINKER_WORDS |= {os.strerror(number): number for number in (errno.ENOMEM, errno.EMFILE, errno.ENFILE)}
 
 
 def resource_error(error: BaseException, path: Path | None = None) -> ResourceError | None:

@@ -8,6 +8,7 @@ the renderers. Sums are written out, since a BLAS call may round differently on 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -51,13 +52,6 @@ class Pose:
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _unpickle_pose, (self.position.tolist(), self.quat_xyzw.tolist())
-
-    @classmethod
-    def from_matrix(cls, matrix: ArrayLike) -> Pose:
-        """From a (4, 4) homogeneous matrix, or a (3, 3) rotation."""
-        m = np.asarray(matrix, dtype=np.float64)
-        position = m[:3, 3] if m.shape == (4, 4) else np.zeros(3)
-        return cls(position=position, quat_xyzw=quat_from_rotation(m[:3, :3]))
 
     @classmethod
     def from_yaw(cls, position: ArrayLike, yaw: float = 0.0) -> Pose:
@@ -110,14 +104,16 @@ def _unpickle_pose(position: list[float], quat_xyzw: list[float]) -> Pose:
 
 def rotation_from_quat(quat_xyzw: ArrayLike) -> Array:
     """(3, 3) rotation matrix of a unit quaternion (x, y, z, w)."""
-    x, y, z, w = (float(v) for v in np.asarray(quat_xyzw))
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    return np.array(rotation_rows(*(float(v) for v in np.asarray(quat_xyzw))))
+
+
+def rotation_rows(x: Any, y: Any, z: Any, w: Any) -> list[list[Any]]:
+    """The rows of the rotation matrix of a unit quaternion, or of many whose parts are arrays."""
+    return [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
 
 
 def quat_from_rotation(rotation: ArrayLike) -> Array:
@@ -142,16 +138,20 @@ def quat_from_rotation(rotation: ArrayLike) -> Array:
 
 def quat_multiply(a_xyzw: ArrayLike, b_xyzw: ArrayLike) -> Array:
     """Hamilton product of two quaternions (x, y, z, w): rotation b, then rotation a."""
-    ax, ay, az, aw = (float(v) for v in np.asarray(a_xyzw))
-    bx, by, bz, bw = (float(v) for v in np.asarray(b_xyzw))
-    return np.array(
-        [
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-            aw * bw - ax * bx - ay * by - az * bz,
-        ]
-    )
+    a, b = ([float(v) for v in np.asarray(quat)] for quat in (a_xyzw, b_xyzw))
+    return np.array(quat_product(a, b))
+
+
+def quat_product(a: Iterable[Any], b: Iterable[Any]) -> list[Any]:
+    """x, y, z, w of the Hamilton product of two quaternions, or of many whose parts are arrays."""
+    ax, ay, az, aw = a
+    bx, by, bz, bw = b
+    return [
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+        aw * bw - ax * bx - ay * by - az * bz,
+    ]
 
 
 def rotate(quat_xyzw: ArrayLike, vector: ArrayLike) -> Array:
@@ -186,6 +186,4 @@ def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) 
         raise ValueError(f"the viewing direction {forward.tolist()} is parallel to up {up_.tolist()}")
     right = right / norm
     down = np.cross(forward, right)
-    matrix = np.eye(4)
-    matrix[:3, 0], matrix[:3, 1], matrix[:3, 2], matrix[:3, 3] = right, down, forward, eye_
-    return Pose.from_matrix(matrix)
+    return Pose(position=eye_, quat_xyzw=quat_from_rotation(np.stack([right, down, forward], axis=1)))

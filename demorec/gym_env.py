@@ -11,7 +11,6 @@ module is imported; `env_id` registers somebody else's.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -22,18 +21,18 @@ from numpy.typing import NDArray
 
 from demorec.config import EpisodePlan, GenerateConfig
 from demorec.errors import ConfigError, SceneError
-from demorec.geometry import Array
-from demorec.loop import Decision, Episode, Session, make_world, prepare
-from demorec.loop.actions import ActionDecoder, action_bounds, check_action_kind, check_state_kind
-from demorec.render import Renderer
+from demorec.loop import Decision, Episode, Session, Workshop, prepare
+from demorec.loop.actions import ACTION_KINDS, ActionDecoder, action_bounds
+from demorec.registry import check_choice
 from demorec.render.painter import Painter
+from demorec.render.warm import WarmRenderer
 from demorec.scene import features
 from demorec.scene.episode import POLICY_PHASE, Action, CameraImages, EpisodeInfo, Frame, Observation, SuccessCheck
-from demorec.scene.features import ActionKind, ObservationRows, StateKind
+from demorec.scene.features import STATE_KINDS, ActionKind, ObservationRows, StateKind
 from demorec.scene.scene import Scene
 from demorec.scene.variation import Preset
 from demorec.sim.world import World
-from demorec.tables import CAMERAS, RENDERERS, TASKS, environment_name
+from demorec.tables import CAMERAS, TASKS, environment_name
 
 SUCCESS_FRAMES = 5
 """For how many frames in a row every check of the task must hold."""
@@ -150,13 +149,12 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
                 renderer=renderer or GenerateConfig.renderer,
             )
         config.validate()
-        check_action_kind(action)
-        self._state_kind: StateKind = check_state_kind(state)
+        self._action_kind = check_choice("action", action, ACTION_KINDS)
+        self._state_kind = check_choice("state", state, STATE_KINDS)
         if render_mode not in (None, "rgb_array"):
             raise ConfigError(f"render_mode is {render_mode!r}, allowed are None and 'rgb_array'.")
         self.config, self.render_mode = config, render_mode
         self.metadata = {**type(self).metadata, "render_fps": config.fps}
-        self._action_kind: ActionKind = action
         self._render_size = (render_width, render_height)
         self._render_camera = render_camera
         self.episode = prepare(EpisodePlan(config=config, episode_index=0))
@@ -165,11 +163,9 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         self.privileged = self._is_privileged() if privileged is None else privileged
         self._vector_lengths = _lengths(info, privileged=self.privileged, state=self._state_kind)
         self.observation_space = _observation_space(info, self._vector_lengths)
-        self.action_space = _box(action_bounds(info.robot, action, fps=config.fps))
-        self._resources = ExitStack()
-        self._world: World | None = None
-        self._renderer: Renderer | None = None
-        self._viewer_renderer: Renderer | None = None
+        low, high = action_bounds(info.robot, action, fps=config.fps)
+        self.action_space = spaces.Box(low.astype(np.float32), high.astype(np.float32))
+        self._workshop, self._viewers = Workshop(), WarmRenderer()
         self._viewer: Painter | None = None
         self._session: Session | None = None
         self._situation: Situation | None = None
@@ -189,16 +185,12 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
     @property
     def world(self) -> World:
         """The simulated world, after a reset."""
-        if self._world is None:
-            raise RuntimeError("the environment has no world yet: call reset first")
-        return self._world
+        return _after_reset(self._session, "world").world
 
     @property
     def situation(self) -> Situation:
         """What the simulation is at, after a reset or a step."""
-        if self._situation is None:
-            raise RuntimeError("the environment has no episode yet: call reset first")
-        return self._situation
+        return _after_reset(self._situation)
 
     @property
     def max_episode_steps(self) -> int:
@@ -235,22 +227,12 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
                 f"Episode {index} of {self.config.task!r} has other objects than episode 0, and an environment has one "
                 "observation space: leave privileged out and use cameras."
             )
-        if self._world is None:
-            self._world = self._resources.enter_context(make_world(info))
-        painter = None
-        if info.scene.cameras:
-            self._renderer = self._renderer or self._new_renderer()
-            painter = Painter(
-                self._renderer,
-                self.episode.cameras,
-                true_from_recorded=self.episode.true_from_recorded,
-                antialias=self.config.antialias,
-            )
-        session = Session(self._world, info.scene, self.episode.task, painter=painter)
+        world, renderer = self._workshop.equip(info)
+        session = Session.of_episode(world, self.episode, renderer, only_color=True)
         session.reset()
         self._session = session
         self._viewer, self._held = None, 0
-        self._decoder = ActionDecoder(self._world, self._action_kind)
+        self._decoder = ActionDecoder(world, self._action_kind)
         self._situation = self._look(session, None)
         return self._observation(self._situation), {"is_success": False, "episode_index": index}
 
@@ -261,8 +243,7 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
 
     def command_for(self, action: NDArray[np.floating]) -> Action:
         """What `step` would send now; errors as there. Deltas go on from here, unless `act` sends something else."""
-        if self._session is None:
-            raise RuntimeError("the environment has no episode yet: call reset first")
+        _after_reset(self._session)
         values = np.asarray(action, dtype=np.float64)
         if values.shape != self.action_space.shape or not np.isfinite(values).all():
             raise ValueError(f"An action has shape {self.action_space.shape} and finite values, found {values!r}.")
@@ -270,14 +251,13 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
 
     def act(self, decision: Decision) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """One control step as `step` makes it, whoever decided it; its command is sent as it is."""
-        if self._session is None:
-            raise RuntimeError("the environment has no episode yet: call reset first")
+        session = _after_reset(self._session)
         self._decoder.follow(decision.command)
-        frame = self._session.frame(decision)
-        self._session.step(frame.command)
-        self._situation = self._look(self._session, frame)
+        frame = session.frame(decision)
+        session.step(frame.command)
+        self._situation = self._look(session, frame)
         success = self._situation.is_success
-        truncated = not success and self._session.frame_index >= self._max_episode_steps
+        truncated = not success and session.frame_index >= self._max_episode_steps
         information = {"is_success": success, "episode_index": self.episode.plan.episode_index}
         return self._observation(self._situation), float(success), success, truncated, information
 
@@ -285,22 +265,21 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         """(H, W, 3) uint8 picture of the present state from `render_camera`; None without a render mode."""
         if self.render_mode is None:
             return None
-        if self._situation is None:
-            raise RuntimeError("the environment has no episode yet: call reset first")
+        _after_reset(self._situation)
         if self._viewer is None:
-            self._viewer_renderer = self._viewer_renderer or self._new_renderer()
             width, height = self._render_size
             camera = CAMERAS.load(self._render_camera).camera(
                 self._render_camera, self.info.robot, width=width, height=height
             )
-            self._viewer = Painter(self._viewer_renderer, (camera,), antialias=self.config.antialias)
+            self._viewer = Painter(self._viewers.of(self.config.renderer), (camera,), antialias=self.config.antialias)
             self._viewer.setup(self.world)
         return self._viewer.images()[self._render_camera].color
 
     def close(self) -> None:
         """Free the simulator and the renderers; harmless when called twice."""
-        self._resources.close()
-        self._world = self._renderer = self._viewer_renderer = self._viewer = self._session = self._situation = None
+        self._workshop.close()
+        self._viewers.close()
+        self._viewer = self._session = self._situation = None
 
     # ------------------------------------------------------------------------------------------------ parts
 
@@ -327,10 +306,6 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         infos = [self._prepare(index, None).info for index in range(PROBED_SCENES)]
         # A round object has no yaw, so that its vector is shorter.
         return len({tuple(_lengths(info, privileged=True).values()) for info in infos}) == 1
-
-    def _new_renderer(self) -> Renderer:
-        renderer: Renderer = self._resources.enter_context(RENDERERS.load(self.config.renderer)())
-        return renderer
 
     def _look(self, session: Session, last_frame: Frame | None) -> Situation:
         checks = session.checks()
@@ -377,9 +352,10 @@ def _observation_space(info: EpisodeInfo, vector_lengths: Mapping[str, int]) -> 
     return spaces.Dict(found)
 
 
-def _box(bounds: tuple[Array, Array]) -> spaces.Box:
-    low, high = bounds
-    return spaces.Box(low.astype(np.float32), high.astype(np.float32))
+def _after_reset[T](value: T | None, what: str = "episode") -> T:
+    if value is None:
+        raise RuntimeError(f"the environment has no {what} yet: call reset first")
+    return value
 
 
 def env_id(task: str) -> str:

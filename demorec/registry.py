@@ -9,7 +9,7 @@ from __future__ import annotations
 import difflib
 import importlib
 import inspect
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -21,6 +21,14 @@ def nearest_match(name: str, allowed: Iterable[str]) -> str:
     """Return " Did you mean 'x'?" for the closest allowed name, or an empty string."""
     matches = difflib.get_close_matches(name, list(allowed), n=1, cutoff=0.5)
     return f" Did you mean {matches[0]!r}?" if matches else ""
+
+
+def check_choice[T: str](kind: str, name: str, allowed: Collection[T]) -> T:
+    """Return `name`; ConfigError with the nearest match unless it is allowed."""
+    for choice in allowed:
+        if choice == name:
+            return choice
+    raise ConfigError(f"Unknown {kind} {name!r}.{nearest_match(name, allowed)} Allowed: {', '.join(allowed)}.")
 
 
 @dataclass(frozen=True)

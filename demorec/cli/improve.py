@@ -67,8 +67,10 @@ class Improve:
         self.takeover.validate()
         refuse_inside([self.out])
         from demorec.evaluate.improvement import Improvement, Plan
-        from demorec.loop.actions import check_action_kind, check_state_kind
+        from demorec.loop.actions import ACTION_KINDS
         from demorec.processes import available_cores
+        from demorec.registry import check_choice
+        from demorec.scene.features import STATE_KINDS
 
         plan = Plan(
             demonstrations=self.demonstrations,
@@ -78,8 +80,8 @@ class Improve:
             num_episodes=self.num_episodes,
             num_scenes=self.num_scenes,
             seed=self.seed,
-            action=check_action_kind(self.action),
-            state=check_state_kind(self.state),
+            action=check_choice("action", self.action, ACTION_KINDS),
+            state=check_choice("state", self.state, STATE_KINDS),
             privileged=self.privileged,
             features=self.features,
             takeover=self.takeover,

@@ -24,7 +24,7 @@ from demorec.generate.options import RunOptions
 from demorec.generate.plan import Schedule
 from demorec.generate.survey import Inspector
 from demorec.processes import available_cores
-from demorec.render.warm_up import warm_up_renderer
+from demorec.render.warm import warm_up_renderer
 from demorec.runs.recordings import inspect_recording
 from demorec.runs.run_file import UNFINISHED, RunFile
 

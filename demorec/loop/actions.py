@@ -7,12 +7,10 @@ from typing import get_args
 
 import numpy as np
 
-from demorec.errors import ConfigError
 from demorec.geometry import Array, Pose, wrap_angle
-from demorec.registry import nearest_match
 from demorec.scene import features
 from demorec.scene.episode import Action
-from demorec.scene.features import STATE_KINDS, ActionKind, StateKind
+from demorec.scene.features import ActionKind
 from demorec.scene.robot import RobotSpec
 from demorec.sim.world import World
 
@@ -20,24 +18,6 @@ ACTION_KINDS: tuple[ActionKind, ...] = get_args(ActionKind)
 
 NULL_GAIN = 0.05
 """Pull of the elbow towards where the expert has it, when a policy commands poses."""
-
-
-def check_action_kind(name: str) -> ActionKind:
-    """Return `name`; ConfigError unless it is a kind of action."""
-    for kind in ACTION_KINDS:
-        if kind == name:
-            return kind
-    raise ConfigError(
-        f"Unknown action {name!r}.{nearest_match(name, ACTION_KINDS)} Allowed: {', '.join(ACTION_KINDS)}."
-    )
-
-
-def check_state_kind(name: str) -> StateKind:
-    """Return `name`; ConfigError unless it is a kind of observation.state."""
-    for kind in STATE_KINDS:
-        if kind == name:
-            return kind
-    raise ConfigError(f"Unknown state {name!r}.{nearest_match(name, STATE_KINDS)} Allowed: {', '.join(STATE_KINDS)}.")
 
 
 def action_bounds(robot: RobotSpec, kind: ActionKind, *, fps: int) -> tuple[Array, Array]:
@@ -77,7 +57,7 @@ class ActionDecoder:
     def __init__(self, world: World, kind: ActionKind, *, is_limited: bool = True) -> None:
         self.num_unreachable = 0
         self._is_limited = is_limited
-        self._robot, self._kinematics, self._kind = world.robot, world.arm.kinematics, kind
+        self._robot, self._arm, self._kinematics, self._kind = world.robot, world.arm, world.arm.kinematics, kind
         self._max_step = np.array(world.robot.velocity_limit) / world.fps
         self._joint_target: Array = world.arm.target.copy()
         self._tcp_target: Pose = world.observe().base_from_tcp
@@ -91,9 +71,7 @@ class ActionDecoder:
             wanted = np.clip(wanted, self._joint_target - self._max_step, self._joint_target + self._max_step)
             gripper = float(np.clip(gripper, 0.0, self._robot.gripper.max_width))
         self._joint_target = wanted
-        self._given = Action(
-            joint_target=wanted, gripper_target=gripper, base_from_tcp_target=self._kinematics.forward(wanted)
-        )
+        self._given = self._arm.action(wanted, gripper)
         return self._given
 
     def follow(self, command: Action) -> None:

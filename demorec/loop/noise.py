@@ -23,7 +23,7 @@ class ActionNoise:
     """
 
     def __init__(self, world: World, *, sigma: float, rng: np.random.Generator, fps: int) -> None:
-        self._kinematics = world.arm.kinematics
+        self._arm = world.arm
         self._sigma, self._rng = sigma, rng
         self._decay = (1.0 - NOISE_DECAY) ** (30 / fps)
         self._max_step = np.array(world.robot.velocity_limit) / fps
@@ -39,11 +39,7 @@ class ActionNoise:
         if step.noise_allowed:
             self._noise = self._noise + math.sqrt(1 - self._decay**2) * drawn
         target = step.action.joint_target + self._noise
-        target = np.clip(target, self._kinematics.lower, self._kinematics.upper)
+        target = np.clip(target, self._arm.kinematics.lower, self._arm.kinematics.upper)
         target = np.clip(target, self._last - self._max_step, self._last + self._max_step)
         self._last = target
-        return Action(
-            joint_target=target,
-            gripper_target=step.action.gripper_target,
-            base_from_tcp_target=self._kinematics.forward(target),
-        )
+        return self._arm.action(target, step.action.gripper_target)

@@ -52,8 +52,13 @@ class Session:
         self._outcome: Outcome | None = None
 
     @classmethod
-    def of_episode(cls, world: World, episode: Episode, renderer: Renderer | None = None) -> Self:
-        """A session of a prepared episode with its cameras and time limit; without a renderer it has no pictures."""
+    def of_episode(
+        cls, world: World, episode: Episode, renderer: Renderer | None = None, *, only_color: bool = False
+    ) -> Self:
+        """A session of a prepared episode with its cameras and time limit; without a renderer it has no pictures.
+
+        `only_color` leaves out the depth and the segmentation that its config asks for.
+        """
         config = episode.plan.config
         painter = None
         if renderer is not None:
@@ -61,8 +66,8 @@ class Session:
                 renderer,
                 episode.cameras,
                 true_from_recorded=episode.true_from_recorded,
-                depth=config.depth,
-                segmentation=config.segmentation,
+                depth=config.depth and not only_color,
+                segmentation=config.segmentation and not only_color,
                 antialias=config.antialias,
             )
         max_frames = math.floor(config.max_episode_seconds * episode.info.fps)

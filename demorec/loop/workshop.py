@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager
-
-from demorec.loop.prepare import make_renderer, make_world
+from demorec.loop.prepare import make_world
 from demorec.render import Renderer
+from demorec.render.warm import WarmRenderer
 from demorec.scene.episode import EpisodeInfo
 from demorec.sim.world import World
 
@@ -15,8 +14,7 @@ class Workshop:
 
     def __init__(self) -> None:
         self._world: World | None = None
-        self._renderer: AbstractContextManager[Renderer | None] | None = None
-        self._entered: Renderer | None = None
+        self._renderers = WarmRenderer()
         self._key: object = None
 
     @property
@@ -25,19 +23,21 @@ class Workshop:
         return self._world is not None
 
     def equip(self, info: EpisodeInfo) -> tuple[World, Renderer | None]:
-        """A world and a renderer for episodes like this one; the present ones where they fit."""
-        config = info.config
-        key = (info.robot, info.fps, config.get("joint_rate"), config.get("renderer"), bool(info.scene.cameras))
+        """A world and a renderer (None without cameras) for episodes like this one; the present ones where they fit.
+
+        Raises:
+            ConfigError: An unknown renderer.
+            MissingDependencyError, RenderError: It cannot work on this machine.
+        """
+        key = (info.robot, info.fps, info.config.get("joint_rate"))
         if self._world is None or key != self._key:
             self.close()
-            self._world, self._renderer, self._key = make_world(info), make_renderer(info), key
-            self._entered = self._renderer.__enter__()
-        return self._world, self._entered
+            self._world, self._key = make_world(info), key
+        return self._world, self._renderers.of(str(info.config.get("renderer", "raster"))) if info.scene.cameras else None
 
     def close(self) -> None:
         """Free both; harmless when called twice."""
-        if self._renderer is not None:
-            self._renderer.__exit__(None, None, None)
+        self._renderers.close()
         if self._world is not None:
             self._world.close()
-        self._world = self._renderer = self._entered = self._key = None
+        self._world = self._key = None

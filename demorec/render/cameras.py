@@ -6,9 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-import numpy as np
-
-from demorec.geometry import Pose, look_at
+from demorec.geometry import look_at
 from demorec.scene.robot import RobotSpec
 from demorec.scene.scene import Camera, Vector3
 
@@ -28,7 +26,7 @@ class CameraPreset:
     """
 
     summary: str
-    mount: Literal["world", "tcp"]
+    mount: Literal["world", "tcp"] = "world"
     eye: Vector3
     target: Vector3
     up: Vector3 = (0.0, 0.0, 1.0)
@@ -43,17 +41,12 @@ class CameraPreset:
             height=height,
             fov_y=max(self.fov_y, 2.0 * math.atan(math.tan(self.fov_x / 2.0) * height / width)),
             mount=self.mount if self.mount == "world" else robot.tcp_link,
-            mount_from_camera=self.mount_from_camera(),
+            mount_from_camera=look_at(self.eye, self.target, self.up),
         )
-
-    def mount_from_camera(self) -> Pose:
-        """Pose in the mount's frame, OpenCV axes."""
-        return look_at(np.array(self.eye), np.array(self.target), np.array(self.up))
 
 
 FRONT = CameraPreset(
     summary="in front of the table, looking at the arm: sees the whole workspace",
-    mount="world",
     eye=(1.45, 0.0, 0.95),
     target=(0.40, 0.0, 0.19),
     fov_y=math.radians(44.0),
@@ -61,7 +54,6 @@ FRONT = CameraPreset(
 
 TOP = CameraPreset(
     summary="above the table, looking down, the arm comes from below: sees where things stand",
-    mount="world",
     eye=(0.5, 0.0, 1.25),
     target=(0.5, 0.0, 0.0),
     up=(1.0, 0.0, 0.0),
@@ -72,7 +64,6 @@ TOP = CameraPreset(
 # (demorec.tasks.sampling.WORKSPACE) fills pictures of 7 to 5: 11 mm a pixel at 56 x 40.
 WORKSPACE = CameraPreset(
     summary="from in front and above, close: sees the objects, the fingers and little else, for small pictures",
-    mount="world",
     eye=(1.05, 0.0, 1.0),
     target=(0.49, 0.0, 0.03),
     fov_y=math.radians(22.5),

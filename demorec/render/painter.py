@@ -56,12 +56,16 @@ class Painter:
         detail: Mapping[str, int] | None = None,
     ) -> None:
         self._renderer = renderer
-        self._cameras = cameras
         self._true_from_recorded = true_from_recorded or {}
-        self._depth, self._segmentation, self._antialias = depth, segmentation, antialias
-        self._detail = detail or {}
         self._world: Drawable | None = None
-        self._setup: RenderSetup | None = None
+        self._setup = RenderSetup(
+            bodies=(),
+            cameras=cameras,
+            depth=depth,
+            segmentation=segmentation,
+            antialias=antialias,
+            detail=detail or {},
+        )
 
     def setup(self, world: Drawable) -> None:
         """Take over a world in a new scene; it is drawn from now on.
@@ -70,16 +74,7 @@ class Painter:
             RenderError: The renderer cannot draw a shape or camera.
         """
         self._world = world
-        self._setup = RenderSetup(
-            bodies=world.visuals(),
-            cameras=self._cameras,
-            mounts=world.mounts(),
-            light=world.scene.light,
-            depth=self._depth,
-            segmentation=self._segmentation,
-            antialias=self._antialias,
-            detail=self._detail,
-        )
+        self._setup = replace(self._setup, bodies=world.visuals(), mounts=world.mounts(), light=world.scene.light)
         self._renderer.setup(self._setup)
 
     def images(self) -> dict[str, CameraImages]:
@@ -89,7 +84,7 @@ class Painter:
             RuntimeError: `setup` was not called.
             RenderError: A shape that was changed since cannot be drawn.
         """
-        if self._world is None or self._setup is None:
+        if self._world is None:
             raise RuntimeError("the painter has no world: call setup first")
         bodies = self._world.visuals()
         if bodies != self._setup.bodies:  # a colour or shape was changed

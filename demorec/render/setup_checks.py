@@ -16,7 +16,7 @@ MAX_SAMPLES = 1 << 28
 def check_setup(setup: RenderSetup) -> None:
     """Raise RenderError for a camera that cannot draw, or whose mount does not exist."""
     for camera in setup.cameras:
-        check_camera(camera, antialias=setup.antialias)
+        _check_camera(camera, antialias=setup.antialias)
         if camera.mount != "world" and camera.mount not in setup.mounts:
             raise RenderError(
                 f"The camera {camera.name!r} is mounted on the link {camera.mount!r}, which the robot does not have; "
@@ -24,7 +24,7 @@ def check_setup(setup: RenderSetup) -> None:
             )
 
 
-def check_camera(camera: Camera, *, antialias: bool) -> None:
+def _check_camera(camera: Camera, *, antialias: bool) -> None:
     """Raise RenderError for a camera that cannot draw: no pixels, too many, or clipping distances that cross."""
     if camera.width < 1 or camera.height < 1:
         raise RenderError(f"Camera {camera.name!r} is {camera.width}x{camera.height}: both sizes must be at least 1.")

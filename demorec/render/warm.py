@@ -1,8 +1,7 @@
-"""A renderer kept warm from one recording to the next: what it has read of meshes and textures is not read again."""
+"""Renderers that are ready: warmed up once on a machine, and kept warm from one recording to the next."""
 
 from __future__ import annotations
 
-from types import TracebackType
 from typing import Self
 
 from demorec.render import Renderer
@@ -10,7 +9,10 @@ from demorec.tables import RENDERERS
 
 
 class WarmRenderer:
-    """Hands out one renderer again and again, and another only when another name is asked for; a context manager."""
+    """Hands out one renderer again and again, and another only when another name is asked for; a context manager.
+
+    What it has read of meshes and textures is not read again.
+    """
 
     def __init__(self) -> None:
         self._name = ""
@@ -19,9 +21,7 @@ class WarmRenderer:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *exc: object) -> None:
         self.close()
 
     def of(self, name: str) -> Renderer:
@@ -41,3 +41,11 @@ class WarmRenderer:
         renderer, self._renderer = self._renderer, None
         if renderer is not None:
             renderer.close()
+
+
+def warm_up_renderer(renderer: str) -> None:
+    """Do what a renderer needs once on a machine, before several processes that use it start: compiling, for raster."""
+    if renderer == "raster":
+        from demorec.render.raster import warm_up
+
+        warm_up()

@@ -18,7 +18,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.geometry import Array, Pose, quat_multiply
+from demorec.geometry import Array, Pose, quat_multiply, quat_product, rotation_rows
 from demorec.scene.episode import EpisodeColumns, Observation
 from demorec.scene.robot import RobotSpec
 from demorec.scene.scene import Goal, Scene
@@ -136,31 +136,26 @@ def observation_vectors(
 
 
 def _environment_names(robot: RobotSpec, scene: Scene) -> Iterable[str]:
-    yield from (f"tcp.{axis}" for axis in _POSITION)
-    yield from ("tcp.yaw.sin", "tcp.yaw.cos")
+    yield from (*_axes("tcp."), "tcp.yaw.sin", "tcp.yaw.cos")
     for label, goal in _labelled_goals(scene):
-        n = scene.body(goal.object).yaw_symmetry
-        yield from (f"{label}.{axis}" for axis in _POSITION)
-        yield from (f"{label}.size.{axis}" for axis in _POSITION)
-        yield from (f"{label}.from_tcp.{axis}" for axis in _POSITION)
-        yield from (f"{label}.from_tcp.hand_{axis}" for axis in _POSITION)
+        n, wanted = scene.body(goal.object).yaw_symmetry, f"{label}.goal"
+        yield from _axes(f"{label}.", f"{label}.size.", f"{label}.from_tcp.", f"{label}.from_tcp.hand_")
         if n:
             yield from _yaw_names(f"{label}.yaw", n)
             yield from _yaw_names(f"{label}.from_tcp.yaw", n)
-        yield from (f"{label}.goal.{axis}" for axis in _POSITION)
-        yield from (f"{label}.goal.size.{axis}" for axis in _POSITION)
-        yield from (f"{label}.goal.from_tcp.{axis}" for axis in _POSITION)
-        yield from (f"{label}.goal.from_tcp.hand_{axis}" for axis in _POSITION)
-        yield from (f"{label}.from_tcp.near_{axis}" for axis in _POSITION)
-        yield from (f"{label}.goal.from_tcp.near_{axis}" for axis in _POSITION)
-        yield from (f"{label}.goal.from_{goal.object}.near_{axis}" for axis in _POSITION)
+        yield from _axes(f"{wanted}.", f"{wanted}.size.", f"{wanted}.from_tcp.", f"{wanted}.from_tcp.hand_")
+        yield from _axes(f"{label}.from_tcp.near_", f"{wanted}.from_tcp.near_", f"{wanted}.from_{goal.object}.near_")
         if goal.yaw_symmetry:
-            yield from _yaw_names(f"{label}.goal.yaw", goal.yaw_symmetry)
-            yield from _yaw_names(f"{label}.goal.from_{goal.object}.yaw", goal.yaw_symmetry)
+            yield from _yaw_names(f"{wanted}.yaw", goal.yaw_symmetry)
+            yield from _yaw_names(f"{wanted}.from_{goal.object}.yaw", goal.yaw_symmetry)
     yield from (f"{joint}.vel" for joint in robot.arm_joints)
     yield "gripper.vel"
     for body in scene.movable:
         yield from (f"{body.name}.pose.{axis}" for axis in _POSE)
+
+
+def _axes(*prefixes: str) -> Iterable[str]:
+    return (f"{prefix}{axis}" for prefix in prefixes for axis in _POSITION)
 
 
 def _yaw_names(prefix: str, n: int) -> tuple[str, str]:
@@ -381,30 +376,13 @@ def _continuous(pose: Array) -> Array:
 
 def _compose(a: Array, b: Array) -> Array:
     """(T, 7) of a @ b; either may have one row."""
-    ax, ay, az, aw = a[:, 3], a[:, 4], a[:, 5], a[:, 6]
-    bx, by, bz, bw = b[:, 3], b[:, 4], b[:, 5], b[:, 6]
     position = a[:, :3] + _rotate(a[:, 3:], b[:, :3])
-    quat = np.stack(
-        [
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-            aw * bw - ax * bx - ay * by - az * bz,
-        ],
-        axis=1,
-    )
-    return np.concatenate([position, quat], axis=1)
+    return np.concatenate([position, np.stack(quat_product(a[:, 3:].T, b[:, 3:].T), axis=1)], axis=1)
 
 
 def _rotation(quat: Array) -> Array:
     """(T, 3, 3) of unit quaternions (T, 4) xyzw."""
-    x, y, z, w = quat[:, 0], quat[:, 1], quat[:, 2], quat[:, 3]
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, axis=1) for row in rows], axis=1)
+    return np.stack([np.stack(row, axis=1) for row in rotation_rows(*quat.T)], axis=1)
 
 
 def _rotate(quat: Array, vector: Array) -> Array:

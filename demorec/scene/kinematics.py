@@ -17,6 +17,7 @@ from demorec.scene.urdf import Urdf
 
 POSITION_TOLERANCE = 1e-5
 ROTATION_TOLERANCE = 1e-4
+MAX_ITERATIONS = 60
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -85,19 +86,9 @@ class ArmKinematics:
 
     def forward(self, joint_position: Array) -> Pose:
         """`base_from_tcp` at (n,) joint positions, rad."""
-        position, rotation, _ = self._forward(joint_position)
-        return Pose(position=position, quat_xyzw=quat_from_rotation(rotation))
-
-    def jacobian(self, joint_position: Array) -> Array:
-        """(6, n) geometric Jacobian of the TCP in the base frame: linear, then angular velocity."""
-        return self._forward(joint_position)[2]
-
-    def _forward(self, joint_position: Array) -> tuple[Array, Array, Array]:
         q = np.ascontiguousarray(joint_position, dtype=np.float64)
-        return cast(
-            tuple[Array, Array, Array],
-            forward(q, self.origins, self.rotations, self.axes, self.tool, self.tool_rotation),
-        )
+        position, rotation, _ = forward(q, self.origins, self.rotations, self.axes, self.tool, self.tool_rotation)
+        return Pose(position=position, quat_xyzw=quat_from_rotation(rotation))
 
     def inverse(
         self,
@@ -106,7 +97,6 @@ class ArmKinematics:
         start: Array,
         rest: Array | None = None,
         null_gain: float = 0.1,
-        max_iterations: int = 60,
     ) -> Array | None:
         """Joint positions (n,) that reach a pose to 0.01 mm and 0.1 mrad, or None.
 
@@ -115,7 +105,6 @@ class ArmKinematics:
             start: (n,) where the iteration starts, rad.
             rest: (n,) configuration towards which the null space is pulled; None for no pull.
             null_gain: Strength of the pull, 1 per iteration.
-            max_iterations: Bound.
         """
         q, reached = inverse(
             np.array(base_from_tcp.position),
@@ -123,7 +112,7 @@ class ArmKinematics:
             np.array(start, dtype=np.float64),
             np.array(start if rest is None else rest, dtype=np.float64),
             0.0 if rest is None else null_gain,
-            max_iterations,
+            MAX_ITERATIONS,
             POSITION_TOLERANCE,
             ROTATION_TOLERANCE,
             *self._tables(),

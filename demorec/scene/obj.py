@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -80,26 +80,22 @@ def read_obj(path: Path) -> ObjFile:
         )
         return a, b, c
 
-    for line in path.read_text(errors="replace").splitlines():
-        words = line.split()
-        if not words:
-            continue
-        key = words[0]
+    for key, *words in _lines(path):
         if key == "v":
-            points.append([float(words[1]), float(words[2]), float(words[3])])
+            points.append([float(words[0]), float(words[1]), float(words[2])])
         elif key == "vt":
-            uvs.append([float(words[1]), float(words[2]) if len(words) > 2 else 0.0])
+            uvs.append([float(words[0]), float(words[1]) if len(words) > 1 else 0.0])
         elif key == "vn":
-            normals.append([float(words[1]), float(words[2]), float(words[3])])
+            normals.append([float(words[0]), float(words[1]), float(words[2])])
         elif key == "f":
-            polygon = [parse(word) for word in words[1:]]
+            polygon = [parse(word) for word in words]
             for i in range(1, len(polygon) - 1):
                 corners += [polygon[0], polygon[i], polygon[i + 1]]
                 face_materials.append(material)
         elif key == "mtllib":
-            materials |= _materials(path.parent / " ".join(words[1:]))
+            materials |= _materials(path.parent / " ".join(words))
         elif key == "usemtl":
-            material = " ".join(words[1:])
+            material = " ".join(words)
     found = ObjFile(
         points=np.array(points, dtype=np.float64).reshape(-1, 3),
         uvs=np.array(uvs, dtype=np.float64).reshape(-1, 2),
@@ -114,23 +110,25 @@ def read_obj(path: Path) -> ObjFile:
     return found
 
 
+def _lines(path: Path) -> Iterator[list[str]]:
+    """The words of each line that has any."""
+    return filter(None, map(str.split, path.read_text(errors="replace").splitlines()))
+
+
 def _materials(path: Path) -> dict[str, Material]:
     """Material name -> material, of an MTL file; a missing file means no materials."""
     found: dict[str, Material] = {}
     name = None
     if not path.is_file():
         return found
-    for line in path.read_text(errors="replace").splitlines():
-        words = line.split()
-        if not words:
-            continue
-        if words[0] == "newmtl":
-            name = " ".join(words[1:])
+    for key, *words in _lines(path):
+        if key == "newmtl":
+            name = " ".join(words)
             found[name] = Material(color=np.ones(3), texture=None)
-        elif name is not None and words[0] == "Kd" and len(words) >= 4:
-            color = np.array([float(word) for word in words[1:4]])
+        elif name is not None and key == "Kd" and len(words) >= 3:
+            color = np.array([float(word) for word in words[:3]])
             found[name] = Material(color=color, texture=found[name].texture)
-        elif name is not None and words[0] == "map_Kd" and len(words) >= 2:
+        elif name is not None and key == "map_Kd" and words:
             # Options (-s 1 1 1, ...) stand before the name.
             texture = path.parent / words[-1]
             found[name] = Material(color=found[name].color, texture=texture if texture.is_file() else None)

@@ -143,13 +143,9 @@ class Urdf:
     def link_poses(self, joint_position: Mapping[str, float]) -> dict[str, Pose]:
         """Link name -> base_from_link for the given joint positions (rad, m); joints left out are at 0."""
         poses = {self.root: Pose()}
-        waiting = list(self.joints)
-        while waiting:
-            ready = [joint for joint in waiting if joint.parent in poses]
-            for joint in ready:
-                moved = joint_motion(joint, joint_position.get(joint.name, 0.0))
-                poses[joint.child] = poses[joint.parent] @ joint.parent_from_joint @ moved
-            waiting = [joint for joint in waiting if joint.child not in poses]
+        for joint in self.depth_first():
+            moved = joint_motion(joint, joint_position.get(joint.name, 0.0))
+            poses[joint.child] = poses[joint.parent] @ joint.parent_from_joint @ moved
         return poses
 
     def depth_first(self) -> tuple[UrdfJoint, ...]:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from demorec.errors import DemorecError, SceneError
+from demorec.errors import SceneError
 from demorec.geometry import Array, Pose
 from demorec.scene.assets import asset_path
 from demorec.scene.episode import Action
@@ -14,7 +14,7 @@ from demorec.scene.kinematics import ArmKinematics
 from demorec.scene.robot import RobotSpec
 from demorec.scene.scene import POSITION_GAIN, RobotPlacement
 from demorec.scene.urdf import Urdf
-from demorec.sim.urdf_file import urdf_file
+from demorec.sim.urdf_file import load_urdf
 
 FINGER_DAMPING = 1_000.0
 """Contact of the finger pads, N s/m (the value of panda.urdf)."""
@@ -43,19 +43,8 @@ class Arm:
                 f"The robot {spec.name!r} has {len(spec.gripper.joints)} finger joints; a gripper of its kind has "
                 f"{num_fingers}."
             )
-        try:
-            with urdf_file(spec.urdf) as path:
-                self.body = client.loadURDF(
-                    path,
-                    placement.world_from_base.position.tolist(),
-                    placement.world_from_base.quat_xyzw.tolist(),
-                    useFixedBase=True,
-                    globalScaling=placement.scale,
-                )
-        except DemorecError:
-            raise
-        except Exception as error:  # PyBullet raises its own bare pybullet.error
-            raise SceneError(f"The robot {spec.name!r} cannot be loaded from {spec.urdf!r} ({error}).") from error
+        base, what = placement.world_from_base, f"robot {spec.name!r}"
+        self.body = load_urdf(client, spec.urdf, base, scale=placement.scale, is_fixed=True, what=what)
         info = [client.getJointInfo(self.body, i) for i in range(client.getNumJoints(self.body))]
         self.links = {spec.base_link: -1} | {row[12].decode(): row[0] for row in info}
         by_name = {row[1].decode(): row[0] for row in info}
@@ -121,6 +110,11 @@ class Arm:
         """Set all joints (n_joints,), fingers included, at once, at rest, without physics."""
         for joint, position in zip(self._arm + self._fingers, joint_position.tolist(), strict=True):
             self._client.resetJointState(self.body, joint, position)
+
+    def action(self, joint_target: Array, gripper_target: float) -> Action:
+        """The action with these targets, rad and metres; its pose is where they bring the TCP."""
+        pose = self.kinematics.forward(joint_target)
+        return Action(joint_target=joint_target, gripper_target=gripper_target, base_from_tcp_target=pose)
 
     def command(self, action: Action) -> None:
         """Begin a control step: the gripper's motors are set for all of it."""

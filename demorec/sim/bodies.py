@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
-from demorec.errors import DemorecError, SceneError
+from demorec.errors import SceneError
 from demorec.scene.assets import asset_path
-from demorec.scene.scene import Body, Shape
-from demorec.sim.urdf_file import urdf_file
+from demorec.scene.scene import Body
+from demorec.sim.urdf_file import load_urdf
 
 
 def add_body(client: Any, body: Body) -> int:
@@ -16,38 +17,29 @@ def add_body(client: Any, body: Body) -> int:
     Raises:
         SceneError: The shape's file is missing or cannot be loaded.
     """
-    pose = body.world_from_body
-    position, quat = pose.position.tolist(), pose.quat_xyzw.tolist()
-    if body.shape.kind == "urdf":
-        try:
-            with urdf_file(body.shape.file) as path:
-                index = client.loadURDF(
-                    path,
-                    position,
-                    quat,
-                    useFixedBase=not body.movable,
-                    globalScaling=body.shape.scale,
-                )
-        except DemorecError:
-            raise
-        except Exception as error:  # PyBullet raises its own bare pybullet.error
-            raise SceneError(f"The body {body.name!r} cannot be loaded from {body.shape.file!r} ({error}).") from error
+    pose, shape = body.world_from_body, body.shape
+    if shape.kind == "urdf":
+        what = f"body {body.name!r}"
+        index = load_urdf(client, shape.file, pose, scale=shape.scale, is_fixed=not body.movable, what=what)
         if body.mass > 0:
             client.changeDynamics(index, -1, mass=body.mass)
         if body.rgba != (1.0, 1.0, 1.0, 1.0):
             for link in range(-1, client.getNumJoints(index)):
                 client.changeVisualShape(index, link, rgbaColor=body.rgba)
     else:
-        frame = body.shape.body_from_mesh
+        frame = shape.body_from_mesh
         place = {"FramePosition": frame.position.tolist(), "FrameOrientation": frame.quat_xyzw.tolist()}
+        size, file = shape.size, ""
+        if shape.kind == "mesh":
+            size, file = (shape.scale,) * 3, str(asset_path(shape.file))
         collision = -1
         if body.collides:  # a mesh becomes its convex hull
-            geometry = _geometry(client, body.shape, length_name="height")
+            geometry = shape_arguments(client, shape.kind, size, file, length_name="height")
             collision = client.createCollisionShape(**geometry, **{f"collision{k}": v for k, v in place.items()})
-        geometry = _geometry(client, body.shape, length_name="length")
+        geometry = shape_arguments(client, shape.kind, size, file)
         placed = {f"visual{k}": v for k, v in place.items()}
         visual = client.createVisualShape(**geometry, **placed, rgbaColor=body.rgba)
-        index = client.createMultiBody(body.mass, collision, visual, position, quat)
+        index = client.createMultiBody(body.mass, collision, visual, pose.position.tolist(), pose.quat_xyzw.tolist())
     for link in range(-1, client.getNumJoints(index)):
         client.changeDynamics(
             index,
@@ -64,18 +56,27 @@ def add_body(client: Any, body: Body) -> int:
     return int(index)
 
 
-def _geometry(client: Any, shape: Shape, *, length_name: str) -> dict[str, Any]:
-    """Arguments of createCollisionShape ("height" of a cylinder) or createVisualShape (its "length")."""
-    match shape.kind:
+def shape_arguments(
+    client: Any, kind: str, size: Sequence[float], file: str = "", *, length_name: str = "length"
+) -> dict[str, Any]:
+    """Arguments of createVisualShape, or of createCollisionShape (`length_name` "height").
+
+    Args:
+        client: The PyBullet client.
+        kind, size, file: As of `demorec.render.Visual`.
+        length_name: What the length of a cylinder or capsule is called.
+
+    Raises:
+        SceneError: There is no such shape.
+    """
+    match kind:
         case "box":
-            return {"shapeType": client.GEOM_BOX, "halfExtents": [v / 2 for v in shape.size]}
+            return {"shapeType": client.GEOM_BOX, "halfExtents": [v / 2 for v in size]}
         case "sphere":
-            return {"shapeType": client.GEOM_SPHERE, "radius": shape.size[0]}
-        case "cylinder":
-            return {"shapeType": client.GEOM_CYLINDER, "radius": shape.size[0], length_name: shape.size[1]}
-        case "capsule":
-            return {"shapeType": client.GEOM_CAPSULE, "radius": shape.size[0], length_name: shape.size[1]}
+            return {"shapeType": client.GEOM_SPHERE, "radius": size[0]}
+        case "cylinder" | "capsule":
+            shape = client.GEOM_CYLINDER if kind == "cylinder" else client.GEOM_CAPSULE
+            return {"shapeType": shape, "radius": size[0], length_name: size[1]}
         case "mesh":
-            path = str(asset_path(shape.file))
-            return {"shapeType": client.GEOM_MESH, "fileName": path, "meshScale": [shape.scale] * 3}
-    raise SceneError(f"A body of shape {shape.kind!r} cannot be built.")
+            return {"shapeType": client.GEOM_MESH, "fileName": file, "meshScale": size}
+    raise SceneError(f"A body of shape {kind!r} cannot be built.")

@@ -1,4 +1,4 @@
-"""URDFs of our own and of the user's, with meshes of pybullet_data: PyBullet looks for meshes beside the URDF only."""
+"""URDFs into PyBullet, which looks for meshes beside the URDF only: ours and the user's name those of pybullet_data."""
 
 from __future__ import annotations
 
@@ -9,8 +9,35 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
+from demorec.errors import DemorecError, SceneError
+from demorec.geometry import Pose
 from demorec.scene.assets import asset_path, mesh_path
+
+
+def load_urdf(client: Any, name: str, pose: Pose, *, scale: float, is_fixed: bool, what: str) -> int:
+    """Load a URDF and return its PyBullet index.
+
+    Args:
+        client: The PyBullet client.
+        name: As in `demorec.scene.assets.asset_path`.
+        pose: Of its base.
+        scale: Uniform scale.
+        is_fixed: Whether physics cannot move its base.
+        what: Whose model it is, for messages ("body 'duck'").
+
+    Raises:
+        SceneError: The URDF or one of its meshes is missing or cannot be loaded.
+    """
+    try:
+        with urdf_file(name) as path:
+            place = pose.position.tolist(), pose.quat_xyzw.tolist()
+            return int(client.loadURDF(path, *place, useFixedBase=is_fixed, globalScaling=scale))
+    except DemorecError:
+        raise
+    except Exception as error:  # PyBullet raises its own bare pybullet.error
+        raise SceneError(f"The {what} cannot be loaded from {name!r} ({error}).") from error
 
 
 @contextmanager

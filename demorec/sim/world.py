@@ -44,7 +44,6 @@ class World:
         self.joint_samples: tuple[JointSample, ...] = ()
         """Of the last control step, both ends left out."""
         self._sample_joints = sample_joints
-        self._closed = False
         self._scene: Scene | None = None
         self._shape_rows: ShapeRows = ()
         self._visuals: tuple[VisualBody, ...] = ()
@@ -57,9 +56,7 @@ class World:
 
     def close(self) -> None:
         """Free the client; harmless when called twice."""
-        if not self._closed:
-            self._closed = True
-            self.client.disconnect()
+        self.client.disconnect()
 
     @property
     def scene(self) -> Scene:
@@ -106,12 +103,7 @@ class World:
 
     def hold(self) -> Action:
         """The command that keeps the present targets."""
-        q = self.arm.target.copy()
-        return Action(
-            joint_target=q,
-            gripper_target=self.arm.gripper_target,
-            base_from_tcp_target=self.arm.kinematics.forward(q),
-        )
+        return self.arm.action(self.arm.target.copy(), self.arm.gripper_target)
 
     def apply(self, command: Action) -> None:
         """Advance by one control step; the joint targets move linearly from the last command to this one."""

@@ -25,16 +25,20 @@ COLORS: Mapping[str, Rgba] = {
 """Colours that have a name in instructions."""
 
 
-def table_and_floor() -> tuple[Body, Body]:
-    """The floor and a table whose top is at z = 0."""
-    floor = Body(
+def floor(height: float) -> Body:
+    """A floor whose upper face is at z = `height`, metres."""
+    return Body(
         name="floor",
         role="fixture",
         shape=Shape(kind="box", size=(8.0, 8.0, 0.02)),
-        world_from_body=Pose(position=np.array([0.0, 0.0, -TABLE_HEIGHT - 0.01])),
+        world_from_body=Pose(position=np.array([0.0, 0.0, height - 0.01])),
         lateral_friction=1.0,
         rgba=(0.47, 0.49, 0.52, 1.0),
     )
+
+
+def table_and_floor() -> tuple[Body, Body]:
+    """The floor and a table whose top is at z = 0."""
     table = Body(
         name="table",
         role="support",
@@ -43,7 +47,7 @@ def table_and_floor() -> tuple[Body, Body]:
         lateral_friction=0.6,
         rgba=(0.80, 0.70, 0.57, 1.0),
     )
-    return floor, table
+    return floor(-TABLE_HEIGHT), table
 
 
 def mark(name: str, point: tuple[float, float], yaw: float, *, side: float, color_name: str) -> Body:

@@ -43,6 +43,11 @@ def symmetric_yaws(yaw: float, symmetry: int) -> list[float]:
     return [wrap_angle(yaw + 2 * math.pi * k / symmetry) for k in range(symmetry)]
 
 
+def nearest_first(yaws: Iterable[float], now: float) -> list[float]:
+    """Yaws, rad, in the order of how far the hand turns to them from its present one."""
+    return sorted(yaws, key=lambda yaw: abs(wrap_angle(yaw - now)))
+
+
 def grasp_yaws(body: Body, pose: Pose, now: float, open_width: float) -> list[float]:
     """Hand yaws, rad, at which the fingers close over two opposite faces that fit between them.
 

@@ -4,15 +4,11 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
 from demorec.scene.episode import SuccessCheck
-from demorec.scene.robot import RobotSpec
-from demorec.scene.scene import Scene
 from demorec.sim.world import World
-from demorec.tasks.furniture import mark, robot_at_origin, table_and_floor
-from demorec.tasks.placing import PlacingTask, on_table, random_cube
-from demorec.tasks.sampling import WORKSPACE, Region, Sampler, wording
+from demorec.tasks.furniture import mark
+from demorec.tasks.placing import Layout, TableTask, on_table, random_cube
+from demorec.tasks.sampling import WORKSPACE, Region, Sampler
 from demorec.tasks.success import at_most
 
 ROW = Region(x=(0.40, 0.60), y=(-0.10, 0.10))
@@ -22,7 +18,7 @@ COLORS_IN_ORDER = (("red", "green", "blue"), ("green", "blue", "red"), ("blue", 
 MAX_UNEVENNESS = 0.015
 
 
-class LineUp(PlacingTask):
+class LineUp(TableTask):
     """Put three cubes on three marks in a row.
 
     Task: three cubes on the table, three marks in a straight row at even distance.
@@ -33,9 +29,13 @@ class LineUp(PlacingTask):
     """
 
     summary = "three cubes in a row at even distance"
+    wordings = (
+        "line up the cubes on the yellow marks: {moved[0]}, {moved[1]}, {moved[2]}",
+        "put the {moved[0]}, {moved[1]} and {moved[2]} cubes in a row on the marks",
+    )
 
-    def sample_scene(self, robot: RobotSpec, sampler: Sampler) -> Scene:
-        """Draw a layout."""
+    def layout(self, sampler: Sampler) -> Layout:
+        """Draw it."""
         spacing = sampler.uniform(0.12, 0.15)
         direction = sampler.uniform(-math.pi / 2, math.pi / 2)
         along = (math.cos(direction), math.sin(direction))
@@ -58,23 +58,8 @@ class LineUp(PlacingTask):
         marks = [
             mark(f"mark_{k + 1}", place, direction, side=0.06, color_name="yellow") for k, place in enumerate(places)
         ]
-        return Scene(
-            robot=robot_at_origin(robot, sampler),
-            bodies=(*table_and_floor(), *marks, *cubes),
-            goals=tuple(on_table(body, place, direction) for body, place in zip(cubes, places, strict=True)),
-        )
-
-    def instruction(self, scene: Scene, rng: np.random.Generator) -> str:
-        """What to do, in words."""
-        first, second, third = (scene.body(goal.object).color_name for goal in scene.goals)
-        return wording(
-            rng,
-            "line up the cubes on the yellow marks: {first}, {second}, {third}",
-            "put the {first}, {second} and {third} cubes in a row on the marks",
-            first=first,
-            second=second,
-            third=third,
-        )
+        goals = [on_table(body, place, direction) for body, place in zip(cubes, places, strict=True)]
+        return [*marks, *cubes], goals
 
     def evaluate(self, world: World) -> tuple[SuccessCheck, ...]:
         """Each cube on its mark, the row straight and even."""

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import numpy as np
-
-from demorec.scene.robot import RobotSpec
-from demorec.scene.scene import Body, Scene
-from demorec.tasks.furniture import COLORS, mark, robot_at_origin, table_and_floor
-from demorec.tasks.placing import PlacingTask, on_table
-from demorec.tasks.sampling import WORKSPACE, Region, Sampler, wording
-from demorec.tasks.things import make_thing, words_for
+from demorec.scene.scene import Body
+from demorec.tasks.furniture import COLORS, mark
+from demorec.tasks.placing import Layout, TableTask, on_table
+from demorec.tasks.sampling import WORKSPACE, Region, Sampler
+from demorec.tasks.things import make_thing
 
 CLUTTER = Region(x=(0.33, 0.68), y=(-0.30, 0.30))
 OTHER_KINDS = ("block", "cylinder", "cube", "cube")
@@ -17,7 +14,7 @@ GAP = 0.115
 """Between the centres of neighbours, metres: the open hand must fit between them."""
 
 
-class PickFromClutter(PlacingTask):
+class PickFromClutter(TableTask):
     """Pick the cube of the named colour out of a clutter and place it on the mark.
 
     Task: three to five things of other colours and shapes around the wanted cube, a square mark.
@@ -28,9 +25,14 @@ class PickFromClutter(PlacingTask):
     """
 
     summary = "the cube of the named colour out of a clutter"
+    wordings = (
+        "pick the {thing} out of the clutter and place it on the green target",
+        "find the {thing} and put it on the green target",
+        "move only the {thing} to the green target",
+    )
 
-    def sample_scene(self, robot: RobotSpec, sampler: Sampler) -> Scene:
-        """Draw a layout."""
+    def layout(self, sampler: Sampler) -> Layout:
+        """Draw it."""
         colors = [name for name in COLORS if name != "green"]
         order = sampler.rng.permutation(len(colors))
         colors = [colors[i] for i in order]
@@ -48,18 +50,4 @@ class PickFromClutter(PlacingTask):
             name = f"{color}_{kind}" if index < len(OTHER_KINDS) else f"other_{color}_{kind}"
             others.append(make_thing(sampler, kind, name, point, sampler.yaw(), color_name=color, role="distractor"))
         target = mark("green_target", place, place_yaw, side=0.08, color_name="green")
-        return Scene(
-            robot=robot_at_origin(robot, sampler),
-            bodies=(*table_and_floor(), target, wanted, *others),
-            goals=(on_table(wanted, place, place_yaw),),
-        )
-
-    def instruction(self, scene: Scene, rng: np.random.Generator) -> str:
-        """What to do, in words."""
-        return wording(
-            rng,
-            "pick the {thing} out of the clutter and place it on the green target",
-            "find the {thing} and put it on the green target",
-            "move only the {thing} to the green target",
-            thing=words_for(scene.body(scene.goals[0].object)),
-        )
+        return [target, wanted, *others], [on_table(wanted, place, place_yaw)]

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import numpy as np
-
-from demorec.scene.robot import RobotSpec
-from demorec.scene.scene import Scene
-from demorec.tasks.furniture import mark, robot_at_origin, table_and_floor
-from demorec.tasks.placing import PlacingTask, on_table, random_cube
-from demorec.tasks.sampling import WORKSPACE, Sampler, wording
+from demorec.tasks.furniture import mark
+from demorec.tasks.placing import Layout, TableTask, on_table, random_cube
+from demorec.tasks.sampling import WORKSPACE, Sampler
 
 
-class PickPlace(PlacingTask):
+class PickPlace(TableTask):
     """Pick up the cube and place it on the mark.
 
     Task: one cube, one square mark on the table.
@@ -22,32 +18,18 @@ class PickPlace(PlacingTask):
     """
 
     summary = "a cube to a target mark on the table"
+    wordings = (
+        "pick up the {moved[0]} cube and place it on the {targets[0]} target",
+        "put the {moved[0]} cube on the {targets[0]} target",
+        "move the {moved[0]} cube to the {targets[0]} target",
+    )
 
-    def sample_scene(self, robot: RobotSpec, sampler: Sampler) -> Scene:
-        """Draw a layout."""
+    def layout(self, sampler: Sampler) -> Layout:
+        """Draw it."""
         start = sampler.point(WORKSPACE, what="the cube")
         cube_yaw = sampler.yaw()
         place = sampler.point(WORKSPACE, away_from=[start], min_distance=0.12, what="the target")
         place_yaw = sampler.yaw()
         body = random_cube(sampler, "red", start, cube_yaw, sides=(0.03, 0.06))
         target = mark("green_target", place, place_yaw, side=0.08, color_name="green")
-        goal = on_table(body, place, place_yaw)
-        return Scene(
-            robot=robot_at_origin(robot, sampler),
-            bodies=(*table_and_floor(), target, body),
-            goals=(goal,),
-        )
-
-    def instruction(self, scene: Scene, rng: np.random.Generator) -> str:
-        """What to do, in words."""
-        goal = scene.goals[0]
-        color = scene.body(goal.object).color_name
-        target = next(body for body in scene.bodies if body.role == "target")
-        return wording(
-            rng,
-            "pick up the {color} cube and place it on the {mark} target",
-            "put the {color} cube on the {mark} target",
-            "move the {color} cube to the {mark} target",
-            color=color,
-            mark=target.color_name,
-        )
+        return [target, body], [on_table(body, place, place_yaw)]

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import numpy as np
-
-from demorec.scene.robot import RobotSpec
-from demorec.scene.scene import Scene
-from demorec.tasks.furniture import COLORS, mark, robot_at_origin, table_and_floor
-from demorec.tasks.placing import PlacingTask, on_table
-from demorec.tasks.sampling import WORKSPACE, Sampler, wording
-from demorec.tasks.things import THINGS, make_thing, words_for
+from demorec.tasks.furniture import COLORS, mark
+from demorec.tasks.placing import Layout, TableTask, on_table
+from demorec.tasks.sampling import WORKSPACE, Sampler
+from demorec.tasks.things import THINGS, make_thing
 
 KINDS = tuple(kind for kind in THINGS if kind != "cube")
 
 
-class PickShapes(PlacingTask):
+class PickShapes(TableTask):
     """Pick up a thing of any shape and place it on the mark.
 
     Task: one of a block, a cylinder, a wooden plank, a toy brick, a duck or a mug; a square mark on the table.
@@ -25,9 +21,14 @@ class PickShapes(PlacingTask):
     """
 
     summary = "blocks, cylinders and small household things to a mark"
+    wordings = (
+        "pick up the {thing} and place it on the green target",
+        "put the {thing} on the green target",
+        "move the {thing} to the green target",
+    )
 
-    def sample_scene(self, robot: RobotSpec, sampler: Sampler) -> Scene:
-        """Draw a layout."""
+    def layout(self, sampler: Sampler) -> Layout:
+        """Draw it."""
         kind = sampler.choice(KINDS)
         color = sampler.choice([name for name in COLORS if name != "green"])
         start = sampler.point(WORKSPACE, what="the thing")
@@ -37,18 +38,4 @@ class PickShapes(PlacingTask):
         name = f"{color}_{kind}" if THINGS[kind].painted else kind
         thing = make_thing(sampler, kind, name, start, yaw, color_name=color, role="object")
         target = mark("green_target", place, place_yaw, side=0.10, color_name="green")
-        return Scene(
-            robot=robot_at_origin(robot, sampler),
-            bodies=(*table_and_floor(), target, thing),
-            goals=(on_table(thing, place, place_yaw, yaw_symmetry=0),),
-        )
-
-    def instruction(self, scene: Scene, rng: np.random.Generator) -> str:
-        """What to do, in words."""
-        return wording(
-            rng,
-            "pick up the {thing} and place it on the green target",
-            "put the {thing} on the green target",
-            "move the {thing} to the green target",
-            thing=words_for(scene.body(scene.goals[0].object)),
-        )
+        return [target, thing], [on_table(thing, place, place_yaw, yaw_symmetry=0)]

@@ -5,18 +5,16 @@ from __future__ import annotations
 import numpy as np
 
 from demorec.geometry import Pose
-from demorec.scene.robot import RobotSpec
-from demorec.scene.scene import Goal, Scene
-from demorec.tasks.furniture import robot_at_origin, table_and_floor
-from demorec.tasks.placing import TRAY_FLOOR, PlacingTask, random_cube, tray
-from demorec.tasks.sampling import Region, Sampler, wording
+from demorec.scene.scene import Goal
+from demorec.tasks.placing import TRAY_FLOOR, Layout, TableTask, random_cube, tray
+from demorec.tasks.sampling import Region, Sampler
 
 CUBES = Region(x=(0.35, 0.65), y=(-0.25, 0.15))
 TRAYS = Region(x=(0.40, 0.50), y=(0.36, 0.40))
 """Of the tray's middle: its far corner must be within the reach of a hand that points down."""
 
 
-class PlaceInTray(PlacingTask):
+class PlaceInTray(TableTask):
     """Pick up the cube and put it into the tray.
 
     Task: one cube on the table, one shallow tray at the robot's left.
@@ -27,9 +25,14 @@ class PlaceInTray(PlacingTask):
     """
 
     summary = "a cube into a tray"
+    wordings = (
+        "pick up the {moved[0]} cube and put it into the {bases[0]} tray",
+        "put the {moved[0]} cube in the {bases[0]} tray",
+        "place the {moved[0]} cube inside the {bases[0]} tray",
+    )
 
-    def sample_scene(self, robot: RobotSpec, sampler: Sampler) -> Scene:
-        """Draw a layout."""
+    def layout(self, sampler: Sampler) -> Layout:
+        """Draw it."""
         point = sampler.point(CUBES, what="the cube")
         yaw = sampler.yaw()
         body = random_cube(sampler, "red", point, yaw, sides=(0.03, 0.06))
@@ -46,16 +49,4 @@ class PlaceInTray(PlacingTask):
             onto=target.name,
             onto_from_goal=Pose.from_yaw((*offset, height), sampler.uniform(-np.pi, np.pi)),
         )
-        return Scene(robot=robot_at_origin(robot, sampler), bodies=(*table_and_floor(), target, body), goals=(goal,))
-
-    def instruction(self, scene: Scene, rng: np.random.Generator) -> str:
-        """What to do, in words."""
-        goal = scene.goals[0]
-        words = {"cube": scene.body(goal.object).color_name, "tray": scene.body(goal.onto).color_name}
-        return wording(
-            rng,
-            "pick up the {cube} cube and put it into the {tray} tray",
-            "put the {cube} cube in the {tray} tray",
-            "place the {cube} cube inside the {tray} tray",
-            **words,
-        )
+        return [target, body], [goal]

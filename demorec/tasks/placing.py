@@ -3,26 +3,33 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from abc import abstractmethod
+from collections.abc import Iterator, Sequence
+from typing import ClassVar
 
 import numpy as np
 
 from demorec.geometry import Pose
 from demorec.scene.episode import SuccessCheck
-from demorec.scene.scene import Body, Goal, Rgba, Shape
+from demorec.scene.robot import RobotSpec
+from demorec.scene.scene import Body, Goal, Rgba, Scene, Shape
 from demorec.sim.world import World
 from demorec.tasks.base import Task
-from demorec.tasks.furniture import COLORS, cube
+from demorec.tasks.furniture import COLORS, cube, robot_at_origin, table_and_floor
 from demorec.tasks.recovery import finish, put_back
-from demorec.tasks.sampling import Sampler
+from demorec.tasks.sampling import Sampler, wording
 from demorec.tasks.script import Step
 from demorec.tasks.skills import Expert
 from demorec.tasks.success import at_most, gripper_open_check, placement_checks
+from demorec.tasks.things import words_for
 
 TRAY_FLOOR = 0.004
 """Height of a tray's floor above its lower face, metres (tray.urdf)."""
 MAX_DISTURBANCE = 0.02
 """How far an object that is not to be moved may end from where it was, metres."""
+
+Layout = tuple[Sequence[Body], Sequence[Goal]]
+"""What is on the table, and the goals."""
 
 
 class PlacingTask(Task):
@@ -51,6 +58,35 @@ class PlacingTask(Task):
         """Goals, bystanders, gripper."""
         placed = [check for goal in world.scene.goals for check in placement_checks(world, goal)]
         return (*placed, *undisturbed_checks(world), gripper_open_check(world))
+
+
+class TableTask(PlacingTask):
+    """A placing task of things on the table behind which the robot stands."""
+
+    wordings: ClassVar[tuple[str, ...]]
+    """Of the instruction: `thing` is what the first goal moves; `moved`, `bases` and `targets` are the colours of what
+    the goals move, of what they put it on or into, and of marks and trays."""
+
+    @abstractmethod
+    def layout(self, sampler: Sampler) -> Layout:
+        """Draw what is on the table, and the goals; SceneError when none is found."""
+
+    def sample_scene(self, robot: RobotSpec, sampler: Sampler) -> Scene:
+        """Draw a layout."""
+        bodies, goals = self.layout(sampler)
+        return Scene(robot=robot_at_origin(robot, sampler), bodies=(*table_and_floor(), *bodies), goals=tuple(goals))
+
+    def instruction(self, scene: Scene, rng: np.random.Generator) -> str:
+        """One of the wordings, filled in."""
+        moved = [scene.body(goal.object) for goal in scene.goals]
+        return wording(
+            rng,
+            *self.wordings,
+            thing=words_for(moved[0]),
+            moved=[body.color_name for body in moved],
+            bases=[scene.body(goal.onto).color_name for goal in scene.goals if goal.onto],
+            targets=[body.color_name for body in scene.bodies if body.role == "target"],
+        )
 
 
 def undisturbed_checks(world: World) -> tuple[SuccessCheck, ...]:

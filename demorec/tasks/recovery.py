@@ -12,12 +12,11 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from demorec.geometry import wrap_angle
 from demorec.scene.episode import HALT_PHASE
 from demorec.scene.motion import PEAK_VELOCITY, quintic, slowdown
 from demorec.scene.scene import Goal
 from demorec.sim.world import World
-from demorec.tasks.grasping import hand_down, hand_yaw, symmetric_yaws
+from demorec.tasks.grasping import hand_down, hand_yaw, nearest_first, symmetric_yaws
 from demorec.tasks.script import Step
 from demorec.tasks.skills import Expert, GaveUp
 from demorec.tasks.success import placement_checks, resting_half_height
@@ -156,22 +155,16 @@ def _is_open(expert: Expert) -> bool:
 def _lowest_clear(expert: Expert) -> float:
     """Height of the TCP, metres, at which the finger tips pass over everything that can be moved and every goal."""
     world = expert.world
-    tops = [world.pose(body.name).position[2] + _half_height(world, body.name) for body in world.scene.bodies]
+    placed = [(body, world.pose(body.name)) for body in world.scene.bodies]
+    tops = [pose.position[2] + resting_half_height(body, pose) for body, pose in placed]
     return max(tops, default=0.0) + world.robot.gripper.finger_depth + _CLEARANCE
-
-
-def _half_height(world: World, name: str) -> float:
-    return resting_half_height(world.body(name), world.pose(name))
 
 
 def _rise(expert: Expert) -> Iterator[Step]:
     """Open the hand and rise, straightened, above everything; where no such line can be followed, go home."""
-    world = expert.world
-    yield from expert.set_gripper(
-        expert.open_width, max_seconds=0.5, done=lambda: world.arm.gripper_width() > expert.open_width - 0.002
-    )
+    yield from expert.open_gripper(max_seconds=0.5)
     here = expert.tcp()
-    yaws = sorted(symmetric_yaws(hand_yaw(here), 8), key=lambda yaw: abs(wrap_angle(yaw - hand_yaw(here))))
+    yaws = nearest_first(symmetric_yaws(hand_yaw(here), 8), hand_yaw(here))
     lowest = _lowest_clear(expert) - _CLEARANCE
     for height in _HEIGHTS:
         for yaw in yaws[:3]:

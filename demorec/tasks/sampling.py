@@ -12,7 +12,6 @@ import numpy as np
 
 from demorec.errors import SceneError
 from demorec.geometry import Array
-from demorec.scene.scene import Vector3
 from demorec.scene.variation import PRESETS, Ranges
 from demorec.seeding import generator
 
@@ -151,20 +150,16 @@ def stratified_point(
     """
     if method == "random":
         return ()
-    if method == "sobol":
-        return tuple(float(v) for v in _sobol(root_seed, episode_index))
-    cube, row = divmod(episode_index, block)
-    return tuple(float(v) for v in _latin_hypercube(root_seed, cube, block)[row])
-
-
-def _sobol(root_seed: int, index: int) -> Array:
+    if method == "lhs":
+        cube, row = divmod(episode_index, block)
+        return tuple(_latin_hypercube(root_seed, cube, block)[row].tolist())
     from scipy.stats import qmc
 
     rng = generator(root_seed=root_seed, episode_index=0, attempt=0, purpose="sampling")
     sequence = qmc.Sobol(d=STRATIFIED_NUMBERS, scramble=True, seed=rng)
-    if index:
-        sequence.fast_forward(index)
-    return np.asarray(sequence.random(1)[0], dtype=np.float64)
+    if episode_index:
+        sequence.fast_forward(episode_index)
+    return tuple(sequence.random(1)[0].tolist())
 
 
 @functools.lru_cache(maxsize=4)
@@ -175,11 +170,6 @@ def _latin_hypercube(root_seed: int, cube: int, block: int) -> Array:
     return np.asarray(qmc.LatinHypercube(d=STRATIFIED_NUMBERS, seed=rng).random(block), dtype=np.float64)
 
 
-def at(point: tuple[float, float], z: float) -> Vector3:
-    """A point on the table as (x, y, z)."""
-    return (point[0], point[1], z)
-
-
-def wording(rng: np.random.Generator, *templates: str, **words: str) -> str:
+def wording(rng: np.random.Generator, *templates: str, **words: object) -> str:
     """One of several wordings of an instruction, filled in."""
     return templates[int(rng.integers(len(templates)))].format(**words)

@@ -14,11 +14,19 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from demorec.geometry import Array, Pose, wrap_angle
-from demorec.scene.episode import Action, Event
+from demorec.scene.episode import Event
 from demorec.scene.motion import MotionLimits, plan_straight
 from demorec.scene.scene import Goal, yaw_of
 from demorec.sim.world import World
-from demorec.tasks.grasping import grasp_yaws, grasps_beside, hand_down, hand_yaw, raised, symmetric_yaws
+from demorec.tasks.grasping import (
+    grasp_yaws,
+    grasps_beside,
+    hand_down,
+    hand_yaw,
+    nearest_first,
+    raised,
+    symmetric_yaws,
+)
 from demorec.tasks.script import Behaviour, Step
 from demorec.tasks.success import goal_pose, on_support, placement_checks, resting_half_height
 from demorec.tasks.waiting import steady_width
@@ -92,6 +100,11 @@ class Expert:
         """The gripper's full opening, metres."""
         return self.world.robot.gripper.max_width
 
+    def _out_of_reach(self, what: str) -> GaveUp:
+        """What is raised for something that cannot be reached, which is noted."""
+        self.note("unreachable", f"{what} is out of reach", trouble=True)
+        return GaveUp(self.phase, "unreachable")
+
     def note(self, name: str, message: str, *, trouble: bool = False) -> None:
         """Record an event with the next step; `trouble` also keeps it as the reason of a failure."""
         self._events.append(Event(name=name, message=message, level="warning" if trouble else "info"))
@@ -102,11 +115,7 @@ class Expert:
         """The control step that holds the present targets."""
         events, self._events = tuple(self._events), []
         return Step(
-            action=Action(
-                joint_target=self.joint_target.copy(),
-                gripper_target=self.gripper_target,
-                base_from_tcp_target=self.arm.forward(self.joint_target),
-            ),
+            action=self.world.arm.action(self.joint_target.copy(), self.gripper_target),
             phase=self.phase,
             noise_allowed=self._free and self.tcp().position[2] > self._clear_height,
             events=events,
@@ -143,6 +152,7 @@ class Expert:
         *,
         speed: float,
         free: bool = False,
+        clear_height: float = -math.inf,
         settle: bool = True,
         until: Callable[[], bool] | None = None,
     ) -> Iterator[Step]:
@@ -152,13 +162,14 @@ class Expert:
             world_from_tcp: Where to.
             speed: Peak speed, m/s; multiplied by the behaviour's speed.
             free: Whether exploration noise is allowed.
+            clear_height: Height of the TCP, metres, above which it is.
             settle: Whether to wait, for a fraction of a second, until the joints have caught up.
             until: Stop as soon as this holds.
 
         Raises:
             GaveUp: The arm cannot follow this line.
         """
-        self._free = free
+        self._free, self._clear_height = free, clear_height
         path = plan_straight(
             self.arm,
             start=self.joint_target,
@@ -193,6 +204,13 @@ class Expert:
             yield self.step()
             if done():
                 return
+
+    def open_gripper(self, *, max_seconds: float) -> Iterator[Step]:
+        """Open the hand and hold still until it is open, or until the time is over."""
+        open_enough = self.open_width - 0.002
+        yield from self.set_gripper(
+            self.open_width, max_seconds=max_seconds, done=lambda: self.world.arm.gripper_width() > open_enough
+        )
 
     def pick_and_place(self, goal: Goal, *, is_begun: bool = False) -> Iterator[Step]:
         """Bring one object to its goal, trying again after a miss, a drop or a bad placement.
@@ -232,9 +250,7 @@ class Expert:
         if found is not None:
             self.note("grasp", f"grasp {name} at yaw {hand_yaw(found):.4f} rad")
             return found
-        place = np.round(self.world.pose(name).position, 3).tolist()
-        self.note("unreachable", f"{name} at {place} is out of reach", trouble=True)
-        raise GaveUp(self.phase, "unreachable")
+        raise self._out_of_reach(f"{name} at {np.round(self.world.pose(name).position, 3).tolist()}")
 
     def is_above_object(self, name: str) -> bool:
         """Whether the hand needs but to be lowered to grasp an object."""
@@ -248,11 +264,10 @@ class Expert:
             GaveUp: Out of reach at every yaw.
         """
         now = hand_yaw(self.tcp())
-        yaws = sorted(symmetric_yaws(now, 24), key=lambda yaw: abs(wrap_angle(yaw - now)))
+        yaws = nearest_first(symmetric_yaws(now, 24), now)
         place = next((p for p in (hand_down(position, yaw) for yaw in yaws) if self.reaches(p)), None)
         if place is None:
-            self.note("unreachable", f"{np.round(position, 3).tolist()} is out of reach", trouble=True)
-            raise GaveUp(self.phase, "unreachable")
+            raise self._out_of_reach(f"{np.round(position, 3).tolist()}")
         return place
 
     def pick(self, name: str, *, is_begun: bool = False) -> Generator[Step, None, bool]:
@@ -270,7 +285,6 @@ class Expert:
 
         self.phase = "approach"
         self.gripper_target = self.open_width
-        self._clear_height = -math.inf
         if not (is_begun and self.is_above(grasp)):
             yield from self.move(raised(grasp, above_by), speed=FREE_SPEED, free=True)
         self.phase = "descend"
@@ -337,16 +351,12 @@ class Expert:
             return False
 
         self.phase = "release"
-        open_enough = self.open_width - 0.002
-        yield from self.set_gripper(
-            self.open_width, max_seconds=1.0, done=lambda: world.arm.gripper_width() > open_enough
-        )
+        yield from self.open_gripper(max_seconds=1.0)
         self.phase = "retreat"
         here = self.tcp_target()
-        self._clear_height = here.position[2] + 0.07
         away = raised(here, max(0.1, self.behaviour.approach_height))
-        yield from self.move(away, speed=LIFT_SPEED, free=True, settle=False)
-        self._clear_height = -math.inf
+        clear_height = float(here.position[2]) + 0.07
+        yield from self.move(away, speed=LIFT_SPEED, free=True, clear_height=clear_height, settle=False)
         self.phase = "verify"
         failed = [check.name for check in placement_checks(world, goal) if not check.passed]
         if failed:
@@ -378,13 +388,9 @@ class Expert:
         """Let go of whatever is there and rise."""
         self.phase = "recover"
         self.joint_target = self.world.arm.arm_position()
-        opened = self.open_width - 0.002
-        yield from self.set_gripper(
-            self.open_width, max_seconds=0.3, done=lambda: self.world.arm.gripper_width() > opened
-        )
-        self._clear_height = self.tcp().position[2] + 0.07
-        yield from self.move(world_from_tcp, speed=0.4, free=True)
-        self._clear_height = -math.inf
+        yield from self.open_gripper(max_seconds=0.3)
+        clear_height = float(self.tcp().position[2]) + 0.07
+        yield from self.move(world_from_tcp, speed=0.4, free=True, clear_height=clear_height)
 
     def _grasps(self, name: str) -> list[Pose]:
         """Grasp poses `world_from_tcp` with the behaviour's errors, the yaw nearest to the hand's present one first."""
@@ -395,7 +401,7 @@ class Expert:
         # At the centre, but no deeper than the palm allows, and with the finger tips above the support.
         z = max(pose.position[2], top - (gripper.palm_clearance - 0.007), bottom + gripper.finger_depth + 0.005)
         now = hand_yaw(self.tcp())
-        yaws = sorted(grasp_yaws(body, pose, now, self.open_width), key=lambda yaw: abs(wrap_angle(yaw - now)))
+        yaws = nearest_first(grasp_yaws(body, pose, now, self.open_width), now)
         return [self._perturbed(hand_down((pose.position[0], pose.position[1], z), yaw)) for yaw in yaws]
 
     def _grasps_beside(self, name: str, grasp: Pose) -> list[Pose]:
@@ -428,12 +434,10 @@ class Expert:
         if keep_yaw or goal.yaw_symmetry == 0:
             yaws = [now]
         else:
-            yaws = symmetric_yaws(yaw_of(wanted) + now - yaw_of(pose), goal.yaw_symmetry)
-            yaws.sort(key=lambda yaw: abs(wrap_angle(yaw - now)))
+            yaws = nearest_first(symmetric_yaws(yaw_of(wanted) + now - yaw_of(pose), goal.yaw_symmetry), now)
         for yaw in yaws:
             down = hand_down((0.0, 0.0, 0.0), yaw)
             place = hand_down(centre - down.apply(hand_from_object), yaw)
             if self.reaches(place) and self.reaches(raised(place, self._transport_height(place) - place.position[2])):
                 return place
-        self.note("unreachable", f"the goal of {goal.object} is out of reach", trouble=True)
-        raise GaveUp(self.phase, "unreachable")
+        raise self._out_of_reach(f"the goal of {goal.object}")

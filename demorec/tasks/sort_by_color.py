@@ -4,14 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-
 from demorec.geometry import Pose
-from demorec.scene.robot import RobotSpec
-from demorec.scene.scene import Body, Goal, Scene
-from demorec.tasks.furniture import robot_at_origin, table_and_floor
-from demorec.tasks.placing import TRAY_FLOOR, PlacingTask, random_cube, tray
-from demorec.tasks.sampling import Region, Sampler, wording
+from demorec.scene.scene import Body, Goal
+from demorec.tasks.placing import TRAY_FLOOR, Layout, TableTask, random_cube, tray
+from demorec.tasks.sampling import Region, Sampler
 
 CUBES = Region(x=(0.36, 0.65), y=(-0.19, 0.19))
 TRAY_Y = 0.37
@@ -20,7 +16,7 @@ SLOTS = (-0.065, 0.065)
 COLOR_PAIRS = (("red", "blue"), ("green", "yellow"), ("red", "yellow"), ("blue", "green"))
 
 
-class SortByColor(PlacingTask):
+class SortByColor(TableTask):
     """Put every cube into the tray of its colour.
 
     Task: two to four cubes of two colours, two trays, one on either side.
@@ -31,9 +27,14 @@ class SortByColor(PlacingTask):
     """
 
     summary = "two to four cubes into the trays of their colours"
+    wordings = (
+        "sort the cubes into the trays of their colors",
+        "put every {targets[0]} cube into the {targets[0]} tray and every {targets[1]} cube into the {targets[1]} tray",
+        "sort the {targets[0]} and {targets[1]} cubes by color",
+    )
 
-    def sample_scene(self, robot: RobotSpec, sampler: Sampler) -> Scene:
-        """Draw a layout."""
+    def layout(self, sampler: Sampler) -> Layout:
+        """Draw it."""
         colors = sampler.choice(COLOR_PAIRS)
         if sampler.uniform(0.0, 1.0) < 0.5:
             colors = (colors[1], colors[0])
@@ -55,20 +56,4 @@ class SortByColor(PlacingTask):
                 place = (offset, sampler.uniform(-0.01, 0.01), TRAY_FLOOR + body.shape.size[2] / 2)
                 cubes.append(body)
                 goals.append(Goal(object=body.name, onto=target.name, onto_from_goal=Pose.from_yaw(place)))
-        return Scene(
-            robot=robot_at_origin(robot, sampler),
-            bodies=(*table_and_floor(), *trays, *cubes),
-            goals=tuple(goals),
-        )
-
-    def instruction(self, scene: Scene, rng: np.random.Generator) -> str:
-        """What to do, in words."""
-        colors = [body.color_name for body in scene.bodies if body.role == "target"]
-        return wording(
-            rng,
-            "sort the cubes into the trays of their colors",
-            "put every {first} cube into the {first} tray and every {second} cube into the {second} tray",
-            "sort the {first} and {second} cubes by color",
-            first=colors[0],
-            second=colors[1],
-        )
+        return [*trays, *cubes], goals

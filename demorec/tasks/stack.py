@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from demorec.scene.robot import RobotSpec
-from demorec.scene.scene import Scene
-from demorec.tasks.furniture import cube, mark, robot_at_origin, table_and_floor
-from demorec.tasks.placing import PlacingTask, on_table, onto_cube, random_cube
-from demorec.tasks.sampling import WORKSPACE, Region, Sampler, wording
+from demorec.tasks.furniture import cube, mark
+from demorec.tasks.placing import Layout, TableTask, on_table, onto_cube, random_cube
+from demorec.tasks.sampling import WORKSPACE, Region, Sampler
 
 INNER = Region(x=(0.38, 0.60), y=(-0.22, 0.22))
 """Where a tower stands: the hand must get above it."""
 
 
-class Stack(PlacingTask):
+class Stack(TableTask):
     """Pick up one cube and stack it on the other.
 
     Task: two cubes on the table.
@@ -25,9 +23,14 @@ class Stack(PlacingTask):
     """
 
     summary = "a cube onto another cube"
+    wordings = (
+        "stack the {moved[0]} cube on the {bases[0]} cube",
+        "pick up the {moved[0]} cube and place it on top of the {bases[0]} cube",
+        "put the {moved[0]} cube onto the {bases[0]} one",
+    )
 
-    def sample_scene(self, robot: RobotSpec, sampler: Sampler) -> Scene:
-        """Draw a layout."""
+    def layout(self, sampler: Sampler) -> Layout:
+        """Draw it."""
         upper_color, lower_color = sampler.choice([("red", "blue"), ("blue", "red"), ("red", "green")])
         start = sampler.point(WORKSPACE, what="the upper cube")
         yaw = sampler.yaw()
@@ -35,26 +38,10 @@ class Stack(PlacingTask):
         lower_yaw = sampler.yaw()
         upper = random_cube(sampler, upper_color, start, yaw, sides=(0.03, 0.06))
         lower = random_cube(sampler, lower_color, place, lower_yaw, sides=(0.04, 0.06))
-        return Scene(
-            robot=robot_at_origin(robot, sampler),
-            bodies=(*table_and_floor(), lower, upper),
-            goals=(onto_cube(upper, lower),),
-        )
-
-    def instruction(self, scene: Scene, rng: np.random.Generator) -> str:
-        """What to do, in words."""
-        goal = scene.goals[0]
-        return wording(
-            rng,
-            "stack the {upper} cube on the {lower} cube",
-            "pick up the {upper} cube and place it on top of the {lower} cube",
-            "put the {upper} cube onto the {lower} one",
-            upper=scene.body(goal.object).color_name,
-            lower=scene.body(goal.onto).color_name,
-        )
+        return [lower, upper], [onto_cube(upper, lower)]
 
 
-class StackThree(PlacingTask):
+class StackThree(TableTask):
     """Build a tower of three cubes.
 
     Task: three cubes on the table; the second goes onto the first, the third onto the second.
@@ -65,9 +52,13 @@ class StackThree(PlacingTask):
     """
 
     summary = "a tower of three cubes"
+    wordings = (
+        "stack the {moved[0]} cube on the {bases[0]} cube, then the {moved[1]} cube on the {moved[0]} cube",
+        "build a tower: {bases[0]} at the bottom, {moved[0]} in the middle, {moved[1]} on top",
+    )
 
-    def sample_scene(self, robot: RobotSpec, sampler: Sampler) -> Scene:
-        """Draw a layout."""
+    def layout(self, sampler: Sampler) -> Layout:
+        """Draw it."""
         colors = sampler.choice([("red", "green", "blue"), ("blue", "red", "green"), ("green", "blue", "red")])
         base = sampler.point(INNER, what="the lowest cube")
         base_yaw = sampler.yaw()
@@ -79,26 +70,10 @@ class StackThree(PlacingTask):
             random_cube(sampler, color, point, yaw, sides=(0.04, 0.055))
             for color, point, yaw in zip(colors, (base, second, third), (base_yaw, second_yaw, third_yaw), strict=True)
         ]
-        return Scene(
-            robot=robot_at_origin(robot, sampler),
-            bodies=(*table_and_floor(), *cubes),
-            goals=(onto_cube(cubes[1], cubes[0]), onto_cube(cubes[2], cubes[1])),
-        )
-
-    def instruction(self, scene: Scene, rng: np.random.Generator) -> str:
-        """What to do, in words."""
-        first, second = scene.goals
-        return wording(
-            rng,
-            "stack the {middle} cube on the {bottom} cube, then the {top} cube on the {middle} cube",
-            "build a tower: {bottom} at the bottom, {middle} in the middle, {top} on top",
-            bottom=scene.body(first.onto).color_name,
-            middle=scene.body(first.object).color_name,
-            top=scene.body(second.object).color_name,
-        )
+        return cubes, [onto_cube(cubes[1], cubes[0]), onto_cube(cubes[2], cubes[1])]
 
 
-class Unstack(PlacingTask):
+class Unstack(TableTask):
     """Take the upper cube off the lower one and place it on the mark.
 
     Task: a cube that stands on another, a square mark on the table.
@@ -109,9 +84,14 @@ class Unstack(PlacingTask):
     """
 
     summary = "a cube off another cube and onto a mark"
+    wordings = (
+        "take the red cube off the blue cube and place it on the green target",
+        "unstack the red cube and put it on the green target",
+        "lift the red cube from the blue one and set it on the green target",
+    )
 
-    def sample_scene(self, robot: RobotSpec, sampler: Sampler) -> Scene:
-        """Draw a layout."""
+    def layout(self, sampler: Sampler) -> Layout:
+        """Draw it."""
         tower = sampler.point(INNER, what="the tower")
         tower_yaw = sampler.yaw()
         place = sampler.point(WORKSPACE, away_from=[tower], min_distance=0.14, what="the target")
@@ -128,17 +108,4 @@ class Unstack(PlacingTask):
             z=lower.shape.size[2] + 5e-4,
         )
         target = mark("green_target", place, place_yaw, side=0.08, color_name="green")
-        return Scene(
-            robot=robot_at_origin(robot, sampler),
-            bodies=(*table_and_floor(), target, lower, upper),
-            goals=(on_table(upper, place, place_yaw),),
-        )
-
-    def instruction(self, scene: Scene, rng: np.random.Generator) -> str:
-        """What to do, in words."""
-        return wording(
-            rng,
-            "take the red cube off the blue cube and place it on the green target",
-            "unstack the red cube and put it on the green target",
-            "lift the red cube from the blue one and set it on the green target",
-        )
+        return [target, lower, upper], [on_table(upper, place, place_yaw)]

@@ -109,5 +109,5 @@ def make_thing(
 
 def words_for(body: Body) -> str:
     """What a thing is called: "red cube", "duck"."""
-    kind = body.name.split("_")[-1] if body.name.split("_")[-1] in THINGS else body.name.split("_")[0]
+    kind = next(part for part in body.name.split("_") if part in THINGS)
     return f"{body.color_name} {THINGS[kind].noun}".strip()

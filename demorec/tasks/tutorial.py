@@ -16,7 +16,7 @@ from demorec.scene.robot import RobotSpec
 from demorec.scene.scene import Body, Goal, RobotPlacement, Scene, Shape
 from demorec.sim.world import World
 from demorec.tasks.base import Task
-from demorec.tasks.furniture import COLORS
+from demorec.tasks.furniture import COLORS, floor
 from demorec.tasks.grasping import raised
 from demorec.tasks.sampling import Sampler, wording
 from demorec.tasks.script import Step
@@ -95,14 +95,6 @@ class Tutorial(Task):
             world_from_body=Pose(),
             rgba=(0.80, 0.70, 0.57, 1.0),
         )
-        floor = Body(
-            name="floor",
-            role="fixture",
-            shape=Shape(kind="box", size=(8.0, 8.0, 0.02)),
-            world_from_body=Pose(position=np.array([0.0, 0.0, -0.01])),
-            lateral_friction=1.0,
-            rgba=(0.47, 0.49, 0.52, 1.0),
-        )
         place = (BASE[0] + radius * math.cos(angle), BASE[1] + radius * math.sin(angle), CUBE_START[2])
         cube = Body(
             name="red_cube",
@@ -130,7 +122,7 @@ class Tutorial(Task):
                 joint_position=tuple(q + sampler.uniform(-spread, spread) for q in joints),
                 gripper_width=robot.gripper.scaled(ROBOT_SCALE).max_width,
             ),
-            bodies=(floor, table, cube),
+            bodies=(floor(0.0), table, cube),
             goals=(goal,),
             hold="constraint",
         )
@@ -144,10 +136,7 @@ class Tutorial(Task):
         world = expert.world
         goal = world.scene.goals[0]
         expert.phase = "open"
-        open_width = expert.open_width
-        yield from expert.set_gripper(
-            open_width, max_seconds=1.0, done=lambda: world.arm.gripper_width() > open_width - 0.002
-        )
+        yield from expert.open_gripper(max_seconds=1.0)
         grasp = expert.reachable_grasp(goal.object, above_by=ABOVE_CUBE)
         expert.phase = "above_cube"
         yield from expert.move(raised(grasp, ABOVE_CUBE), speed=0.6, free=True)
@@ -163,7 +152,7 @@ class Tutorial(Task):
         expert.phase = "release"
         # For a while: at the moment of landing the cube can be as slow as at rest.
         rests = lasting(lambda: self._rests(world), steps=max(1, round(REST_SECONDS * world.fps)))
-        yield from expert.set_gripper(open_width, max_seconds=MAX_FALL_SECONDS, done=rests)
+        yield from expert.set_gripper(expert.open_width, max_seconds=MAX_FALL_SECONDS, done=rests)
 
     def evaluate(self, world: World) -> tuple[SuccessCheck, ...]:
         """The cube lies on the table."""

@@ -32,19 +32,15 @@ DISTRACTOR_MARGIN = 0.045
 
 def draw_behaviour(ranges: Ranges, rng: np.random.Generator) -> Behaviour:
     """How the expert does it in one episode."""
-    speed, approach, lift = (ranges.draw(name, rng) for name in ("speed", "approach_height", "lift_height"))
-    offset, noise = ranges.draw("grasp_offset", rng), ranges.draw("action_noise", rng)
+    names = ("speed", "approach_height", "lift_height", "grasp_offset", "action_noise")
+    drawn = {name: ranges.draw(name, rng) for name in names}
     misses = float(rng.uniform()) < ranges.number("miss_probability")
     # To either side along the fingers' faces, up to 0.4 rad askew: across them a finger would land on the object.
     distance, side = ranges.draw("miss_distance", rng), float(rng.uniform(-1.0, 1.0))
     askew = 0.8 * abs(side) - 0.4
     error_x, error_y, error_yaw = (float(v) for v in rng.normal(0.0, 1.0, 3))
     return Behaviour(
-        speed=speed,
-        approach_height=approach,
-        lift_height=lift,
-        grasp_offset=offset,
-        action_noise=noise,
+        **drawn,
         miss_x=math.copysign(distance * math.cos(askew), side) if misses else 0.0,
         miss_y=distance * math.sin(askew) if misses else 0.0,
         perception_x=error_x * ranges.number("perception_error"),
@@ -177,18 +173,15 @@ def _other_surface(body: Body, ranges: Ranges, rng: np.random.Generator) -> Body
 
 def _other_light(light: Light, ranges: Ranges, rng: np.random.Generator) -> Light:
     turn, elevation = ranges.draw("light_turn", rng), ranges.draw("light_elevation", rng)
-    ambient, diffuse = ranges.draw("light_ambient", rng), ranges.draw("light_diffuse", rng)
-    shadow, warmth = ranges.draw("light_shadow", rng), ranges.draw("light_warmth", rng)
-    brightness = ranges.draw("sky_brightness", rng)
+    strengths = {name: ranges.draw(f"light_{name}", rng) for name in ("ambient", "diffuse", "shadow")}
+    warmth, brightness = ranges.draw("light_warmth", rng), ranges.draw("sky_brightness", rng)
     azimuth = math.atan2(light.direction[1], light.direction[0]) + turn
     flat = math.cos(elevation)
     sky: Vector3 = tuple(min(1.0, brightness * channel) for channel in light.sky_color)  # type: ignore[assignment]
     return replace(
         light,
         direction=(flat * math.cos(azimuth), flat * math.sin(azimuth), math.sin(elevation)),
-        ambient=ambient,
-        diffuse=diffuse,
-        shadow=shadow,
+        **strengths,
         color=(1.0 + min(0.0, 0.15 * warmth), 1.0 - 0.04 * abs(warmth), 1.0 - max(0.0, 0.2 * warmth)),
         sky_color=sky,
     )

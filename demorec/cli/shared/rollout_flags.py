@@ -67,13 +67,14 @@ class RolloutFlags:
             check_option("workers", self.workers, 1, 1024)
         refuse_inside([out])
         from demorec.evaluate.rollouts import evaluate, settings_for
-        from demorec.loop.actions import check_action_kind
+        from demorec.loop.actions import ACTION_KINDS
         from demorec.processes import available_cores
+        from demorec.registry import check_choice
 
         settings = settings_for(
             policy,
             self._config(),
-            action=None if self.action is None else check_action_kind(self.action),
+            action=None if self.action is None else check_choice("action", self.action, ACTION_KINDS),
             action_steps=self.action_steps,
             episode_length=self.episode_length,
             allowed=allowed_modules(self.allow),

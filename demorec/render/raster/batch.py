@@ -40,11 +40,6 @@ class Geometry:
     num_vertices: int
     faces: NDArray[np.int32]
 
-    @property
-    def capacity(self) -> int:
-        """How many vertices there is room for."""
-        return len(self.vertices) // layout.BLOCK * layout.LANES
-
 
 def merge(attributes: Sequence[Floats], faces: Sequence[NDArray[np.integer]], *, spare: int = 0) -> Geometry:
     """Merge meshes given by vertex attributes (v, up to 8: position, normal, u, v) and vertex numbers (f, 3)."""
@@ -77,7 +72,7 @@ def caster_geometry(instances: Sequence[Instance], levels: Sequence[int | None],
     """Positions only, for the shadow map; those that cast none have no faces."""
     points, faces = [], []
     for instance, level, does in zip(instances, levels, casts, strict=True):
-        piece = instance.caster(level) if does else None
+        piece = instance.model.caster(level) if does else None
         points.append(np.zeros((0, 3)) if piece is None else piece.points * instance.scale)
         faces.append(np.zeros((0, 3), dtype=np.int64) if piece is None else piece.point_faces)
     return merge(points, faces)
@@ -113,10 +108,9 @@ def make_batch(instances: Sequence[Instance], levels: Sequence[int | None], *, s
     """
     attributes: list[Floats] = []
     faces: list[NDArray[np.integer]] = []
-    tables: list[NDArray[np.int32]] = []
-    colors: list[Floats] = []
-    pictures: list[Picture] = []
-    rows: dict[int, int] = {}
+    tables = [np.zeros((0, 4), dtype=np.int32)]
+    colors: list[Floats] = [np.zeros((0, 4))]
+    pictures: dict[int, tuple[int, Picture]] = {}
     num_groups = 0
     for instance, level in zip(instances, levels, strict=True):
         piece = instance.piece(level)
@@ -133,18 +127,16 @@ def make_batch(instances: Sequence[Instance], levels: Sequence[int | None], *, s
         if instance.texture is None:
             color[:, :3] *= 255
         else:
-            if id(instance.texture) not in rows:
-                rows[id(instance.texture)] = len(pictures)
-                pictures.append(instance.texture)
-            table[:, layout.FACE_TEXTURE] = rows[id(instance.texture)]
+            row, _ = pictures.setdefault(id(instance.texture), (len(pictures), instance.texture))
+            table[:, layout.FACE_TEXTURE] = row
         color[:, layout.FACE_SPECULAR] = 255 * specular if n > SPECULAR_FACES else 0
         tables.append(table)
         colors.append(color)
-    texels, mips = textures.pack(pictures)
+    texels, mips = textures.pack([picture for _, picture in pictures.values()])
     return Batch(
         geometry=merge(attributes, faces, spare=SPARE_VERTICES),
-        face_table=np.concatenate(tables) if tables else np.zeros((0, 4), dtype=np.int32),
-        face_color=np.ascontiguousarray(np.concatenate(colors) if colors else np.zeros((0, 4)), dtype=np.float32),
+        face_table=np.concatenate(tables),
+        face_color=np.concatenate(colors).astype(np.float32),
         texels=texels,
         mips=mips,
     )

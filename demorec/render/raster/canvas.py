@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -201,9 +202,8 @@ class Canvas:
         still: Floats32 | None,
     ) -> tuple[int, int]:
         """Shade the pixels of records from `first` (all with `everything`); returns the numbers of edges and mixed."""
-        batch, stage = self._batch, self._stage
         lowest = layout.BACKGROUND if everything else first
-        heights = stage.heights if still is None else stage.still_heights
+        heights = self._stage.heights if still is None else self._stage.still_heights
         self._flags[first:last] = 0
         edge_count, mixed_count = self._find_owners(left, right, first, lowest)
         set_up_records(
@@ -212,7 +212,7 @@ class Canvas:
             self._flags,
             self._corners,
             self._faces,
-            batch.face_table,
+            self._batch.face_table,
             self._vertices,
             self.records,
             self.origins,
@@ -223,17 +223,7 @@ class Canvas:
             lowest,
             self.pixel_ids,
             self.samples,
-            self._faces,
-            batch.face_table,
-            batch.face_color,
-            self.records,
-            self.origins,
-            stage.light_table,
-            heights.reshape(-1),
-            stage.shadow_size,
-            batch.texels,
-            batch.mips,
-            self._sky,
+            *self._surfaces(heights),
             images.color,
             still is not None,
             self._no_still if still is None else still,
@@ -243,6 +233,13 @@ class Canvas:
             images.segments,
         )
         return edge_count, mixed_count
+
+    def _surfaces(self, heights: Floats32) -> tuple[Any, ...]:
+        """What shading asks about what lies under a sample: records, faces, light and shadow, textures, sky."""
+        batch, stage = self._batch, self._stage
+        faces = self._faces, batch.face_table, batch.face_color, self.records, self.origins
+        shadow = heights.reshape(-1), stage.shadow_size
+        return (*faces, stage.light_table, *shadow, batch.texels, batch.mips, self._sky)
 
     def _find_owners(self, left: Int32s, right: Int32s, first: int, lowest: int) -> tuple[int, int]:
         """Flag the records that own pixels, list the edges between them; returns the numbers of edges and mixed."""
@@ -270,36 +267,18 @@ class Canvas:
         """Shade the listed edges, and see what lies at the centres of mixed pixels; nothing when not antialiased."""
         if self.samples == 1:
             return
-        batch, stage = self._batch, self._stage
-        shade_edges(
-            0,
-            edge_count,
-            self.edges,
-            self.ids,
-            self.camera.width,
-            self._faces,
-            batch.face_table,
-            batch.face_color,
-            self.records,
-            self.origins,
-            stage.light_table,
-            heights.reshape(-1),
-            stage.shadow_size,
-            batch.texels,
-            batch.mips,
-            self._sky,
-            images.color,
-        )
+        width = self.camera.width
+        shade_edges(0, edge_count, self.edges, self.ids, width, *self._surfaces(heights), images.color)
         if self.want_depth or self.want_segments:
             centre_of_mixed(
                 self._mixed,
                 mixed_count,
-                self.camera.width,
+                width,
                 self.ids,
                 self.values,
                 self._corners,
                 self._faces,
-                batch.face_table,
+                self._batch.face_table,
                 self._vertices,
                 self.records,
                 self.origins,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from demorec.render.raster.mesh import Floats, RasterMesh, make_mesh
 
@@ -16,8 +17,8 @@ PLANE_EXTENT = 100.0
 """Half the side of the square that stands for an infinite plane, metres."""
 
 
-def box(size: tuple[float, float, float]) -> RasterMesh:
-    """A box of full extents `size` around the origin, the texture once on each side."""
+def box(*size: float) -> RasterMesh:
+    """A box of three full extents around the origin, the texture once on each side."""
     corners = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
     points: list[Floats] = []
     normals: list[Floats] = []
@@ -58,19 +59,23 @@ def revolve(profile: Floats, profile_normals: Floats, along: Floats, segments: i
     n, m = len(profile), segments + 1
     radial = ring[:, None, :]
     profile = profile * [roundness(segments), 1.0]
-    points = np.concatenate(
-        [radial * profile[None, :, :1], np.broadcast_to(profile[None, :, 1:], (m, n, 1))], 2
-    ).reshape(-1, 3)
-    normals = np.concatenate(
-        [radial * profile_normals[None, :, :1], np.broadcast_to(profile_normals[None, :, 1:], (m, n, 1))], 2
-    ).reshape(-1, 3)
+    points, normals = (
+        np.concatenate([radial * line[None, :, :1], np.broadcast_to(line[None, :, 1:], (m, n, 1))], 2).reshape(-1, 3)
+        for line in (profile, profile_normals)
+    )
     u = np.broadcast_to((angles / (2 * math.pi))[:, None], (m, n))
     uv = np.stack([u, np.broadcast_to(along[None, :], (m, n))], 2).reshape(-1, 2)
-    i, j = (a.reshape(-1) for a in np.meshgrid(np.arange(segments), np.arange(n - 1), indexing="ij"))
-    a, b, c, d = i * n + j, (i + 1) * n + j, (i + 1) * n + j + 1, i * n + j + 1
-    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    faces = _grid_faces(m, n)
     # At a pole the side that has shrunk to a point makes an empty triangle, which make_mesh leaves out.
     return make_mesh(points, faces, normals=normals[faces], uv=uv[faces])
+
+
+def _grid_faces(rows: int, columns: int) -> NDArray[np.int64]:
+    """(f, 3) two triangles for each cell of a grid of points that are numbered row by row."""
+    i, j = (a.reshape(-1) for a in np.meshgrid(np.arange(rows - 1), np.arange(columns - 1), indexing="ij"))
+    a = i * columns + j
+    b, c, d = a + columns, a + columns + 1, a + 1
+    return np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
 
 
 def sphere(radius: float, segments: int = SEGMENTS) -> RasterMesh:
@@ -111,7 +116,5 @@ def plane() -> RasterMesh:
     n = len(edge)
     x, y = (a.reshape(-1) for a in np.meshgrid(edge, edge, indexing="ij"))
     points = np.stack([x, y, np.zeros(n * n)], 1)
-    i, j = (a.reshape(-1) for a in np.meshgrid(np.arange(n - 1), np.arange(n - 1), indexing="ij"))
-    a = i * n + j
-    faces = np.concatenate([np.stack([a, a + n, a + n + 1], 1), np.stack([a, a + n + 1, a + 1], 1)])
+    faces = _grid_faces(n, n)
     return make_mesh(points, faces, uv=points[faces][:, :, :2])

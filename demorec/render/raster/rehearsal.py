@@ -2,45 +2,28 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from demorec.geometry import look_at
+from demorec.geometry import Pose, look_at
+from demorec.render import Visual, VisualBody, VisualKind
 from demorec.render.raster.batch import make_batch
 from demorec.render.raster.canvas import Canvas
-from demorec.render.raster.mesh import RasterMesh
-from demorec.render.raster.primitives import box, sphere
-from demorec.render.raster.shapes import Instance, Model
+from demorec.render.raster.shapes import ModelStore, make_instances
 from demorec.render.raster.stage import Stage
 from demorec.render.raster.view import CameraView
-from demorec.scene.scene import Camera, Light
+from demorec.scene.scene import Camera, Light, Texture
 
 
-def _instance(body: int, mesh: RasterMesh, *, stands: bool, texture: Any = None) -> Instance:
-    return Instance(
-        body=body,
-        link=-1,
-        row=body,
-        model=Model(key=str(body), mesh=mesh),
-        scale=np.ones(3),
-        link_from_shape=np.eye(4)[:3].copy(),
-        color=np.ones(3),
-        texture=texture,
-        stands=stands,
-        has_links=False,
-        centre=np.zeros(3),
-        radius=0.2,
-    )
+def _body(kind: VisualKind, *size: float, is_fixed: bool, texture: Texture | None = None) -> VisualBody:
+    visual = Visual(link=-1, kind=kind, size=size, link_from_shape=Pose(), rgba=(1.0, 1.0, 1.0, 1.0))
+    return VisualBody(name=kind, num_links=0, is_fixed=is_fixed, visuals=(visual,), texture=texture)
 
 
 def rehearse() -> None:
     """Draw a box and a sphere in every mode."""
-    picture = np.full((4, 4, 3), 128, dtype=np.uint8)
-    instances = [
-        _instance(0, box((0.3, 0.3, 0.1)), stands=True, texture=picture),
-        _instance(1, sphere(0.1), stands=False),
-    ]
+    texture = Texture(pattern="plain", colors=((0.5, 0.5, 0.5), (0.5, 0.5, 0.5)))
+    bodies = [_body("box", 0.3, 0.3, 0.1, is_fixed=True, texture=texture), _body("sphere", 0.1, is_fixed=False)]
+    instances = make_instances(bodies, ModelStore())
     light = Light()
     camera = Camera(
         name="rehearsal",

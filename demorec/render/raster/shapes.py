@@ -51,7 +51,7 @@ class Model:
         return self._pieces[place]
 
     def caster(self, target: int | None) -> Piece:
-        """The same for the shadow map."""
+        """The same for the shadow map, where textures do not matter."""
         if self.coarse is None:
             return self.piece(target, textured=False)
         if "caster" not in self._pieces:
@@ -73,7 +73,7 @@ class Instance:
     """One visual shape of the scene.
 
     Attributes:
-        body, link: Numbers as of `RenderSetup.bodies`; the base is link -1.
+        segment: Its number in segmentation pictures.
         row: Of its link in the poses that are drawn.
         model: Its mesh.
         scale: (3,) of the mesh.
@@ -85,8 +85,7 @@ class Instance:
         centre, radius: Bounding sphere in the shape's frame.
     """
 
-    body: int
-    link: int
+    segment: int
     row: int
     model: Model
     scale: Floats
@@ -98,21 +97,12 @@ class Instance:
     centre: Floats
     radius: float
 
-    @property
-    def segment(self) -> int:
-        """Its number in segmentation pictures."""
-        return self.body + ((self.link + 1) << 24)
-
     def piece(self, target: int | None) -> Piece:
         """Its mesh with about `target` faces, None for all of them; not scaled yet.
 
         Textured meshes keep all: their texture coordinates would not survive.
         """
         return self.model.piece(None if self.texture is not None else target, textured=self.texture is not None)
-
-    def caster(self, target: int | None) -> Piece:
-        """Its mesh for the shadow map, where textures do not matter."""
-        return self.model.caster(target)
 
 
 @dataclass
@@ -146,15 +136,10 @@ class ModelStore:
         """A box (x, y, z), sphere (radius), cylinder or capsule (radius, length), or plane ()."""
         place = (name, *size)
         if place not in self._models:
-            if name in ("box", "plane"):
-                mesh = coarse = primitives.plane() if name == "plane" else primitives.box((size[0], size[1], size[2]))
-            else:
-                make: Any = {
-                    "sphere": primitives.sphere,
-                    "cylinder": primitives.cylinder,
-                    "capsule": primitives.capsule,
-                }[name]
-                mesh, coarse = make(*size), make(*size, segments=primitives.COARSE_SEGMENTS)
+            make: Any = getattr(primitives, name)
+            mesh = coarse = make(*size)
+            if name not in ("box", "plane"):  # which have no curves
+                coarse = make(*size, segments=primitives.COARSE_SEGMENTS)
             self._models[place] = Model(key=repr(place), mesh=mesh, coarse=coarse)
         return self._models[place]
 
@@ -206,8 +191,7 @@ def make_instances(bodies: Sequence[VisualBody], store: ModelStore) -> list[Inst
             centre, radius = model.bounding_sphere(scale)
             instances.append(
                 Instance(
-                    body=number,
-                    link=visual.link,
+                    segment=number + ((visual.link + 1) << 24),
                     row=row + 1 + visual.link,
                     model=model,
                     scale=scale,

@@ -69,7 +69,7 @@ class CameraView:
         """The picture of the stage's present state."""
         pose = world_from_camera.vector()
         self._canvas.aim(pose)
-        images = self._draw_changes(pose) if self._keep_still else self._draw_all()
+        images = self._draw_changes(pose) if self._keep_still else self._draw(len(self._stage.instances), None)[0]
         return CameraImages(
             color=images.color,
             depth=images.depth if self._canvas.want_depth else None,
@@ -77,19 +77,27 @@ class CameraView:
             world_from_camera=world_from_camera,
         )
 
-    def _draw_all(self) -> Images:
-        canvas = self._canvas
-        while True:
+    def _draw(self, count: int, still: Floats32 | None) -> tuple[Images, int, int]:
+        """Draw so many instances onto the background.
+
+        Args:
+            count: The first ones.
+            still: As of `Canvas.shade`.
+
+        Returns:
+            The pictures, and how many records and vertices they have used up.
+        """
+        canvas, stage = self._canvas, self._stage
+        records = -1
+        while records < 0:  # the buffers grow until there is room for all
             canvas.clear()
-            n = len(self._stage.instances)
-            num_vertices = canvas.num_vertices
-            records, _ = canvas.draw_instances(0, n, 0, num_vertices, self._scratch_left, self._scratch_right)
-            if records >= 0:
-                break
+            records, vertices = canvas.draw_instances(
+                0, count, 0, canvas.num_vertices, self._scratch_left, self._scratch_right
+            )
         images = canvas.new_images()
-        counts = canvas.shade(images, self._whole_left, self._whole_right, 0, records, everything=True, still=None)
-        canvas.finish_edges(images, *counts, self._stage.heights)
-        return images
+        counts = canvas.shade(images, self._whole_left, self._whole_right, 0, records, everything=True, still=still)
+        canvas.finish_edges(images, *counts, stage.heights if still is None else stage.still_heights)
+        return images, records, vertices
 
     def _draw_changes(self, pose: Floats) -> Images:
         canvas, stage = self._canvas, self._stage
@@ -97,8 +105,6 @@ class CameraView:
         while True:
             if self._still is None or self._still.key != key:
                 self._still = self._draw_still(key)
-                if self._still is None:
-                    continue  # the buffers have grown
             still = self._still
             restore_samples(
                 canvas.values.reshape(-1),
@@ -142,21 +148,12 @@ class CameraView:
             clear_queued(canvas.edges, edge_count, all_edges, canvas.pixel_ids, STILL)
         return images
 
-    def _draw_still(self, key: tuple[bytes, int]) -> _Still | None:
-        """Draw what stands still, with its own shadows; None when the buffers had to grow."""
+    def _draw_still(self, key: tuple[bytes, int]) -> _Still:
+        """Draw what stands still, with its own shadows."""
         canvas, stage = self._canvas, self._stage
         h, w = canvas.camera.height, canvas.camera.width
-        canvas.clear()
-        num_vertices = canvas.num_vertices
-        records, vertices = canvas.draw_instances(
-            0, stage.num_still, 0, num_vertices, self._scratch_left, self._scratch_right
-        )
-        if records < 0:
-            return None
-        images = canvas.new_images()
         terms = np.zeros((h, w, layout.STILL_SIZE), dtype=np.float32)
-        counts = canvas.shade(images, self._whole_left, self._whole_right, 0, records, everything=True, still=terms)
-        canvas.finish_edges(images, *counts, stage.still_heights)
+        images, records, vertices = self._draw(stage.num_still, terms)
         tiles = stage.touched.shape[0]
         tile_start = np.zeros(tiles * tiles + 1, dtype=np.int64)
         tile_pixels = np.zeros(h * w * canvas.samples**2, dtype=np.int32)

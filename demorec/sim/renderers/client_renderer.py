@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +13,7 @@ from demorec.render import RenderSetup
 from demorec.render.setup_checks import check_setup, world_from_camera
 from demorec.scene.episode import CameraImages
 from demorec.scene.scene import Camera
+from demorec.sim.client import connect
 from demorec.sim.renderers.mirror import SceneMirror
 
 # OpenCV's camera axes (y down, z forward) to OpenGL's (y up, z backward).
@@ -22,25 +22,23 @@ _NOTHING_HIT = 1.0 - 1e-7
 """Depth buffer value of the background (TinyRenderer's is one float32 step below 1)."""
 
 
-class ClientRenderer(ABC):
+class ClientRenderer:
     """Draws the shapes of a setup in a client of its own; a context manager."""
+
+    constant: ClassVar[str]
+    """PyBullet's name of the renderer that draws."""
 
     def __init__(self) -> None:
         self._client: Any = None
-        self._setup: RenderSetup | None = None
         self._mirror: SceneMirror | None = None
 
-    @abstractmethod
     def _connect(self) -> Any:
         """A new client that can draw; RenderError when there can be none."""
+        return connect()
 
-    @abstractmethod
     def _disconnect(self, client: Any) -> None:
         """Give the client up."""
-
-    @abstractmethod
-    def _renderer_flag(self, client: Any) -> int:
-        """Which of PyBullet's renderers draws."""
+        client.disconnect()
 
     def __enter__(self) -> Self:
         return self
@@ -52,7 +50,7 @@ class ClientRenderer(ABC):
         """Free the client; harmless when called twice."""
         if self._client is not None:
             self._disconnect(self._client)
-        self._client = self._setup = self._mirror = None
+        self._client = self._mirror = None
 
     def setup(self, setup: RenderSetup) -> None:
         """Take over a scene.
@@ -64,18 +62,17 @@ class ClientRenderer(ABC):
         if self._client is None:
             self._client = self._connect()
             _require_numpy(self._client)
-        self._setup = setup
         self._mirror = SceneMirror(self._client, setup)
 
     def render(self, poses: Array) -> dict[str, CameraImages]:
         """Camera name -> images, with poses (n, 7) as of `Renderer.render`; RuntimeError without a scene."""
-        if self._setup is None or self._mirror is None:
+        if self._mirror is None:
             raise RuntimeError("the renderer has no scene: call setup first")
         self._mirror.follow(poses)
-        return {camera.name: self._draw(self._setup, self._mirror, camera, poses) for camera in self._setup.cameras}
+        return {camera.name: self._draw(self._mirror, camera, poses) for camera in self._mirror.setup.cameras}
 
-    def _draw(self, setup: RenderSetup, mirror: SceneMirror, camera: Camera, poses: Array) -> CameraImages:
-        client = self._client
+    def _draw(self, mirror: SceneMirror, camera: Camera, poses: Array) -> CameraImages:
+        client, setup = self._client, mirror.setup
         pose = world_from_camera(setup, camera, poses)
         light = setup.light
         _, _, rgba, depth, segmentation = client.getCameraImage(
@@ -95,7 +92,7 @@ class ClientRenderer(ABC):
             flags=client.ER_SEGMENTATION_MASK_OBJECT_AND_LINKINDEX
             if setup.segmentation
             else client.ER_NO_SEGMENTATION_MASK,
-            renderer=self._renderer_flag(client),
+            renderer=getattr(client, self.constant),
         )
         shape = (camera.height, camera.width)
         color = np.ascontiguousarray(np.reshape(rgba, (*shape, 4))[:, :, :3], dtype=np.uint8)

@@ -11,7 +11,6 @@ from typing import Any
 from demorec.errors import RenderError
 from demorec.geometry import Array
 from demorec.scene.episode import CameraImages
-from demorec.sim.client import connect
 from demorec.sim.renderers.client_renderer import ClientRenderer
 
 _PROBE = """
@@ -55,6 +54,8 @@ class EglRenderer(ClientRenderer):
         RenderError: The plugin does not work on this machine.
     """
 
+    constant = "ER_BULLET_HARDWARE_OPENGL"
+
     def __init__(self) -> None:
         super().__init__()
         reason = probe()
@@ -67,7 +68,7 @@ class EglRenderer(ClientRenderer):
         self._is_first_picture = True
 
     def _connect(self) -> Any:
-        client = connect()
+        client = super()._connect()
         self._plugin = client.loadPlugin(_plugin_path(), "_eglRendererPlugin")
         if self._plugin < 0:
             client.disconnect()
@@ -78,10 +79,7 @@ class EglRenderer(ClientRenderer):
     def _disconnect(self, client: Any) -> None:
         if client.isConnected():
             client.unloadPlugin(self._plugin)
-            client.disconnect()
-
-    def _renderer_flag(self, client: Any) -> int:
-        return int(client.ER_BULLET_HARDWARE_OPENGL)
+            super()._disconnect(client)
 
     def render(self, poses: Array) -> dict[str, CameraImages]:
         """As `ClientRenderer.render`."""

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import os
 import tempfile
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,16 +20,7 @@ from demorec.geometry import Array, Pose
 from demorec.render import RenderSetup, Visual, first_rows
 from demorec.scene.scene import Texture
 from demorec.scene.textures import texture_pixels
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Copy:
-    """One visual shape: the row of its pose, its number in segmentation pictures, and its body in the client."""
-
-    row: int
-    segment: int
-    link_from_shape: Pose
-    index: int
+from demorec.sim.bodies import shape_arguments
 
 
 class SceneMirror:
@@ -40,14 +30,20 @@ class SceneMirror:
         client: The client that is filled; emptied first.
         setup: The scene.
 
+    Attributes:
+        setup: As given.
+
     Raises:
         RenderError: PyBullet cannot load one of the shapes.
     """
 
     def __init__(self, client: Any, setup: RenderSetup) -> None:
+        self.setup = setup
         self._client = client
         client.resetSimulation()
-        self._copies: list[_Copy] = []
+        # By the number of a shape's body in the client: the row of its pose and its pose there; its number in pictures.
+        self._places: dict[int, tuple[int, Pose]] = {}
+        self._segments: dict[int, int] = {}
         for number, (body, row) in enumerate(zip(setup.bodies, first_rows(setup.bodies), strict=True)):
             texture = None if body.texture is None else _load_texture(client, body.texture)
             for visual in body.visuals:
@@ -60,45 +56,27 @@ class SceneMirror:
                         f"PyBullet cannot draw body {number} ({body.name!r}), link {visual.link} "
                         f"({visual.file or visual.kind}: {error})."
                     ) from error
-                self._copies.append(
-                    _Copy(
-                        row=row + 1 + visual.link,
-                        segment=number + ((visual.link + 1) << 24),
-                        link_from_shape=visual.link_from_shape,
-                        index=index,
-                    )
-                )
+                self._places[index] = (row + 1 + visual.link, visual.link_from_shape)
+                self._segments[index] = number + ((visual.link + 1) << 24)
 
     def follow(self, poses: Array) -> None:
         """Put every shape where `poses`, as `Renderer.render` is given them, say."""
-        for item in self._copies:
-            row = poses[item.row]
-            pose = Pose(position=row[:3], quat_xyzw=row[3:]) @ item.link_from_shape
-            self._client.resetBasePositionAndOrientation(item.index, pose.position.tolist(), pose.quat_xyzw.tolist())
+        for index, (row, link_from_shape) in self._places.items():
+            pose = Pose(position=poses[row, :3], quat_xyzw=poses[row, 3:]) @ link_from_shape
+            self._client.resetBasePositionAndOrientation(index, pose.position.tolist(), pose.quat_xyzw.tolist())
 
     def original_labels(self, labels: NDArray[np.int32]) -> NDArray[np.int32]:
         """Segmentation of the client in the numbers of the setup: body + ((link + 1) << 24)."""
-        table = np.full(max((item.index for item in self._copies), default=0) + 2, -1, dtype=np.int32)
-        for item in self._copies:
-            table[item.index] = item.segment
+        table = np.full(max(self._segments, default=0) + 2, -1, dtype=np.int32)
+        table[list(self._segments)] = list(self._segments.values())
         bodies = np.where(labels >= 0, labels & 0xFFFFFF, len(table) - 1)
         return np.asarray(table[bodies], dtype=np.int32)
 
 
 def _add(client: Any, visual: Visual, texture: int | None) -> int:
     """A body of one visual shape; returns its index."""
-    geometry: dict[str, Any] = {"rgbaColor": visual.rgba}
-    match visual.kind:
-        case "mesh":
-            geometry |= {"shapeType": client.GEOM_MESH, "fileName": visual.file, "meshScale": visual.size}
-        case "box":
-            geometry |= {"shapeType": client.GEOM_BOX, "halfExtents": [v / 2 for v in visual.size]}
-        case "sphere":
-            geometry |= {"shapeType": client.GEOM_SPHERE, "radius": visual.size[0]}
-        case "cylinder" | "capsule":
-            kind = client.GEOM_CYLINDER if visual.kind == "cylinder" else client.GEOM_CAPSULE
-            geometry |= {"shapeType": kind, "radius": visual.size[0], "length": visual.size[1]}
-    index = int(client.createMultiBody(0, -1, client.createVisualShape(**geometry)))
+    geometry = shape_arguments(client, visual.kind, visual.size, visual.file)
+    index = int(client.createMultiBody(0, -1, client.createVisualShape(**geometry, rgbaColor=visual.rgba)))
     if texture is not None:
         client.changeVisualShape(index, -1, textureUniqueId=texture)
     return index
