@@ -5,6 +5,11 @@ From common_interfaces, rcl_interfaces, geometry2, vision_msgs and foxglove_msgs
 
 from __future__ import annotations
 
+import re
+from collections.abc import Mapping
+from functools import cache
+from typing import NamedTuple
+
 _TIME = "MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
 _HEADER = "MSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
 _VECTOR3 = "MSG: geometry_msgs/Vector3\nfloat64 x\nfloat64 y\nfloat64 z\n"
@@ -90,3 +95,37 @@ DEFINITIONS: dict[str, str] = {
         _VISION_CLASS,
     ),
 }
+_FIELD = re.compile(r"^([\w/]+)(\[(\d*)\])?\s+(\w+)$")
+
+
+class FieldType(NamedTuple):
+    """A field of a message; `length` is that of an array, None where each message says it."""
+
+    name: str
+    kind: str
+    is_array: bool
+    length: int | None
+
+
+Types = Mapping[str, tuple[FieldType, ...]]
+"""Type -> its fields; "" is the message itself."""
+
+
+@cache
+def types_of(schema: str) -> Types:
+    """What the definition of a type says."""
+    first, *others = re.split(r"^=+\n", DEFINITIONS[schema], flags=re.MULTILINE)
+    types = {"": _fields(first)}
+    for text in others:
+        head, _, body = text.partition("\n")
+        types[head.removeprefix("MSG: ")] = _fields(body)
+    return types
+
+
+def _fields(text: str) -> tuple[FieldType, ...]:
+    found = (_FIELD.match(line) for line in text.splitlines())  # constants, which have a value, do not match
+    return tuple(
+        FieldType(match[4], match[1], match[2] is not None, int(match[3]) if match[3] else None)
+        for match in found
+        if match is not None
+    )

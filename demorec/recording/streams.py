@@ -10,14 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from demorec.geometry import Array, Pose
 from demorec.recording import messages
-from demorec.recording.cdr import CdrWriter, Layout
+from demorec.recording.cdr import Layout, Slot, layout
 from demorec.recording.channels import (
     ACTION,
     COMMAND,
@@ -35,6 +35,10 @@ from demorec.scene.robot import RobotSpec
 
 GRIPPER_JOINT = "gripper"
 """Name of the gripper's opening beside the joints' names."""
+
+POSE_SLOTS = ((Slot.VALUE,) * 3, (Slot.VALUE,) * 4)
+"""Position and quaternion xyzw in a layout."""
+_WRENCH_SLOTS = ((Slot.VALUE,) * 3, (Slot.VALUE,) * 3)
 
 Columns = dict[str, Array | dict[str, Array]]
 """Field of `EpisodeColumns` -> its rows, or name -> rows where the field is a mapping."""
@@ -116,7 +120,7 @@ def _every_stream(info: EpisodeInfo) -> Iterator[FrameStream]:
     yield FrameStream(
         topic=WRENCH,
         schema=messages.WRENCH,
-        layout=_stamped_layout(robot.hand_link, 6),
+        layout=layout(messages.WRENCH, (Slot.TIME, robot.hand_link), _WRENCH_SLOTS),
         parts=_wrench_parts,
         columns=lambda values: {"wrench": values},
         since=2,
@@ -142,13 +146,8 @@ def tf_stream(frames: FrameTree) -> FrameStream:
 
 def transforms_layout(frames: Sequence[tuple[str, str]]) -> Layout:
     """Of tf2_msgs/TFMessage with these (parent, child): position and quaternion xyzw of each."""
-    message = CdrWriter()
-    message.u32(len(frames))
-    for parent, child in frames:
-        message.header(parent)
-        message.text(child)
-        message.value_slot(7)
-    return message.layout()
+    rows = tuple(((Slot.TIME, parent), child, POSE_SLOTS) for parent, child in frames)
+    return layout(messages.TRANSFORMS, rows)
 
 
 def merged_columns(found: Iterable[Columns]) -> dict[str, Any]:
@@ -262,9 +261,14 @@ def _joints(
     columns: Callable[[Array], Columns],
     arrange: Callable[[Array], Array] | None = None,
 ) -> FrameStream:
-    layout = _joints_layout(tuple(names))
+    slots = (Slot.VALUE,) * len(names)  # position, velocity, effort
     return FrameStream(
-        topic=topic, schema=messages.JOINT_STATE, layout=layout, parts=parts, columns=columns, arrange=arrange
+        topic=topic,
+        schema=messages.JOINT_STATE,
+        layout=layout(messages.JOINT_STATE, (Slot.TIME, ""), tuple(names), slots, slots, slots),
+        parts=parts,
+        columns=columns,
+        arrange=arrange,
     )
 
 
@@ -273,30 +277,7 @@ def _pose(topic: str, frame_id: str, pose: Callable[[FrameValues], Pose], column
     return FrameStream(
         topic=topic,
         schema=messages.POSE,
-        layout=_stamped_layout(frame_id, 7),
+        layout=layout(messages.POSE, (Slot.TIME, frame_id), POSE_SLOTS),
         parts=lambda values: ((found := pose(values)).position, found.quat_xyzw),
         columns=lambda values: {column: {key: values}} if key else {column: values},
     )
-
-
-# The recordings of a run have the same few layouts, and an export opens many.
-@lru_cache(maxsize=64)
-def _joints_layout(names: tuple[str, ...]) -> Layout:
-    message = CdrWriter()
-    message.header("")
-    message.u32(len(names))
-    for name in names:
-        message.text(name)
-    for _ in range(3):  # position, velocity, effort
-        message.u32(len(names))
-        message.value_slot(len(names))
-    return message.layout()
-
-
-@lru_cache(maxsize=64)
-def _stamped_layout(frame_id: str, num_values: int) -> Layout:
-    """A header and float64 after float64: PoseStamped, WrenchStamped."""
-    message = CdrWriter()
-    message.header(frame_id)
-    message.value_slot(num_values)
-    return message.layout()
