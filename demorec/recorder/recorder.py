@@ -7,9 +7,9 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from importlib.metadata import version
 from pathlib import Path
-from types import TracebackType
-from typing import Self, get_args
+from typing import get_args
 
+from demorec.closing import Closing
 from demorec.config import VideoConfig
 from demorec.errors import ConfigError, RecordingError
 from demorec.recorder.coder import Buffers, Coder, WhenFull
@@ -24,7 +24,7 @@ from demorec.scene.collected import CollectedCamera, CollectedFeature, Collected
 _REAL_TIME = VideoConfig(preset="ultrafast")
 
 
-class Recorder:
+class Recorder(Closing):
     """Context manager over a run: a folder of recorded episodes, which goes on where it ended.
 
     Args:
@@ -87,14 +87,6 @@ class Recorder:
             wrong.append(f"when_full is {self.when_full!r}, allowed are {', '.join(get_args(WhenFull))}")
         if wrong:
             raise ConfigError(f"This cannot be recorded: {'; '.join(wrong)}.")
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         """End the open episode, if there is one, and the run; harmless when called twice."""

@@ -18,7 +18,7 @@ from demorec.recording.labels import encode_labels
 from demorec.recording.metadata import CameraStreams
 from demorec.recording.pixels import PixelCounter
 from demorec.recording.transforms import camera_frame
-from demorec.recording.video import make_encoder
+from demorec.recording.video import Encoder, Rgb, make_encoder
 from demorec.scene.episode import CameraImages, Frame
 from demorec.scene.scene import Camera
 
@@ -46,36 +46,68 @@ class ColorMessages:
             result.append((self._again_topic, messages.COMPRESSED_VIDEO, again))
         return result
 
-    def statistics(self, pixels: PixelCounter) -> Message:
-        """What was counted of all pictures."""
-        data = messages.pixel_statistics(pixels.statistics())
-        return camera_topic(self._camera, "histogram"), messages.INT64_ARRAY, data
+
+class PictureCoder:
+    """Codes the pictures of one camera and keeps the packets until they are written.
+
+    Args:
+        camera: Its name.
+        encoder: None for pictures that come coded.
+        pixels: Counts those that do not.
+
+    Attributes:
+        num_ready: Packets so far.
+        num_video_bytes: Of them.
+        last_ns: Stamp of the last picture.
+    """
+
+    def __init__(self, camera: str, encoder: Encoder | None, pixels: PixelCounter) -> None:
+        self._name, self._encoder, self._pixels = camera, encoder, pixels
+        self._packets: list[bytes] = []
+        self.num_ready = self.num_video_bytes = self.last_ns = 0
+
+    def _code(self, picture: Rgb) -> None:
+        assert self._encoder is not None
+        self._pixels.add(picture)
+        self._keep(self._encoder.encode(picture))
+
+    def _keep(self, packets: list[bytes]) -> None:
+        self._packets += packets
+        self.num_ready += len(packets)
+        self.num_video_bytes += sum(map(len, packets))
+
+    def end(self) -> None:
+        """Take what the encoder held back."""
+        if self._encoder is not None:
+            self._keep(self._encoder.finish())
+
+    def statistics(self) -> Message | None:
+        """What was counted of all pictures; None where nothing was."""
+        if self._encoder is None or not self.num_ready:
+            return None
+        data = messages.pixel_statistics(self._pixels.statistics())
+        return camera_topic(self._name, "histogram"), messages.INT64_ARRAY, data
 
 
-class CameraRecorder:
+class CameraRecorder(PictureCoder):
     """Codes what a camera sees and keeps it until it is written.
 
     Attributes:
         streams: What is recorded; depth and segmentation when the first frame has them.
-        num_ready: Frames whose pictures have left the encoder since the beginning.
-        num_video_bytes: Of coded colour pictures.
     """
 
     def __init__(self, camera: Camera, first: CameraImages, *, video: VideoConfig, fps: int) -> None:
         self._camera = camera
-        self._encoder = make_encoder(video=video, width=camera.width, height=camera.height, fps=fps)
+        encoder = make_encoder(video, camera.width, camera.height, fps)
+        super().__init__(camera.name, encoder, PixelCounter(compiled=True))
         self.streams = CameraStreams(
-            video=self._encoder.settings, depth=first.depth is not None, segmentation=first.segmentation is not None
+            video=encoder.settings, depth=first.depth is not None, segmentation=first.segmentation is not None
         )
-        self._pixels = PixelCounter(compiled=True)
         frame_id = camera_frame(camera.name)
         self._color = ColorMessages(camera.name, video.codec)
         self._depth = messages.PictureMessages(frame_id, DEPTH_FORMAT)
         self._labels = messages.PictureMessages(frame_id, LABELS_FORMAT)
-        self._packets: list[bytes] = []
         self._others: list[list[Message]] = []
-        self.num_ready = 0
-        self.num_video_bytes = 0
 
     def add(self, frame: Frame) -> None:
         """Take the camera's pictures of the next frame.
@@ -93,8 +125,8 @@ class CameraRecorder:
             self._check(frame.frame_index, "depth", images.depth, self.streams.depth)
         if images.segmentation is not None or self.streams.segmentation:
             self._check(frame.frame_index, "segmentation", images.segmentation, self.streams.segmentation)
-        self._pixels.add(images.color)
-        self._take(self._encoder.encode(images.color))
+        self._code(images.color)
+        self.last_ns = frame.time_ns
         if images.depth is not None:
             data = self._depth.compressed_image(frame.time_ns, encode_depth(images.depth))
             others.append((camera_topic(name, "depth"), messages.COMPRESSED_IMAGE, data))
@@ -112,15 +144,6 @@ class CameraRecorder:
                 f"has the same pictures of {size[1]}x{size[0]} pixels."
             )
 
-    def end(self) -> None:
-        """Take what the encoder held back."""
-        self._take(self._encoder.finish())
-
-    def _take(self, packets: list[bytes]) -> None:
-        self._packets += packets
-        self.num_ready += len(packets)
-        self.num_video_bytes += sum(map(len, packets))
-
     def take_messages(self, time_ns: list[int]) -> Iterator[list[Message]]:
         """The messages of the oldest frames that are not yet written, one list a frame."""
         count = len(time_ns)
@@ -128,7 +151,3 @@ class CameraRecorder:
             yield self._color.of(time, packet) + others
         del self._packets[:count]
         del self._others[:count]
-
-    def statistics(self) -> Message:
-        """What `pixels` counted."""
-        return self._color.statistics(self._pixels)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import json
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from types import MappingProxyType
 
@@ -12,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.errors import RecordingError
-from demorec.plain import to_json, to_plain
+from demorec.plain import to_json
 from demorec.recording import channels, messages, metadata
 from demorec.recording.chunks import Block
 from demorec.recording.container import damage_as_recording_error
@@ -21,7 +20,7 @@ from demorec.recording.episode_file import EpisodeFile
 from demorec.recording.labels import LabelDecoder, from_labels
 from demorec.recording.streams import Columns, FrameStream, frame_streams, merged_columns
 from demorec.recording.video import Rgb, VideoPacket, VideoSettings, is_keyframe
-from demorec.scene.episode import EpisodeColumns, Event, JointSample, frame_time_ns
+from demorec.scene.episode import EpisodeColumns, EpisodeInfo, Event, JointSample, Outcome, frame_time_ns
 from demorec.scene.urdf import check_primitives
 
 
@@ -29,7 +28,7 @@ class CollectedEpisodeError(RecordingError):
     """The recording is one of a collected episode, which `CollectedRecording` reads."""
 
 
-class RecordingReader(EpisodeFile):
+class RecordingReader(EpisodeFile[Outcome, metadata.CameraStreams]):
     """What one file holds: numbers as columns, pictures as packets or decoded, labels; a context manager.
 
     Attributes:
@@ -42,6 +41,7 @@ class RecordingReader(EpisodeFile):
         RecordingError: No recording, cut off, damaged, or of an unknown format version; so do all methods.
     """
 
+    info: EpisodeInfo
     _said: tuple[tuple[int, bytes], ...] | None = None
     """(time_ns, message) of all events, once `columns` has come by them: they lie among the numbers in the file."""
     _packed_labels: Mapping[str, Block] = MappingProxyType({})
@@ -58,10 +58,7 @@ class RecordingReader(EpisodeFile):
             raise RecordingError(f"The MCAP file is no demorec recording, it has no episode metadata: {self.path}")
         try:
             self.info, self._cameras = metadata.read_episode_metadata(found)
-            outcome = self._container.metadata(metadata.OUTCOME)
-            self.outcome = None if outcome is None else metadata.read_outcome_metadata(outcome)
-            self.num_frames = self._container.counts.get(channels.GRIPPER, 0)
-            self._check_end(self.num_frames, None if self.outcome is None else self.outcome.num_frames)
+            self._read_end(channels.GRIPPER, Outcome)
             if self.num_frames and len(self._cameras) != len(self.info.scene.cameras):
                 raise RecordingError("The recording has frames, but none of its scene's cameras was recorded")
         except RecordingError as error:
@@ -83,14 +80,6 @@ class RecordingReader(EpisodeFile):
     def has_segmentation(self, camera: str) -> bool:
         """Whether segmentation pictures of a camera were recorded."""
         return self._camera(camera).segmentation
-
-    def _camera(self, camera: str) -> metadata.CameraStreams:
-        if camera not in self._cameras:
-            raise RecordingError(
-                f"The recording has no camera {camera!r}, its cameras are {', '.join(self._cameras) or 'none'}: "
-                f"{self.path}"
-            )
-        return self._cameras[camera]
 
     def _frame_times(self) -> NDArray[np.int64]:
         """(T,) `frame_time_ns` of every frame."""
@@ -300,10 +289,7 @@ class RecordingReader(EpisodeFile):
         episode to the bit. A column that the format version does not have is not part of it, so that recordings of
         older versions keep their digests.
         """
-        described = to_plain(self.info)
-        del described["versions"], described["format_version"]
-        result = hashlib.sha256(json.dumps(described, sort_keys=True).encode())
-        result.update(b"no outcome" if self.outcome is None else to_json(self.outcome).encode())
+        result = self._digest_of_description()
         for name, value in _column_bytes(self.columns()):
             result.update(name.encode() + value)
         for sample in self.joint_samples():

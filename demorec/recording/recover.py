@@ -13,7 +13,7 @@ from pathlib import Path
 
 from demorec.errors import ConfigError, RecordingError, resource_error, without_path
 from demorec.recording import channels, messages, metadata
-from demorec.recording.collected.metadata import read_collected_metadata, read_collected_outcome
+from demorec.recording.collected.metadata import read_collected_metadata
 from demorec.recording.collected.reader import CollectedRecording
 from demorec.recording.collected.streams import FRAMES, feature_streams
 from demorec.recording.container import SalvagedMessage, SalvagedMetadata, salvage
@@ -23,8 +23,8 @@ from demorec.recording.recording import Recording
 from demorec.recording.ros2 import DEFINITIONS
 from demorec.recording.streams import frame_streams
 from demorec.safety.files import make_folder
-from demorec.scene.collected import Origin
-from demorec.scene.episode import frame_time_ns
+from demorec.scene.collected import CollectedOutcome, Origin
+from demorec.scene.episode import Outcome, frame_time_ns
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -188,12 +188,10 @@ def _survey_of_episode(
         topics.append(channels.video_topic(camera, streams.video.codec))
         topics += [channels.camera_topic(camera, name) for name in ("depth", "segmentation") if getattr(streams, name)]
     num_frames = min(counts[topic] for topic in topics)
-    if outcome is not None and metadata.read_outcome_metadata(outcome).num_frames != num_frames:
-        outcome = None
     last_ns = frame_time_ns(max(num_frames - 1, 0), info.fps)
     return _Survey(
         episode={metadata.EPISODE: episode},
-        outcome=outcome,
+        outcome=_if_of(num_frames, outcome, Outcome),
         num_frames=num_frames,
         reason=reason,
         keeps=lambda message, count: message.time_ns <= last_ns,
@@ -207,16 +205,22 @@ def _survey_of_collected(
     info, _, _ = read_collected_metadata(episode)
     topics = {FRAMES, *(stream.topic for stream in feature_streams(info).values())}
     num_frames = min(counts[topic] for topic in topics)
-    if outcome is not None and read_collected_outcome(outcome).num_frames != num_frames:
-        outcome = None
     return _Survey(
         episode={metadata.COLLECTED: episode},
-        outcome=outcome,
+        outcome=_if_of(num_frames, outcome, CollectedOutcome),
         num_frames=num_frames,
         reason=reason,
         keeps=lambda message, count: message.topic not in topics | {channels.TF} or count <= num_frames,
         reader=CollectedRecording,
     )
+
+
+def _if_of[O: (Outcome, CollectedOutcome)](
+    num_frames: int, outcome: dict[str, str] | None, kind: type[O]
+) -> dict[str, str] | None:
+    """The outcome, if it is that of so many frames."""
+    is_whole = outcome is not None and metadata.read_outcome_metadata(outcome, kind).num_frames == num_frames
+    return outcome if is_whole else None
 
 
 def _is_known(schema: str) -> bool:

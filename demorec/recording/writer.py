@@ -7,42 +7,21 @@ and a crash loses at most the last second.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from types import TracebackType
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 
 from demorec.config import VideoConfig
 from demorec.errors import RecordingError
 from demorec.recording import channels, messages, metadata
+from demorec.recording.file_writer import FileWriter
 from demorec.recording.frame_check import FrameCheck, check_joint_names
-from demorec.recording.part_file import PartFile
 from demorec.recording.pictures import CameraRecorder
-from demorec.recording.recover import can_be_made_again
 from demorec.recording.streams import FrameValues, frame_streams, tf_stream
 from demorec.recording.transforms import FrameTree
 from demorec.scene.episode import EpisodeInfo, Event, Frame, JointSample, Outcome, frame_time_ns
-
-
-@dataclass(frozen=True, kw_only=True)
-class WriteStats:
-    """What was written.
-
-    Attributes:
-        path: The finished file.
-        num_frames: Frames in it.
-        num_bytes: Its size.
-        video_bytes: camera -> bytes of its coded colour pictures.
-    """
-
-    path: Path
-    num_frames: int
-    num_bytes: int
-    video_bytes: Mapping[str, int]
 
 
 class _Pending(NamedTuple):
@@ -61,7 +40,7 @@ class _Pending(NamedTuple):
     changes: list[tuple[str, str, bytes]]
 
 
-class EpisodeWriter:
+class EpisodeWriter(FileWriter[Outcome, CameraRecorder]):
     """Context manager that writes one episode; leaving it without `finish` leaves NAME.mcap.part for `recover`.
 
     Depth and segmentation are recorded when the first frame has them.
@@ -89,21 +68,10 @@ class EpisodeWriter:
         self._streams = [*frame_streams(info), tf_stream(self._tree)]
         self._cameras: dict[str, CameraRecorder] = {}
         self._pending: list[_Pending] = []
-        self._num_frames = 0
         self._num_written = 0
         self._phase: str | None = None
         self._is_miss: bool | None = None
-        self._file = PartFile(
-            path, overwrite=overwrite, is_worthless=lambda part: can_be_made_again(part, origin=info.origin)
-        )
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self._file.close()
+        super().__init__(path, origin=info.origin, overwrite=overwrite)
 
     def write(self, frame: Frame) -> None:
         """Add the next frame.
@@ -206,31 +174,9 @@ class EpisodeWriter:
             result.append((channels.DELIBERATE_MISS, messages.BOOL, data))
         return result + [(channels.EVENTS, messages.LOG, messages.log(frame.time_ns, event)) for event in events]
 
-    def finish(self, outcome: Outcome) -> WriteStats:
-        """Write the rest, make the file durable and give it its name.
-
-        Raises:
-            ConfigError: A file of that name has appeared meanwhile.
-            RecordingError: The outcome speaks of another number of frames, or the disk is full.
-        """
-        if outcome.num_frames != self._num_frames:
-            raise RecordingError(f"The outcome has {outcome.num_frames} frames, the recording {self._num_frames}.")
+    def _write_rest(self) -> None:
         if self._num_frames == 0:
             self._begin(None)
-        for camera in self._cameras.values():
-            camera.end()
         self._write_pending()
         if self._pending:
             raise RecordingError(f"The video encoder kept the last {len(self._pending)} pictures to itself.")
-        last_ns = frame_time_ns(max(self._num_frames - 1, 0), self._info.fps)
-        for camera in self._cameras.values():
-            topic, schema, data = camera.statistics()
-            self._file.log(topic, schema, data, last_ns)
-        self._file.metadata(metadata.OUTCOME, metadata.outcome_metadata(outcome))
-        self._file.publish()
-        return WriteStats(
-            path=self._file.path,
-            num_frames=self._num_frames,
-            num_bytes=self._file.path.stat().st_size,
-            video_bytes={name: camera.num_video_bytes for name, camera in self._cameras.items()},
-        )

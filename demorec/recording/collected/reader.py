@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import json
 from collections.abc import Callable, Iterator
 from functools import cached_property
 from typing import Any
@@ -13,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.errors import RecordingError
-from demorec.plain import to_json, to_plain
 from demorec.recording import messages
 from demorec.recording.channels import description_topic, video_topic
 from demorec.recording.chunks import Block
@@ -23,7 +21,7 @@ from demorec.recording.collected.streams import FRAMES, SUBTASK, feature_streams
 from demorec.recording.collected.validity import what_is_wrong
 from demorec.recording.container import damage_as_recording_error
 from demorec.recording.episode_file import EpisodeFile
-from demorec.recording.metadata import COLLECTED, OUTCOME
+from demorec.recording.metadata import COLLECTED
 from demorec.recording.video import Rgb, VideoPacket, VideoSettings, is_keyframe
 from demorec.scene.collected import DEPTH_UNITS, NO_PICTURE, CollectedColumns, CollectedInfo, CollectedOutcome
 
@@ -58,7 +56,7 @@ class _Table:
         return np.concatenate([np.empty(0, np.int64), *self._times]), np.concatenate(self._values)
 
 
-class CollectedRecording(EpisodeFile):
+class CollectedRecording(EpisodeFile[CollectedOutcome, VideoSettings]):
     """What one file holds of a collected episode; a context manager.
 
     Attributes:
@@ -73,8 +71,6 @@ class CollectedRecording(EpisodeFile):
     """
 
     info: CollectedInfo
-    outcome: CollectedOutcome | None
-    num_frames: int
 
     def _read_metadata(self) -> None:
         found = self._container.metadata(COLLECTED)
@@ -82,10 +78,7 @@ class CollectedRecording(EpisodeFile):
             raise RecordingError(f"The file holds no collected episode: {self.path}")
         try:
             info, self._cameras, urdf_sha256 = metadata.read_collected_metadata(found)
-            outcome = self._container.metadata(OUTCOME)
-            self.outcome = None if outcome is None else metadata.read_collected_outcome(outcome)
-            self.num_frames = self._container.counts.get(FRAMES, 0)
-            self._check_end(self.num_frames, None if self.outcome is None else self.outcome.num_frames)
+            self._read_end(FRAMES, CollectedOutcome)
             self.info = self._with_urdf(info, urdf_sha256)
         except RecordingError as error:
             text = str(error).removesuffix(f": {self.path}")
@@ -122,12 +115,7 @@ class CollectedRecording(EpisodeFile):
 
     def video_settings(self, camera: str) -> VideoSettings:
         """How the pictures of a camera were coded."""
-        if camera not in self._cameras:
-            raise RecordingError(
-                f"The recording has no camera {camera!r}, its cameras are {', '.join(self._cameras) or 'none'}: "
-                f"{self.path}"
-            )
-        return self._cameras[camera]
+        return self._camera(camera)
 
     def columns(self) -> CollectedColumns:
         """All numbers, one row a frame, to the bit as they were written, and which pictures the frames hold."""
@@ -249,10 +237,7 @@ class CollectedRecording(EpisodeFile):
 
     def digest(self) -> str:
         """SHA-256 (hex) of the content: metadata, numbers, stamps, coded pictures; not of what versions wrote it."""
-        described = to_plain(self.info)
-        del described["versions"], described["format_version"]
-        result = hashlib.sha256(json.dumps(described, sort_keys=True).encode())
-        result.update(b"no outcome" if self.outcome is None else to_json(self.outcome).encode())
+        result = self._digest_of_description()
         columns = self.columns()
         result.update(columns.time_ns.tobytes())
         for mapping in (columns.features, columns.stamps, columns.pictures, columns.picture_stamps):
