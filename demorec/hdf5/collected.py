@@ -52,16 +52,13 @@ def write_collected(demo: h5py.Group, recording: CollectedRecording, options: Hd
             add_vectors(observations, names[name], values, elements[name])
     for camera, numbers in data.pictures.items():
         settings = recording.video_settings(camera)
+        size = settings.height, settings.width
         if camera in recording.depth_cameras:
-            shape = (count, settings.height, settings.width, 1)
-            stored = add_pictures(observations, names[camera], shape, np.float32, options.compression)
-            for index, metres in enumerate(shown_depth(recording, camera, numbers)):
-                stored[index] = metres[..., np.newaxis]
-            continue
-        shape = (count, settings.height, settings.width, 3)
-        stored = add_pictures(observations, names[camera + _IMAGE], shape, np.uint8, options.compression)
-        for index, picture in enumerate(shown_images(recording, camera, numbers)):
-            stored[index] = picture
+            distances = shown_depth(recording, camera, numbers)
+            add_pictures(observations, names[camera], (count, *size, 1), distances, options.compression)
+        else:
+            pictures = shown_images(recording, camera, numbers)
+            add_pictures(observations, names[camera + _IMAGE], (count, *size, 3), pictures, options.compression)
     return count
 
 
