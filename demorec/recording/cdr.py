@@ -54,8 +54,8 @@ def layout(schema: str, *values: Any) -> Layout:
     return Layout(
         dtype="<i8" if schema.endswith("Int64MultiArray") else "<f8",
         constant=np.frombuffer(bytes(writer.data), dtype=np.uint8),
-        time_bytes=_slot_bytes(writer.slots[Slot.TIME]),
-        value_bytes=_slot_bytes(writer.slots[Slot.VALUE]),
+        time_slots=np.array(writer.slots[Slot.TIME], dtype=np.intp),
+        value_slots=np.array(writer.slots[Slot.VALUE], dtype=np.intp),
     )
 
 
@@ -104,19 +104,6 @@ class _Writer:
         self.data += bytes(-(len(self.data) - 4) % size)
 
 
-def _slot_bytes(offsets: Sequence[int]) -> NDArray[np.intp]:
-    return (np.array(offsets, dtype=np.intp)[:, None] + np.arange(8)).reshape(-1)
-
-
-def _runs(positions: NDArray[np.intp]) -> list[tuple[int, int]]:
-    """(first, last + 1) of the stretches without a gap in ascending positions."""
-    if not len(positions):
-        return []
-    cuts = np.flatnonzero(np.diff(positions) != 1) + 1
-    firsts, lasts = positions[[0, *cuts]], positions[[*(cuts - 1), -1]]
-    return [(int(a), int(b) + 1) for a, b in zip(firsts, lasts, strict=True)]
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Layout:
     """A message of constant length whose stamps and values change.
@@ -124,27 +111,28 @@ class Layout:
     Attributes:
         dtype: Of the values: float64 or int64.
         constant: (L,) uint8, the message with zeros in the slots.
-        time_bytes: (8 S,) positions of the bytes of the S time stamps, which are all set to the message's time.
-        value_bytes: (8 K,) positions of the bytes of the K values.
+        time_slots: (S,) where the time stamps begin, which are all set to the message's time.
+        value_slots: (K,) where the values begin, which have eight bytes as the stamps do.
     """
 
     dtype: Literal["<f8", "<i8"] = "<f8"
     constant: NDArray[np.uint8]
-    time_bytes: NDArray[np.intp]
-    value_bytes: NDArray[np.intp]
+    time_slots: NDArray[np.intp]
+    value_slots: NDArray[np.intp]
 
     @property
     def num_values(self) -> int:
         """K."""
-        return len(self.value_bytes) // 8
+        return len(self.value_slots)
 
     @cached_property
     def _value_runs(self) -> list[tuple[int, int]]:
-        return _runs(self.value_bytes)
-
-    @cached_property
-    def _time_runs(self) -> list[tuple[int, int]]:
-        return _runs(self.time_bytes)
+        """(first, last + 1) of the stretches of bytes that values fill without a gap."""
+        runs: list[tuple[int, int]] = []
+        for slot in self.value_slots.tolist():
+            first = runs.pop()[0] if runs and runs[-1][1] == slot else slot
+            runs.append((first, slot + 8))
+        return runs
 
     def encode(self, time_ns: NDArray[np.int64], values: NDArray[Any]) -> list[bytes]:
         """One message for each row of `values` (N, K), stamped with `time_ns` (N,)."""
@@ -155,9 +143,9 @@ class Layout:
         rows[:, 4 : 4 + length] = self.constant
         seconds, nanoseconds = np.divmod(time_ns, _NANOSECONDS)
         words = rows.view("<u4")
-        words[:, (self.time_bytes[::8] + 4) // 4] = seconds[:, None]
-        words[:, (self.time_bytes[::8] + 8) // 4] = nanoseconds[:, None]
-        rows.view(self.dtype)[:, (self.value_bytes[::8] + 4) // 8] = values
+        words[:, (self.time_slots + 4) // 4] = seconds[:, None]
+        words[:, (self.time_slots + 8) // 4] = nanoseconds[:, None]
+        rows.view(self.dtype)[:, (self.value_slots + 4) // 8] = values
         data = rows.tobytes()
         return [data[start : start + length] for start in range(4, count * width, width)]
 
@@ -179,8 +167,8 @@ class Layout:
             values[:, column : column + count] = np.ascontiguousarray(rows[:, first:last]).view(self.dtype)
             rest[:, first:last] = 0
             column += count
-        for first, last in self._time_runs:
-            rest[:, first:last] = 0
+        for slot in self.time_slots.tolist():
+            rest[:, slot : slot + 8] = 0
         # The slots of the constant are zero, so what is left must be the constant.
         if not (rest == self.constant).all():
             raise ValueError("a message with other names or lengths than the episode's metadata")

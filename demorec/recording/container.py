@@ -310,15 +310,7 @@ class SalvagedMessage:
     is_latched: bool
 
 
-@dataclass(frozen=True, kw_only=True)
-class SalvagedMetadata:
-    """A metadata record of a file without an index."""
-
-    name: str
-    values: dict[str, str]
-
-
-def salvage(path: Path) -> Iterator[SalvagedMessage | SalvagedMetadata | str | None]:
+def salvage(path: Path) -> Iterator[SalvagedMessage | Metadata | str | None]:
     """Everything whole from the front of a file: messages and metadata, None at the end of each chunk.
 
     Ends with a string that says why reading stopped, or without one where the data ends as it should. Raises OSError.
@@ -367,7 +359,7 @@ class _Salvage:
         self._schemas: dict[int, str] = {}
         self._channels: dict[int, Channel] = {}
 
-    def read(self, opcode: int, content: bytes) -> Iterator[SalvagedMessage | SalvagedMetadata]:
+    def read(self, opcode: int, content: bytes) -> Iterator[SalvagedMessage | Metadata]:
         """What a record holds."""
         if opcode == Opcode.CHUNK:
             unpacked = chunk_content(content, self._limits)
@@ -389,8 +381,7 @@ class _Salvage:
                 is_latched="offered_qos_profiles" in channel.metadata,
             )
         elif opcode == Opcode.METADATA:
-            record = _read(content, Metadata)
-            yield SalvagedMetadata(name=record.name, values=dict(record.metadata))
+            yield _read(content, Metadata)
         elif opcode == Opcode.SCHEMA:
             schema = _read_schema(content)
             self._schemas[schema.id] = schema.name

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from numpy.typing import NDArray
@@ -24,6 +24,13 @@ from demorec.scene.scene import Camera
 
 Message = tuple[str, str, bytes]
 """Topic, type, bytes."""
+
+
+_OTHERS: dict[str, tuple[str, Callable[[Any], bytes]]] = {
+    "depth": (DEPTH_FORMAT, encode_depth),
+    "segmentation": (LABELS_FORMAT, encode_labels),
+}
+"""Pictures beside colour: stream -> its format, and how one is coded."""
 
 
 class ColorMessages:
@@ -105,8 +112,7 @@ class CameraRecorder(PictureCoder):
         )
         frame_id = camera_frame(camera.name)
         self._color = ColorMessages(camera.name, video.codec)
-        self._depth = messages.PictureMessages(frame_id, DEPTH_FORMAT)
-        self._labels = messages.PictureMessages(frame_id, LABELS_FORMAT)
+        self._layouts = {kind: messages.PictureMessages(frame_id, form) for kind, (form, _) in _OTHERS.items()}
         self._others: list[list[Message]] = []
 
     def add(self, frame: Frame) -> None:
@@ -119,20 +125,16 @@ class CameraRecorder(PictureCoder):
         images = frame.images.get(name)
         if images is None:
             raise RecordingError(f"Frame {frame.frame_index} has no picture of the camera {name!r}.")
-        others: list[Message] = []
         self._check(frame.frame_index, "colour", images.color, True)
-        if images.depth is not None or self.streams.depth:
-            self._check(frame.frame_index, "depth", images.depth, self.streams.depth)
-        if images.segmentation is not None or self.streams.segmentation:
-            self._check(frame.frame_index, "segmentation", images.segmentation, self.streams.segmentation)
+        for kind in _OTHERS:
+            self._check(frame.frame_index, kind, getattr(images, kind), getattr(self.streams, kind))
         self._code(images.color)
         self.last_ns = frame.time_ns
-        if images.depth is not None:
-            data = self._depth.compressed_image(frame.time_ns, encode_depth(images.depth))
-            others.append((camera_topic(name, "depth"), messages.COMPRESSED_IMAGE, data))
-        if images.segmentation is not None:
-            data = self._labels.compressed_image(frame.time_ns, encode_labels(images.segmentation))
-            others.append((camera_topic(name, "segmentation"), messages.COMPRESSED_IMAGE, data))
+        others: list[Message] = []
+        for kind, (_, encode) in _OTHERS.items():
+            if (pixels := getattr(images, kind)) is not None:
+                data = self._layouts[kind].compressed_image(frame.time_ns, encode(pixels))
+                others.append((camera_topic(name, kind), messages.COMPRESSED_IMAGE, data))
         self._others.append(others)
 
     def _check(self, frame_index: int, kind: str, pixels: NDArray[Any] | None, is_recorded: bool) -> None:

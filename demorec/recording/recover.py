@@ -11,12 +11,14 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from mcap.records import Metadata
+
 from demorec.errors import ConfigError, RecordingError, resource_error, without_path
 from demorec.recording import channels, messages, metadata
 from demorec.recording.collected.metadata import read_collected_metadata
 from demorec.recording.collected.reader import CollectedRecording
 from demorec.recording.collected.streams import FRAMES, feature_streams
-from demorec.recording.container import SalvagedMessage, SalvagedMetadata, salvage
+from demorec.recording.container import SalvagedMessage, salvage
 from demorec.recording.opening import open_recording
 from demorec.recording.part_file import PartFile
 from demorec.recording.recording import Recording
@@ -25,6 +27,8 @@ from demorec.recording.streams import frame_streams
 from demorec.safety.files import make_folder
 from demorec.scene.collected import CollectedOutcome, Origin
 from demorec.scene.episode import Outcome, frame_time_ns
+
+_KNOWN_TYPES = {*DEFINITIONS, messages.PROTOBUF_VIDEO}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,7 +79,7 @@ def recover(source: Path, target: Path, *, overwrite: bool = False) -> Recovered
                 break
             if isinstance(item, SalvagedMessage):
                 seen[item.topic] += 1
-                if survey.keeps(item, seen[item.topic]) and _is_known(item.schema):
+                if survey.keeps(item, seen[item.topic]) and item.schema in _KNOWN_TYPES:
                     file.log(item.topic, item.schema, item.data, item.time_ns, latched=item.is_latched)
                     num_messages += 1
             elif item is None:
@@ -117,11 +121,11 @@ def can_be_made_again(part: Path, *, origin: str | Origin) -> bool:
         origin: That of the recording that is about to be written in its place, as its info has it.
     """
     for item in _items(part):
-        if isinstance(item, SalvagedMetadata) and item.name == metadata.EPISODE:
-            info, _ = metadata.read_episode_metadata(item.values)
+        if isinstance(item, Metadata) and item.name == metadata.EPISODE:
+            info, _ = metadata.read_episode_metadata(item.metadata)
             return bool(origin) and info.origin == origin
-        if isinstance(item, SalvagedMetadata) and item.name == metadata.COLLECTED:
-            collected, _, _ = read_collected_metadata(item.values)
+        if isinstance(item, Metadata) and item.name == metadata.COLLECTED:
+            collected, _, _ = read_collected_metadata(item.metadata)
             return collected.origin.kind == "import" and collected.origin == origin
         if isinstance(item, str):
             return item == "the end is missing"  # after nothing: the writer was killed before the first frame
@@ -151,7 +155,7 @@ class _Survey:
     reader: type[Recording] | type[CollectedRecording] = Recording
 
 
-def _items(source: Path) -> Iterator[SalvagedMessage | SalvagedMetadata | str | None]:
+def _items(source: Path) -> Iterator[SalvagedMessage | Metadata | str | None]:
     try:
         yield from salvage(source)
     except OSError as error:
@@ -167,9 +171,9 @@ def _survey(source: Path) -> _Survey:
     for item in _items(source):
         if isinstance(item, str):
             reason = item
-        elif isinstance(item, SalvagedMetadata):
-            metadata.check_seal(item.name, item.values)
-            found[item.name] = item.values
+        elif isinstance(item, Metadata):
+            metadata.check_seal(item.name, item.metadata)
+            found[item.name] = item.metadata
         elif item is not None:
             counts[item.topic] += 1
     outcome = found.get(metadata.OUTCOME)
@@ -221,7 +225,3 @@ def _if_of[O: (Outcome, CollectedOutcome)](
     """The outcome, if it is that of so many frames."""
     is_whole = outcome is not None and metadata.read_outcome_metadata(outcome, kind).num_frames == num_frames
     return outcome if is_whole else None
-
-
-def _is_known(schema: str) -> bool:
-    return schema in DEFINITIONS or schema == messages.PROTOBUF_VIDEO

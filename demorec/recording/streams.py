@@ -11,7 +11,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from operator import attrgetter
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -106,7 +107,8 @@ def _every_stream(info: EpisodeInfo) -> Iterator[FrameStream]:
     robot, scene = info.robot, info.scene
     arm_and_gripper = (*robot.arm_joints, GRIPPER_JOINT)
     base = robot.base_link
-    yield _joints(JOINT_STATES, robot.joint_names, _joint_state_parts, _joint_state_columns)
+    joint_state = attrgetter(*(f"observation.{name}" for name in _JOINT_STATE))
+    yield _joints(JOINT_STATES, robot.joint_names, joint_state, _joint_state_columns)
     yield _joints(GRIPPER, (GRIPPER_JOINT,), partial(_gripper_parts, robot), _gripper_columns)
     yield _joints(
         ACTION, arm_and_gripper, lambda v: _targets(v.action), partial(_target_columns, "action"), _with_zeros
@@ -114,9 +116,9 @@ def _every_stream(info: EpisodeInfo) -> Iterator[FrameStream]:
     yield _joints(
         COMMAND, arm_and_gripper, lambda v: _targets(v.command), partial(_target_columns, "command"), _with_zeros
     )
-    yield _pose(EE_POSE, base, lambda v: v.observation.base_from_tcp, "base_from_tcp")
-    yield _pose(ACTION + EE_POSE, base, lambda v: v.action.base_from_tcp_target, "action_base_from_tcp")
-    yield _pose(COMMAND + EE_POSE, base, lambda v: v.command.base_from_tcp_target, "command_base_from_tcp")
+    yield _pose(EE_POSE, base, "observation.base_from_tcp", "base_from_tcp")
+    yield _pose(ACTION + EE_POSE, base, "action.base_from_tcp_target", "action_base_from_tcp")
+    yield _pose(COMMAND + EE_POSE, base, "command.base_from_tcp_target", "command_base_from_tcp")
     yield FrameStream(
         topic=WRENCH,
         schema=messages.WRENCH,
@@ -126,10 +128,10 @@ def _every_stream(info: EpisodeInfo) -> Iterator[FrameStream]:
         since=2,
     )
     for body in scene.movable:
-        yield _pose(object_topic(body.name), WORLD, partial(_object_pose, body.name), "object_poses", body.name)
+        yield _pose(object_topic(body.name), WORLD, "observation.object_poses", "object_poses", body.name)
     for camera in scene.cameras:
         topic = camera_topic(camera.name, "pose")
-        yield _pose(topic, WORLD, partial(_camera_pose, camera.name), "world_from_camera", camera.name)
+        yield _pose(topic, WORLD, "world_from_camera", "world_from_camera", camera.name)
 
 
 def tf_stream(frames: FrameTree) -> FrameStream:
@@ -179,21 +181,12 @@ def observation_at(columns: EpisodeColumns, frame: int) -> Observation:
     )
 
 
-def action_at(columns: EpisodeColumns, frame: int) -> Action:
-    """What the expert wanted at a frame."""
+def action_at(columns: EpisodeColumns, frame: int, kind: Literal["action", "command"]) -> Action:
+    """What the expert wanted at a frame, or the command that was sent to the motors."""
     return Action(
-        joint_target=columns.action_joint_target[frame].copy(),
-        gripper_target=float(columns.action_gripper[frame]),
-        base_from_tcp_target=pose_of(columns.action_base_from_tcp[frame]),
-    )
-
-
-def command_at(columns: EpisodeColumns, frame: int) -> Action:
-    """What was sent to the motors at a frame."""
-    return Action(
-        joint_target=columns.command_joint_target[frame].copy(),
-        gripper_target=float(columns.command_gripper[frame]),
-        base_from_tcp_target=pose_of(columns.command_base_from_tcp[frame]),
+        joint_target=getattr(columns, f"{kind}_joint_target")[frame].copy(),
+        gripper_target=float(getattr(columns, f"{kind}_gripper")[frame]),
+        base_from_tcp_target=pose_of(getattr(columns, f"{kind}_base_from_tcp")[frame]),
     )
 
 
@@ -205,14 +198,11 @@ def pose_of(row: Array) -> Pose:
 # ------------------------------------------------------------------------------------ what the rows are made of
 
 
-def _joint_state_parts(values: FrameValues) -> Sequence[Array]:
-    observation = values.observation
-    return observation.joint_position, observation.joint_velocity, observation.joint_effort
+_JOINT_STATE = ("joint_position", "joint_velocity", "joint_effort")
 
 
 def _joint_state_columns(values: Array) -> Columns:
-    names = ("joint_position", "joint_velocity", "joint_effort")
-    return {name: part.copy() for name, part in zip(names, np.split(values, 3, axis=1), strict=True)}
+    return {name: part.copy() for name, part in zip(_JOINT_STATE, np.split(values, 3, axis=1), strict=True)}
 
 
 def _gripper_parts(robot: RobotSpec, values: FrameValues) -> Sequence[Array]:
@@ -246,14 +236,6 @@ def _wrench_parts(values: FrameValues) -> Sequence[Array]:
     return (wrench,)
 
 
-def _object_pose(name: str, values: FrameValues) -> Pose:
-    return values.observation.object_poses[name]
-
-
-def _camera_pose(name: str, values: FrameValues) -> Pose:
-    return values.world_from_camera[name]
-
-
 def _joints(
     topic: str,
     names: Sequence[str],
@@ -272,12 +254,18 @@ def _joints(
     )
 
 
-def _pose(topic: str, frame_id: str, pose: Callable[[FrameValues], Pose], column: str, key: str = "") -> FrameStream:
-    """A pose that becomes the rows of `column`, or of `key` in it."""
+def _pose(topic: str, frame_id: str, path: str, column: str, key: str = "") -> FrameStream:
+    """A pose at a path in `FrameValues` that becomes the rows of `column`; or with a key one of the poses there."""
+    found = attrgetter(path)
+
+    def parts(values: FrameValues) -> Sequence[Array]:
+        pose: Pose = found(values)[key] if key else found(values)
+        return pose.position, pose.quat_xyzw
+
     return FrameStream(
         topic=topic,
         schema=messages.POSE,
         layout=layout(messages.POSE, (Slot.TIME, frame_id), POSE_SLOTS),
-        parts=lambda values: ((found := pose(values)).position, found.quat_xyzw),
+        parts=parts,
         columns=lambda values: {column: {key: values}} if key else {column: values},
     )
