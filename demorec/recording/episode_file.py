@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from abc import abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
 
@@ -96,6 +96,13 @@ class EpisodeFile[O: (Outcome, CollectedOutcome), C](Closing):
             for topic in sorted(container.channels)
         }
 
+    def _read[V](self, topic: str, read: Callable[[bytes], V]) -> Iterator[tuple[int, V]]:
+        """(time_ns, what was read) of the messages of a topic, in order."""
+        for message in self._container.messages((topic,)):
+            with damage_as_recording_error(self.path):
+                found = read(message.data)
+            yield message.time_ns, found
+
     @abstractmethod
     def video_settings(self, camera: str) -> VideoSettings:
         """How the pictures of a camera were coded."""
@@ -119,9 +126,8 @@ class EpisodeFile[O: (Outcome, CollectedOutcome), C](Closing):
     def pixel_statistics(self, camera: str) -> PixelStatistics:
         """Histograms of a camera's pictures: as written, or counted now where none were written."""
         self.video_settings(camera)
-        for message in self._container.messages((camera_topic(camera, "histogram"),)):
-            with damage_as_recording_error(self.path):
-                return messages.read_pixel_statistics(message.data)
+        for _, statistics in self._read(camera_topic(camera, "histogram"), messages.read_pixel_statistics):
+            return statistics
         counter = PixelCounter()
         for picture in self.images(camera):
             counter.add(picture)

@@ -36,24 +36,14 @@ _MOST_PIXELS = 1 << 50
 _LOG_LEVELS = {"info": 20, "warning": 30, "error": 40}
 
 
-def string(text: str) -> bytes:
-    """std_msgs/String."""
-    return encode(STRING, text)
-
-
 def read_string(data: bytes) -> str:
-    """Inverse of `string`."""
+    """The text of a std_msgs/String."""
     text: str = next(CdrReader(data).values(STRING))
     return text
 
 
-def boolean(value: bool) -> bytes:
-    """std_msgs/Bool."""
-    return encode(BOOL, value)
-
-
 def read_boolean(data: bytes) -> bool:
-    """Inverse of `boolean`."""
+    """The value of a std_msgs/Bool."""
     return bool(next(CdrReader(data).values(BOOL)))
 
 
@@ -241,13 +231,11 @@ class Calibration:
     intrinsics: Array
 
 
-def camera_info(calibration: Calibration, frame_id: str, distortion: Sequence[float] = (0.0,) * 5) -> bytes:
-    """sensor_msgs/CameraInfo, with the distortion of the plumb bob model."""
-    k = calibration.intrinsics
+def camera_info(frame_id: str, size: tuple[int, int], k: Array, distortion: Sequence[float] = (0.0,) * 5) -> bytes:
+    """sensor_msgs/CameraInfo of (height, width) pixels and K (3, 3), with the distortion of the plumb bob model."""
     projection = np.hstack((k, np.zeros((3, 1))))
     matrices = (matrix.reshape(-1) for matrix in (k, np.eye(3), projection))
     whole_picture = (0, 0, 0, 0, False)  # as the region of interest; without binning
-    size = (calibration.height, calibration.width)
     header = (_stamp(0), frame_id)
     return encode(CAMERA_INFO, header, *size, "plumb_bob", distortion, *matrices, 0, 0, whole_picture)
 

@@ -19,6 +19,7 @@ from demorec.recording.metadata import CameraStreams
 from demorec.recording.pixels import PixelCounter
 from demorec.recording.transforms import camera_frame
 from demorec.recording.video import Encoder, Rgb, make_encoder
+from demorec.scene.collected import CollectedCamera
 from demorec.scene.episode import CameraImages, Frame
 from demorec.scene.scene import Camera
 
@@ -33,21 +34,30 @@ _OTHERS: dict[str, tuple[str, Callable[[Any], bytes]]] = {
 """Pictures beside colour: stream -> its format, and how one is coded."""
 
 
-class ColorMessages:
-    """The messages of the coded colour pictures of one camera, and of their statistics."""
+class PictureTopics:
+    """Where the coded pictures of one camera go, be they of colours or of distances.
 
-    def __init__(self, camera: str, codec: str) -> None:
-        self._camera, self._codec = camera, codec
-        self._topic, self._again_topic = video_topic(camera, codec), camera_topic(camera, "video")
-        self._layout = messages.PictureMessages(camera_frame(camera), codec)
+    Args:
+        camera: The camera.
+        codec: Of the pictures.
+    """
+
+    def __init__(self, camera: Camera | CollectedCamera, codec: str) -> None:
+        self._codec, self._size = codec, (camera.height, camera.width)
+        self._topic, self._again_topic = video_topic(camera.name, codec), camera_topic(camera.name, "video")
+        self._frame_id = camera_frame(camera.name)
+        self._layout = messages.PictureMessages(self._frame_id, DEPTH_FORMAT if codec == "16UC1" else codec)
 
     def of(self, time_ns: int, packet: bytes) -> list[Message]:
-        """Those of one picture."""
+        """The messages of one picture."""
         if self._codec == "av1":
-            data = messages.protobuf_video(time_ns, camera_frame(self._camera), self._codec, packet)
+            data = messages.protobuf_video(time_ns, self._frame_id, self._codec, packet)
             return [(self._topic, messages.PROTOBUF_VIDEO, data)]
+        if self._codec == "32FC1":
+            data = messages.image(time_ns, self._frame_id, self._codec, self._size, packet)
+            return [(self._topic, messages.IMAGE, data)]
         result = [(self._topic, messages.COMPRESSED_IMAGE, self._layout.compressed_image(time_ns, packet))]
-        if self._codec != "jpeg":
+        if self._codec in ("h264", "h265"):
             # The same bytes once more, as Foxglove wants them; next to the first, compression folds them.
             again = self._layout.compressed_video(time_ns, packet)
             result.append((self._again_topic, messages.COMPRESSED_VIDEO, again))
@@ -111,7 +121,7 @@ class CameraRecorder(PictureCoder):
             video=encoder.settings, depth=first.depth is not None, segmentation=first.segmentation is not None
         )
         frame_id = camera_frame(camera.name)
-        self._color = ColorMessages(camera.name, video.codec)
+        self._color = PictureTopics(camera, video.codec)
         self._layouts = {kind: messages.PictureMessages(frame_id, form) for kind, (form, _) in _OTHERS.items()}
         self._others: list[list[Message]] = []
 

@@ -118,22 +118,18 @@ class RecordingReader(EpisodeFile[Outcome, metadata.CameraStreams]):
     def description(self, body: str = "") -> str:
         """URDF of the robot, or of the body of that name: primitives only, complete without any other file."""
         topic = channels.description_topic(body)
-        for message in self._container.messages((topic,)):
+        for _, text in self._read(topic, messages.read_string):
             with damage_as_recording_error(self.path):
-                text = messages.read_string(message.data)
                 check_primitives(text)
-                return text
+            return text
         raise RecordingError(f"The recording has no description on {topic}: {self.path}")
 
     def joint_samples(self) -> Iterator[JointSample]:
         """Every recorded joint state in order of time: the frames' own and those between them."""
         stream = next(row for row in frame_streams(self.info) if row.topic == channels.JOINT_STATES)
-        for message in self._container.messages((channels.JOINT_STATES,)):
-            with damage_as_recording_error(self.path):
-                position, velocity, effort = stream.layout.decode([message.data]).reshape(3, -1)
-            yield JointSample(
-                time_ns=message.time_ns, joint_position=position, joint_velocity=velocity, joint_effort=effort
-            )
+        read = self._read(channels.JOINT_STATES, lambda data: stream.layout.decode([data]).reshape(3, -1))
+        for time_ns, (position, velocity, effort) in read:
+            yield JointSample(time_ns=time_ns, joint_position=position, joint_velocity=velocity, joint_effort=effort)
 
     def events(self) -> Iterator[tuple[int, Event]]:
         """(time_ns, event) in order of time; changes of phase are in `columns().phase`."""
@@ -237,10 +233,7 @@ class RecordingReader(EpisodeFile[Outcome, metadata.CameraStreams]):
 
     def segment_labels(self) -> dict[int, str]:
         """Label in the files -> name, as of `segment_names`."""
-        for message in self._container.messages((channels.LABELS,)):
-            with damage_as_recording_error(self.path):
-                return messages.read_label_info(message.data)
-        return {}
+        return next((labels for _, labels in self._read(channels.LABELS, messages.read_label_info)), {})
 
     def _pictures[P](self, topic: str, read: Callable[[bytes], P]) -> Iterator[tuple[int, P]]:
         """(time_ns, picture) of a topic that has one message a frame."""
@@ -276,10 +269,8 @@ class RecordingReader(EpisodeFile[Outcome, metadata.CameraStreams]):
 
     def calibration(self, camera: str) -> messages.Calibration:
         """What the calibration message of a camera says, which is what other programs go by."""
-        topic = channels.camera_topic(camera, "camera_info")
-        for message in self._container.messages((topic,)):
-            with damage_as_recording_error(self.path):
-                return messages.read_camera_info(message.data)
+        for _, found in self._read(channels.camera_topic(camera, "camera_info"), messages.read_camera_info):
+            return found
         raise RecordingError(f"The recording has no calibration of the camera {camera!r}: {self.path}")
 
     def digest(self) -> str:

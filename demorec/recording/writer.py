@@ -16,6 +16,7 @@ import numpy as np
 from demorec.config import VideoConfig
 from demorec.errors import RecordingError
 from demorec.recording import channels, messages, metadata
+from demorec.recording.cdr import encode
 from demorec.recording.file_writer import FileWriter
 from demorec.recording.frame_check import FrameCheck, check_joint_names
 from demorec.recording.pictures import CameraRecorder
@@ -167,10 +168,10 @@ class EpisodeWriter(FileWriter[Outcome, CameraRecorder]):
         if frame.phase != self._phase:
             self._phase = frame.phase
             events.insert(0, Event(name=channels.PHASE_EVENT, message=frame.phase))
-            result.append((channels.PHASE, messages.STRING, messages.string(frame.phase)))
+            result.append((channels.PHASE, messages.STRING, encode(messages.STRING, frame.phase)))
         if frame.is_deliberate_miss != self._is_miss:
             self._is_miss = frame.is_deliberate_miss
-            data = messages.boolean(frame.is_deliberate_miss)
+            data = encode(messages.BOOL, frame.is_deliberate_miss)
             result.append((channels.DELIBERATE_MISS, messages.BOOL, data))
         return result + [(channels.EVENTS, messages.LOG, messages.log(frame.time_ns, event)) for event in events]
 

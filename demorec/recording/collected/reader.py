@@ -16,10 +16,10 @@ from demorec.recording import messages
 from demorec.recording.channels import description_topic, video_topic
 from demorec.recording.chunks import Block
 from demorec.recording.collected import metadata
-from demorec.recording.collected.depth import decode_distances
 from demorec.recording.collected.streams import FRAMES, SUBTASK, feature_streams, frames_layout
 from demorec.recording.collected.validity import what_is_wrong
 from demorec.recording.container import damage_as_recording_error
+from demorec.recording.depth import decode_distances
 from demorec.recording.episode_file import EpisodeFile
 from demorec.recording.metadata import COLLECTED
 from demorec.recording.video import Rgb, VideoPacket, VideoSettings, is_keyframe
@@ -87,10 +87,7 @@ class CollectedRecording(EpisodeFile[CollectedOutcome, VideoSettings]):
     def _with_urdf(self, info: CollectedInfo, sha256: str) -> CollectedInfo:
         if not sha256:
             return info
-        urdf = ""
-        for message in self._container.messages((description_topic(),)):
-            with damage_as_recording_error(self.path):
-                urdf = messages.read_string(message.data)
+        urdf = ["", *(text for _, text in self._read(description_topic(), messages.read_string))][-1]
         if metadata.urdf_sha256(urdf) != sha256:
             raise RecordingError("The URDF of the recording is not the one that its metadata tells of")
         described = dataclasses.replace(info, urdf=urdf)
@@ -158,12 +155,11 @@ class CollectedRecording(EpisodeFile[CollectedOutcome, VideoSettings]):
     def subtasks(self) -> tuple[tuple[int, str], ...]:
         """(frame, what is begun there), in order; empty where nobody said any."""
         found = []
-        for message in self._container.messages((SUBTASK,)):
-            frame = int(np.searchsorted(self._columns.time_ns, message.time_ns))
-            if frame == self.num_frames or self._columns.time_ns[frame] != message.time_ns:
+        for time_ns, text in self._read(SUBTASK, messages.read_string):
+            frame = int(np.searchsorted(self._columns.time_ns, time_ns))
+            if frame == self.num_frames or self._columns.time_ns[frame] != time_ns:
                 raise RecordingError(f"A subtask of the recording begins where no frame is: {self.path}")
-            with damage_as_recording_error(self.path):
-                found.append((frame, messages.read_string(message.data)))
+            found.append((frame, text))
         return tuple(found)
 
     def _stamps(self, topic: str) -> NDArray[np.int64]:
@@ -187,12 +183,8 @@ class CollectedRecording(EpisodeFile[CollectedOutcome, VideoSettings]):
         """The coded pictures of a camera in order; `frame_index` is their number, by which frames hold them."""
         codec = self.video_settings(camera).codec
         read = _READERS.get(codec, messages.read_compressed_image)
-        for number, message in enumerate(self._container.messages((self._picture_topic(camera),))):
-            with damage_as_recording_error(self.path):
-                data = read(message.data)
-            yield VideoPacket(
-                frame_index=number, time_ns=message.time_ns, data=data, is_keyframe=is_keyframe(codec, data)
-            )
+        for number, (time_ns, data) in enumerate(self._read(self._picture_topic(camera), read)):
+            yield VideoPacket(frame_index=number, time_ns=time_ns, data=data, is_keyframe=is_keyframe(codec, data))
 
     def images(self, camera: str) -> Iterator[Rgb]:
         """The decoded pictures of a camera, (H, W, 3) uint8 RGB, in order; RecordingError for a depth camera."""

@@ -15,16 +15,17 @@ from numpy.typing import NDArray
 from demorec.config import VideoConfig
 from demorec.errors import ConfigError, RecordingError
 from demorec.recording import messages
+from demorec.recording.cdr import encode
 from demorec.recording.channels import TF, TF_STATIC, camera_topic, description_topic
 from demorec.recording.collected import metadata
-from demorec.recording.collected.depth import DepthMessages, encode_distances
 from demorec.recording.collected.frame_check import CollectedCheck
 from demorec.recording.collected.streams import FRAMES, SUBTASK, feature_streams, frames_layout
 from demorec.recording.collected.transforms import CollectedTree
 from demorec.recording.collected.validity import what_is_wrong
+from demorec.recording.depth import encode_distances
 from demorec.recording.file_writer import FileWriter
 from demorec.recording.metadata import COLLECTED
-from demorec.recording.pictures import ColorMessages, PictureCoder
+from demorec.recording.pictures import PictureCoder, PictureTopics
 from demorec.recording.pixels import PixelCounter
 from demorec.recording.transforms import camera_frame
 from demorec.recording.video import make_encoder, settings_of_coded
@@ -38,7 +39,7 @@ class _Pictures(PictureCoder):
 
     Attributes:
         settings: How they are coded.
-        messages: What becomes of them.
+        topics: Where they go.
     """
 
     def __init__(self, camera: CollectedCamera, video: VideoConfig, fps: int) -> None:
@@ -48,7 +49,7 @@ class _Pictures(PictureCoder):
         else:
             encoder = make_encoder(video, *size, fps)
             self.settings = encoder.settings
-        self.messages = DepthMessages(camera) if camera.is_depth else ColorMessages(camera.name, self.settings.codec)
+        self.topics = PictureTopics(camera, self.settings.codec)
         super().__init__(camera.name, encoder, PixelCounter())
         self._stamps: list[int] = []
 
@@ -119,16 +120,15 @@ class CollectedWriter(FileWriter[CollectedOutcome, _Pictures]):
         settings = {name: camera.settings for name, camera in self._cameras.items()}
         self._file.metadata(COLLECTED, metadata.collected_metadata(self._info, settings))
         if self._tree is not None:
-            self._file.log(description_topic(), messages.STRING, messages.string(self._info.urdf), 0, latched=True)
+            urdf = encode(messages.STRING, self._info.urdf)
+            self._file.log(description_topic(), messages.STRING, urdf, 0, latched=True)
             static = messages.transforms(self._tree.static)
             self._file.log(TF_STATIC, messages.TRANSFORMS, static, 0, latched=True)
         for camera in self._info.cameras:
             if camera.intrinsics is not None:
-                calibration = messages.Calibration(
-                    width=camera.width, height=camera.height, intrinsics=np.array(camera.intrinsics).reshape(3, 3)
-                )
+                size, intrinsics = (camera.height, camera.width), np.array(camera.intrinsics).reshape(3, 3)
                 distortion = camera.distortion or (0.0,) * 5
-                data = messages.camera_info(calibration, camera_frame(camera.name), distortion)
+                data = messages.camera_info(camera_frame(camera.name), size, intrinsics, distortion)
                 topic = camera_topic(camera.name, "camera_info")
                 self._file.log(topic, messages.CAMERA_INFO, data, 0, latched=True)
         self._file.flush()
@@ -191,14 +191,14 @@ class CollectedWriter(FileWriter[CollectedOutcome, _Pictures]):
             for log, data in encoded:
                 log(data[index], log_time=time)
             if text := frames[index].subtask:
-                self._file.log(SUBTASK, messages.STRING, messages.string(text), time)
+                self._file.log(SUBTASK, messages.STRING, encode(messages.STRING, text), time)
         self._file.flush()
         del self._pending[: len(frames)]
 
     def _write_pictures(self, name: str, camera: _Pictures) -> bool:
         taken = camera.take()
         for stamp, packet in taken:
-            for topic, schema, data in camera.messages.of(stamp, packet):
+            for topic, schema, data in camera.topics.of(stamp, packet):
                 self._file.log(topic, schema, data, stamp)
         return bool(taken)
 
