@@ -27,10 +27,7 @@ from demorec.safety.files import HDF5_MAGIC, open_regular
 
 Kind = Literal["group", "dataset", "other"]
 Scalar = str | bool | int | float
-_MAX_CHILDREN = trial.MAX_OBJECTS
 _MAX_CHUNK_BYTES = 1 << 28
-_MAX_ATTRIBUTE_BYTES = trial.MAX_ATTRIBUTE_BYTES
-_MAX_NAME = trial.MAX_NAME
 _MAX_DEPTH = 6
 _BLOCK_BYTES = 8 << 20
 """Of rows that are read at once; whole chunks of the file, unless these are larger than `_MAX_BLOCK_BYTES`."""
@@ -121,9 +118,9 @@ class ForeignFile(Closing):
         if not isinstance(group, h5py.Group):
             raise Hdf5Error(f"{_shown(place)} is no group: {self.path}")
         with _errors_told(f"{_shown(place)} cannot be read", self.path):
-            if len(group) > _MAX_CHILDREN:
+            if len(group) > trial.MAX_OBJECTS:
                 raise Hdf5Error(
-                    f"{_shown(place)} has {len(group):,} entries, at most {_MAX_CHILDREN:,} are read: {self.path}"
+                    f"{_shown(place)} has {len(group):,} entries, at most {trial.MAX_OBJECTS:,} are read: {self.path}"
                 )
             return {str(name): self._kind(group, str(name)) for name in group}
 
@@ -136,7 +133,7 @@ class ForeignFile(Closing):
             names = [name for name, kind in below if kind == "dataset"]
             found += len(below)
             yield from names
-            if depth < _MAX_DEPTH and found < _MAX_CHILDREN:
+            if depth < _MAX_DEPTH and found < trial.MAX_OBJECTS:
                 waiting += [(name, depth + 1) for name, kind in reversed(below) if kind == "group"]
 
     def has(self, place: str) -> bool:
@@ -185,7 +182,7 @@ class ForeignFile(Closing):
         with _errors_told(f"{place} cannot be read", self.path):
             is_list = isinstance(found, h5py.Dataset) and len(found.shape or ()) == 1 and not found.is_virtual
             kind = h5py.check_string_dtype(found.dtype) if is_list else None
-            if kind is None or found.external or len(found) > _MAX_CHILDREN or (kind.length or 0) > _MAX_NAME:
+            if kind is None or found.external or len(found) > trial.MAX_OBJECTS or (kind.length or 0) > trial.MAX_NAME:
                 raise Hdf5Error(f"{place} is no list of texts: {self.path}")
             return [str(text) for text in found.asstr(errors="replace")[:]]
 
@@ -197,7 +194,7 @@ class ForeignFile(Closing):
             with _errors_told(f"{walked}{part} cannot be read", self.path):
                 names = found if isinstance(found, h5py.Group) else ()
                 if part not in names:
-                    near = nearest_match(part, list(names)[:_MAX_CHILDREN]).rstrip("?")
+                    near = nearest_match(part, list(names)[: trial.MAX_OBJECTS]).rstrip("?")
                     raise Hdf5Error(f"There is no {walked}{part}.{near and f'{near}?'}".rstrip(".") + f": {self.path}")
                 if self._kind(found, part) == "other":
                     raise Hdf5Error(
@@ -242,9 +239,7 @@ def _attribute(found: h5py.Group | h5py.Dataset, name: str, place: str, path: Pa
     with _errors_told(f"The attribute {name} of {place} cannot be read", path):
         if name not in found.attrs:
             return None
-        stored = found.attrs.get_id(name)
-        is_empty = stored.get_space().get_simple_extent_type() == h5py.h5s.NULL
-        if is_empty or stored.shape not in ((), (1,)) or stored.get_storage_size() > _MAX_ATTRIBUTE_BYTES:
+        if not trial.is_single(found.attrs.get_id(name)):
             return None
         value = found.attrs[name]
         return _scalar(value.item() if isinstance(value, np.ndarray) else value)

@@ -121,10 +121,9 @@ class RecordedEpisode:
         return self._queue(CollectedFrame(time_ns=time_ns, samples=samples), pictures)
 
     def _begin(self, vectors: NamedVectors) -> None:
-        info = self._run.describe(vectors, self._index, self._instruction)
+        info, self._coder = self._run.start(vectors, self._index, self._instruction)
         self._check = CollectedCheck(info)
         self._features = {feature.name: feature for feature in info.features}
-        self._coder = self._run.start_coder(info)
 
     def _samples(
         self,
@@ -324,18 +323,14 @@ class Recorder(Closing):
 
     # ------------------------------------------------------------------------------- for the episode
 
-    def describe(self, vectors: NamedVectors, episode_index: int, instruction: str) -> CollectedInfo:
-        """What an episode with these vectors is; ConfigError when the run has episodes of another kind."""
+    def start(self, vectors: NamedVectors, episode_index: int, instruction: str) -> tuple[CollectedInfo, Coder]:
+        """Begin an episode with these vectors; ConfigError when the run has episodes of another kind."""
         info = self._info(self._features or features_of(vectors, self._robot), episode_index, instruction)
         if wrong := what_is_wrong(info):
             raise ConfigError(f"This cannot be recorded: {'; '.join(wrong)}.")
         self._folder.check_fits(info)
-        return info
-
-    def start_coder(self, info: CollectedInfo) -> Coder:
-        """Begin the recording."""
         writer = CollectedWriter(self._folder.path_of(info.episode_index), info, video=self._video)
-        return Coder(writer, self._buffers, cameras=info.cameras, fps=info.fps, waits=self.when_full == "wait")
+        return info, Coder(writer, self._buffers, cameras=info.cameras, fps=info.fps, waits=self.when_full == "wait")
 
     def add(self, recording: Path) -> None:
         """Take a finished recording into the run."""

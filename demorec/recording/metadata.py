@@ -101,7 +101,7 @@ def _check_cameras(info: EpisodeInfo, cameras: Mapping[str, CameraStreams]) -> N
             raise ValueError(f"the video of the camera {camera.name!r} has a GOP of {video.gop}")
 
 
-def read_outcome_metadata[O: (Outcome, CollectedOutcome)](metadata: Mapping[str, str], kind: type[O]) -> O:
+def read_outcome_metadata[O: Outcome | CollectedOutcome](metadata: Mapping[str, str], kind: type[O]) -> O:
     """Inverse of `outcome_metadata`, of such an outcome; RecordingError on damage."""
     check_seal(OUTCOME, metadata)
     try:

@@ -144,7 +144,8 @@ class RecordingReader(EpisodeFile[Outcome, metadata.CameraStreams]):
         """The coded pictures of a camera, one a frame, in order."""
         codec = self.video_settings(camera).codec
         read = messages.read_protobuf_video if codec == "av1" else messages.read_compressed_image
-        for index, (time_ns, data) in enumerate(self._pictures(channels.video_topic(camera, codec), read)):
+        for index, data in enumerate(self._pictures(channels.video_topic(camera, codec), read)):
+            time_ns = frame_time_ns(index, self.info.fps)
             yield VideoPacket(frame_index=index, time_ns=time_ns, data=data, is_keyframe=is_keyframe(codec, data))
 
     def coded_pictures(self, cameras: Sequence[str]) -> dict[str, Block]:
@@ -179,14 +180,12 @@ class RecordingReader(EpisodeFile[Outcome, metadata.CameraStreams]):
         if not self.has_depth(camera):
             raise RecordingError(f"The recording has no depth pictures of the camera {camera!r}: {self.path}")
         topic, size = channels.camera_topic(camera, "depth"), self._size(camera)
-        for _, picture in self._pictures(topic, lambda data: decode_depth(messages.read_compressed_image(data), size)):
-            yield picture
+        yield from self._pictures(topic, lambda data: decode_depth(messages.read_compressed_image(data), size))
 
     def segmentation(self, camera: str) -> Iterator[NDArray[np.int32]]:
         """Segmentation pictures, (H, W) int32 as in `CameraImages`, one a frame; `segment_names` tells what is what."""
         topic, decoder = self._segmentation_topic(camera), LabelDecoder(self._size(camera))
-        for _, labels in self._pictures(topic, lambda data: decoder.decode(messages.read_compressed_image(data))):
-            yield labels
+        yield from self._pictures(topic, lambda data: decoder.decode(messages.read_compressed_image(data)))
 
     def segmentation_at(
         self, cameras: Sequence[str], frames: Collection[int]
@@ -235,17 +234,15 @@ class RecordingReader(EpisodeFile[Outcome, metadata.CameraStreams]):
         """Label in the files -> name, as of `segment_names`."""
         return next((labels for _, labels in self._read(channels.LABELS, messages.read_label_info)), {})
 
-    def _pictures[P](self, topic: str, read: Callable[[bytes], P]) -> Iterator[tuple[int, P]]:
-        """(time_ns, picture) of a topic that has one message a frame."""
+    def _pictures[P](self, topic: str, read: Callable[[bytes], P]) -> Iterator[P]:
+        """The pictures of a topic that has one message a frame."""
         count = 0
-        for message in self._container.messages((topic,)):
-            if count >= self.num_frames or message.time_ns != frame_time_ns(count, self.info.fps):
+        for time_ns, picture in self._read(topic, read):
+            if count >= self.num_frames or time_ns != frame_time_ns(count, self.info.fps):
                 raise RecordingError(
-                    f"Picture {count} of {topic} is at {message.time_ns} ns, not at its frame's time: {self.path}"
+                    f"Picture {count} of {topic} is at {time_ns} ns, not at its frame's time: {self.path}"
                 )
-            with damage_as_recording_error(self.path):
-                picture = read(message.data)
-            yield message.time_ns, picture
+            yield picture
             count += 1
         self._check_num_pictures(topic, count)
 

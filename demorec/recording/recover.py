@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from mcap.records import Metadata
 
@@ -61,10 +62,9 @@ def recover(source: Path, target: Path, *, overwrite: bool = False) -> Recovered
         raise ConfigError(f"The recovered recording needs another name than the damaged one: {source}")
     try:
         survey = _survey(source)
+        frames = survey.frames
     except RecordingError as error:
         raise RecordingError(f"{without_path(error, source)}: {source}") from error
-    if survey.num_frames == 0:
-        raise RecordingError(f"Nothing can be recovered, the file holds no whole frame ({survey.reason}): {source}")
     make_folder(target.parent)
     num_messages = 0
     seen: Counter[str] = Counter()
@@ -72,14 +72,13 @@ def recover(source: Path, target: Path, *, overwrite: bool = False) -> Recovered
     part = target.with_name(f"{target.name}.recovering")
     file = PartFile(target, part=part, overwrite=overwrite, is_worthless=lambda part: True)
     try:
-        for name, values in survey.episode.items():
-            file.metadata(name, values)
+        file.metadata(*survey.episode)
         for item in _items(source):
             if isinstance(item, str):
                 break
             if isinstance(item, SalvagedMessage):
                 seen[item.topic] += 1
-                if survey.keeps(item, seen[item.topic]) and item.schema in _KNOWN_TYPES:
+                if frames.keeps(item, seen[item.topic]) and item.schema in _KNOWN_TYPES:
                     file.log(item.topic, item.schema, item.data, item.time_ns, latched=item.is_latched)
                     num_messages += 1
             elif item is None:
@@ -87,9 +86,9 @@ def recover(source: Path, target: Path, *, overwrite: bool = False) -> Recovered
         if survey.outcome is not None:
             file.metadata(metadata.OUTCOME, survey.outcome)
         else:
-            file.metadata(metadata.RECOVERED, metadata.recovered_metadata(kept_frames=survey.num_frames))
+            file.metadata(metadata.RECOVERED, metadata.recovered_metadata(kept_frames=frames.num_frames))
         file.end()
-        with survey.reader(part) as recording:
+        with frames.reader(part) as recording:
             recording.columns()  # a recovered file that cannot be read would be worse than none
         file.publish()
     except BaseException:
@@ -97,7 +96,7 @@ def recover(source: Path, target: Path, *, overwrite: bool = False) -> Recovered
         raise
     return Recovered(
         path=target,
-        num_frames=survey.num_frames,
+        num_frames=frames.num_frames,
         num_messages=num_messages,
         is_complete=survey.outcome is not None,
         reason="" if survey.outcome is not None else survey.reason,
@@ -134,6 +133,22 @@ def can_be_made_again(part: Path, *, origin: str | Origin) -> bool:
     return True  # it ended in order, before the first frame
 
 
+class _Frames(NamedTuple):
+    """What the metadata and the messages of an episode say of its frames.
+
+    Attributes:
+        num_frames: That all streams have in common.
+        keeps: Whether a message belongs to these frames, given which message of its topic it is, from 1.
+        reader: Of such recordings.
+        outcome: Of such episodes.
+    """
+
+    num_frames: int
+    keeps: Callable[[SalvagedMessage, int], bool]
+    reader: type[Recording] | type[CollectedRecording]
+    outcome: type[Outcome] | type[CollectedOutcome]
+
+
 @dataclass(frozen=True, kw_only=True)
 class _Survey:
     """What is whole in a file.
@@ -141,18 +156,14 @@ class _Survey:
     Attributes:
         episode: Name and values of the metadata that say what is recorded.
         outcome: How it ended, where all of it is there.
-        num_frames: That all streams have in common.
+        frames: What is there of them.
         reason: Why reading stopped.
-        keeps: Whether a message belongs to these frames, given which message of its topic it is, from 1.
-        reader: Of such recordings.
     """
 
-    episode: dict[str, dict[str, str]]
+    episode: tuple[str, dict[str, str]]
     outcome: dict[str, str] | None
-    num_frames: int
+    frames: _Frames
     reason: str
-    keeps: Callable[[SalvagedMessage, int], bool] = lambda message, count: True
-    reader: type[Recording] | type[CollectedRecording] = Recording
 
 
 def _items(source: Path) -> Iterator[SalvagedMessage | Metadata | str | None]:
@@ -164,7 +175,7 @@ def _items(source: Path) -> Iterator[SalvagedMessage | Metadata | str | None]:
 
 
 def _survey(source: Path) -> _Survey:
-    """Read everything once to learn how many frames all streams have in common."""
+    """Read everything once to learn how many frames all streams have in common; RecordingError when it is none."""
     found: dict[str, dict[str, str]] = {}
     reason = ""
     counts: Counter[str] = Counter()
@@ -176,16 +187,19 @@ def _survey(source: Path) -> _Survey:
             found[item.name] = item.metadata
         elif item is not None:
             counts[item.topic] += 1
-    outcome = found.get(metadata.OUTCOME)
-    for name, survey in ((metadata.EPISODE, _survey_of_episode), (metadata.COLLECTED, _survey_of_collected)):
-        if name in found:
-            return survey(found[name], outcome, counts, reason or "the end is missing")
-    return _Survey(episode={}, outcome=None, num_frames=0, reason=reason or "no episode metadata")
+    for name, look in ((metadata.EPISODE, _frames_of_episode), (metadata.COLLECTED, _frames_of_collected)):
+        if name not in found:
+            continue
+        frames, outcome, reason = look(found[name], counts), found.get(metadata.OUTCOME), reason or "the end is missing"
+        if outcome is not None:
+            ended = metadata.read_outcome_metadata(outcome, frames.outcome)
+            outcome = outcome if ended.num_frames == frames.num_frames else None
+        if frames.num_frames:
+            return _Survey(episode=(name, found[name]), outcome=outcome, frames=frames, reason=reason)
+    raise RecordingError(f"Nothing can be recovered, the file holds no whole frame ({reason or 'no episode metadata'})")
 
 
-def _survey_of_episode(
-    episode: dict[str, str], outcome: dict[str, str] | None, counts: Counter[str], reason: str
-) -> _Survey:
+def _frames_of_episode(episode: dict[str, str], counts: Counter[str]) -> _Frames:
     info, cameras = metadata.read_episode_metadata(episode)
     topics = [stream.topic for stream in frame_streams(info) if stream.topic != channels.JOINT_STATES]
     for camera, streams in cameras.items():
@@ -193,35 +207,16 @@ def _survey_of_episode(
         topics += [channels.camera_topic(camera, name) for name in ("depth", "segmentation") if getattr(streams, name)]
     num_frames = min(counts[topic] for topic in topics)
     last_ns = frame_time_ns(max(num_frames - 1, 0), info.fps)
-    return _Survey(
-        episode={metadata.EPISODE: episode},
-        outcome=_if_of(num_frames, outcome, Outcome),
-        num_frames=num_frames,
-        reason=reason,
-        keeps=lambda message, count: message.time_ns <= last_ns,
-    )
+    return _Frames(num_frames, lambda message, count: message.time_ns <= last_ns, Recording, Outcome)
 
 
-def _survey_of_collected(
-    episode: dict[str, str], outcome: dict[str, str] | None, counts: Counter[str], reason: str
-) -> _Survey:
+def _frames_of_collected(episode: dict[str, str], counts: Counter[str]) -> _Frames:
     """Pictures come before the frames that hold them, so what is there of the frames has its pictures."""
     info, _, _ = read_collected_metadata(episode)
     topics = {FRAMES, *(stream.topic for stream in feature_streams(info).values())}
     num_frames = min(counts[topic] for topic in topics)
-    return _Survey(
-        episode={metadata.COLLECTED: episode},
-        outcome=_if_of(num_frames, outcome, CollectedOutcome),
-        num_frames=num_frames,
-        reason=reason,
-        keeps=lambda message, count: message.topic not in topics | {channels.TF} or count <= num_frames,
-        reader=CollectedRecording,
-    )
 
+    def keeps(message: SalvagedMessage, count: int) -> bool:
+        return message.topic not in topics | {channels.TF} or count <= num_frames
 
-def _if_of[O: (Outcome, CollectedOutcome)](
-    num_frames: int, outcome: dict[str, str] | None, kind: type[O]
-) -> dict[str, str] | None:
-    """The outcome, if it is that of so many frames."""
-    is_whole = outcome is not None and metadata.read_outcome_metadata(outcome, kind).num_frames == num_frames
-    return outcome if is_whole else None
+    return _Frames(num_frames, keeps, CollectedRecording, CollectedOutcome)
