@@ -135,13 +135,9 @@ class _StreamEncoder:
         else:
             # Low delay, one thread: frames leave in the order and at the pace in which they came.
             encoder, crf, preset, options = "libsvtav1", 30, "12", {"svtav1-params": "fast-decode=0:lp=1:pred-struct=1"}
-        self.settings = VideoSettings(
-            codec=cast(Literal["h264", "av1"], video.codec),
+        self.settings = replace(
+            settings_of_coded(video.codec, width, height, fps),
             encoder=encoder,
-            width=width,
-            height=height,
-            fps=fps,
-            pix_fmt="yuv420p",
             gop=video.gop,
             crf=crf if video.crf is None else video.crf,
             preset=preset if video.preset is None else video.preset,
