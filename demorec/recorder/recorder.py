@@ -52,6 +52,7 @@ class RecordedEpisode:
         success: Whether it succeeded, for you to set; None when you do not say.
         drops: "frames" -> how many were dropped because the coder could not keep up, where that is allowed.
         num_frames: Frames that were taken.
+        is_open: Whether it takes more.
     """
 
     def __init__(self, run: Recorder, episode_index: int, instruction: str) -> None:
@@ -63,7 +64,7 @@ class RecordedEpisode:
         self._coder: Coder | None = None
         self._features: dict[str, CollectedFeature] = {}
         self._picture_stamps: dict[str, int] = {}
-        self._is_open = True
+        self.is_open = True
 
     def __enter__(self) -> Self:
         return self
@@ -107,7 +108,7 @@ class RecordedEpisode:
             RecordingError: What was given cannot be recorded, the coder cannot keep up and drops are not allowed, or
                 the disk is full.
         """
-        if not self._is_open:
+        if not self.is_open:
             raise RecordingError("The episode has ended: begin another with recorder.episode().")
         if self._coder is not None and self._coder.error is not None:
             raise _as_recording_error(self._coder.error)
@@ -115,15 +116,12 @@ class RecordedEpisode:
             time_ns = self._run.clock()
         vectors = named_vectors(observation, action)
         if self._coder is None:
-            self._begin(vectors)
+            info, self._coder = self._run.start(vectors, self._index, self._instruction)
+            self._check = CollectedCheck(info)
+            self._features = {feature.name: feature for feature in info.features}
         samples = self._samples(vectors, time_ns, stamps or {})
         pictures = self._pictures(images or {}, time_ns)
         return self._queue(CollectedFrame(time_ns=time_ns, samples=samples), pictures)
-
-    def _begin(self, vectors: NamedVectors) -> None:
-        info, self._coder = self._run.start(vectors, self._index, self._instruction)
-        self._check = CollectedCheck(info)
-        self._features = {feature.name: feature for feature in info.features}
 
     def _samples(
         self,
@@ -154,10 +152,8 @@ class RecordedEpisode:
             pixels, stamp_ns = image if isinstance(image, tuple) else (image, time_ns)
             if pixels is None:
                 continue
-            if camera in self._picture_stamps and stamp_ns == self._picture_stamps[camera]:
-                pictures[camera] = stamp_ns, None
-            else:
-                pictures[camera] = stamp_ns, pixels
+            is_same = camera in self._picture_stamps and stamp_ns == self._picture_stamps[camera]
+            pictures[camera] = stamp_ns, None if is_same else pixels
         return pictures
 
     def _queue(self, frame: CollectedFrame, pictures: WaitingPictures) -> bool:
@@ -217,8 +213,7 @@ class RecordedEpisode:
     def _end(self) -> Coder | None:
         """Take no more frames; the coder, with all that came, if there was anything and nobody else has ended it."""
         coder, self._coder = self._coder, None
-        self._is_open = False
-        self._run.forget(self)
+        self.is_open = False
         if coder is not None:
             coder.end()
         return coder
@@ -311,7 +306,7 @@ class Recorder(Closing):
             RecordingError: One is being recorded already.
             ConfigError: There is no task text.
         """
-        if self._open is not None:
+        if self._open is not None and self._open.is_open:
             raise RecordingError(
                 "An episode is being recorded already: end it first, one robot does one thing at a time."
             )
@@ -335,11 +330,6 @@ class Recorder(Closing):
     def add(self, recording: Path) -> None:
         """Take a finished recording into the run."""
         self._folder.add(recording)
-
-    def forget(self, episode: RecordedEpisode) -> None:
-        """The episode has ended."""
-        if self._open is episode:
-            self._open = None
 
     def _info(self, features: tuple[CollectedFeature, ...], episode_index: int, instruction: str) -> CollectedInfo:
         return CollectedInfo(

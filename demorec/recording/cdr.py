@@ -120,11 +120,6 @@ class Layout:
     time_slots: NDArray[np.intp]
     value_slots: NDArray[np.intp]
 
-    @property
-    def num_values(self) -> int:
-        """K."""
-        return len(self.value_slots)
-
     @cached_property
     def _value_runs(self) -> list[tuple[int, int]]:
         """(first, last + 1) of the stretches of bytes that values fill without a gap."""
@@ -159,7 +154,7 @@ class Layout:
 
     def decode_rows(self, rows: NDArray[np.uint8]) -> NDArray[Any]:
         """(N, K) values of messages of the right length, given as (N, L) bytes; ValueError as `decode`."""
-        values = np.empty((len(rows), self.num_values), dtype=self.dtype)
+        values = np.empty((len(rows), len(self.value_slots)), dtype=self.dtype)
         rest = rows.copy()
         column = 0
         for first, last in self._value_runs:

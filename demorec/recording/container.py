@@ -133,12 +133,7 @@ class Container:
         self._metadata: dict[str, MetadataIndex] = {}
         self._attachments: dict[str, AttachmentIndex] = {}
         counts: dict[int, int] = {}
-        position = 0
-        while position < len(summary):
-            opcode, length = RECORD_HEAD.unpack_from(summary, position)
-            position += RECORD_HEAD.size
-            content = summary[position : position + length]
-            position += length
+        for opcode, content in _records_of(summary, "the file's index"):
             if opcode == Opcode.CHANNEL:
                 channel = _read_channel(content)
                 channels[channel.id] = channel
@@ -267,14 +262,14 @@ def _read_schema(content: bytes) -> Schema:
     return _read(content, Schema)
 
 
-def _records_of(content: bytes) -> Iterator[tuple[int, bytes]]:
-    """(opcode, content) of the records in a chunk."""
+def _records_of(content: bytes, where: str = "its chunk") -> Iterator[tuple[int, bytes]]:
+    """(opcode, content) of the records in a chunk, or in what `where` says."""
     position = 0
     while position < len(content):
         opcode, length = RECORD_HEAD.unpack_from(content, position)
         position += RECORD_HEAD.size
         if position + length > len(content):
-            raise ValueError("a record that reaches beyond its chunk")
+            raise ValueError(f"a record that reaches beyond {where}")
         yield opcode, content[position : position + length]
         position += length
 

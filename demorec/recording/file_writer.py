@@ -42,22 +42,20 @@ class FileWriter[O: (Outcome, CollectedOutcome), C: PictureCoder](Closing):
         path: The file to be made.
         origin: Of the episode: an unfinished file of the same one is replaced.
         overwrite: Whether a recording of that name may be replaced.
+
+    Attributes:
+        num_frames: So far.
     """
 
     _cameras: Mapping[str, C]
 
     def __init__(self, path: Path, *, origin: str | Origin, overwrite: bool) -> None:
-        self._num_frames = 0
+        self.num_frames = 0
         self._file = PartFile(path, overwrite=overwrite, is_worthless=partial(can_be_made_again, origin=origin))
 
     def close(self) -> None:
         """End it and leave NAME.mcap.part as it is; harmless when called twice, and after `finish`."""
         self._file.close()
-
-    @property
-    def num_frames(self) -> int:
-        """Frames so far."""
-        return self._num_frames
 
     def finish(self, outcome: O) -> WriteStats:
         """Write the rest, make the file durable and give it its name.
@@ -66,8 +64,8 @@ class FileWriter[O: (Outcome, CollectedOutcome), C: PictureCoder](Closing):
             ConfigError: A file of that name has appeared meanwhile.
             RecordingError: The outcome speaks of another number of frames, or the disk is full.
         """
-        if outcome.num_frames != self._num_frames:
-            raise RecordingError(f"The outcome has {outcome.num_frames} frames, the recording {self._num_frames}.")
+        if outcome.num_frames != self.num_frames:
+            raise RecordingError(f"The outcome has {outcome.num_frames} frames, the recording {self.num_frames}.")
         for camera in self._cameras.values():
             camera.end()
         self._write_rest()
@@ -78,7 +76,7 @@ class FileWriter[O: (Outcome, CollectedOutcome), C: PictureCoder](Closing):
         self._file.publish()
         return WriteStats(
             path=self._file.path,
-            num_frames=self._num_frames,
+            num_frames=self.num_frames,
             num_bytes=self._file.path.stat().st_size,
             video_bytes={name: camera.num_video_bytes for name, camera in self._cameras.items()},
         )

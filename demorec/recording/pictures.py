@@ -18,7 +18,7 @@ from demorec.recording.labels import encode_labels
 from demorec.recording.metadata import CameraStreams
 from demorec.recording.pixels import PixelCounter
 from demorec.recording.transforms import camera_frame
-from demorec.recording.video import Encoder, Rgb, make_encoder
+from demorec.recording.video import Rgb, make_encoder, settings_of_coded
 from demorec.scene.collected import CollectedCamera
 from demorec.scene.episode import CameraImages, Frame
 from demorec.scene.scene import Camera
@@ -68,18 +68,30 @@ class PictureCoder:
     """Codes the pictures of one camera and keeps the packets until they are written.
 
     Args:
-        camera: Its name.
-        encoder: None for pictures that come coded.
-        pixels: Counts those that do not.
+        camera: The camera.
+        video: How colours are coded, where they do not come so.
+        fps: Of the episode.
+        compiled: Whether pixels are counted by a compiled function.
 
     Attributes:
+        settings: How the pictures are coded.
+        topics: Where they go.
         num_ready: Packets so far.
         num_video_bytes: Of them.
         last_ns: Stamp of the last picture.
     """
 
-    def __init__(self, camera: str, encoder: Encoder | None, pixels: PixelCounter) -> None:
-        self._name, self._encoder, self._pixels = camera, encoder, pixels
+    def __init__(
+        self, camera: Camera | CollectedCamera, video: VideoConfig, fps: int, *, compiled: bool = False
+    ) -> None:
+        self._encoder, self._pixels = None, PixelCounter(compiled=compiled)
+        if isinstance(camera, CollectedCamera) and camera.kept:
+            self.settings = settings_of_coded(camera.kept, camera.width, camera.height, fps)
+        else:
+            self._encoder = make_encoder(video, camera.width, camera.height, fps)
+            self.settings = self._encoder.settings
+        self.topics = PictureTopics(camera, self.settings.codec)
+        self._name = camera.name
         self._packets: list[bytes] = []
         self.num_ready = self.num_video_bytes = self.last_ns = 0
 
@@ -115,13 +127,11 @@ class CameraRecorder(PictureCoder):
 
     def __init__(self, camera: Camera, first: CameraImages, *, video: VideoConfig, fps: int) -> None:
         self._camera = camera
-        encoder = make_encoder(video, camera.width, camera.height, fps)
-        super().__init__(camera.name, encoder, PixelCounter(compiled=True))
+        super().__init__(camera, video, fps, compiled=True)
         self.streams = CameraStreams(
-            video=encoder.settings, depth=first.depth is not None, segmentation=first.segmentation is not None
+            video=self.settings, depth=first.depth is not None, segmentation=first.segmentation is not None
         )
         frame_id = camera_frame(camera.name)
-        self._color = PictureTopics(camera, video.codec)
         self._layouts = {kind: messages.PictureMessages(frame_id, form) for kind, (form, _) in _OTHERS.items()}
         self._others: list[list[Message]] = []
 
@@ -160,6 +170,6 @@ class CameraRecorder(PictureCoder):
         """The messages of the oldest frames that are not yet written, one list a frame."""
         count = len(time_ns)
         for time, packet, others in zip(time_ns, self._packets[:count], self._others[:count], strict=True):
-            yield self._color.of(time, packet) + others
+            yield self.topics.of(time, packet) + others
         del self._packets[:count]
         del self._others[:count]

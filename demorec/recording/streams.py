@@ -110,12 +110,8 @@ def _every_stream(info: EpisodeInfo) -> Iterator[FrameStream]:
     joint_state = attrgetter(*(f"observation.{name}" for name in _JOINT_STATE))
     yield _joints(JOINT_STATES, robot.joint_names, joint_state, _joint_state_columns)
     yield _joints(GRIPPER, (GRIPPER_JOINT,), partial(_gripper_parts, robot), _gripper_columns)
-    yield _joints(
-        ACTION, arm_and_gripper, lambda v: _targets(v.action), partial(_target_columns, "action"), _with_zeros
-    )
-    yield _joints(
-        COMMAND, arm_and_gripper, lambda v: _targets(v.command), partial(_target_columns, "command"), _with_zeros
-    )
+    for topic, kind in ((ACTION, "action"), (COMMAND, "command")):
+        yield _joints(topic, arm_and_gripper, partial(_targets, kind), partial(_target_columns, kind), _with_zeros)
     yield _pose(EE_POSE, base, "observation.base_from_tcp", "base_from_tcp")
     yield _pose(ACTION + EE_POSE, base, "action.base_from_tcp_target", "action_base_from_tcp")
     yield _pose(COMMAND + EE_POSE, base, "command.base_from_tcp_target", "command_base_from_tcp")
@@ -216,7 +212,8 @@ def _gripper_columns(values: Array) -> Columns:
     return {"gripper_width": values[:, 0].copy(), "contact_force": values[:, 2].copy()}
 
 
-def _targets(action: Action) -> Sequence[Array]:
+def _targets(kind: str, values: FrameValues) -> Sequence[Array]:
+    action: Action = getattr(values, kind)
     return action.joint_target, np.array((action.gripper_target,))
 
 

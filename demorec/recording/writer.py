@@ -81,14 +81,14 @@ class EpisodeWriter(FileWriter[Outcome, CameraRecorder]):
             RecordingError: Frames out of order, vectors of another length, other objects or cameras than the scene's,
                 numbers that are not finite, pictures missing or of another size, or a full disk.
         """
-        due = (self._num_frames, frame_time_ns(self._num_frames, self._info.fps))
+        due = (self.num_frames, frame_time_ns(self.num_frames, self._info.fps))
         if (frame.frame_index, frame.time_ns) != due:
             raise RecordingError(
                 f"Frame {frame.frame_index} at {frame.time_ns} ns came where frame {due[0]} at {due[1]} ns was due: "
                 "frames are written in order, one each."
             )
         self._check(frame)
-        if self._num_frames == 0:
+        if self.num_frames == 0:
             self._begin(frame)
         for camera in self._cameras.values():
             camera.add(frame)
@@ -100,7 +100,7 @@ class EpisodeWriter(FileWriter[Outcome, CameraRecorder]):
                 changes=self._changes(frame),
             )
         )
-        self._num_frames += 1
+        self.num_frames += 1
         if len(self._pending) >= self._info.fps:
             self._write_pending()
 
@@ -122,7 +122,7 @@ class EpisodeWriter(FileWriter[Outcome, CameraRecorder]):
 
     def _write_pending(self) -> None:
         """Write the frames whose pictures have all left the encoders: numbers first, then pictures."""
-        num_ready = min((camera.num_ready for camera in self._cameras.values()), default=self._num_frames)
+        num_ready = min((camera.num_ready for camera in self._cameras.values()), default=self.num_frames)
         frames = self._pending[: num_ready - self._num_written]
         if not frames:
             return
@@ -176,7 +176,7 @@ class EpisodeWriter(FileWriter[Outcome, CameraRecorder]):
         return result + [(channels.EVENTS, messages.LOG, messages.log(frame.time_ns, event)) for event in events]
 
     def _write_rest(self) -> None:
-        if self._num_frames == 0:
+        if self.num_frames == 0:
             self._begin(None)
         self._write_pending()
         if self._pending:

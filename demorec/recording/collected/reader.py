@@ -134,10 +134,14 @@ class CollectedRecording(EpisodeFile[CollectedOutcome, VideoSettings]):
         time_ns, rows = tables[FRAMES].whole()
         if len(time_ns) > 1 and int(np.diff(time_ns).min()) <= 0:
             raise RecordingError(f"The frames of the recording are not in the order of their times: {self.path}")
-        features = {
-            name: self._feature(stream.topic, *tables.pop(stream.topic).whole(), time_ns)
-            for name, stream in streams.items()
-        }
+        features = {}
+        for name, stream in streams.items():
+            times, features[name] = tables.pop(stream.topic).whole()
+            if not np.array_equal(times, time_ns):
+                raise RecordingError(
+                    f"The recording has {len(times)} messages on {stream.topic} at other times than its "
+                    f"{len(time_ns)} frames: {self.path}"
+                )
         stamps = {name: rows[:, index].copy() for index, name in enumerate(streams)}
         pictures = {name: rows[:, len(streams) + index].copy() for index, name in enumerate(self._cameras_in_order)}
         picture_stamps = {name: self._stamps(topic) for name, topic in picture_topics.items()}
@@ -165,16 +169,6 @@ class CollectedRecording(EpisodeFile[CollectedOutcome, VideoSettings]):
     def _stamps(self, topic: str) -> NDArray[np.int64]:
         """(N,) of the messages of a topic, one chunk of them in memory at a time: pictures may take gigabytes."""
         return np.fromiter((message.time_ns for message in self._container.messages((topic,))), dtype=np.int64)
-
-    def _feature(
-        self, topic: str, times: NDArray[np.int64], values: NDArray[Any], time_ns: NDArray[np.int64]
-    ) -> NDArray[Any]:
-        if not np.array_equal(times, time_ns):
-            raise RecordingError(
-                f"The recording has {len(times)} messages on {topic} at other times than its {len(time_ns)} "
-                f"frames: {self.path}"
-            )
-        return values
 
     def _picture_topic(self, camera: str) -> str:
         return video_topic(camera, self.video_settings(camera).codec)

@@ -45,14 +45,15 @@ class CollectedTree:
 
     Attributes:
         static: Rows that never change.
-        layout: Of the messages of those that do.
+        is_moving: Whether any joint is known to move.
     """
 
     def __init__(self, info: CollectedInfo) -> None:
         urdf = Urdf.parse(info.urdf)
         self._positions = JointPositions(info.features)
         self._joints = MovingJoints(urdf, self._positions.joints)
-        self.layout = transforms_layout(self._joints.moving)
+        self._layout = transforms_layout(self._joints.moving)
+        self.is_moving = bool(self._joints.moving)
         self.static: tuple[Row, ...] = (
             (RERUN_ROOT, WORLD, Pose()),
             (WORLD, urdf.root, Pose()),
@@ -64,15 +65,10 @@ class CollectedTree:
             ),
         )
 
-    @property
-    def is_still(self) -> bool:
-        """Whether nothing is known to move."""
-        return self.layout.num_values == 0
-
     def encode(self, frames: Sequence[CollectedFrame]) -> list[bytes]:
         """tf2_msgs/TFMessage of each frame, at its time."""
         names = frames[0].samples
         features = {name: np.array([frame.samples[name].vector for frame in frames]) for name in names}
         values = self._joints.values(self._positions.of(features))
         times = np.array([frame.time_ns for frame in frames], dtype=np.int64)
-        return self.layout.encode(times, values.reshape(len(frames), -1))
+        return self._layout.encode(times, values.reshape(len(frames), -1))

@@ -25,32 +25,18 @@ from demorec.recording.collected.validity import what_is_wrong
 from demorec.recording.depth import encode_distances
 from demorec.recording.file_writer import FileWriter
 from demorec.recording.metadata import COLLECTED
-from demorec.recording.pictures import PictureCoder, PictureTopics
-from demorec.recording.pixels import PixelCounter
+from demorec.recording.pictures import PictureCoder
 from demorec.recording.transforms import camera_frame
-from demorec.recording.video import make_encoder, settings_of_coded
 from demorec.scene.collected import NO_PICTURE, CollectedCamera, CollectedFrame, CollectedInfo, CollectedOutcome
 
 _SECOND_NS = 1_000_000_000
 
 
 class _Pictures(PictureCoder):
-    """The pictures of one camera on their way into the file.
-
-    Attributes:
-        settings: How they are coded.
-        topics: Where they go.
-    """
+    """The pictures of one camera on their way into the file."""
 
     def __init__(self, camera: CollectedCamera, video: VideoConfig, fps: int) -> None:
-        encoder, size = None, (camera.width, camera.height)
-        if camera.kept:
-            self.settings = settings_of_coded(camera.kept, *size, fps)
-        else:
-            encoder = make_encoder(video, *size, fps)
-            self.settings = encoder.settings
-        self.topics = PictureTopics(camera, self.settings.codec)
-        super().__init__(camera.name, encoder, PixelCounter())
+        super().__init__(camera, video, fps)
         self._stamps: list[int] = []
 
     @property
@@ -160,7 +146,7 @@ class CollectedWriter(FileWriter[CollectedOutcome, _Pictures]):
         self._check.check_frame(frame)
         self._check.note_frame(frame)
         self._pending.append(frame)
-        self._num_frames += 1
+        self.num_frames += 1
         if frame.time_ns - self._pending[0].time_ns >= _SECOND_NS or len(self._pending) > self._info.fps:
             self.flush()
 
@@ -170,8 +156,13 @@ class CollectedWriter(FileWriter[CollectedOutcome, _Pictures]):
         Raises:
             RecordingError: The disk is full or gone.
         """
-        logged = [self._write_pictures(name, camera) for name, camera in self._cameras.items()]
-        if any(logged):
+        num_taken = 0
+        for camera in self._cameras.values():
+            for stamp, packet in camera.take():
+                num_taken += 1
+                for message in camera.topics.of(stamp, packet):
+                    self._file.log(*message, stamp)
+        if num_taken:
             self._file.flush()
         frames = self._pending[: self._count_ready()]
         if not frames:
@@ -182,7 +173,7 @@ class CollectedWriter(FileWriter[CollectedOutcome, _Pictures]):
             samples = [frame.samples[name] for frame in frames]
             data = stream.encode([sample.stamp_ns for sample in samples], [sample.vector for sample in samples])
             encoded.append((self._file.logger(stream.topic, stream.schema), data))
-        if self._tree is not None and not self._tree.is_still:
+        if self._tree is not None and self._tree.is_moving:
             encoded.append((self._file.logger(TF, messages.TRANSFORMS), self._tree.encode(frames)))
         rows = np.array([self._row(frame) for frame in frames], dtype=np.int64)
         rows_data = self._frames_layout.encode(np.array(times, dtype=np.int64), rows)
@@ -194,13 +185,6 @@ class CollectedWriter(FileWriter[CollectedOutcome, _Pictures]):
                 self._file.log(SUBTASK, messages.STRING, encode(messages.STRING, text), time)
         self._file.flush()
         del self._pending[: len(frames)]
-
-    def _write_pictures(self, name: str, camera: _Pictures) -> bool:
-        taken = camera.take()
-        for stamp, packet in taken:
-            for topic, schema, data in camera.topics.of(stamp, packet):
-                self._file.log(topic, schema, data, stamp)
-        return bool(taken)
 
     def _count_ready(self) -> int:
         """Of the pending frames, how many have all their pictures written: an encoder may hold some back."""
