@@ -22,6 +22,7 @@ COLLECTED = "demorec.collected"
 """In place of EPISODE in the recordings of `demorec.recording.collected`."""
 OUTCOME = "demorec.outcome"
 RECOVERED = "demorec.recovered"
+"""Of a recording that a crash cut off."""
 _CHECKSUM = "crc32"
 _KNOWN_VERSIONS = tuple(str(version) for version in range(1, FORMAT_VERSION + 1))
 
@@ -60,11 +61,6 @@ def outcome_metadata(outcome: Outcome | CollectedOutcome) -> dict[str, str]:
     """The record that ends a complete recording."""
     success = "unknown" if outcome.success is None else str(outcome.success).lower()
     return sealed({"success": success, "outcome": to_json(outcome)})
-
-
-def recovered_metadata(*, kept_frames: int) -> dict[str, str]:
-    """The record of a recording that a crash cut off."""
-    return sealed({"kept_frames": str(kept_frames)})
 
 
 def read_episode_metadata(metadata: Mapping[str, str]) -> tuple[EpisodeInfo, dict[str, CameraStreams]]:

@@ -28,11 +28,6 @@ _LATCHED_QOS = (
 """Quality of service of topics that are said once: "transient local", so that a late subscriber hears them too."""
 
 
-def part_path(path: Path) -> Path:
-    """Where the file is while it is being written."""
-    return path.with_name(path.name + ".part")
-
-
 class _Disk(io.FileIO):
     """The file below the MCAP writer, unbuffered.
 
@@ -95,7 +90,7 @@ class PartFile:
         overwrite: bool = False,
         is_worthless: Callable[[Path], bool] = lambda part: False,
     ) -> None:
-        self.path, self.part, self._overwrite = path, part or part_path(path), overwrite
+        self.path, self.part, self._overwrite = path, part or path.with_name(f"{path.name}.part"), overwrite
         self._check_free()
         try:
             # Held until the file has its name or is left: no other process takes it for what a dead one left.

@@ -86,7 +86,7 @@ def recover(source: Path, target: Path, *, overwrite: bool = False) -> Recovered
         if survey.outcome is not None:
             file.metadata(metadata.OUTCOME, survey.outcome)
         else:
-            file.metadata(metadata.RECOVERED, metadata.recovered_metadata(kept_frames=frames.num_frames))
+            file.metadata(metadata.RECOVERED, metadata.sealed({"kept_frames": str(frames.num_frames)}))
         file.end()
         with frames.reader(part) as recording:
             recording.columns()  # a recovered file that cannot be read would be worse than none

@@ -234,7 +234,8 @@ def _decode_jpeg(settings: VideoSettings, packets: Iterable[VideoPacket]) -> Ite
 
 
 def _decode_stream(settings: VideoSettings, packets: Iterable[VideoPacket]) -> Iterator[Rgb]:
-    context = cast(av.VideoCodecContext, av.CodecContext.create(_decoder_name(settings.codec), "r"))
+    decoder = {"av1": "libdav1d", "h265": "hevc"}.get(settings.codec, settings.codec)
+    context = cast(av.VideoCodecContext, av.CodecContext.create(decoder, "r"))
     context.thread_count = 1
     # A few bytes can announce pictures of gigabytes; coded pictures are whole blocks of at most 128 pixels.
     context.options = {"max_pixels": str((settings.width + 128) * (settings.height + 128))}
@@ -254,10 +255,6 @@ def _decode_stream(settings: VideoSettings, packets: Iterable[VideoPacket]) -> I
         raise RecordingError(f"The {settings.codec} video cannot be decoded near frame {num_pictures}.") from error
     if num_pictures != num_packets:
         raise RecordingError(f"{num_packets} packets of {settings.codec} video gave {num_pictures} pictures.")
-
-
-def _decoder_name(codec: str) -> str:
-    return {"av1": "libdav1d", "h265": "hevc"}.get(codec, codec)
 
 
 def is_keyframe(codec: str, data: bytes) -> bool:

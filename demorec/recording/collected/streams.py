@@ -28,7 +28,7 @@ class FeatureStream:
     """The messages of a feature, one a frame.
 
     Attributes:
-        topic: Where.
+        topic: Where: "/observation/state".
         schema: ROS 2 type.
         layout: Of its messages, which hold D values.
         dtype: Of the feature.
@@ -48,18 +48,13 @@ class FeatureStream:
         return self.layout.decode_rows(rows).astype(self.dtype)
 
 
-def feature_topic(name: str) -> str:
-    """Where the vectors of a feature are: "/observation/state"."""
-    return "/" + name.replace(".", "/")
-
-
 def feature_streams(info: CollectedInfo) -> dict[str, FeatureStream]:
     """Feature -> its messages: sensor_msgs/JointState where there are joints, else std_msgs/Float64MultiArray."""
     streams = {}
     for feature in info.features:
         schema = messages.JOINT_STATE if any(feature.joints) else messages.FLOAT64_ARRAY
         streams[feature.name] = FeatureStream(
-            topic=feature_topic(feature.name),
+            topic="/" + feature.name.replace(".", "/"),
             schema=schema,
             layout=_joints_layout(feature) if any(feature.joints) else _array_layout(schema, feature.names),
             dtype=feature.dtype,
