@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,6 @@ from demorec.errors import ConfigError, ExportError
 from demorec.export.columns import DONE, check_feature_names
 from demorec.export.options import CommonOptions
 from demorec.recording import CollectedRecording
-from demorec.recording.video import Rgb
 from demorec.scene.collected import NO_PICTURE, CollectedColumns
 from demorec.scene.features import IMAGE_PREFIX
 
@@ -139,30 +139,21 @@ def shown_pictures(
     return numbers
 
 
-def shown_images(recording: CollectedRecording, camera: str, numbers: NDArray[np.int64]) -> Iterator[Rgb]:
-    """The decoded pictures that frames show, one a frame, of which `numbers` never decrease.
+def shown(recording: CollectedRecording, camera: str, numbers: NDArray[np.int64]) -> Iterator[NDArray[Any]]:
+    """The pictures that frames show, one a frame, of which `numbers` never decrease.
+
+    They are (H, W, 3) uint8 RGB, of a depth camera (H, W) float32 metres.
 
     Raises:
         ExportError: They do.
     """
-    return _shown(recording, camera, numbers, recording.images(camera))
-
-
-def shown_depth(
-    recording: CollectedRecording, camera: str, numbers: NDArray[np.int64]
-) -> Iterator[NDArray[np.float32]]:
-    """The distances (H, W), metres, that frames show; as `shown_images`."""
-    return _shown(recording, camera, numbers, recording.depth(camera))
-
-
-def _shown[P](
-    recording: CollectedRecording, camera: str, numbers: NDArray[np.int64], pictures: Iterator[P]
-) -> Iterator[P]:
     if (np.diff(numbers) < 0).any():
         raise ExportError(f"The pictures of the camera {camera} are not in the order of the frames: {recording.path}")
-    images = enumerate(pictures)
-    number, picture = next(images)
+    is_depth = camera in recording.depth_cameras
+    found: Iterator[NDArray[Any]] = recording.depth(camera) if is_depth else recording.images(camera)
+    pictures = enumerate(found)
+    number, picture = next(pictures)
     for wanted in numbers.tolist():
         while number < wanted:
-            number, picture = next(images)
+            number, picture = next(pictures)
         yield picture

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import importlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,16 +16,22 @@ if TYPE_CHECKING:
 class Exporter[O: CommonOptions]:
     """A format that recordings are exported to.
 
-    Its module is loaded for `--help`, so `export` imports what is heavy when it is called.
+    Its module is loaded for `--help`, so what is heavy is imported when `export` is called.
 
     Attributes:
         summary: What comes out, in one line.
         options: Its flags; a dataclass with a docstring below each field.
-        export: (sources, out, options, progress) -> report. Reads `Recording`s and nothing else, takes those that
-            `demorec.export.sources` finds, and makes `out` whole or not at all. Raises ConfigError, ExportError and
-            RecordingError.
+        function: "module:name" of (sources, out, options, progress) -> report. It reads `Recording`s and nothing else,
+            takes those that `demorec.export.sources` finds, and makes `out` whole or not at all. Raises ConfigError,
+            ExportError and RecordingError.
     """
 
     summary: str
     options: type[O]
-    export: Callable[[Sequence[Path], Path, O, ProgressCallback | None], ExportReport]
+    function: str
+
+    def export(self, sources: Sequence[Path], out: Path, options: O, progress: ProgressCallback | None) -> ExportReport:
+        """Call it."""
+        module, _, name = self.function.partition(":")
+        report: ExportReport = getattr(importlib.import_module(module), name)(sources, out, options, progress)
+        return report

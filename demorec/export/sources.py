@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from demorec.errors import ConfigError
+from demorec.export.collected import wanted_cameras, wanted_depth
 from demorec.export.options import CommonOptions, parse_episodes
 from demorec.plain import digest
 from demorec.recording import AnyRecording, CollectedRecording, open_recording
@@ -151,8 +152,7 @@ def _collected_traits(recording: CollectedRecording, options: CommonOptions) -> 
     info = recording.info
     wanted = [feature for feature in info.features if options.takes(feature.name)]
     features = [(f"feature {feature.name}", ", ".join(feature.names)) for feature in wanted]
-    offered = (*recording.cameras, *(recording.depth_cameras if options.depth else ()))
-    cameras = [name for name in offered if options.takes(IMAGE_PREFIX + name)]
+    cameras = [*wanted_cameras(recording, options), *wanted_depth(recording, options)]
     names = ("features", " ".join(feature.name for feature in wanted))
     return (
         ("kind of episode", "collected"),

@@ -64,7 +64,8 @@ def staged_folder(target: Path, kind: ReplaceableKind, *, replace: bool, sources
                     shutil.rmtree(new)
                 new.mkdir()
                 yield new
-                _sync_folders(new)
+                for folder, _, _ in os.walk(new, topdown=False):
+                    sync_file(Path(folder))
                 check()  # much may have been put there meanwhile
                 _take_place(new, target)
                 sync_file(target.parent)
@@ -147,8 +148,3 @@ def sync_file(path: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
-
-
-def _sync_folders(root: Path) -> None:
-    for folder, _, _ in os.walk(root, topdown=False):
-        sync_file(Path(folder))

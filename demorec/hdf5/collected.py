@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 
 from demorec.errors import ConfigError
-from demorec.export.collected import collected_data, shown_depth, shown_images, wanted_cameras, wanted_depth
+from demorec.export.collected import collected_data, shown, wanted_cameras, wanted_depth
 from demorec.export.columns import DONE
 from demorec.hdf5.file import COLLECTED_ARGUMENTS, COLLECTED_ENVIRONMENT
 from demorec.hdf5.options import Hdf5Options
@@ -52,16 +52,10 @@ def write_collected(demo: h5py.Group, recording: CollectedRecording, options: Hd
             add_vectors(observations, names[name], values, elements[name])
     for camera, numbers in data.pictures.items():
         settings = recording.video_settings(camera)
-        if camera in recording.depth_cameras:
-            shape = (count, settings.height, settings.width, 1)
-            stored = add_pictures(observations, names[camera], shape, np.float32, options.compression)
-            for index, metres in enumerate(shown_depth(recording, camera, numbers)):
-                stored[index] = metres[..., np.newaxis]
-            continue
-        shape = (count, settings.height, settings.width, 3)
-        stored = add_pictures(observations, names[camera + _IMAGE], shape, np.uint8, options.compression)
-        for index, picture in enumerate(shown_images(recording, camera, numbers)):
-            stored[index] = picture
+        is_depth = camera in recording.depth_cameras
+        shape = (count, settings.height, settings.width, 1 if is_depth else 3)
+        name = names[camera if is_depth else camera + _IMAGE]
+        add_pictures(observations, name, shape, shown(recording, camera, numbers), options.compression)
     return count
 
 

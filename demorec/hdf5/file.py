@@ -98,39 +98,21 @@ UNFINISHED = ReplaceableKind(name="an HDF5 file", recognises=_begins_as_hdf5)
 """What a killed export leaves (`NewFile` sees to its first bytes)."""
 
 
-class _Storage(io.RawIOBase):
+class _Storage(io.FileIO):
     """A file whose writes never fail: the first error is kept, and what is written after it goes nowhere.
 
     The HDF5 library ends the process with a segmentation fault when it cannot write what it still holds on closing.
     """
 
     def __init__(self, path: Path) -> None:
-        self._file = path.open("r+b", buffering=0)
+        super().__init__(path, "r+")
         self.error: BaseException | None = None
-
-    def readable(self) -> bool:
-        return True
-
-    def writable(self) -> bool:
-        return True
-
-    def seekable(self) -> bool:
-        return True
-
-    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
-        return self._file.seek(offset, whence)
-
-    def tell(self) -> int:
-        return self._file.tell()
-
-    def readinto(self, buffer: memoryview) -> int | None:  # type: ignore[override]
-        return self._file.readinto(buffer)
 
     def write(self, data: memoryview) -> int:  # type: ignore[override]
         left = memoryview(data)
         try:
             while self.error is None and left:
-                left = left[self._file.write(left) :]
+                left = left[super().write(left) :]
         except BaseException as error:  # an interrupt, too, must not reach HDF5
             self.error = error
         return len(data)
@@ -138,14 +120,10 @@ class _Storage(io.RawIOBase):
     def truncate(self, size: int | None = None) -> int:
         try:
             if self.error is None:
-                return self._file.truncate(size)
+                return super().truncate(size)
         except BaseException as error:
             self.error = error
         return 0 if size is None else size
-
-    def close(self) -> None:
-        self._file.close()
-        super().close()
 
 
 class NewFile:

@@ -10,14 +10,15 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from types import TracebackType
-from typing import Literal, Self
+from typing import Literal
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from demorec.closing import Closing
 from demorec.errors import DemorecError, resource_error
 from demorec.hdf5 import trial
 from demorec.recording.limits import LimitError, Limits
@@ -26,10 +27,7 @@ from demorec.safety.files import HDF5_MAGIC, open_regular
 
 Kind = Literal["group", "dataset", "other"]
 Scalar = str | bool | int | float
-_MAX_CHILDREN = trial.MAX_OBJECTS
 _MAX_CHUNK_BYTES = 1 << 28
-_MAX_ATTRIBUTE_BYTES = trial.MAX_ATTRIBUTE_BYTES
-_MAX_NAME = trial.MAX_NAME
 _MAX_DEPTH = 6
 _BLOCK_BYTES = 8 << 20
 """Of rows that are read at once; whole chunks of the file, unless these are larger than `_MAX_BLOCK_BYTES`."""
@@ -67,10 +65,8 @@ class StoredArray:
 
     def read(self, begin: int, end: int) -> NDArray[np.generic]:
         """Rows from `begin` to before `end`; Hdf5Error when they cannot be read."""
-        try:
+        with _errors_told(f"{self.place} cannot be read", self._file):
             rows: NDArray[np.generic] = self._dataset[begin:end]
-        except (OSError, RuntimeError, ValueError, KeyError, TypeError, MemoryError) as error:
-            raise _unreadable(error, f"{self.place} cannot be read", self._file) from error
         return rows
 
     def rows(self) -> Iterator[NDArray[np.generic]]:
@@ -90,7 +86,7 @@ class StoredArray:
         return step if step * row <= _MAX_BLOCK_BYTES else max(1, _MAX_BLOCK_BYTES // row)
 
 
-class ForeignFile:
+class ForeignFile(Closing):
     """An HDF5 file that anyone may have written; a context manager.
 
     Attributes:
@@ -103,7 +99,7 @@ class ForeignFile:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._claimed: dict[str, int] = {}
-        try:
+        with _errors_told("The HDF5 file cannot be read", path):
             with open_regular(path) as file:
                 if file.read(len(HDF5_MAGIC)) != HDF5_MAGIC:
                     raise Hdf5Error(f"This is no HDF5 file: {path}")
@@ -111,28 +107,22 @@ class ForeignFile:
             if reason := trial.why_not_read(path):
                 raise Hdf5Error(f"The HDF5 file cannot be read ({reason}): {path}")
             self._root = h5py.File(path, "r", locking=False)
-        except (OSError, RuntimeError, ValueError) as error:
-            raise _unreadable(error, "The HDF5 file cannot be read", path) from error
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def close(self) -> None:
+        """Close the file; harmless when called twice."""
         self._root.close()
 
     def children(self, place: str) -> dict[str, Kind]:
         """What a group holds: name -> what it is; links are "other"."""
-        group = self._group(place)
-        try:
-            if len(group) > _MAX_CHILDREN:
-                raise Hdf5Error(f"{_shown(place)} has {len(group):,} entries, at most {_MAX_CHILDREN:,} are read")
+        group = self._find(place)
+        if not isinstance(group, h5py.Group):
+            raise Hdf5Error(f"{_shown(place)} is no group: {self.path}")
+        with _errors_told(f"{_shown(place)} cannot be read", self.path):
+            if len(group) > trial.MAX_OBJECTS:
+                raise Hdf5Error(
+                    f"{_shown(place)} has {len(group):,} entries, at most {trial.MAX_OBJECTS:,} are read: {self.path}"
+                )
             return {str(name): self._kind(group, str(name)) for name in group}
-        except (OSError, RuntimeError, ValueError, KeyError, TypeError) as error:
-            raise _unreadable(error, f"{_shown(place)} cannot be read", self.path) from error
-        except Hdf5Error as error:
-            raise Hdf5Error(f"{error}: {self.path}") from error
 
     def datasets(self, place: str) -> Iterator[str]:
         """The places of all datasets below a group, some levels deep: a group may be in itself."""
@@ -143,7 +133,7 @@ class ForeignFile:
             names = [name for name, kind in below if kind == "dataset"]
             found += len(below)
             yield from names
-            if depth < _MAX_DEPTH and found < _MAX_CHILDREN:
+            if depth < _MAX_DEPTH and found < trial.MAX_OBJECTS:
                 waiting += [(name, depth + 1) for name, kind in reversed(below) if kind == "group"]
 
     def has(self, place: str) -> bool:
@@ -173,15 +163,11 @@ class ForeignFile:
                 or claims more than a file of this size may unpack to.
         """
         found = self._find(place)
-        try:
+        with _errors_told(f"{place} cannot be read", self.path):
             reason = _why_unusable(found)
             if not reason:
                 self._claimed[place] = found.nbytes
                 self._limits.check_total(sum(self._claimed.values()))
-        except LimitError as error:
-            raise Hdf5Error(f"The HDF5 file is not read, since {error}: {self.path}") from error
-        except (OSError, RuntimeError, ValueError, TypeError) as error:
-            raise _unreadable(error, f"{place} cannot be read", self.path) from error
         if reason:
             raise Hdf5Error(f"{place} cannot be used, since {reason}: {self.path}")
         return StoredArray(self.path, place, found)
@@ -193,30 +179,22 @@ class ForeignFile:
             Hdf5Error: There is none, or it is no list of so many short texts.
         """
         found = self._find(place)
-        try:
+        with _errors_told(f"{place} cannot be read", self.path):
             is_list = isinstance(found, h5py.Dataset) and len(found.shape or ()) == 1 and not found.is_virtual
             kind = h5py.check_string_dtype(found.dtype) if is_list else None
-            if kind is None or found.external or len(found) > _MAX_CHILDREN or (kind.length or 0) > _MAX_NAME:
+            if kind is None or found.external or len(found) > trial.MAX_OBJECTS or (kind.length or 0) > trial.MAX_NAME:
                 raise Hdf5Error(f"{place} is no list of texts: {self.path}")
             return [str(text) for text in found.asstr(errors="replace")[:]]
-        except (OSError, RuntimeError, ValueError, TypeError) as error:
-            raise _unreadable(error, f"{place} cannot be read", self.path) from error
-
-    def _group(self, place: str) -> h5py.Group:
-        found = self._find(place)
-        if not isinstance(found, h5py.Group):
-            raise Hdf5Error(f"{_shown(place)} is no group: {self.path}")
-        return found
 
     def _find(self, place: str) -> h5py.Group | h5py.Dataset:
         """What has a name, by hard links alone: others can lead out of the file, or in circles."""
         found: h5py.Group | h5py.Dataset = self._root
         walked = ""
-        try:
-            for part in filter(None, place.split("/")):
+        for part in filter(None, place.split("/")):
+            with _errors_told(f"{walked}{part} cannot be read", self.path):
                 names = found if isinstance(found, h5py.Group) else ()
                 if part not in names:
-                    near = nearest_match(part, list(names)[:_MAX_CHILDREN]).rstrip("?")
+                    near = nearest_match(part, list(names)[: trial.MAX_OBJECTS]).rstrip("?")
                     raise Hdf5Error(f"There is no {walked}{part}.{near and f'{near}?'}".rstrip(".") + f": {self.path}")
                 if self._kind(found, part) == "other":
                     raise Hdf5Error(
@@ -224,8 +202,6 @@ class ForeignFile:
                         f"{self.path}"
                     )
                 found, walked = found[part], f"{walked}{part}/"
-        except (OSError, RuntimeError, ValueError, KeyError, TypeError) as error:
-            raise _unreadable(error, f"{walked}{part} cannot be read", self.path) from error
         return found
 
     @staticmethod
@@ -260,17 +236,13 @@ def _is_written(dataset: h5py.Dataset) -> bool:
 
 
 def _attribute(found: h5py.Group | h5py.Dataset, name: str, place: str, path: Path) -> Scalar | None:
-    try:
+    with _errors_told(f"The attribute {name} of {place} cannot be read", path):
         if name not in found.attrs:
             return None
-        stored = found.attrs.get_id(name)
-        is_empty = stored.get_space().get_simple_extent_type() == h5py.h5s.NULL
-        if is_empty or stored.shape not in ((), (1,)) or stored.get_storage_size() > _MAX_ATTRIBUTE_BYTES:
+        if not trial.is_single(found.attrs.get_id(name)):
             return None
         value = found.attrs[name]
         return _scalar(value.item() if isinstance(value, np.ndarray) else value)
-    except (OSError, RuntimeError, ValueError, KeyError, TypeError) as error:
-        raise _unreadable(error, f"The attribute {name} of {place} cannot be read", path) from error
 
 
 def _scalar(value: object) -> Scalar | None:
@@ -285,7 +257,14 @@ def _shown(place: str) -> str:
     return place or "The file's root"
 
 
-def _unreadable(error: BaseException, what: str, path: Path) -> DemorecError:
-    reason = error.strerror if isinstance(error, OSError) else ""
-    reason = reason or next((words for said, words in _REASONS if said in str(error)), "it is damaged")
-    return resource_error(error, path) or Hdf5Error(f"{what} ({reason}): {path}")
+@contextmanager
+def _errors_told(what: str, path: Path) -> Iterator[None]:
+    """Turn what the HDF5 library raises into an error that begins with what it was."""
+    try:
+        yield
+    except LimitError as error:
+        raise Hdf5Error(f"The HDF5 file is not read, since {error}: {path}") from error
+    except (OSError, RuntimeError, ValueError, KeyError, TypeError, MemoryError) as error:
+        reason = error.strerror if isinstance(error, OSError) else ""
+        reason = reason or next((words for said, words in _REASONS if said in str(error)), "it is damaged")
+        raise resource_error(error, path) or Hdf5Error(f"{what} ({reason}): {path}") from error

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import h5py
 import numpy as np
@@ -20,22 +20,24 @@ def add_vectors(group: h5py.Group, name: str, values: NDArray[np.generic], compo
 
 
 def add_pictures(
-    group: h5py.Group, name: str, shape: tuple[int, ...], kind: type[np.generic], compression: int
-) -> h5py.Dataset:
-    """An empty stream of pictures, each a compressed chunk of its own, so that one is read by itself.
+    group: h5py.Group, name: str, shape: tuple[int, ...], pictures: Iterable[NDArray[np.generic]], compression: int
+) -> None:
+    """A stream of pictures, each a compressed chunk of its own, so that one is read by itself.
 
     Args:
         group: Where it goes.
         name: Of the dataset.
-        shape: Of all pictures: (T, H, W, C).
-        kind: Of a number.
+        shape: Of all pictures: (T, H, W, 3) of colours, uint8; (T, H, W, 1) of distances, float32.
+        pictures: One after the other.
         compression: Level of gzip, 0 for none.
     """
-    return group.create_dataset(
+    stored = group.create_dataset(
         name,
         shape,
-        kind,
+        np.uint8 if shape[-1] == 3 else np.float32,
         chunks=(1, *shape[1:]),
         compression="gzip" if compression else None,
         compression_opts=compression or None,
     )
+    for index, picture in enumerate(pictures):
+        stored[index] = picture.reshape(shape[1:])

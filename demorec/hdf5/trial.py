@@ -135,12 +135,16 @@ def _names(group: h5py.h5g.GroupID) -> list[bytes]:
     return []
 
 
-def _read_attribute(found: h5py.h5g.GroupID | h5py.h5d.DatasetID, attribute: h5py.h5a.AttrID) -> None:
+def is_single(attribute: h5py.h5a.AttrID) -> bool:
+    """Whether an attribute has one value, which is not too large to be read."""
     is_empty = attribute.get_space().get_simple_extent_type() == h5py.h5s.NULL
-    if is_empty or attribute.shape not in ((), (1,)) or attribute.get_storage_size() > MAX_ATTRIBUTE_BYTES:
-        return
-    owner = h5py.Group(found) if isinstance(found, h5py.h5g.GroupID) else h5py.Dataset(found)
-    owner.attrs[attribute.name]
+    return not is_empty and attribute.shape in ((), (1,)) and attribute.get_storage_size() <= MAX_ATTRIBUTE_BYTES
+
+
+def _read_attribute(found: h5py.h5g.GroupID | h5py.h5d.DatasetID, attribute: h5py.h5a.AttrID) -> None:
+    if is_single(attribute):
+        owner = h5py.Group(found) if isinstance(found, h5py.h5g.GroupID) else h5py.Dataset(found)
+        owner.attrs[attribute.name]
 
 
 def _read_dataset(found: h5py.h5d.DatasetID) -> None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable
-from dataclasses import dataclass
 from fractions import Fraction
 from itertools import islice
 
@@ -36,25 +35,16 @@ from demorec.scene.features import (
 )
 from demorec.tables import environment_name
 
-
-@dataclass(frozen=True, kw_only=True)
-class _Observation:
-    """One of robomimic's observations: which components of which feature."""
-
-    name: str
-    feature: str
-    components: slice = slice(None)
-
-
-_OBSERVATIONS = (
-    _Observation(name="robot0_joint_pos", feature=STATE, components=slice(None, -1)),
-    _Observation(name="robot0_gripper_qpos", feature=STATE, components=slice(-1, None)),
-    _Observation(name="robot0_joint_vel", feature=VELOCITY, components=slice(None, -1)),
-    _Observation(name="robot0_gripper_qvel", feature=VELOCITY, components=slice(-1, None)),
-    _Observation(name="robot0_eef_pos", feature=EE_POSE, components=slice(0, 3)),
-    _Observation(name="robot0_eef_quat", feature=EE_POSE, components=slice(3, 7)),
-    _Observation(name="object", feature=ENVIRONMENT_STATE),
-)
+_OBSERVATIONS = {
+    "robot0_joint_pos": (STATE, slice(None, -1)),
+    "robot0_gripper_qpos": (STATE, slice(-1, None)),
+    "robot0_joint_vel": (VELOCITY, slice(None, -1)),
+    "robot0_gripper_qvel": (VELOCITY, slice(-1, None)),
+    "robot0_eef_pos": (EE_POSE, slice(0, 3)),
+    "robot0_eef_quat": (EE_POSE, slice(3, 7)),
+    "object": (ENVIRONMENT_STATE, slice(None)),
+}
+"""robomimic's observations: which components of which feature."""
 
 
 class RobomimicWriter:
@@ -104,10 +94,9 @@ class RobomimicWriter:
         demo["rewards"] = columns.features[REWARD]
         demo["dones"] = columns.features[DONE].astype(np.int64)
         observations = demo.create_group("obs")
-        for row in _OBSERVATIONS:
-            if row.feature in names and options.takes(row.feature):
-                values = columns.features[row.feature][:, row.components]
-                add_vectors(observations, row.name, values, names[row.feature][row.components])
+        for name, (feature, components) in _OBSERVATIONS.items():
+            if feature in names and options.takes(feature):
+                add_vectors(observations, name, columns.features[feature][:, components], names[feature][components])
         self._add_pictures(observations, recording, len(columns.rows))
         return len(columns.rows)
 
@@ -133,13 +122,11 @@ class RobomimicWriter:
             settings = recording.video_settings(camera)
             size = settings.height, settings.width
             if options.takes(IMAGE_PREFIX + camera):
-                stored = add_pictures(observations, f"{camera}_image", (count, *size, 3), np.uint8, level)
-                for index, picture in enumerate(islice(recording.images(camera), 0, None, stride)):
-                    stored[index] = picture
+                pictures = islice(recording.images(camera), 0, None, stride)
+                add_pictures(observations, f"{camera}_image", (count, *size, 3), pictures, level)
             if options.depth and options.takes(IMAGE_PREFIX + camera + DEPTH_SUFFIX):
-                stored = add_pictures(observations, f"{camera}_depth", (count, *size, 1), np.float32, level)
-                for index, metres in enumerate(islice(recording.depth(camera), 0, None, stride)):
-                    stored[index] = metres[..., np.newaxis]
+                distances = islice(recording.depth(camera), 0, None, stride)
+                add_pictures(observations, f"{camera}_depth", (count, *size, 1), distances, level)
 
     def _attributes(self, recording: Recording) -> dict[str, str | int]:
         """The attributes of `data` that robomimic makes an environment from, and what else holds for all episodes."""

@@ -12,8 +12,7 @@ from demorec.config import VideoConfig
 from demorec.export.collected import (
     check_options,
     collected_data,
-    shown_depth,
-    shown_images,
+    shown,
     shown_pictures,
     wanted_cameras,
     wanted_depth,
@@ -114,7 +113,7 @@ def prepare_collected(
         key = IMAGE_PREFIX + camera
         if camera in recording.depth_cameras:
             if code_depth:
-                pictures = shown_depth(recording, camera, numbers)
+                pictures = shown(recording, camera, numbers)
                 videos[key], pixels[key] = depth_video(pictures, fps=recording.info.fps)
             continue
         videos[key] = (
@@ -158,7 +157,7 @@ def _transcoded(
 ) -> CodedVideo:
     settings = recording.video_settings(camera)
     encoder = make_encoder(video=video, width=settings.width, height=settings.height, fps=recording.info.fps)
-    units = [unit for picture in shown_images(recording, camera, numbers) for unit in encoder.encode(picture)]
+    units = [unit for picture in shown(recording, camera, numbers) for unit in encoder.encode(picture)]
     units += encoder.finish()
     lengths = [len(unit) for unit in units]
     return CodedVideo.of_access_units(encoder.settings.codec, settings.width, settings.height, b"".join(units), lengths)

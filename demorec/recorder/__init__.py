@@ -6,7 +6,6 @@ with Recorder("runs/mine", robot="so101", cameras={"top": (480, 640)}, fps=30, t
         episode.success = True
 """
 
-from demorec.recorder.episode import RecordedEpisode
-from demorec.recorder.recorder import Recorder
+from demorec.recorder.recorder import RecordedEpisode, Recorder
 
 __all__ = ["RecordedEpisode", "Recorder"]

@@ -12,15 +12,15 @@ import time
 from collections import deque
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from queue import Empty, Full, Queue
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.recording import CollectedWriter, WriteStats
-from demorec.scene.collected import CollectedCamera, CollectedFrame, CollectedOutcome, Sample
+from demorec.recording import CollectedWriter
+from demorec.scene.collected import CollectedCamera, CollectedFrame
 
 WhenFull = Literal["error", "drop", "wait"]
 
@@ -34,21 +34,6 @@ _MIN_WAITING_FRAMES = 8
 
 WaitingPictures = Mapping[str, tuple[int, NDArray[np.uint8] | None]]
 """Camera -> stamp and pixels of a new picture, or its stamp and None for the same one again."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class WaitingFrame:
-    """A frame on its way to the file.
-
-    Attributes:
-        time_ns: Its stamp.
-        samples: Feature -> what it holds.
-        pictures: That it holds.
-    """
-
-    time_ns: int
-    samples: Mapping[str, Sample]
-    pictures: WaitingPictures
 
 
 class Buffers:
@@ -78,13 +63,13 @@ class Coder:
     """Feeds a writer from a queue in a thread of its own.
 
     Args:
-        writer: Of the episode; used by the thread alone until `end` returns.
         buffers: Where pictures are given back to.
         cameras: Of the episode; they decide how many frames may wait.
         fps: Frames a second, nominal: as many may wait as come in half a second, if memory allows.
         waits: Whether `put` waits for room.
 
     Attributes:
+        writer: Of the episode; used by the thread alone until `end` returns.
         error: What ended the thread, if anything did.
         capacity: How many frames may wait.
     """
@@ -98,20 +83,20 @@ class Coder:
         fps: int,
         waits: bool = False,
     ) -> None:
-        self._writer, self._buffers, self._waits = writer, buffers, waits
+        self.writer, self._buffers, self._waits = writer, buffers, waits
         self.error: BaseException | None = None
         frame_bytes = sum(3 * camera.width * camera.height for camera in cameras)
         most = _MAX_WAITING_BYTES // max(frame_bytes, 1)
         self.capacity = max(_MIN_WAITING_FRAMES, min(round(_WAITING_SECONDS * fps), most))
-        self._queue: Queue[WaitingFrame | None] = Queue(self.capacity)
+        self._queue: Queue[tuple[CollectedFrame, WaitingPictures] | None] = Queue(self.capacity)
         self._last: dict[str, int] = {}
         self._flushed_at = time.monotonic()
         self._pool = ThreadPoolExecutor(max(len(cameras), 1), thread_name_prefix="demorec-camera")
         self._thread = threading.Thread(target=self._run, name="demorec-coder", daemon=True)
         self._thread.start()
 
-    def put(self, frame: WaitingFrame) -> bool:
-        """Copy the pictures of a frame and queue it; False when the queue is full and is not waited for.
+    def put(self, frame: CollectedFrame, pictures: WaitingPictures) -> bool:
+        """Copy the pictures that a frame holds and queue both; False when the queue is full and is not waited for.
 
         Only one thread may put frames.
         """
@@ -123,9 +108,9 @@ class Coder:
             time.sleep(_WAIT_SECONDS)
         copies = {
             camera: (stamp_ns, None if pixels is None else self._buffers.copy(pixels))
-            for camera, (stamp_ns, pixels) in frame.pictures.items()
+            for camera, (stamp_ns, pixels) in pictures.items()
         }
-        self._queue.put_nowait(replace(frame, pictures=copies))
+        self._queue.put_nowait((frame, copies))
         return True
 
     def end(self) -> None:
@@ -139,44 +124,32 @@ class Coder:
         self._thread.join()
         self._pool.shutdown()
 
-    def finish(self, outcome: CollectedOutcome) -> WriteStats:
-        """Complete the recording, after `end`."""
-        return self._writer.finish(outcome)
-
-    def close(self) -> None:
-        """Leave the recording as it is, after `end`."""
-        self._writer.close()
-
-    def discard(self) -> None:
-        """Remove the recording, after `end`."""
-        self._writer.discard()
-
     def _run(self) -> None:
         try:
             while True:
                 wait = self._flushed_at + _FLUSH_SECONDS - time.monotonic()
                 try:
-                    frame = self._queue.get(timeout=wait) if wait > 0 else self._queue.get_nowait()
+                    waiting = self._queue.get(timeout=wait) if wait > 0 else self._queue.get_nowait()
                 except Empty:
                     self._flush()
                     continue
-                if frame is None:
+                if waiting is None:
                     return
-                self._write(frame)
+                self._write(*waiting)
                 if time.monotonic() - self._flushed_at >= _FLUSH_SECONDS:
                     self._flush()
         except BaseException as error:
             self.error = error
 
     def _flush(self) -> None:
-        self._writer.flush()
+        self.writer.flush()
         self._flushed_at = time.monotonic()
 
-    def _write(self, frame: WaitingFrame) -> None:
-        new = [(camera, stamp, pixels) for camera, (stamp, pixels) in frame.pictures.items() if pixels is not None]
-        numbers = list(self._pool.map(lambda picture: self._writer.picture(*picture), new))
+    def _write(self, frame: CollectedFrame, pictures: WaitingPictures) -> None:
+        new = [(camera, stamp, pixels) for camera, (stamp, pixels) in pictures.items() if pixels is not None]
+        numbers = list(self._pool.map(lambda picture: self.writer.picture(*picture), new))
         for (camera, _, pixels), number in zip(new, numbers, strict=True):
             self._last[camera] = number
             self._buffers.give_back(pixels)
-        held = {camera: self._last[camera] for camera in frame.pictures}
-        self._writer.write(CollectedFrame(time_ns=frame.time_ns, samples=frame.samples, pictures=held))
+        held = {camera: self._last[camera] for camera in pictures}
+        self.writer.write(replace(frame, pictures=held))

@@ -23,14 +23,12 @@ class RobotFacts:
         name: Of it.
         urdf: Its description as text, "" when unknown; that of a file with every mesh replaced by boxes and cylinders,
             so that it can be drawn without any other file.
-        joints: Names in the order in which vectors have them, where that is known.
-        known_joints: Names of all joints that move.
+        joints: Names of all that move, in the order in which vectors have them, where that is known.
     """
 
     name: str
     urdf: str = ""
     joints: tuple[str, ...] = ()
-    known_joints: frozenset[str] = frozenset()
 
 
 def robot_facts(robot: RobotLike) -> RobotFacts:
@@ -42,7 +40,7 @@ def robot_facts(robot: RobotLike) -> RobotFacts:
     if isinstance(robot, RobotSpec):
         joints = robot.joint_names
         urdf = robot_description(robot.urdf, 1.0)
-        return RobotFacts(name=robot.name, urdf=urdf, joints=joints, known_joints=frozenset(joints))
+        return RobotFacts(name=robot.name, urdf=urdf, joints=joints)
     if isinstance(robot, Path) or (isinstance(robot, str) and robot.endswith(".urdf")):
         path = Path(robot)
         try:
@@ -58,7 +56,7 @@ def robot_facts(robot: RobotLike) -> RobotFacts:
     joints = tuple(robot)
     if not joints or not all(isinstance(joint, str) and joint for joint in joints):
         raise ConfigError(f"The robot is {joints!r}: give a name, a URDF, or the names of its joints.")
-    return RobotFacts(name="robot", joints=joints, known_joints=frozenset(joints))
+    return RobotFacts(name="robot", joints=joints)
 
 
 def _described(text: str, path: Path | None) -> RobotFacts:
@@ -71,4 +69,4 @@ def _described(text: str, path: Path | None) -> RobotFacts:
     except (ValueError, SceneError) as error:
         raise ConfigError(f"The robot's URDF cannot be used ({in_words(error)}){where}") from error
     moving = tuple(joint.name for joint in urdf.joints if joint.kind != "fixed")
-    return RobotFacts(name=name, urdf=text, joints=moving, known_joints=frozenset(moving))
+    return RobotFacts(name=name, urdf=text, joints=moving)

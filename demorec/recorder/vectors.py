@@ -132,4 +132,4 @@ def _element_names(count: int, joints: tuple[str, ...]) -> tuple[str, ...]:
 def _joint(element: str, robot: RobotFacts) -> str:
     """The joint of which an element is the position: LeRobot's robots call that "JOINT.pos"."""
     name = element.removesuffix(".pos")
-    return name if name in robot.known_joints else ""
+    return name if name in robot.joints else ""

@@ -12,12 +12,13 @@ with Recording(path) as recording:
 
 from demorec.recording.collected.reader import CollectedRecording
 from demorec.recording.collected.writer import CollectedWriter
+from demorec.recording.file_writer import WriteStats
 from demorec.recording.opening import AnyRecording, open_recording
 from demorec.recording.pixels import PixelStatistics
 from demorec.recording.recording import Recording
 from demorec.recording.recover import Recovered, is_whole, recover
 from demorec.recording.video import VideoPacket, VideoSettings
-from demorec.recording.writer import EpisodeWriter, WriteStats
+from demorec.recording.writer import EpisodeWriter
 
 __all__ = [
     "AnyRecording",

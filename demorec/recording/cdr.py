@@ -1,5 +1,8 @@
 """CDR, the wire format of ROS 2 messages (OMG DDS-XTypes, plain XCDR1, little endian).
 
+Messages are written and read by the definitions of their types (`demorec.recording.ros2`). A value is one for each
+field, in order: a tuple of a struct, a sequence of an array, the bytes of uint8[].
+
 A recording consists of many messages with the same names and lengths and other numbers. So a message is laid out
 once, as a `Layout`: constant bytes with slots for time stamps and float64 (or int64) values. Writing or reading a
 batch is then a copy into or out of the slots of all its messages at once, instead of a walk through every field of
@@ -9,120 +12,96 @@ each.
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from enum import Enum
+from functools import cached_property, lru_cache
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.geometry import Array
+from demorec.recording.ros2 import FieldType, Types, types_of
 
-_HEADER = b"\x00\x01\x00\x00"
+HEADER = b"\x00\x01\x00\x00"
 _NANOSECONDS = 1_000_000_000
+_CODES = {
+    "bool": "?", "byte": "B", "uint8": "B", "int8": "b", "uint16": "H", "int16": "h", "uint32": "I", "int32": "i",
+    "uint64": "Q", "int64": "q", "float32": "f", "float64": "d",
+}  # fmt: skip
 
 
-class CdrWriter:
+class Slot(Enum):
+    """What `Layout.encode` fills in: the message's time, in place of a builtin_interfaces/Time, or the next value."""
+
+    TIME = 4
+    VALUE = 8
+
+
+def encode(schema: str, *values: Any) -> bytes:
+    """A message of a type, or its beginning, where there are fewer values than fields."""
+    writer = _Writer(types_of(schema))
+    writer.struct("", values)
+    return bytes(writer.data)
+
+
+# The recordings of a run have the same few layouts, and an export opens many.
+@lru_cache(maxsize=128)
+def layout(schema: str, *values: Any) -> Layout:
+    """Messages of a type that differ in what a `Slot` stands for alone; tuples for all that is in order."""
+    writer = _Writer(types_of(schema))
+    writer.struct("", values)
+    return Layout(
+        dtype="<i8" if schema.endswith("Int64MultiArray") else "<f8",
+        constant=np.frombuffer(bytes(writer.data), dtype=np.uint8),
+        time_slots=np.array(writer.slots[Slot.TIME], dtype=np.intp),
+        value_slots=np.array(writer.slots[Slot.VALUE], dtype=np.intp),
+    )
+
+
+class _Writer:
     """Appends fields to one message; alignment counts from the end of the four header bytes."""
 
-    def __init__(self) -> None:
-        self._data = bytearray(_HEADER)
-        self.time_slots: list[int] = []
-        self.value_slots: list[int] = []
+    def __init__(self, types: Types) -> None:
+        self._types = types
+        self.data = bytearray(HEADER)
+        self.slots: dict[Slot, list[int]] = {slot: [] for slot in Slot}
 
-    def _pack(self, code: str, size: int, value: float) -> None:
-        self._data += b"\x00" * (-(len(self._data) - 4) % size)
-        self._data += struct.pack("<" + code, value)
+    def struct(self, kind: str, values: Sequence[Any]) -> None:
+        for field, value in zip(self._types[kind], values, strict=False):
+            if not field.is_array:
+                self._value(field.kind, value)
+                continue
+            if field.length is None:
+                self._value("uint32", len(value))
+            if isinstance(value, bytes):
+                self.data += value
+            elif isinstance(value, np.ndarray):
+                dtype = np.dtype("<" + _CODES[field.kind])
+                self._align(dtype.itemsize if len(value) else 1)
+                self.data += value.astype(dtype).tobytes()
+            else:
+                for item in value:
+                    self._value(field.kind, item)
 
-    def u8(self, value: int) -> None:
-        """One byte; also bool."""
-        self._data.append(value)
+    def _value(self, kind: str, value: Any) -> None:
+        if isinstance(value, Slot):
+            self._align(value.value)
+            self.slots[value].append(len(self.data))
+            self.data += bytes(8)
+        elif kind in self._types:
+            self.struct(kind, value)
+        elif kind == "string":
+            raw = value.encode() + b"\x00"
+            self._value("uint32", len(raw))
+            self.data += raw
+        else:
+            raw = struct.pack("<" + _CODES[kind], value)
+            self._align(len(raw))
+            self.data += raw
 
-    def u16(self, value: int) -> None:
-        """uint16."""
-        self._pack("H", 2, value)
-
-    def u32(self, value: int) -> None:
-        """uint32; also the length of a sequence."""
-        self._pack("I", 4, value)
-
-    def i32(self, value: int) -> None:
-        """int32."""
-        self._pack("i", 4, value)
-
-    def f64(self, value: float) -> None:
-        """float64."""
-        self._pack("d", 8, value)
-
-    def f32(self, value: float) -> None:
-        """float32."""
-        self._pack("f", 4, value)
-
-    def integers(self, values: NDArray[np.int64]) -> None:
-        """A sequence of int64."""
-        self.u32(len(values))
-        if len(values):
-            self._data += b"\x00" * (-(len(self._data) - 4) % 8)
-            self._data += np.ascontiguousarray(values, dtype="<i8").tobytes()
-
-    def floats(self, values: Sequence[float]) -> None:
-        """float64 after float64: a fixed-size array, or the elements of a sequence."""
-        for value in values:
-            self.f64(value)
-
-    def text(self, value: str) -> None:
-        """A string: length with the closing NUL, UTF-8 bytes, NUL."""
-        raw = value.encode()
-        self.u32(len(raw) + 1)
-        self._data += raw + b"\x00"
-
-    def time(self, time_ns: int) -> None:
-        """builtin_interfaces/Time."""
-        self.i32(time_ns // _NANOSECONDS)
-        self.u32(time_ns % _NANOSECONDS)
-
-    def header(self, frame_id: str, time_ns: int = 0) -> None:
-        """std_msgs/Header; its stamp is a slot of the layout."""
-        self.time_slot(time_ns)
-        self.text(frame_id)
-
-    def time_slot(self, time_ns: int = 0) -> None:
-        """A time stamp that `Layout.encode` fills in."""
-        self.time(time_ns)
-        self.time_slots.append(len(self._data) - 8)
-
-    def value_slot(self, count: int = 1) -> None:
-        """Values of eight bytes that `Layout.encode` fills in."""
-        for _ in range(count):
-            self.f64(0.0)
-            self.value_slots.append(len(self._data) - 8)
-
-    def finish(self) -> bytes:
-        """The message."""
-        return bytes(self._data)
-
-    def layout(self, dtype: Literal["<f8", "<i8"] = "<f8") -> Layout:
-        """The message as a layout, whose values are all of one type."""
-        return Layout(
-            dtype=dtype,
-            constant=np.frombuffer(bytes(self._data), dtype=np.uint8),
-            time_bytes=_slot_bytes(self.time_slots),
-            value_bytes=_slot_bytes(self.value_slots),
-        )
-
-
-def _slot_bytes(offsets: Sequence[int]) -> NDArray[np.intp]:
-    return (np.array(offsets, dtype=np.intp)[:, None] + np.arange(8)).reshape(-1)
-
-
-def _runs(positions: NDArray[np.intp]) -> list[tuple[int, int]]:
-    """(first, last + 1) of the stretches without a gap in ascending positions."""
-    if not len(positions):
-        return []
-    cuts = np.flatnonzero(np.diff(positions) != 1) + 1
-    firsts, lasts = positions[[0, *cuts]], positions[[*(cuts - 1), -1]]
-    return [(int(a), int(b) + 1) for a, b in zip(firsts, lasts, strict=True)]
+    def _align(self, size: int) -> None:
+        self.data += bytes(-(len(self.data) - 4) % size)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -132,27 +111,23 @@ class Layout:
     Attributes:
         dtype: Of the values: float64 or int64.
         constant: (L,) uint8, the message with zeros in the slots.
-        time_bytes: (8 S,) positions of the bytes of the S time stamps, which are all set to the message's time.
-        value_bytes: (8 K,) positions of the bytes of the K values.
+        time_slots: (S,) where the time stamps begin, which are all set to the message's time.
+        value_slots: (K,) where the values begin, which have eight bytes as the stamps do.
     """
 
     dtype: Literal["<f8", "<i8"] = "<f8"
     constant: NDArray[np.uint8]
-    time_bytes: NDArray[np.intp]
-    value_bytes: NDArray[np.intp]
-
-    @property
-    def num_values(self) -> int:
-        """K."""
-        return len(self.value_bytes) // 8
+    time_slots: NDArray[np.intp]
+    value_slots: NDArray[np.intp]
 
     @cached_property
     def _value_runs(self) -> list[tuple[int, int]]:
-        return _runs(self.value_bytes)
-
-    @cached_property
-    def _time_runs(self) -> list[tuple[int, int]]:
-        return _runs(self.time_bytes)
+        """(first, last + 1) of the stretches of bytes that values fill without a gap."""
+        runs: list[tuple[int, int]] = []
+        for slot in self.value_slots.tolist():
+            first = runs.pop()[0] if runs and runs[-1][1] == slot else slot
+            runs.append((first, slot + 8))
+        return runs
 
     def encode(self, time_ns: NDArray[np.int64], values: NDArray[Any]) -> list[bytes]:
         """One message for each row of `values` (N, K), stamped with `time_ns` (N,)."""
@@ -163,9 +138,9 @@ class Layout:
         rows[:, 4 : 4 + length] = self.constant
         seconds, nanoseconds = np.divmod(time_ns, _NANOSECONDS)
         words = rows.view("<u4")
-        words[:, (self.time_bytes[::8] + 4) // 4] = seconds[:, None]
-        words[:, (self.time_bytes[::8] + 8) // 4] = nanoseconds[:, None]
-        rows.view(self.dtype)[:, (self.value_bytes[::8] + 4) // 8] = values
+        words[:, (self.time_slots + 4) // 4] = seconds[:, None]
+        words[:, (self.time_slots + 8) // 4] = nanoseconds[:, None]
+        rows.view(self.dtype)[:, (self.value_slots + 4) // 8] = values
         data = rows.tobytes()
         return [data[start : start + length] for start in range(4, count * width, width)]
 
@@ -179,7 +154,7 @@ class Layout:
 
     def decode_rows(self, rows: NDArray[np.uint8]) -> NDArray[Any]:
         """(N, K) values of messages of the right length, given as (N, L) bytes; ValueError as `decode`."""
-        values = np.empty((len(rows), self.num_values), dtype=self.dtype)
+        values = np.empty((len(rows), len(self.value_slots)), dtype=self.dtype)
         rest = rows.copy()
         column = 0
         for first, last in self._value_runs:
@@ -187,22 +162,70 @@ class Layout:
             values[:, column : column + count] = np.ascontiguousarray(rows[:, first:last]).view(self.dtype)
             rest[:, first:last] = 0
             column += count
-        for first, last in self._time_runs:
-            rest[:, first:last] = 0
+        for slot in self.time_slots.tolist():
+            rest[:, slot : slot + 8] = 0
         # The slots of the constant are zero, so what is left must be the constant.
         if not (rest == self.constant).all():
             raise ValueError("a message with other names or lengths than the episode's metadata")
         return values
 
 
-class CdrReader:
-    """Reads the fields of one message in order; ValueError when it is too short or of another encoding."""
+def strict_text(raw: bytes) -> str:
+    """A string as it is in a message; ValueError for none."""
+    if not raw.endswith(b"\x00"):
+        raise ValueError("a string without its closing NUL")
+    return raw[:-1].decode()
 
-    def __init__(self, data: bytes) -> None:
-        if data[:4] != _HEADER:
+
+class CdrReader:
+    """Reads one message in order; ValueError when it is too short or of another encoding.
+
+    Args:
+        data: The message.
+        text: What becomes of the bytes of a string.
+    """
+
+    def __init__(self, data: bytes, *, text: Callable[[bytes], str] = strict_text) -> None:
+        if data[:4] != HEADER:
             raise ValueError(f"a message with the encapsulation {data[:4].hex() or 'of no bytes'}, expected 00010000")
-        self._data = data
+        self._data, self._text = data, text
         self._position = 4
+
+    @property
+    def num_left(self) -> int:
+        """Bytes that were not read."""
+        return len(self._data) - self._position
+
+    def values(self, schema: str) -> Iterator[Any]:
+        """The fields of a message of a type; an array of numbers is a NumPy array."""
+        types = types_of(schema)
+        return (self._field(types, field) for field in types[""])
+
+    def _field(self, types: Types, field: FieldType) -> Any:
+        if not field.is_array:
+            return self._value(types, field.kind)
+        length = self._value(types, "uint32") if field.length is None else field.length
+        if field.kind == "uint8" and field.length is None:
+            return self._take(length)
+        if field.kind not in _CODES:
+            return [self._value(types, field.kind) for _ in range(length)]
+        dtype = np.dtype("<" + _CODES[field.kind])
+        if length:
+            self._align(dtype.itemsize)
+        return np.frombuffer(self._take(dtype.itemsize * length), dtype)
+
+    def _value(self, types: Types, kind: str) -> Any:
+        if kind in types:
+            return tuple([self._field(types, field) for field in types[kind]])
+        if kind == "string":
+            return self._text(self._take(self._value(types, "uint32")))
+        code = "<" + _CODES[kind]
+        size = struct.calcsize(code)
+        self._align(size)
+        return struct.unpack(code, self._take(size))[0]
+
+    def _align(self, size: int) -> None:
+        self._position += -(self._position - 4) % size
 
     def _take(self, size: int) -> bytes:
         start = self._position
@@ -210,52 +233,3 @@ class CdrReader:
             raise ValueError(f"a message of {len(self._data)} bytes that ends within a field")
         self._position = start + size
         return self._data[start : start + size]
-
-    def _unpack(self, code: str, size: int) -> int:
-        self._position += -(self._position - 4) % size
-        value: int = struct.unpack("<" + code, self._take(size))[0]
-        return value
-
-    def u8(self) -> int:
-        """One byte."""
-        return self._take(1)[0]
-
-    def u16(self) -> int:
-        """uint16."""
-        return self._unpack("H", 2)
-
-    def u32(self) -> int:
-        """uint32."""
-        return self._unpack("I", 4)
-
-    def floats(self, count: int) -> Array:
-        """(count,) float64 after float64."""
-        if count:
-            self._position += -(self._position - 4) % 8
-        return np.frombuffer(self._take(8 * count), dtype="<f8").astype(np.float64)
-
-    def text(self) -> str:
-        """A string."""
-        raw = self._take(self.u32())
-        if not raw.endswith(b"\x00"):
-            raise ValueError("a string without its closing NUL")
-        return raw[:-1].decode()
-
-    def octets(self, count: int) -> bytes:
-        """Byte after byte."""
-        return self._take(count)
-
-    def integers(self) -> NDArray[np.int64]:
-        """A sequence of int64."""
-        count = self.u32()
-        if count:
-            self._position += -(self._position - 4) % 8
-        return np.frombuffer(self._take(8 * count), dtype="<i8").astype(np.int64)
-
-    def time(self) -> int:
-        """builtin_interfaces/Time, as nanoseconds."""
-        return self.u32() * _NANOSECONDS + self.u32()
-
-    def header(self) -> tuple[int, str]:
-        """std_msgs/Header: stamp in nanoseconds, frame."""
-        return self.time(), self.text()

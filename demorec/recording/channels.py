@@ -10,6 +10,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from demorec.recording import messages
+from demorec.recording.cdr import encode
 from demorec.recording.description import body_description, robot_description
 from demorec.recording.labels import segment_names, to_labels
 from demorec.recording.transforms import FrameTree, camera_frame
@@ -51,14 +52,13 @@ def latched_messages(info: EpisodeInfo, frames: FrameTree, *, has_labels: bool) 
     """(topic, type, message) of what is said once, before the first frame."""
     yield TF_STATIC, messages.TRANSFORMS, messages.transforms(frames.static)
     robot = robot_description(info.robot.urdf, info.scene.robot.scale)
-    yield description_topic(), messages.STRING, messages.string(robot)
+    yield description_topic(), messages.STRING, encode(messages.STRING, robot)
     for body in info.scene.bodies:
         if max(body.shape.extents) > _BACKDROP_METRES:
             continue
-        yield description_topic(body.name), messages.STRING, messages.string(body_description(body))
+        yield description_topic(body.name), messages.STRING, encode(messages.STRING, body_description(body))
     for camera in info.scene.cameras:
-        calibration = messages.Calibration(width=camera.width, height=camera.height, intrinsics=camera.intrinsics)
-        data = messages.camera_info(calibration, camera_frame(camera.name))
+        data = messages.camera_info(camera_frame(camera.name), (camera.height, camera.width), camera.intrinsics)
         yield camera_topic(camera.name, "camera_info"), messages.CAMERA_INFO, data
     if has_labels:
         values, names = zip(*segment_names(info), strict=True)

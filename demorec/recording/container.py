@@ -133,12 +133,7 @@ class Container:
         self._metadata: dict[str, MetadataIndex] = {}
         self._attachments: dict[str, AttachmentIndex] = {}
         counts: dict[int, int] = {}
-        position = 0
-        while position < len(summary):
-            opcode, length = RECORD_HEAD.unpack_from(summary, position)
-            position += RECORD_HEAD.size
-            content = summary[position : position + length]
-            position += length
+        for opcode, content in _records_of(summary, "the file's index"):
             if opcode == Opcode.CHANNEL:
                 channel = _read_channel(content)
                 channels[channel.id] = channel
@@ -267,14 +262,14 @@ def _read_schema(content: bytes) -> Schema:
     return _read(content, Schema)
 
 
-def _records_of(content: bytes) -> Iterator[tuple[int, bytes]]:
-    """(opcode, content) of the records in a chunk."""
+def _records_of(content: bytes, where: str = "its chunk") -> Iterator[tuple[int, bytes]]:
+    """(opcode, content) of the records in a chunk, or in what `where` says."""
     position = 0
     while position < len(content):
         opcode, length = RECORD_HEAD.unpack_from(content, position)
         position += RECORD_HEAD.size
         if position + length > len(content):
-            raise ValueError("a record that reaches beyond its chunk")
+            raise ValueError(f"a record that reaches beyond {where}")
         yield opcode, content[position : position + length]
         position += length
 
@@ -310,15 +305,7 @@ class SalvagedMessage:
     is_latched: bool
 
 
-@dataclass(frozen=True, kw_only=True)
-class SalvagedMetadata:
-    """A metadata record of a file without an index."""
-
-    name: str
-    values: dict[str, str]
-
-
-def salvage(path: Path) -> Iterator[SalvagedMessage | SalvagedMetadata | str | None]:
+def salvage(path: Path) -> Iterator[SalvagedMessage | Metadata | str | None]:
     """Everything whole from the front of a file: messages and metadata, None at the end of each chunk.
 
     Ends with a string that says why reading stopped, or without one where the data ends as it should. Raises OSError.
@@ -367,7 +354,7 @@ class _Salvage:
         self._schemas: dict[int, str] = {}
         self._channels: dict[int, Channel] = {}
 
-    def read(self, opcode: int, content: bytes) -> Iterator[SalvagedMessage | SalvagedMetadata]:
+    def read(self, opcode: int, content: bytes) -> Iterator[SalvagedMessage | Metadata]:
         """What a record holds."""
         if opcode == Opcode.CHUNK:
             unpacked = chunk_content(content, self._limits)
@@ -389,8 +376,7 @@ class _Salvage:
                 is_latched="offered_qos_profiles" in channel.metadata,
             )
         elif opcode == Opcode.METADATA:
-            record = _read(content, Metadata)
-            yield SalvagedMetadata(name=record.name, values=dict(record.metadata))
+            yield _read(content, Metadata)
         elif opcode == Opcode.SCHEMA:
             schema = _read_schema(content)
             self._schemas[schema.id] = schema.name

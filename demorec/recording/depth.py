@@ -9,12 +9,15 @@ Rerun draws as depth and RViz shows; PNG in that frame Rerun takes for a broken 
 from __future__ import annotations
 
 import struct
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 FORMAT = "16UC1; compressedDepth rvl"
 MAX_METRES = 65.535
+DEPTH_TYPES: dict[str, type[np.uint16] | type[np.float32]] = {"16UC1": np.uint16, "32FC1": np.float32}
+"""Encodings of collected episodes, which keep distances to the bit: millimetres as RVL, or metres as they are."""
 _HEAD = struct.Struct("<iffii")
 """ConfigHeader (format, two parameters of inverse depth, both unused here), then width and height."""
 
@@ -56,3 +59,17 @@ def decode_millimetres(data: bytes, size: tuple[int, int]) -> NDArray[np.uint16]
     if not kernels.rvl_decode(words, flat):
         raise ValueError("a depth picture whose runs do not fit its size")
     return flat.reshape(height, width)
+
+
+def encode_distances(values: NDArray[Any]) -> bytes:
+    """The packet of distances (H, W) uint16 or float32."""
+    return encode_millimetres(values) if values.dtype == np.uint16 else values.astype("<f4").tobytes()
+
+
+def decode_distances(encoding: str, data: bytes, size: tuple[int, int]) -> NDArray[np.uint16] | NDArray[np.float32]:
+    """(H, W) of a packet, uint16 or float32; ValueError when it is none of that (height, width)."""
+    if encoding == "16UC1":
+        return decode_millimetres(data, size)
+    if len(data) != 4 * size[0] * size[1]:
+        raise ValueError(f"a depth picture of {len(data)} bytes, expected {size[1]}x{size[0]} pixels of 4")
+    return np.frombuffer(data, "<f4").astype(np.float32).reshape(size)

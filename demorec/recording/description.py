@@ -7,6 +7,7 @@ import math
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,13 @@ from demorec.scene.urdf import parse_xml, quat_from_rpy
 from demorec.scene.urdf_shapes import UrdfShape, read_links
 
 _WHITE: Rgba = (1.0, 1.0, 1.0, 1.0)
+_KINDS: dict[str, Literal["box", "sphere", "cylinder"]] = {
+    "box": "box",
+    "sphere": "sphere",
+    "cylinder": "cylinder",
+    "capsule": "cylinder",
+}
+"""Shape -> the primitive that it is, but for a capsule's ends."""
 
 
 @functools.lru_cache(maxsize=8)
@@ -70,37 +78,29 @@ def body_description(body: Body) -> str:
 
 def _body_primitives(body: Body) -> Iterator[tuple[Primitive, Pose]]:
     shape = body.shape
-    origin = (0.0, 0.0, 0.0)
-    if shape.kind == "box":
-        yield Primitive(kind="box", center=origin, axis=2, size=shape.size, volume=0.0), Pose()
-    elif shape.kind == "sphere":
-        yield Primitive(kind="sphere", center=origin, axis=2, size=shape.size, volume=0.0), Pose()
-    elif shape.kind in ("cylinder", "capsule"):
-        radius, length = shape.size
-        yield Primitive(kind="cylinder", center=origin, axis=2, size=(radius, length), volume=0.0), Pose()
-        if shape.kind == "capsule":
-            for end in (-length / 2, length / 2):
-                yield Primitive(kind="sphere", center=(0.0, 0.0, end), axis=2, size=(radius,), volume=0.0), Pose()
-    elif shape.kind == "mesh":
+    if shape.kind == "mesh":
         for primitive in _mesh_primitives(asset_path(shape.file), (shape.scale,) * 3):
             yield primitive, shape.body_from_mesh
-    else:
+    elif shape.kind == "urdf":
         path = asset_path(shape.file)
         for link in read_links(path.read_text(), scale=shape.scale):
             for visual in link.visuals:
                 for primitive in _primitives(visual, path.parent):
                     yield primitive, visual.link_from_shape
+    else:
+        yield Primitive(kind=_KINDS[shape.kind], size=shape.size), Pose()
+        if shape.kind == "capsule":
+            radius, length = shape.size
+            for end in (-length / 2, length / 2):
+                yield Primitive(kind="sphere", center=(0.0, 0.0, end), size=(radius,)), Pose()
 
 
 def _primitives(shape: UrdfShape, folder: Path) -> Iterator[Primitive]:
     """A shape of a URDF as primitives in its own frame."""
-    center = (0.0, 0.0, 0.0)
     if shape.kind == "mesh":
         yield from _mesh_primitives(mesh_path(folder, shape.file), shape.size)
-    elif shape.kind in ("box", "sphere"):
-        yield Primitive(kind=shape.kind, center=center, axis=2, size=shape.size, volume=0.0)
-    elif shape.kind in ("cylinder", "capsule"):
-        yield Primitive(kind="cylinder", center=center, axis=2, size=shape.size, volume=0.0)
+    elif shape.kind in _KINDS:
+        yield Primitive(kind=_KINDS[shape.kind], size=shape.size)
 
 
 @functools.lru_cache(maxsize=256)

@@ -2,30 +2,42 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+import hashlib
+import json
+from abc import abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
+from demorec.closing import Closing
 from demorec.errors import RecordingError
+from demorec.plain import to_json, to_plain
 from demorec.recording import messages, metadata
 from demorec.recording.channels import camera_topic
 from demorec.recording.container import Container, damage_as_recording_error
 from demorec.recording.pixels import PixelCounter, PixelStatistics
 from demorec.recording.video import Rgb, VideoPacket, VideoSettings, decode
+from demorec.scene.collected import CollectedInfo, CollectedOutcome
+from demorec.scene.episode import EpisodeInfo, Outcome
 
 
-class EpisodeFile(ABC):
+class EpisodeFile[O: (Outcome, CollectedOutcome), C](Closing):
     """Context manager over the file of one episode.
 
     Attributes:
         path: Of the file.
+        info: What was known before the first frame.
+        outcome: How the episode ended; None when a crash cut it off.
+        num_frames: Length.
         is_recovered: Whether a crash cut it off.
     """
 
+    info: EpisodeInfo | CollectedInfo
+    outcome: O | None
+    num_frames: int
     is_recovered: bool
+    _cameras: Mapping[str, C]
+    """What is known of each camera."""
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
@@ -36,14 +48,6 @@ class EpisodeFile(ABC):
             self.close()
             raise
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self.close()
-
     def close(self) -> None:
         """Close the file; harmless when called twice."""
         self._container.close()
@@ -52,16 +56,36 @@ class EpisodeFile(ABC):
     def _read_metadata(self) -> None:
         """Read what is known without reading messages."""
 
-    def _check_end(self, num_frames: int, outcome_frames: int | None) -> None:
-        """Note whether it was recovered; RecordingError unless its end is that of so many frames."""
-        recovered = self._container.metadata(metadata.RECOVERED)
+    def _read_end(self, topic: str, kind: type[O]) -> None:
+        """Read how it ended; RecordingError unless its end is that of as many frames as `topic` has messages."""
+        outcome, recovered = self._container.metadata(metadata.OUTCOME), self._container.metadata(metadata.RECOVERED)
+        self.outcome = None if outcome is None else metadata.read_outcome_metadata(outcome, kind)
+        self.num_frames = self._container.counts.get(topic, 0)
         if recovered is not None:
             metadata.check_seal(metadata.RECOVERED, recovered)
         self.is_recovered = recovered is not None
-        if outcome_frames is None and not self.is_recovered:
+        if self.outcome is None and not self.is_recovered:
             raise RecordingError("The recording was never finished; demorec recover keeps what is whole")
-        if outcome_frames is not None and outcome_frames != num_frames:
-            raise RecordingError(f"The recording has {num_frames} frames, but its outcome says {outcome_frames}")
+        if self.outcome is not None and self.outcome.num_frames != self.num_frames:
+            raise RecordingError(
+                f"The recording has {self.num_frames} frames, but its outcome says {self.outcome.num_frames}"
+            )
+
+    def _camera(self, name: str) -> C:
+        if name not in self._cameras:
+            raise RecordingError(
+                f"The recording has no camera {name!r}, its cameras are {', '.join(self._cameras) or 'none'}: "
+                f"{self.path}"
+            )
+        return self._cameras[name]
+
+    def _digest_of_description(self) -> hashlib._Hash:
+        """That of the metadata, to go on with: not of what versions wrote them."""
+        described = to_plain(self.info)
+        del described["versions"], described["format_version"]
+        result = hashlib.sha256(json.dumps(described, sort_keys=True).encode())
+        result.update(b"no outcome" if self.outcome is None else to_json(self.outcome).encode())
+        return result
 
     @property
     def topics(self) -> dict[str, tuple[str, int]]:
@@ -71,6 +95,13 @@ class EpisodeFile(ABC):
             topic: (container.schemas[container.channels[topic].schema_id].name, container.counts[topic])
             for topic in sorted(container.channels)
         }
+
+    def _read[V](self, topic: str, read: Callable[[bytes], V]) -> Iterator[tuple[int, V]]:
+        """(time_ns, what was read) of the messages of a topic, in order."""
+        for message in self._container.messages((topic,)):
+            with damage_as_recording_error(self.path):
+                found = read(message.data)
+            yield message.time_ns, found
 
     @abstractmethod
     def video_settings(self, camera: str) -> VideoSettings:
@@ -95,9 +126,8 @@ class EpisodeFile(ABC):
     def pixel_statistics(self, camera: str) -> PixelStatistics:
         """Histograms of a camera's pictures: as written, or counted now where none were written."""
         self.video_settings(camera)
-        for message in self._container.messages((camera_topic(camera, "histogram"),)):
-            with damage_as_recording_error(self.path):
-                return messages.read_pixel_statistics(message.data)
+        for _, statistics in self._read(camera_topic(camera, "histogram"), messages.read_pixel_statistics):
+            return statistics
         counter = PixelCounter()
         for picture in self.images(camera):
             counter.add(picture)

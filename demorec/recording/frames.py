@@ -9,7 +9,7 @@ from itertools import islice
 import numpy as np
 
 from demorec.recording.reader import RecordingReader
-from demorec.recording.streams import action_at, command_at, observation_at, pose_of
+from demorec.recording.streams import action_at, observation_at, pose_of
 from demorec.scene.episode import CameraImages, EpisodeColumns, Event, Frame, JointSample
 
 
@@ -32,8 +32,8 @@ def frames_of(recording: RecordingReader, columns: EpisodeColumns | None = None)
             frame_index=index,
             time_ns=time_ns,
             observation=observation_at(columns, index),
-            action=action_at(columns, index),
-            command=command_at(columns, index),
+            action=action_at(columns, index, "action"),
+            command=action_at(columns, index, "command"),
             phase=columns.phase[index],
             events=tuple(events.get(index, ())),
             joint_samples=samples.get(index, ()),

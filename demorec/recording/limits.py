@@ -58,14 +58,11 @@ class Limits:
 
     def check_total(self, size: int) -> None:
         """Raise LimitError when all chunks together are larger than allowed."""
-        if size > self.total:
-            raise LimitError(_refusal(size, self.total))
+        _check(size, self.total)
 
     def check_chunk(self, size: int, stored: int) -> None:
         """Raise LimitError when a chunk that takes `stored` bytes in the file is larger than allowed."""
-        allowed = min(max(self.floor, _CHUNK_RATIO * stored), self.total)
-        if size > allowed:
-            raise LimitError(_refusal(size, allowed))
+        _check(size, min(max(self.floor, _CHUNK_RATIO * stored), self.total))
 
     def check_records(self, count: int) -> None:
         """Raise LimitError for more records than allowed."""
@@ -75,5 +72,8 @@ class Limits:
             )
 
 
-def _refusal(size: int, allowed: int) -> str:
-    return f"it would unpack to {size / 1e6:,.0f} MB, allowed are {allowed / 1e6:,.0f} MB; {VARIABLE} raises this"
+def _check(size: int, allowed: int) -> None:
+    if size > allowed:
+        raise LimitError(
+            f"it would unpack to {size / 1e6:,.0f} MB, allowed are {allowed / 1e6:,.0f} MB; {VARIABLE} raises this"
+        )

@@ -5,11 +5,12 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 
 import numpy as np
 
 from demorec.geometry import Array, Pose
-from demorec.recording.cdr import CdrReader, CdrWriter
+from demorec.recording.cdr import CdrReader, encode
 from demorec.recording.chunks import Block
 from demorec.recording.pixels import PixelStatistics
 from demorec.scene.episode import Event
@@ -35,52 +36,35 @@ _MOST_PIXELS = 1 << 50
 _LOG_LEVELS = {"info": 20, "warning": 30, "error": 40}
 
 
-def string(text: str) -> bytes:
-    """std_msgs/String."""
-    message = CdrWriter()
-    message.text(text)
-    return message.finish()
-
-
 def read_string(data: bytes) -> str:
-    """Inverse of `string`."""
-    return CdrReader(data).text()
-
-
-def boolean(value: bool) -> bytes:
-    """std_msgs/Bool."""
-    message = CdrWriter()
-    message.u8(value)
-    return message.finish()
+    """The text of a std_msgs/String."""
+    text: str = next(CdrReader(data).values(STRING))
+    return text
 
 
 def read_boolean(data: bytes) -> bool:
-    """Inverse of `boolean`."""
-    return bool(CdrReader(data).u8())
+    """The value of a std_msgs/Bool."""
+    return bool(next(CdrReader(data).values(BOOL)))
 
 
 def log(time_ns: int, event: Event) -> bytes:
-    """rcl_interfaces/Log."""
-    message = CdrWriter()
-    message.time(time_ns)
-    message.u8(_LOG_LEVELS[event.level])
-    message.text(event.name)
-    message.text(event.message)
-    message.text("")  # file
-    message.text("")  # function
-    message.u32(0)  # line
-    return message.finish()
+    """rcl_interfaces/Log, without file, function and line."""
+    return encode(LOG, _stamp(time_ns), _LOG_LEVELS[event.level], event.name, event.message, "", "", 0)
 
 
 def read_log(data: bytes) -> Event:
     """Inverse of `log`; ValueError for an unknown level."""
-    message = CdrReader(data)
-    message.time()
-    level_number = message.u8()
+    values = CdrReader(data).values(LOG)
+    _, level_number = islice(values, 2)
     for level, number in _LOG_LEVELS.items():
         if number == level_number:
-            return Event(name=message.text(), message=message.text(), level=level)  # type: ignore[arg-type]
+            return Event(name=next(values), message=next(values), level=level)  # type: ignore[arg-type]
     raise ValueError(f"a log message of level {level_number}")
+
+
+def _stamp(time_ns: int) -> tuple[int, int]:
+    """builtin_interfaces/Time."""
+    return divmod(time_ns, 1_000_000_000)
 
 
 class PictureMessages:
@@ -92,15 +76,9 @@ class PictureMessages:
     """
 
     def __init__(self, frame_id: str, picture_format: str) -> None:
-        image = CdrWriter()
-        image.header(frame_id)
-        image.text(picture_format)
-        image.u32(0)
-        self._image = image.finish()
-        video = CdrWriter()
-        video.header(frame_id)
-        video.u32(0)
-        self._video = video.finish()
+        header = (_stamp(0), frame_id)
+        self._image = encode(COMPRESSED_IMAGE, header, picture_format, b"")
+        self._video = encode(COMPRESSED_VIDEO, *header, b"")
         self._format = struct.pack("<I", len(picture_format) + 1) + picture_format.encode() + b"\x00"
 
     def compressed_image(self, time_ns: int, data: bytes) -> bytes:
@@ -115,7 +93,7 @@ class PictureMessages:
     @staticmethod
     def _filled(head: bytes, time_ns: int, data: bytes) -> bytes:
         # Encapsulation, stamp, the constant fields, length of the data, data.
-        stamp = struct.pack("<II", *divmod(time_ns, 1_000_000_000))
+        stamp = struct.pack("<II", *_stamp(time_ns))
         return head[:4] + stamp + head[12:-4] + struct.pack("<I", len(data)) + data
 
 
@@ -124,28 +102,15 @@ _U32 = struct.Struct("<I")
 
 def image(time_ns: int, frame_id: str, encoding: str, size: tuple[int, int], data: bytes) -> bytes:
     """sensor_msgs/Image of (height, width) pixels in little endian."""
-    message = CdrWriter()
-    message.header(frame_id, time_ns)
-    message.u32(size[0])
-    message.u32(size[1])
-    message.text(encoding)
-    message.u8(0)  # is_bigendian
-    message.u32(len(data) // size[0])
-    message.u32(len(data))
-    return message.finish() + data
+    height, width = size
+    head = encode(IMAGE, (_stamp(time_ns), frame_id), height, width, encoding, False, len(data) // height)
+    return head + _U32.pack(len(data)) + data
 
 
 def read_image(data: bytes) -> bytes:
     """The pixels of an `image`; ValueError when it is cut off."""
-    message = CdrReader(data)
-    message.header()
-    for _ in range(2):
-        message.u32()
-    message.text()
-    message.u8()
-    message.u32()
-    count = message.u32()
-    return message.octets(count)
+    *_, pixels = CdrReader(data).values(IMAGE)
+    return bytes(pixels)
 
 
 def read_compressed_image(data: bytes) -> bytes:
@@ -243,26 +208,15 @@ def _varint(data: bytes, position: int) -> tuple[int, int]:
 
 def pixel_statistics(statistics: PixelStatistics) -> bytes:
     """std_msgs/Int64MultiArray, a table of 3 x 256 counts after one number: how many pictures were counted."""
-    message = CdrWriter()
-    message.u32(2)
-    for label, size, stride in (("red, green, blue", 3, 3 * 256), ("value", 256, 256)):
-        message.text(label)
-        message.u32(size)
-        message.u32(stride)
-    message.u32(1)  # data_offset: what comes in front of the table
-    message.integers(np.concatenate(([statistics.num_images], statistics.counts.reshape(-1))))
-    return message.finish()
+    dimensions = (("red, green, blue", 3, 3 * 256), ("value", 256, 256))
+    data_offset = 1  # what comes in front of the table
+    values = np.concatenate(([statistics.num_images], statistics.counts.reshape(-1)))
+    return encode(INT64_ARRAY, (dimensions, data_offset), values)
 
 
 def read_pixel_statistics(data: bytes) -> PixelStatistics:
     """Inverse of `pixel_statistics`."""
-    message = CdrReader(data)
-    for _ in range(message.u32()):
-        message.text()
-        message.u32()
-        message.u32()
-    message.u32()
-    values = message.integers()
+    _, values = CdrReader(data).values(INT64_ARRAY)
     if len(values) != 1 + 3 * 256 or not ((values >= 0) & (values < _MOST_PIXELS)).all():
         raise ValueError("a histogram of other numbers than counts")
     return PixelStatistics(num_images=int(values[0]), counts=values[1:].reshape(3, 256))
@@ -277,62 +231,35 @@ class Calibration:
     intrinsics: Array
 
 
-def camera_info(calibration: Calibration, frame_id: str, distortion: Sequence[float] = (0.0,) * 5) -> bytes:
-    """sensor_msgs/CameraInfo, with the distortion of the plumb bob model."""
-    k = calibration.intrinsics
-    message = CdrWriter()
-    message.header(frame_id)
-    message.u32(calibration.height)
-    message.u32(calibration.width)
-    message.text("plumb_bob")
-    message.u32(len(distortion))
-    message.floats(distortion)
-    message.floats(k.reshape(-1).tolist())
-    message.floats(np.eye(3).reshape(-1).tolist())
-    message.floats(np.hstack((k, np.zeros((3, 1)))).reshape(-1).tolist())
-    message.u32(0)  # binning_x
-    message.u32(0)  # binning_y
-    for _ in range(4):  # the region of interest is the whole picture
-        message.u32(0)
-    message.u8(False)
-    return message.finish()
+def camera_info(frame_id: str, size: tuple[int, int], k: Array, distortion: Sequence[float] = (0.0,) * 5) -> bytes:
+    """sensor_msgs/CameraInfo of (height, width) pixels and K (3, 3), with the distortion of the plumb bob model."""
+    projection = np.hstack((k, np.zeros((3, 1))))
+    matrices = (matrix.reshape(-1) for matrix in (k, np.eye(3), projection))
+    whole_picture = (0, 0, 0, 0, False)  # as the region of interest; without binning
+    header = (_stamp(0), frame_id)
+    return encode(CAMERA_INFO, header, *size, "plumb_bob", distortion, *matrices, 0, 0, whole_picture)
 
 
 def read_camera_info(data: bytes) -> Calibration:
     """Inverse of `camera_info`."""
-    message = CdrReader(data)
-    message.header()
-    height, width = message.u32(), message.u32()
-    message.text()
-    message.floats(message.u32())
-    return Calibration(width=width, height=height, intrinsics=message.floats(9).reshape(3, 3))
+    _, height, width, _, _, k = islice(CdrReader(data).values(CAMERA_INFO), 6)
+    return Calibration(width=width, height=height, intrinsics=k.astype(np.float64).reshape(3, 3))
 
 
 def transforms(rows: Sequence[tuple[str, str, Pose]]) -> bytes:
     """tf2_msgs/TFMessage at time 0: (parent frame, child frame, parent_from_child) each."""
-    message = CdrWriter()
-    message.u32(len(rows))
-    for parent, child, pose in rows:
-        message.header(parent)
-        message.text(child)
-        message.floats(pose.vector().tolist())
-    return message.finish()
+    return encode(
+        TRANSFORMS,
+        [((_stamp(0), parent), child, (pose.position, pose.quat_xyzw)) for parent, child, pose in rows],
+    )
 
 
 def label_info(labels: Sequence[tuple[int, str]]) -> bytes:
     """vision_msgs/LabelInfo: which number stands for what in segmentation pictures."""
-    message = CdrWriter()
-    message.header("")
-    message.u32(len(labels))
-    for number, name in labels:
-        message.u16(number)
-        message.text(name)
-    message.f32(0.0)
-    return message.finish()
+    return encode(LABEL_INFO, (_stamp(0), ""), labels, 0.0)
 
 
 def read_label_info(data: bytes) -> dict[int, str]:
     """Inverse of `label_info`."""
-    message = CdrReader(data)
-    message.header()
-    return {message.u16(): message.text() for _ in range(message.u32())}
+    _, labels = islice(CdrReader(data).values(LABEL_INFO), 2)
+    return dict(labels)

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from demorec.errors import RecordingError, in_words
 from demorec.plain import to_json
 from demorec.recording.video import VideoSettings
+from demorec.scene.collected import CollectedOutcome
 from demorec.scene.episode import FORMAT_VERSION, EpisodeInfo, Outcome
 from demorec.scene.validity import from_description, read_episode_info
 
@@ -21,6 +22,7 @@ COLLECTED = "demorec.collected"
 """In place of EPISODE in the recordings of `demorec.recording.collected`."""
 OUTCOME = "demorec.outcome"
 RECOVERED = "demorec.recovered"
+"""Of a recording that a crash cut off."""
 _CHECKSUM = "crc32"
 _KNOWN_VERSIONS = tuple(str(version) for version in range(1, FORMAT_VERSION + 1))
 
@@ -55,14 +57,10 @@ def episode_metadata(info: EpisodeInfo, cameras: Mapping[str, CameraStreams]) ->
     )
 
 
-def outcome_metadata(outcome: Outcome) -> dict[str, str]:
+def outcome_metadata(outcome: Outcome | CollectedOutcome) -> dict[str, str]:
     """The record that ends a complete recording."""
-    return sealed({"success": str(outcome.success).lower(), "outcome": to_json(outcome)})
-
-
-def recovered_metadata(*, kept_frames: int) -> dict[str, str]:
-    """The record of a recording that a crash cut off."""
-    return sealed({"kept_frames": str(kept_frames)})
+    success = "unknown" if outcome.success is None else str(outcome.success).lower()
+    return sealed({"success": success, "outcome": to_json(outcome)})
 
 
 def read_episode_metadata(metadata: Mapping[str, str]) -> tuple[EpisodeInfo, dict[str, CameraStreams]]:
@@ -99,13 +97,15 @@ def _check_cameras(info: EpisodeInfo, cameras: Mapping[str, CameraStreams]) -> N
             raise ValueError(f"the video of the camera {camera.name!r} has a GOP of {video.gop}")
 
 
-def read_outcome_metadata(metadata: Mapping[str, str]) -> Outcome:
-    """Inverse of `outcome_metadata`; RecordingError on damage."""
+def read_outcome_metadata[O: Outcome | CollectedOutcome](metadata: Mapping[str, str], kind: type[O]) -> O:
+    """Inverse of `outcome_metadata`, of such an outcome; RecordingError on damage."""
     check_seal(OUTCOME, metadata)
     try:
-        outcome = from_description(metadata["outcome"], Outcome)
-        if min(outcome.num_frames, outcome.num_retries) < 0:
-            raise ValueError("a number of frames or retries below 0")
+        outcome = from_description(metadata["outcome"], kind)
+        is_ours = isinstance(outcome, Outcome)
+        counts = [outcome.num_retries] if isinstance(outcome, Outcome) else outcome.drops.values()
+        if min(outcome.num_frames, *counts, 0) < 0:
+            raise ValueError(f"a number of frames or {'retries' if is_ours else 'drops'} below 0")
     except (KeyError, ValueError) as error:
         raise RecordingError(f"The recording's outcome cannot be read ({in_words(error)})") from error
     return outcome

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -27,12 +28,7 @@ _LATCHED_QOS = (
 """Quality of service of topics that are said once: "transient local", so that a late subscriber hears them too."""
 
 
-def part_path(path: Path) -> Path:
-    """Where the file is while it is being written."""
-    return path.with_name(path.name + ".part")
-
-
-class _Disk:
+class _Disk(io.FileIO):
     """The file below the MCAP writer, unbuffered.
 
     It keeps the first error, stores nothing more after it and goes on as if it did: the writer, told of it, would print
@@ -40,42 +36,35 @@ class _Disk:
     """
 
     def __init__(self, path: Path) -> None:
-        self._file = path.open("wb", buffering=0)
-        self._position = self._end = 0  # as the writer knows them
+        super().__init__(path, "w")
+        self._place = self._end = 0  # as the writer knows them
         self.error: OSError | None = None
 
-    def write(self, data: bytes) -> int:
+    def write(self, data: bytes) -> int:  # type: ignore[override]
         """Write all of it, unless an earlier write failed."""
         rest = memoryview(data)
         try:
             while rest and self.error is None:
-                rest = rest[self._file.write(rest) :]
+                rest = rest[super().write(rest) :]
         except OSError as error:
             self.error = error
-        self._position += len(data)
-        self._end = max(self._end, self._position)
+        self._place += len(data)
+        self._end = max(self._end, self._place)
         return len(data)
 
     def seek(self, offset: int, whence: int = 0) -> int:
         """As any file."""
-        self._position = offset + (0, self._position, self._end)[whence]
+        self._place = offset + (0, self._place, self._end)[whence]
         if self.error is None:
-            self._file.seek(self._position)
-        return self._position
-
-    def flush(self) -> None:
-        """Nothing is buffered here."""
+            super().seek(self._place)
+        return self._place
 
     def sync(self) -> None:
         """Have the operating system put everything on the disk."""
         try:
-            os.fsync(self._file.fileno())
+            os.fsync(self.fileno())
         except OSError as error:
             self.error = self.error or error
-
-    def close(self) -> None:
-        """Close it."""
-        self._file.close()
 
 
 class PartFile:
@@ -101,7 +90,7 @@ class PartFile:
         overwrite: bool = False,
         is_worthless: Callable[[Path], bool] = lambda part: False,
     ) -> None:
-        self.path, self.part, self._overwrite = path, part or part_path(path), overwrite
+        self.path, self.part, self._overwrite = path, part or path.with_name(f"{path.name}.part"), overwrite
         self._check_free()
         try:
             # Held until the file has its name or is left: no other process takes it for what a dead one left.

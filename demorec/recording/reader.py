@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import json
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from types import MappingProxyType
 
@@ -12,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.errors import RecordingError
-from demorec.plain import to_json, to_plain
+from demorec.plain import to_json
 from demorec.recording import channels, messages, metadata
 from demorec.recording.chunks import Block
 from demorec.recording.container import damage_as_recording_error
@@ -21,7 +20,7 @@ from demorec.recording.episode_file import EpisodeFile
 from demorec.recording.labels import LabelDecoder, from_labels
 from demorec.recording.streams import Columns, FrameStream, frame_streams, merged_columns
 from demorec.recording.video import Rgb, VideoPacket, VideoSettings, is_keyframe
-from demorec.scene.episode import EpisodeColumns, Event, JointSample, frame_time_ns
+from demorec.scene.episode import EpisodeColumns, EpisodeInfo, Event, JointSample, Outcome, frame_time_ns
 from demorec.scene.urdf import check_primitives
 
 
@@ -29,7 +28,7 @@ class CollectedEpisodeError(RecordingError):
     """The recording is one of a collected episode, which `CollectedRecording` reads."""
 
 
-class RecordingReader(EpisodeFile):
+class RecordingReader(EpisodeFile[Outcome, metadata.CameraStreams]):
     """What one file holds: numbers as columns, pictures as packets or decoded, labels; a context manager.
 
     Attributes:
@@ -42,6 +41,7 @@ class RecordingReader(EpisodeFile):
         RecordingError: No recording, cut off, damaged, or of an unknown format version; so do all methods.
     """
 
+    info: EpisodeInfo
     _said: tuple[tuple[int, bytes], ...] | None = None
     """(time_ns, message) of all events, once `columns` has come by them: they lie among the numbers in the file."""
     _packed_labels: Mapping[str, Block] = MappingProxyType({})
@@ -58,10 +58,7 @@ class RecordingReader(EpisodeFile):
             raise RecordingError(f"The MCAP file is no demorec recording, it has no episode metadata: {self.path}")
         try:
             self.info, self._cameras = metadata.read_episode_metadata(found)
-            outcome = self._container.metadata(metadata.OUTCOME)
-            self.outcome = None if outcome is None else metadata.read_outcome_metadata(outcome)
-            self.num_frames = self._container.counts.get(channels.GRIPPER, 0)
-            self._check_end(self.num_frames, None if self.outcome is None else self.outcome.num_frames)
+            self._read_end(channels.GRIPPER, Outcome)
             if self.num_frames and len(self._cameras) != len(self.info.scene.cameras):
                 raise RecordingError("The recording has frames, but none of its scene's cameras was recorded")
         except RecordingError as error:
@@ -83,14 +80,6 @@ class RecordingReader(EpisodeFile):
     def has_segmentation(self, camera: str) -> bool:
         """Whether segmentation pictures of a camera were recorded."""
         return self._camera(camera).segmentation
-
-    def _camera(self, camera: str) -> metadata.CameraStreams:
-        if camera not in self._cameras:
-            raise RecordingError(
-                f"The recording has no camera {camera!r}, its cameras are {', '.join(self._cameras) or 'none'}: "
-                f"{self.path}"
-            )
-        return self._cameras[camera]
 
     def _frame_times(self) -> NDArray[np.int64]:
         """(T,) `frame_time_ns` of every frame."""
@@ -129,22 +118,18 @@ class RecordingReader(EpisodeFile):
     def description(self, body: str = "") -> str:
         """URDF of the robot, or of the body of that name: primitives only, complete without any other file."""
         topic = channels.description_topic(body)
-        for message in self._container.messages((topic,)):
+        for _, text in self._read(topic, messages.read_string):
             with damage_as_recording_error(self.path):
-                text = messages.read_string(message.data)
                 check_primitives(text)
-                return text
+            return text
         raise RecordingError(f"The recording has no description on {topic}: {self.path}")
 
     def joint_samples(self) -> Iterator[JointSample]:
         """Every recorded joint state in order of time: the frames' own and those between them."""
         stream = next(row for row in frame_streams(self.info) if row.topic == channels.JOINT_STATES)
-        for message in self._container.messages((channels.JOINT_STATES,)):
-            with damage_as_recording_error(self.path):
-                position, velocity, effort = stream.layout.decode([message.data]).reshape(3, -1)
-            yield JointSample(
-                time_ns=message.time_ns, joint_position=position, joint_velocity=velocity, joint_effort=effort
-            )
+        read = self._read(channels.JOINT_STATES, lambda data: stream.layout.decode([data]).reshape(3, -1))
+        for time_ns, (position, velocity, effort) in read:
+            yield JointSample(time_ns=time_ns, joint_position=position, joint_velocity=velocity, joint_effort=effort)
 
     def events(self) -> Iterator[tuple[int, Event]]:
         """(time_ns, event) in order of time; changes of phase are in `columns().phase`."""
@@ -159,7 +144,8 @@ class RecordingReader(EpisodeFile):
         """The coded pictures of a camera, one a frame, in order."""
         codec = self.video_settings(camera).codec
         read = messages.read_protobuf_video if codec == "av1" else messages.read_compressed_image
-        for index, (time_ns, data) in enumerate(self._pictures(channels.video_topic(camera, codec), read)):
+        for index, data in enumerate(self._pictures(channels.video_topic(camera, codec), read)):
+            time_ns = frame_time_ns(index, self.info.fps)
             yield VideoPacket(frame_index=index, time_ns=time_ns, data=data, is_keyframe=is_keyframe(codec, data))
 
     def coded_pictures(self, cameras: Sequence[str]) -> dict[str, Block]:
@@ -195,14 +181,12 @@ class RecordingReader(EpisodeFile):
         if not self.has_depth(camera):
             raise RecordingError(f"The recording has no depth pictures of the camera {camera!r}: {self.path}")
         topic, size = channels.camera_topic(camera, "depth"), self._size(camera)
-        for _, picture in self._pictures(topic, lambda data: decode_depth(messages.read_compressed_image(data), size)):
-            yield picture
+        yield from self._pictures(topic, lambda data: decode_depth(messages.read_compressed_image(data), size))
 
     def segmentation(self, camera: str) -> Iterator[NDArray[np.int32]]:
         """Segmentation pictures, (H, W) int32 as in `CameraImages`, one a frame; `segment_names` tells what is what."""
         topic, decoder = self._segmentation_topic(camera), LabelDecoder(self._size(camera))
-        for _, labels in self._pictures(topic, lambda data: decoder.decode(messages.read_compressed_image(data))):
-            yield labels
+        yield from self._pictures(topic, lambda data: decoder.decode(messages.read_compressed_image(data)))
 
     def segmentation_at(
         self, cameras: Sequence[str], frames: Collection[int]
@@ -255,17 +239,15 @@ class RecordingReader(EpisodeFile):
                 return messages.read_label_info(message)
         return {}
 
-    def _pictures[P](self, topic: str, read: Callable[[bytes], P]) -> Iterator[tuple[int, P]]:
-        """(time_ns, picture) of a topic that has one message a frame."""
+    def _pictures[P](self, topic: str, read: Callable[[bytes], P]) -> Iterator[P]:
+        """The pictures of a topic that has one message a frame."""
         count = 0
-        for message in self._container.messages((topic,)):
-            if count >= self.num_frames or message.time_ns != frame_time_ns(count, self.info.fps):
+        for time_ns, picture in self._read(topic, read):
+            if count >= self.num_frames or time_ns != frame_time_ns(count, self.info.fps):
                 raise RecordingError(
-                    f"Picture {count} of {topic} is at {message.time_ns} ns, not at its frame's time: {self.path}"
+                    f"Picture {count} of {topic} is at {time_ns} ns, not at its frame's time: {self.path}"
                 )
-            with damage_as_recording_error(self.path):
-                picture = read(message.data)
-            yield message.time_ns, picture
+            yield picture
             count += 1
         self._check_num_pictures(topic, count)
 
@@ -289,10 +271,8 @@ class RecordingReader(EpisodeFile):
 
     def calibration(self, camera: str) -> messages.Calibration:
         """What the calibration message of a camera says, which is what other programs go by."""
-        topic = channels.camera_topic(camera, "camera_info")
-        for message in self._container.messages((topic,)):
-            with damage_as_recording_error(self.path):
-                return messages.read_camera_info(message.data)
+        for _, found in self._read(channels.camera_topic(camera, "camera_info"), messages.read_camera_info):
+            return found
         raise RecordingError(f"The recording has no calibration of the camera {camera!r}: {self.path}")
 
     def digest(self) -> str:
@@ -302,10 +282,7 @@ class RecordingReader(EpisodeFile):
         episode to the bit. A column that the format version does not have is not part of it, so that recordings of
         older versions keep their digests.
         """
-        described = to_plain(self.info)
-        del described["versions"], described["format_version"]
-        result = hashlib.sha256(json.dumps(described, sort_keys=True).encode())
-        result.update(b"no outcome" if self.outcome is None else to_json(self.outcome).encode())
+        result = self._digest_of_description()
         for name, value in _column_bytes(self.columns()):
             result.update(name.encode() + value)
         for sample in self.joint_samples():

@@ -10,21 +10,26 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
+
+from mcap.records import Metadata
 
 from demorec.errors import ConfigError, RecordingError, resource_error, without_path
 from demorec.recording import channels, messages, metadata
-from demorec.recording.collected.metadata import read_collected_metadata, read_collected_outcome
+from demorec.recording.collected.metadata import read_collected_metadata
 from demorec.recording.collected.reader import CollectedRecording
 from demorec.recording.collected.streams import FRAMES, feature_streams
-from demorec.recording.container import SalvagedMessage, SalvagedMetadata, salvage
+from demorec.recording.container import SalvagedMessage, salvage
 from demorec.recording.opening import open_recording
 from demorec.recording.part_file import PartFile
 from demorec.recording.recording import Recording
 from demorec.recording.ros2 import DEFINITIONS
 from demorec.recording.streams import frame_streams
 from demorec.safety.files import make_folder
-from demorec.scene.collected import Origin
-from demorec.scene.episode import frame_time_ns
+from demorec.scene.collected import CollectedOutcome, Origin
+from demorec.scene.episode import Outcome, frame_time_ns
+
+_KNOWN_TYPES = {*DEFINITIONS, messages.PROTOBUF_VIDEO}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,10 +62,9 @@ def recover(source: Path, target: Path, *, overwrite: bool = False) -> Recovered
         raise ConfigError(f"The recovered recording needs another name than the damaged one: {source}")
     try:
         survey = _survey(source)
+        frames = survey.frames
     except RecordingError as error:
         raise RecordingError(f"{without_path(error, source)}: {source}") from error
-    if survey.num_frames == 0:
-        raise RecordingError(f"Nothing can be recovered, the file holds no whole frame ({survey.reason}): {source}")
     make_folder(target.parent)
     num_messages = 0
     seen: Counter[str] = Counter()
@@ -68,14 +72,13 @@ def recover(source: Path, target: Path, *, overwrite: bool = False) -> Recovered
     part = target.with_name(f"{target.name}.recovering")
     file = PartFile(target, part=part, overwrite=overwrite, is_worthless=lambda part: True)
     try:
-        for name, values in survey.episode.items():
-            file.metadata(name, values)
+        file.metadata(*survey.episode)
         for item in _items(source):
             if isinstance(item, str):
                 break
             if isinstance(item, SalvagedMessage):
                 seen[item.topic] += 1
-                if survey.keeps(item, seen[item.topic]) and _is_known(item.schema):
+                if frames.keeps(item, seen[item.topic]) and item.schema in _KNOWN_TYPES:
                     file.log(item.topic, item.schema, item.data, item.time_ns, latched=item.is_latched)
                     num_messages += 1
             elif item is None:
@@ -83,9 +86,9 @@ def recover(source: Path, target: Path, *, overwrite: bool = False) -> Recovered
         if survey.outcome is not None:
             file.metadata(metadata.OUTCOME, survey.outcome)
         else:
-            file.metadata(metadata.RECOVERED, metadata.recovered_metadata(kept_frames=survey.num_frames))
+            file.metadata(metadata.RECOVERED, metadata.sealed({"kept_frames": str(frames.num_frames)}))
         file.end()
-        with survey.reader(part) as recording:
+        with frames.reader(part) as recording:
             recording.columns()  # a recovered file that cannot be read would be worse than none
         file.publish()
     except BaseException:
@@ -93,7 +96,7 @@ def recover(source: Path, target: Path, *, overwrite: bool = False) -> Recovered
         raise
     return Recovered(
         path=target,
-        num_frames=survey.num_frames,
+        num_frames=frames.num_frames,
         num_messages=num_messages,
         is_complete=survey.outcome is not None,
         reason="" if survey.outcome is not None else survey.reason,
@@ -117,17 +120,33 @@ def can_be_made_again(part: Path, *, origin: str | Origin) -> bool:
         origin: That of the recording that is about to be written in its place, as its info has it.
     """
     for item in _items(part):
-        if isinstance(item, SalvagedMetadata) and item.name == metadata.EPISODE:
-            info, _ = metadata.read_episode_metadata(item.values)
+        if isinstance(item, Metadata) and item.name == metadata.EPISODE:
+            info, _ = metadata.read_episode_metadata(item.metadata)
             return bool(origin) and info.origin == origin
-        if isinstance(item, SalvagedMetadata) and item.name == metadata.COLLECTED:
-            collected, _, _ = read_collected_metadata(item.values)
+        if isinstance(item, Metadata) and item.name == metadata.COLLECTED:
+            collected, _, _ = read_collected_metadata(item.metadata)
             return collected.origin.kind == "import" and collected.origin == origin
         if isinstance(item, str):
             return item == "the end is missing"  # after nothing: the writer was killed before the first frame
         if item is not None:
             return False
     return True  # it ended in order, before the first frame
+
+
+class _Frames(NamedTuple):
+    """What the metadata and the messages of an episode say of its frames.
+
+    Attributes:
+        num_frames: That all streams have in common.
+        keeps: Whether a message belongs to these frames, given which message of its topic it is, from 1.
+        reader: Of such recordings.
+        outcome: Of such episodes.
+    """
+
+    num_frames: int
+    keeps: Callable[[SalvagedMessage, int], bool]
+    reader: type[Recording] | type[CollectedRecording]
+    outcome: type[Outcome] | type[CollectedOutcome]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,21 +156,17 @@ class _Survey:
     Attributes:
         episode: Name and values of the metadata that say what is recorded.
         outcome: How it ended, where all of it is there.
-        num_frames: That all streams have in common.
+        frames: What is there of them.
         reason: Why reading stopped.
-        keeps: Whether a message belongs to these frames, given which message of its topic it is, from 1.
-        reader: Of such recordings.
     """
 
-    episode: dict[str, dict[str, str]]
+    episode: tuple[str, dict[str, str]]
     outcome: dict[str, str] | None
-    num_frames: int
+    frames: _Frames
     reason: str
-    keeps: Callable[[SalvagedMessage, int], bool] = lambda message, count: True
-    reader: type[Recording] | type[CollectedRecording] = Recording
 
 
-def _items(source: Path) -> Iterator[SalvagedMessage | SalvagedMetadata | str | None]:
+def _items(source: Path) -> Iterator[SalvagedMessage | Metadata | str | None]:
     try:
         yield from salvage(source)
     except OSError as error:
@@ -160,64 +175,48 @@ def _items(source: Path) -> Iterator[SalvagedMessage | SalvagedMetadata | str | 
 
 
 def _survey(source: Path) -> _Survey:
-    """Read everything once to learn how many frames all streams have in common."""
+    """Read everything once to learn how many frames all streams have in common; RecordingError when it is none."""
     found: dict[str, dict[str, str]] = {}
     reason = ""
     counts: Counter[str] = Counter()
     for item in _items(source):
         if isinstance(item, str):
             reason = item
-        elif isinstance(item, SalvagedMetadata):
-            metadata.check_seal(item.name, item.values)
-            found[item.name] = item.values
+        elif isinstance(item, Metadata):
+            metadata.check_seal(item.name, item.metadata)
+            found[item.name] = item.metadata
         elif item is not None:
             counts[item.topic] += 1
-    outcome = found.get(metadata.OUTCOME)
-    for name, survey in ((metadata.EPISODE, _survey_of_episode), (metadata.COLLECTED, _survey_of_collected)):
-        if name in found:
-            return survey(found[name], outcome, counts, reason or "the end is missing")
-    return _Survey(episode={}, outcome=None, num_frames=0, reason=reason or "no episode metadata")
+    for name, look in ((metadata.EPISODE, _frames_of_episode), (metadata.COLLECTED, _frames_of_collected)):
+        if name not in found:
+            continue
+        frames, outcome, reason = look(found[name], counts), found.get(metadata.OUTCOME), reason or "the end is missing"
+        if outcome is not None:
+            ended = metadata.read_outcome_metadata(outcome, frames.outcome)
+            outcome = outcome if ended.num_frames == frames.num_frames else None
+        if frames.num_frames:
+            return _Survey(episode=(name, found[name]), outcome=outcome, frames=frames, reason=reason)
+    raise RecordingError(f"Nothing can be recovered, the file holds no whole frame ({reason or 'no episode metadata'})")
 
 
-def _survey_of_episode(
-    episode: dict[str, str], outcome: dict[str, str] | None, counts: Counter[str], reason: str
-) -> _Survey:
+def _frames_of_episode(episode: dict[str, str], counts: Counter[str]) -> _Frames:
     info, cameras = metadata.read_episode_metadata(episode)
     topics = [stream.topic for stream in frame_streams(info) if stream.topic != channels.JOINT_STATES]
     for camera, streams in cameras.items():
         topics.append(channels.video_topic(camera, streams.video.codec))
         topics += [channels.camera_topic(camera, name) for name in ("depth", "segmentation") if getattr(streams, name)]
     num_frames = min(counts[topic] for topic in topics)
-    if outcome is not None and metadata.read_outcome_metadata(outcome).num_frames != num_frames:
-        outcome = None
     last_ns = frame_time_ns(max(num_frames - 1, 0), info.fps)
-    return _Survey(
-        episode={metadata.EPISODE: episode},
-        outcome=outcome,
-        num_frames=num_frames,
-        reason=reason,
-        keeps=lambda message, count: message.time_ns <= last_ns,
-    )
+    return _Frames(num_frames, lambda message, count: message.time_ns <= last_ns, Recording, Outcome)
 
 
-def _survey_of_collected(
-    episode: dict[str, str], outcome: dict[str, str] | None, counts: Counter[str], reason: str
-) -> _Survey:
+def _frames_of_collected(episode: dict[str, str], counts: Counter[str]) -> _Frames:
     """Pictures come before the frames that hold them, so what is there of the frames has its pictures."""
     info, _, _ = read_collected_metadata(episode)
     topics = {FRAMES, *(stream.topic for stream in feature_streams(info).values())}
     num_frames = min(counts[topic] for topic in topics)
-    if outcome is not None and read_collected_outcome(outcome).num_frames != num_frames:
-        outcome = None
-    return _Survey(
-        episode={metadata.COLLECTED: episode},
-        outcome=outcome,
-        num_frames=num_frames,
-        reason=reason,
-        keeps=lambda message, count: message.topic not in topics | {channels.TF} or count <= num_frames,
-        reader=CollectedRecording,
-    )
 
+    def keeps(message: SalvagedMessage, count: int) -> bool:
+        return message.topic not in topics | {channels.TF} or count <= num_frames
 
-def _is_known(schema: str) -> bool:
-    return schema in DEFINITIONS or schema == messages.PROTOBUF_VIDEO
+    return _Frames(num_frames, keeps, CollectedRecording, CollectedOutcome)

@@ -5,8 +5,18 @@ From common_interfaces, rcl_interfaces, geometry2, vision_msgs and foxglove_msgs
 
 from __future__ import annotations
 
+import re
+from collections.abc import Mapping
+from functools import cache
+from typing import NamedTuple
+
+
+def _definition(fields: str, *dependencies: str) -> str:
+    return ("=" * 80 + "\n").join((fields, *dependencies))
+
+
 _TIME = "MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
-_HEADER = "MSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
+_HEADER = _definition("MSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n", _TIME)
 _VECTOR3 = "MSG: geometry_msgs/Vector3\nfloat64 x\nfloat64 y\nfloat64 z\n"
 _QUATERNION = "MSG: geometry_msgs/Quaternion\nfloat64 x\nfloat64 y\nfloat64 z\nfloat64 w\n"
 _POINT = "MSG: geometry_msgs/Point\nfloat64 x\nfloat64 y\nfloat64 z\n"
@@ -26,10 +36,6 @@ _ARRAY_DIMENSION = "MSG: std_msgs/MultiArrayDimension\nstring label\nuint32 size
 _VISION_CLASS = "MSG: vision_msgs/VisionClass\nuint16 class_id\nstring class_name\n"
 
 
-def _definition(fields: str, *dependencies: str) -> str:
-    return ("=" * 80 + "\n").join((fields, *dependencies))
-
-
 DEFINITIONS: dict[str, str] = {
     "std_msgs/msg/String": "string data\n",
     "std_msgs/msg/Bool": "bool data\n",
@@ -40,41 +46,29 @@ DEFINITIONS: dict[str, str] = {
         "std_msgs/MultiArrayLayout layout\nfloat64[] data\n", _ARRAY_LAYOUT, _ARRAY_DIMENSION
     ),
     "sensor_msgs/msg/JointState": _definition(
-        "std_msgs/Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort\n",
-        _HEADER,
-        _TIME,
+        "std_msgs/Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort\n", _HEADER
     ),
     "geometry_msgs/msg/PoseStamped": _definition(
-        "std_msgs/Header header\ngeometry_msgs/Pose pose\n", _HEADER, _TIME, _POSE, _POINT, _QUATERNION
+        "std_msgs/Header header\ngeometry_msgs/Pose pose\n", _HEADER, _POSE, _POINT, _QUATERNION
     ),
     "geometry_msgs/msg/WrenchStamped": _definition(
-        "std_msgs/Header header\ngeometry_msgs/Wrench wrench\n", _HEADER, _TIME, _WRENCH, _VECTOR3
+        "std_msgs/Header header\ngeometry_msgs/Wrench wrench\n", _HEADER, _WRENCH, _VECTOR3
     ),
     "tf2_msgs/msg/TFMessage": _definition(
-        "geometry_msgs/TransformStamped[] transforms\n",
-        _TRANSFORM_STAMPED,
-        _TRANSFORM,
-        _HEADER,
-        _TIME,
-        _VECTOR3,
-        _QUATERNION,
+        "geometry_msgs/TransformStamped[] transforms\n", _TRANSFORM_STAMPED, _TRANSFORM, _HEADER, _VECTOR3, _QUATERNION
     ),
     "sensor_msgs/msg/CameraInfo": _definition(
         "std_msgs/Header header\nuint32 height\nuint32 width\nstring distortion_model\nfloat64[] d\nfloat64[9] k\n"
         "float64[9] r\nfloat64[12] p\nuint32 binning_x\nuint32 binning_y\nsensor_msgs/RegionOfInterest roi\n",
         _HEADER,
-        _TIME,
         _ROI,
     ),
     "sensor_msgs/msg/Image": _definition(
         "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\nuint32 step\n"
         "uint8[] data\n",
         _HEADER,
-        _TIME,
     ),
-    "sensor_msgs/msg/CompressedImage": _definition(
-        "std_msgs/Header header\nstring format\nuint8[] data\n", _HEADER, _TIME
-    ),
+    "sensor_msgs/msg/CompressedImage": _definition("std_msgs/Header header\nstring format\nuint8[] data\n", _HEADER),
     "foxglove_msgs/msg/CompressedVideo": _definition(
         "builtin_interfaces/Time timestamp\nstring frame_id\nuint8[] data\nstring format\n", _TIME
     ),
@@ -84,9 +78,40 @@ DEFINITIONS: dict[str, str] = {
         _TIME,
     ),
     "vision_msgs/msg/LabelInfo": _definition(
-        "std_msgs/Header header\nvision_msgs/VisionClass[] class_map\nfloat32 threshold\n",
-        _HEADER,
-        _TIME,
-        _VISION_CLASS,
+        "std_msgs/Header header\nvision_msgs/VisionClass[] class_map\nfloat32 threshold\n", _HEADER, _VISION_CLASS
     ),
 }
+_FIELD = re.compile(r"^([\w/]+)(\[(\d*)\])?\s+(\w+)$")
+
+
+class FieldType(NamedTuple):
+    """A field of a message; `length` is that of an array, None where each message says it."""
+
+    name: str
+    kind: str
+    is_array: bool
+    length: int | None
+
+
+Types = Mapping[str, tuple[FieldType, ...]]
+"""Type -> its fields; "" is the message itself."""
+
+
+@cache
+def types_of(schema: str) -> Types:
+    """What the definition of a type says."""
+    first, *others = re.split(r"^=+\n", DEFINITIONS[schema], flags=re.MULTILINE)
+    types = {"": _fields(first)}
+    for text in others:
+        head, _, body = text.partition("\n")
+        types[head.removeprefix("MSG: ")] = _fields(body)
+    return types
+
+
+def _fields(text: str) -> tuple[FieldType, ...]:
+    found = (_FIELD.match(line) for line in text.splitlines())  # constants, which have a value, do not match
+    return tuple(
+        FieldType(match[4], match[1], match[2] is not None, int(match[3]) if match[3] else None)
+        for match in found
+        if match is not None
+    )

@@ -30,14 +30,14 @@ class Primitive:
         center: (x, y, z) in the mesh's frame.
         axis: 0, 1 or 2: the cylinder's direction; 2 for the others.
         size: box: full extents; cylinder: (radius, length); sphere: (radius,).
-        volume: Of it.
+        volume: Of one that was fitted to a mesh.
     """
 
     kind: Literal["box", "cylinder", "sphere"]
-    center: tuple[float, float, float]
-    axis: int
     size: tuple[float, ...]
-    volume: float
+    center: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    axis: int = 2
+    volume: float = 0.0
 
 
 def fit_primitives(

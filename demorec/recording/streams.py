@@ -10,14 +10,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache, partial
-from typing import Any, NamedTuple
+from functools import partial
+from operator import attrgetter
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from demorec.geometry import Array, Pose
 from demorec.recording import messages
-from demorec.recording.cdr import CdrWriter, Layout
+from demorec.recording.cdr import Layout, Slot, layout
 from demorec.recording.channels import (
     ACTION,
     COMMAND,
@@ -35,6 +36,10 @@ from demorec.scene.robot import RobotSpec
 
 GRIPPER_JOINT = "gripper"
 """Name of the gripper's opening beside the joints' names."""
+
+POSE_SLOTS = ((Slot.VALUE,) * 3, (Slot.VALUE,) * 4)
+"""Position and quaternion xyzw in a layout."""
+_WRENCH_SLOTS = ((Slot.VALUE,) * 3, (Slot.VALUE,) * 3)
 
 Columns = dict[str, Array | dict[str, Array]]
 """Field of `EpisodeColumns` -> its rows, or name -> rows where the field is a mapping."""
@@ -102,30 +107,27 @@ def _every_stream(info: EpisodeInfo) -> Iterator[FrameStream]:
     robot, scene = info.robot, info.scene
     arm_and_gripper = (*robot.arm_joints, GRIPPER_JOINT)
     base = robot.base_link
-    yield _joints(JOINT_STATES, robot.joint_names, _joint_state_parts, _joint_state_columns)
+    joint_state = attrgetter(*(f"observation.{name}" for name in _JOINT_STATE))
+    yield _joints(JOINT_STATES, robot.joint_names, joint_state, _joint_state_columns)
     yield _joints(GRIPPER, (GRIPPER_JOINT,), partial(_gripper_parts, robot), _gripper_columns)
-    yield _joints(
-        ACTION, arm_and_gripper, lambda v: _targets(v.action), partial(_target_columns, "action"), _with_zeros
-    )
-    yield _joints(
-        COMMAND, arm_and_gripper, lambda v: _targets(v.command), partial(_target_columns, "command"), _with_zeros
-    )
-    yield _pose(EE_POSE, base, lambda v: v.observation.base_from_tcp, "base_from_tcp")
-    yield _pose(ACTION + EE_POSE, base, lambda v: v.action.base_from_tcp_target, "action_base_from_tcp")
-    yield _pose(COMMAND + EE_POSE, base, lambda v: v.command.base_from_tcp_target, "command_base_from_tcp")
+    for topic, kind in ((ACTION, "action"), (COMMAND, "command")):
+        yield _joints(topic, arm_and_gripper, partial(_targets, kind), partial(_target_columns, kind), _with_zeros)
+    yield _pose(EE_POSE, base, "observation.base_from_tcp", "base_from_tcp")
+    yield _pose(ACTION + EE_POSE, base, "action.base_from_tcp_target", "action_base_from_tcp")
+    yield _pose(COMMAND + EE_POSE, base, "command.base_from_tcp_target", "command_base_from_tcp")
     yield FrameStream(
         topic=WRENCH,
         schema=messages.WRENCH,
-        layout=_stamped_layout(robot.hand_link, 6),
+        layout=layout(messages.WRENCH, (Slot.TIME, robot.hand_link), _WRENCH_SLOTS),
         parts=_wrench_parts,
         columns=lambda values: {"wrench": values},
         since=2,
     )
     for body in scene.movable:
-        yield _pose(object_topic(body.name), WORLD, partial(_object_pose, body.name), "object_poses", body.name)
+        yield _pose(object_topic(body.name), WORLD, "observation.object_poses", "object_poses", body.name)
     for camera in scene.cameras:
         topic = camera_topic(camera.name, "pose")
-        yield _pose(topic, WORLD, partial(_camera_pose, camera.name), "world_from_camera", camera.name)
+        yield _pose(topic, WORLD, "world_from_camera", "world_from_camera", camera.name)
 
 
 def tf_stream(frames: FrameTree) -> FrameStream:
@@ -142,13 +144,8 @@ def tf_stream(frames: FrameTree) -> FrameStream:
 
 def transforms_layout(frames: Sequence[tuple[str, str]]) -> Layout:
     """Of tf2_msgs/TFMessage with these (parent, child): position and quaternion xyzw of each."""
-    message = CdrWriter()
-    message.u32(len(frames))
-    for parent, child in frames:
-        message.header(parent)
-        message.text(child)
-        message.value_slot(7)
-    return message.layout()
+    rows = tuple(((Slot.TIME, parent), child, POSE_SLOTS) for parent, child in frames)
+    return layout(messages.TRANSFORMS, rows)
 
 
 def merged_columns(found: Iterable[Columns]) -> dict[str, Any]:
@@ -180,21 +177,12 @@ def observation_at(columns: EpisodeColumns, frame: int) -> Observation:
     )
 
 
-def action_at(columns: EpisodeColumns, frame: int) -> Action:
-    """What the expert wanted at a frame."""
+def action_at(columns: EpisodeColumns, frame: int, kind: Literal["action", "command"]) -> Action:
+    """What the expert wanted at a frame, or the command that was sent to the motors."""
     return Action(
-        joint_target=columns.action_joint_target[frame].copy(),
-        gripper_target=float(columns.action_gripper[frame]),
-        base_from_tcp_target=pose_of(columns.action_base_from_tcp[frame]),
-    )
-
-
-def command_at(columns: EpisodeColumns, frame: int) -> Action:
-    """What was sent to the motors at a frame."""
-    return Action(
-        joint_target=columns.command_joint_target[frame].copy(),
-        gripper_target=float(columns.command_gripper[frame]),
-        base_from_tcp_target=pose_of(columns.command_base_from_tcp[frame]),
+        joint_target=getattr(columns, f"{kind}_joint_target")[frame].copy(),
+        gripper_target=float(getattr(columns, f"{kind}_gripper")[frame]),
+        base_from_tcp_target=pose_of(getattr(columns, f"{kind}_base_from_tcp")[frame]),
     )
 
 
@@ -206,14 +194,11 @@ def pose_of(row: Array) -> Pose:
 # ------------------------------------------------------------------------------------ what the rows are made of
 
 
-def _joint_state_parts(values: FrameValues) -> Sequence[Array]:
-    observation = values.observation
-    return observation.joint_position, observation.joint_velocity, observation.joint_effort
+_JOINT_STATE = ("joint_position", "joint_velocity", "joint_effort")
 
 
 def _joint_state_columns(values: Array) -> Columns:
-    names = ("joint_position", "joint_velocity", "joint_effort")
-    return {name: part.copy() for name, part in zip(names, np.split(values, 3, axis=1), strict=True)}
+    return {name: part.copy() for name, part in zip(_JOINT_STATE, np.split(values, 3, axis=1), strict=True)}
 
 
 def _gripper_parts(robot: RobotSpec, values: FrameValues) -> Sequence[Array]:
@@ -227,7 +212,8 @@ def _gripper_columns(values: Array) -> Columns:
     return {"gripper_width": values[:, 0].copy(), "contact_force": values[:, 2].copy()}
 
 
-def _targets(action: Action) -> Sequence[Array]:
+def _targets(kind: str, values: FrameValues) -> Sequence[Array]:
+    action: Action = getattr(values, kind)
     return action.joint_target, np.array((action.gripper_target,))
 
 
@@ -247,14 +233,6 @@ def _wrench_parts(values: FrameValues) -> Sequence[Array]:
     return (wrench,)
 
 
-def _object_pose(name: str, values: FrameValues) -> Pose:
-    return values.observation.object_poses[name]
-
-
-def _camera_pose(name: str, values: FrameValues) -> Pose:
-    return values.world_from_camera[name]
-
-
 def _joints(
     topic: str,
     names: Sequence[str],
@@ -262,41 +240,29 @@ def _joints(
     columns: Callable[[Array], Columns],
     arrange: Callable[[Array], Array] | None = None,
 ) -> FrameStream:
-    layout = _joints_layout(tuple(names))
+    slots = (Slot.VALUE,) * len(names)  # position, velocity, effort
     return FrameStream(
-        topic=topic, schema=messages.JOINT_STATE, layout=layout, parts=parts, columns=columns, arrange=arrange
+        topic=topic,
+        schema=messages.JOINT_STATE,
+        layout=layout(messages.JOINT_STATE, (Slot.TIME, ""), tuple(names), slots, slots, slots),
+        parts=parts,
+        columns=columns,
+        arrange=arrange,
     )
 
 
-def _pose(topic: str, frame_id: str, pose: Callable[[FrameValues], Pose], column: str, key: str = "") -> FrameStream:
-    """A pose that becomes the rows of `column`, or of `key` in it."""
+def _pose(topic: str, frame_id: str, path: str, column: str, key: str = "") -> FrameStream:
+    """A pose at a path in `FrameValues` that becomes the rows of `column`; or with a key one of the poses there."""
+    found = attrgetter(path)
+
+    def parts(values: FrameValues) -> Sequence[Array]:
+        pose: Pose = found(values)[key] if key else found(values)
+        return pose.position, pose.quat_xyzw
+
     return FrameStream(
         topic=topic,
         schema=messages.POSE,
-        layout=_stamped_layout(frame_id, 7),
-        parts=lambda values: ((found := pose(values)).position, found.quat_xyzw),
+        layout=layout(messages.POSE, (Slot.TIME, frame_id), POSE_SLOTS),
+        parts=parts,
         columns=lambda values: {column: {key: values}} if key else {column: values},
     )
-
-
-# The recordings of a run have the same few layouts, and an export opens many.
-@lru_cache(maxsize=64)
-def _joints_layout(names: tuple[str, ...]) -> Layout:
-    message = CdrWriter()
-    message.header("")
-    message.u32(len(names))
-    for name in names:
-        message.text(name)
-    for _ in range(3):  # position, velocity, effort
-        message.u32(len(names))
-        message.value_slot(len(names))
-    return message.layout()
-
-
-@lru_cache(maxsize=64)
-def _stamped_layout(frame_id: str, num_values: int) -> Layout:
-    """A header and float64 after float64: PoseStamped, WrenchStamped."""
-    message = CdrWriter()
-    message.header(frame_id)
-    message.value_slot(num_values)
-    return message.layout()

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+from demorec.recording.collected.reader import CollectedRecording
 from demorec.recording.recording import Recording
 from demorec.recording.video import VideoSettings
 from demorec.scene.episode import SuccessCheck
@@ -68,6 +70,27 @@ class RecordingSummary:
     versions: Mapping[str, str]
 
 
+def common_facts(recording: Recording | CollectedRecording) -> dict[str, Any]:
+    """What summaries of both kinds of recordings tell, by the names of their attributes."""
+    info, outcome = recording.info, recording.outcome
+    return {
+        "path": str(recording.path),
+        "bytes": recording.path.stat().st_size,
+        "format_version": info.format_version,
+        "episode_index": info.episode_index,
+        "instruction": info.instruction,
+        "success": None if outcome is None else outcome.success,
+        "frames": recording.num_frames,
+        "fps": info.fps,
+        "streams": tuple(
+            StreamSummary(topic=topic, type=kind, messages=count) for topic, (kind, count) in recording.topics.items()
+        ),
+        "origin": info.origin,
+        "digest": recording.digest(),
+        "versions": info.versions,
+    }
+
+
 def summarize(path: Path) -> RecordingSummary:
     """Read a recording, all of its content included, and tell what it holds.
 
@@ -77,23 +100,16 @@ def summarize(path: Path) -> RecordingSummary:
     with Recording(path) as recording:
         info, outcome = recording.info, recording.outcome
         return RecordingSummary(
-            path=str(path),
-            bytes=path.stat().st_size,
-            format_version=info.format_version,
-            episode_index=info.episode_index,
+            **common_facts(recording),
             attempt=info.attempt,
             root_seed=info.root_seed,
             task=info.task,
-            instruction=info.instruction,
             robot=info.robot.name,
             objects=tuple(body.name for body in info.scene.movable),
-            success=None if outcome is None else outcome.success,
             failure_phase="" if outcome is None else outcome.failure_phase,
             failure_reason="" if outcome is None else outcome.failure_reason,
             checks=() if outcome is None else outcome.checks,
             retries=0 if outcome is None else outcome.num_retries,
-            frames=recording.num_frames,
-            fps=info.fps,
             physics_hz=info.physics_hz,
             seconds=recording.num_frames / info.fps,
             cameras=tuple(
@@ -107,13 +123,6 @@ def summarize(path: Path) -> RecordingSummary:
                 for camera in info.scene.cameras
                 if camera.name in recording.cameras
             ),
-            streams=tuple(
-                StreamSummary(topic=topic, type=kind, messages=count)
-                for topic, (kind, count) in recording.topics.items()
-            ),
-            origin=info.origin,
             config_digest=info.config_digest,
-            digest=recording.digest(),
             final_state_digest="" if outcome is None else outcome.final_state_digest,
-            versions=info.versions,
         )

@@ -14,7 +14,7 @@ import numpy as np
 from demorec.geometry import Array, Pose, quat_multiply
 from demorec.scene.assets import asset_path
 from demorec.scene.episode import EpisodeInfo, Observation
-from demorec.scene.urdf import Urdf, UrdfJoint, joint_motion
+from demorec.scene.urdf import Urdf, joint_motion
 
 WORLD = "world"
 RERUN_ROOT = "tf#/"
@@ -39,22 +39,14 @@ class FrameTree:
 
     def __init__(self, info: EpisodeInfo) -> None:
         urdf = Urdf.load(asset_path(info.robot.urdf), scale=info.scene.robot.scale)
-        recorded = {name: index for index, name in enumerate(info.robot.joint_names)}
-        moving = [joint for joint in urdf.joints if joint.kind != "fixed" and joint.name in recorded]
-        self._num_joints = len(recorded)
+        self._num_joints = len(info.robot.joint_names)
         self._objects = [body.name for body in info.scene.movable]
-        self._joints = MovingJoints(moving, [recorded[joint.name] for joint in moving])
-        self.moving = tuple((joint.parent, joint.child) for joint in moving) + tuple(
-            (WORLD, name) for name in self._objects
-        )
+        self._joints = MovingJoints(urdf, info.robot.joint_names)
+        self.moving = (*self._joints.moving, *((WORLD, name) for name in self._objects))
         self.static: tuple[Row, ...] = (
             (RERUN_ROOT, WORLD, Pose()),
             (WORLD, urdf.root, info.scene.robot.world_from_base),
-            *(
-                (joint.parent, joint.child, joint.parent_from_joint @ joint_motion(joint, 0.0))
-                for joint in urdf.joints
-                if joint not in moving
-            ),
+            *self._joints.static,
             *((WORLD, body.name, body.world_from_body) for body in info.scene.bodies if not body.movable),
             *((camera.mount, camera_frame(camera.name), camera.mount_from_camera) for camera in info.scene.cameras),
         )
@@ -74,14 +66,30 @@ class FrameTree:
 
 
 class MovingJoints:
-    """parent_from_child of all moving joints at once.
+    """parent_from_child of all joints that move and are recorded, at once; the others stay at 0.
+
+    Args:
+        urdf: The robot.
+        names: Of the recorded joints, in the order in which vectors have them.
+
+    Attributes:
+        moving: (parent, child) of those that move.
+        static: Rows of the others.
 
     A turning joint about axis a from the fixed rotation q0: q0 * (a sin(t/2), cos(t/2)), linear in sine and cosine.
     """
 
-    def __init__(self, joints: Sequence[UrdfJoint], indices: Sequence[int]) -> None:
+    def __init__(self, urdf: Urdf, names: Sequence[str]) -> None:
+        places = {name: index for index, name in enumerate(names)}
+        joints = [joint for joint in urdf.joints if joint.kind != "fixed" and joint.name in places]
+        self.moving = tuple((joint.parent, joint.child) for joint in joints)
+        self.static: tuple[Row, ...] = tuple(
+            (joint.parent, joint.child, joint.parent_from_joint @ joint_motion(joint, 0.0))
+            for joint in urdf.joints
+            if joint not in joints
+        )
         slides = [joint.kind == "prismatic" for joint in joints]
-        self._indices = np.array(indices, dtype=np.intp)
+        self._indices = np.array([places[joint.name] for joint in joints], dtype=np.intp)
         self._half = np.array([0.0 if slide else 0.5 for slide in slides])
         self._origin = np.zeros((len(joints), 3))
         self._slide = np.zeros((len(joints), 3))

@@ -10,7 +10,7 @@ from __future__ import annotations
 import io
 import os
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Literal, Protocol, cast
 
@@ -24,6 +24,7 @@ from demorec.errors import ConfigError, RecordingError, in_words
 from demorec.recording.scheduling import ordinary_scheduling
 
 Rgb = NDArray[np.uint8]
+Codec = Literal["h264", "h265", "av1", "jpeg", "16UC1", "32FC1"]
 
 # SVT-AV1 tells its settings on standard error unless this says "errors only"; it reads it when it starts.
 os.environ.setdefault("SVT_LOG", "1")
@@ -53,7 +54,7 @@ class VideoSettings:
         jpeg_quality: 1..100; None unless the codec is jpeg.
     """
 
-    codec: Literal["h264", "h265", "av1", "jpeg", "16UC1", "32FC1"]
+    codec: Codec
     encoder: str
     width: int
     height: int
@@ -64,6 +65,26 @@ class VideoSettings:
     preset: str
     options: dict[str, str]
     jpeg_quality: int | None = None
+
+
+_PIXEL_FORMATS = {"jpeg": "yuvj420p", "16UC1": "gray16le", "32FC1": "grayf32le"}
+"""Codec -> FFmpeg's name of the pixel format, of codecs whose every picture stands by itself."""
+
+
+def settings_of_coded(codec: Codec, width: int, height: int, fps: int) -> VideoSettings:
+    """Those of packets that came coded, of which nobody knows how."""
+    return VideoSettings(
+        codec=codec,
+        encoder="",
+        width=width,
+        height=height,
+        fps=fps,
+        pix_fmt=_PIXEL_FORMATS.get(codec, "yuv420p"),
+        gop=1 if codec in _PIXEL_FORMATS else 0,
+        crf=None,
+        preset="",
+        options={},
+    )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -95,15 +116,15 @@ class Encoder(Protocol):
         """Return the packets that were held back."""
 
 
-def make_encoder(*, video: VideoConfig, width: int, height: int, fps: int) -> Encoder:
+def make_encoder(video: VideoConfig, width: int, height: int, fps: int) -> Encoder:
     """An encoder as configured; RecordingError when this build of FFmpeg lacks the codec."""
     if video.codec == "jpeg":
-        return _JpegEncoder(video=video, width=width, height=height, fps=fps)
-    return _StreamEncoder(video=video, width=width, height=height, fps=fps)
+        return _JpegEncoder(video, width, height, fps)
+    return _StreamEncoder(video, width, height, fps)
 
 
 class _StreamEncoder:
-    def __init__(self, *, video: VideoConfig, width: int, height: int, fps: int) -> None:
+    def __init__(self, video: VideoConfig, width: int, height: int, fps: int) -> None:
         if video.codec == "h264":
             # Keyframes at a fixed distance; no reordering, no delay. Zero latency also leaves x264's macroblock tree
             # out, which reads memory that it has not set (seen with MALLOC_PERTURB_), so that packets would depend
@@ -114,13 +135,9 @@ class _StreamEncoder:
         else:
             # Low delay, one thread: frames leave in the order and at the pace in which they came.
             encoder, crf, preset, options = "libsvtav1", 30, "12", {"svtav1-params": "fast-decode=0:lp=1:pred-struct=1"}
-        self.settings = VideoSettings(
-            codec=cast(Literal["h264", "av1"], video.codec),
+        self.settings = replace(
+            settings_of_coded(video.codec, width, height, fps),
             encoder=encoder,
-            width=width,
-            height=height,
-            fps=fps,
-            pix_fmt="yuv420p",
             gop=video.gop,
             crf=crf if video.crf is None else video.crf,
             preset=preset if video.preset is None else video.preset,
@@ -172,20 +189,9 @@ def _bare(packets: Iterable[av.Packet]) -> list[bytes]:
 
 
 class _JpegEncoder:
-    def __init__(self, *, video: VideoConfig, width: int, height: int, fps: int) -> None:
-        self.settings = VideoSettings(
-            codec="jpeg",
-            encoder="",
-            width=width,
-            height=height,
-            fps=fps,
-            pix_fmt="yuvj420p",
-            gop=1,
-            crf=None,
-            preset="",
-            options={},
-            jpeg_quality=video.jpeg_quality,
-        )
+    def __init__(self, video: VideoConfig, width: int, height: int, fps: int) -> None:
+        settings = settings_of_coded("jpeg", width, height, fps)
+        self.settings = replace(settings, jpeg_quality=video.jpeg_quality)
 
     def encode(self, picture: Rgb) -> list[bytes]:
         buffer = io.BytesIO()
@@ -228,7 +234,8 @@ def _decode_jpeg(settings: VideoSettings, packets: Iterable[VideoPacket]) -> Ite
 
 
 def _decode_stream(settings: VideoSettings, packets: Iterable[VideoPacket]) -> Iterator[Rgb]:
-    context = cast(av.VideoCodecContext, av.CodecContext.create(_decoder_name(settings.codec), "r"))
+    decoder = {"av1": "libdav1d", "h265": "hevc"}.get(settings.codec, settings.codec)
+    context = cast(av.VideoCodecContext, av.CodecContext.create(decoder, "r"))
     context.thread_count = 1
     # A few bytes can announce pictures of gigabytes; coded pictures are whole blocks of at most 128 pixels.
     context.options = {"max_pixels": str((settings.width + 128) * (settings.height + 128))}
@@ -248,10 +255,6 @@ def _decode_stream(settings: VideoSettings, packets: Iterable[VideoPacket]) -> I
         raise RecordingError(f"The {settings.codec} video cannot be decoded near frame {num_pictures}.") from error
     if num_pictures != num_packets:
         raise RecordingError(f"{num_packets} packets of {settings.codec} video gave {num_pictures} pictures.")
-
-
-def _decoder_name(codec: str) -> str:
-    return {"av1": "libdav1d", "h265": "hevc"}.get(codec, codec)
 
 
 def is_keyframe(codec: str, data: bytes) -> bool:

@@ -7,42 +7,22 @@ and a crash loses at most the last second.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from types import TracebackType
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 
 from demorec.config import VideoConfig
 from demorec.errors import RecordingError
 from demorec.recording import channels, messages, metadata
+from demorec.recording.cdr import encode
+from demorec.recording.file_writer import FileWriter
 from demorec.recording.frame_check import FrameCheck, check_joint_names
-from demorec.recording.part_file import PartFile
 from demorec.recording.pictures import CameraRecorder
-from demorec.recording.recover import can_be_made_again
 from demorec.recording.streams import FrameValues, frame_streams, tf_stream
 from demorec.recording.transforms import FrameTree
 from demorec.scene.episode import EpisodeInfo, Event, Frame, JointSample, Outcome, frame_time_ns
-
-
-@dataclass(frozen=True, kw_only=True)
-class WriteStats:
-    """What was written.
-
-    Attributes:
-        path: The finished file.
-        num_frames: Frames in it.
-        num_bytes: Its size.
-        video_bytes: camera -> bytes of its coded colour pictures.
-    """
-
-    path: Path
-    num_frames: int
-    num_bytes: int
-    video_bytes: Mapping[str, int]
 
 
 class _Pending(NamedTuple):
@@ -61,7 +41,7 @@ class _Pending(NamedTuple):
     changes: list[tuple[str, str, bytes]]
 
 
-class EpisodeWriter:
+class EpisodeWriter(FileWriter[Outcome, CameraRecorder]):
     """Context manager that writes one episode; leaving it without `finish` leaves NAME.mcap.part for `recover`.
 
     Depth and segmentation are recorded when the first frame has them.
@@ -89,21 +69,10 @@ class EpisodeWriter:
         self._streams = [*frame_streams(info), tf_stream(self._tree)]
         self._cameras: dict[str, CameraRecorder] = {}
         self._pending: list[_Pending] = []
-        self._num_frames = 0
         self._num_written = 0
         self._phase: str | None = None
         self._is_miss: bool | None = None
-        self._file = PartFile(
-            path, overwrite=overwrite, is_worthless=lambda part: can_be_made_again(part, origin=info.origin)
-        )
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self._file.close()
+        super().__init__(path, origin=info.origin, overwrite=overwrite)
 
     def write(self, frame: Frame) -> None:
         """Add the next frame.
@@ -112,14 +81,14 @@ class EpisodeWriter:
             RecordingError: Frames out of order, vectors of another length, other objects or cameras than the scene's,
                 numbers that are not finite, pictures missing or of another size, or a full disk.
         """
-        due = (self._num_frames, frame_time_ns(self._num_frames, self._info.fps))
+        due = (self.num_frames, frame_time_ns(self.num_frames, self._info.fps))
         if (frame.frame_index, frame.time_ns) != due:
             raise RecordingError(
                 f"Frame {frame.frame_index} at {frame.time_ns} ns came where frame {due[0]} at {due[1]} ns was due: "
                 "frames are written in order, one each."
             )
         self._check(frame)
-        if self._num_frames == 0:
+        if self.num_frames == 0:
             self._begin(frame)
         for camera in self._cameras.values():
             camera.add(frame)
@@ -131,7 +100,7 @@ class EpisodeWriter:
                 changes=self._changes(frame),
             )
         )
-        self._num_frames += 1
+        self.num_frames += 1
         if len(self._pending) >= self._info.fps:
             self._write_pending()
 
@@ -153,7 +122,7 @@ class EpisodeWriter:
 
     def _write_pending(self) -> None:
         """Write the frames whose pictures have all left the encoders: numbers first, then pictures."""
-        num_ready = min((camera.num_ready for camera in self._cameras.values()), default=self._num_frames)
+        num_ready = min((camera.num_ready for camera in self._cameras.values()), default=self.num_frames)
         frames = self._pending[: num_ready - self._num_written]
         if not frames:
             return
@@ -199,38 +168,16 @@ class EpisodeWriter:
         if frame.phase != self._phase:
             self._phase = frame.phase
             events.insert(0, Event(name=channels.PHASE_EVENT, message=frame.phase))
-            result.append((channels.PHASE, messages.STRING, messages.string(frame.phase)))
+            result.append((channels.PHASE, messages.STRING, encode(messages.STRING, frame.phase)))
         if frame.is_deliberate_miss != self._is_miss:
             self._is_miss = frame.is_deliberate_miss
-            data = messages.boolean(frame.is_deliberate_miss)
+            data = encode(messages.BOOL, frame.is_deliberate_miss)
             result.append((channels.DELIBERATE_MISS, messages.BOOL, data))
         return result + [(channels.EVENTS, messages.LOG, messages.log(frame.time_ns, event)) for event in events]
 
-    def finish(self, outcome: Outcome) -> WriteStats:
-        """Write the rest, make the file durable and give it its name.
-
-        Raises:
-            ConfigError: A file of that name has appeared meanwhile.
-            RecordingError: The outcome speaks of another number of frames, or the disk is full.
-        """
-        if outcome.num_frames != self._num_frames:
-            raise RecordingError(f"The outcome has {outcome.num_frames} frames, the recording {self._num_frames}.")
-        if self._num_frames == 0:
+    def _write_rest(self) -> None:
+        if self.num_frames == 0:
             self._begin(None)
-        for camera in self._cameras.values():
-            camera.end()
         self._write_pending()
         if self._pending:
             raise RecordingError(f"The video encoder kept the last {len(self._pending)} pictures to itself.")
-        last_ns = frame_time_ns(max(self._num_frames - 1, 0), self._info.fps)
-        for camera in self._cameras.values():
-            topic, schema, data = camera.statistics()
-            self._file.log(topic, schema, data, last_ns)
-        self._file.metadata(metadata.OUTCOME, metadata.outcome_metadata(outcome))
-        self._file.publish()
-        return WriteStats(
-            path=self._file.path,
-            num_frames=self._num_frames,
-            num_bytes=self._file.path.stat().st_size,
-            video_bytes={name: camera.num_video_bytes for name, camera in self._cameras.items()},
-        )

@@ -15,7 +15,7 @@ from demorec.errors import ConfigError, OptionError, RecordingError, check_optio
 from demorec.geometry import Array
 from demorec.recording import Recording
 from demorec.recording.frames import frames_of
-from demorec.recording.streams import command_at
+from demorec.recording.streams import action_at
 from demorec.scene.episode import Action, EpisodeInfo, Frame, SuccessCheck
 from demorec.scene.features import ACTION, STATE, ActionKind
 
@@ -124,7 +124,7 @@ def open_demonstration(recording: Recording, options: ReplayOptions) -> Demonstr
         name=recording.path.name,
         info=info,
         fps=fps,
-        commands=tuple(command_at(columns, int(row)) for row in sent),
+        commands=tuple(action_at(columns, int(row), "command") for row in sent),
         joint_position=columns.joint_position[rows],
         joint_velocity=None if options.states else columns.joint_velocity[rows],
         gripper_width=columns.gripper_width[rows],

@@ -263,7 +263,7 @@ def test_folders_of_others_are_left_alone(tmp_path: Path) -> None:
 def held_up(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
     """The coder waits for this."""
     go_on, write = threading.Event(), Coder._write
-    monkeypatch.setattr(Coder, "_write", lambda self, frame: (go_on.wait(30), write(self, frame)))
+    monkeypatch.setattr(Coder, "_write", lambda self, *waiting: (go_on.wait(30), write(self, *waiting)))
     return go_on
 
 

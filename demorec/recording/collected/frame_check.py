@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.errors import RecordingError
-from demorec.recording.collected.depth import DEPTH_TYPES
+from demorec.recording.depth import DEPTH_TYPES
 from demorec.registry import nearest_match
 from demorec.scene.collected import CollectedCamera, CollectedFrame, CollectedInfo
 

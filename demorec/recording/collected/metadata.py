@@ -9,9 +9,9 @@ from collections.abc import Mapping
 from demorec.errors import RecordingError, in_words
 from demorec.plain import to_json
 from demorec.recording.collected.validity import what_is_wrong
-from demorec.recording.metadata import COLLECTED, OUTCOME, check_seal, sealed
+from demorec.recording.metadata import COLLECTED, check_seal, sealed
 from demorec.recording.video import VideoSettings
-from demorec.scene.collected import COLLECTED_VERSION, CollectedInfo, CollectedOutcome
+from demorec.scene.collected import COLLECTED_VERSION, CollectedInfo
 from demorec.scene.validity import from_description
 
 _MOST_TOLD = 5
@@ -70,21 +70,3 @@ def read_collected_metadata(metadata: Mapping[str, str]) -> tuple[CollectedInfo,
         raise RecordingError(
             f"The recording's metadata is not that of a collected episode ({in_words(error)})"
         ) from error
-
-
-def collected_outcome_metadata(outcome: CollectedOutcome) -> dict[str, str]:
-    """The record that ends a complete recording."""
-    success = "unknown" if outcome.success is None else str(outcome.success).lower()
-    return sealed({"success": success, "outcome": to_json(outcome)})
-
-
-def read_collected_outcome(metadata: Mapping[str, str]) -> CollectedOutcome:
-    """Inverse of `collected_outcome_metadata`; RecordingError on damage."""
-    check_seal(OUTCOME, metadata)
-    try:
-        outcome = from_description(metadata["outcome"], CollectedOutcome)
-        if min(outcome.num_frames, *outcome.drops.values(), 0) < 0:
-            raise ValueError("a number of frames or drops below 0")
-    except (KeyError, ValueError) as error:
-        raise RecordingError(f"The recording's outcome cannot be read ({in_words(error)})") from error
-    return outcome

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import json
 from collections.abc import Callable, Iterator
 from functools import cached_property
 from typing import Any
@@ -13,17 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.errors import RecordingError
-from demorec.plain import to_json, to_plain
 from demorec.recording import messages
 from demorec.recording.channels import description_topic, video_topic
 from demorec.recording.chunks import Block
 from demorec.recording.collected import metadata
-from demorec.recording.collected.depth import decode_distances
 from demorec.recording.collected.streams import FRAMES, SUBTASK, feature_streams, frames_layout
 from demorec.recording.collected.validity import what_is_wrong
 from demorec.recording.container import damage_as_recording_error
+from demorec.recording.depth import decode_distances
 from demorec.recording.episode_file import EpisodeFile
-from demorec.recording.metadata import COLLECTED, OUTCOME
+from demorec.recording.metadata import COLLECTED
 from demorec.recording.video import Rgb, VideoPacket, VideoSettings, is_keyframe
 from demorec.scene.collected import DEPTH_UNITS, NO_PICTURE, CollectedColumns, CollectedInfo, CollectedOutcome
 
@@ -58,7 +56,7 @@ class _Table:
         return np.concatenate([np.empty(0, np.int64), *self._times]), np.concatenate(self._values)
 
 
-class CollectedRecording(EpisodeFile):
+class CollectedRecording(EpisodeFile[CollectedOutcome, VideoSettings]):
     """What one file holds of a collected episode; a context manager.
 
     Attributes:
@@ -73,8 +71,6 @@ class CollectedRecording(EpisodeFile):
     """
 
     info: CollectedInfo
-    outcome: CollectedOutcome | None
-    num_frames: int
 
     def _read_metadata(self) -> None:
         found = self._container.metadata(COLLECTED)
@@ -82,10 +78,7 @@ class CollectedRecording(EpisodeFile):
             raise RecordingError(f"The file holds no collected episode: {self.path}")
         try:
             info, self._cameras, urdf_sha256 = metadata.read_collected_metadata(found)
-            outcome = self._container.metadata(OUTCOME)
-            self.outcome = None if outcome is None else metadata.read_collected_outcome(outcome)
-            self.num_frames = self._container.counts.get(FRAMES, 0)
-            self._check_end(self.num_frames, None if self.outcome is None else self.outcome.num_frames)
+            self._read_end(FRAMES, CollectedOutcome)
             self.info = self._with_urdf(info, urdf_sha256)
         except RecordingError as error:
             text = str(error).removesuffix(f": {self.path}")
@@ -94,10 +87,7 @@ class CollectedRecording(EpisodeFile):
     def _with_urdf(self, info: CollectedInfo, sha256: str) -> CollectedInfo:
         if not sha256:
             return info
-        urdf = ""
-        for message in self._container.messages((description_topic(),)):
-            with damage_as_recording_error(self.path):
-                urdf = messages.read_string(message.data)
+        urdf = ["", *(text for _, text in self._read(description_topic(), messages.read_string))][-1]
         if metadata.urdf_sha256(urdf) != sha256:
             raise RecordingError("The URDF of the recording is not the one that its metadata tells of")
         described = dataclasses.replace(info, urdf=urdf)
@@ -122,12 +112,7 @@ class CollectedRecording(EpisodeFile):
 
     def video_settings(self, camera: str) -> VideoSettings:
         """How the pictures of a camera were coded."""
-        if camera not in self._cameras:
-            raise RecordingError(
-                f"The recording has no camera {camera!r}, its cameras are {', '.join(self._cameras) or 'none'}: "
-                f"{self.path}"
-            )
-        return self._cameras[camera]
+        return self._camera(camera)
 
     def columns(self) -> CollectedColumns:
         """All numbers, one row a frame, to the bit as they were written, and which pictures the frames hold."""
@@ -149,10 +134,14 @@ class CollectedRecording(EpisodeFile):
         time_ns, rows = tables[FRAMES].whole()
         if len(time_ns) > 1 and int(np.diff(time_ns).min()) <= 0:
             raise RecordingError(f"The frames of the recording are not in the order of their times: {self.path}")
-        features = {
-            name: self._feature(stream.topic, *tables.pop(stream.topic).whole(), time_ns)
-            for name, stream in streams.items()
-        }
+        features = {}
+        for name, stream in streams.items():
+            times, features[name] = tables.pop(stream.topic).whole()
+            if not np.array_equal(times, time_ns):
+                raise RecordingError(
+                    f"The recording has {len(times)} messages on {stream.topic} at other times than its "
+                    f"{len(time_ns)} frames: {self.path}"
+                )
         stamps = {name: rows[:, index].copy() for index, name in enumerate(streams)}
         pictures = {name: rows[:, len(streams) + index].copy() for index, name in enumerate(self._cameras_in_order)}
         picture_stamps = {name: self._stamps(topic) for name, topic in picture_topics.items()}
@@ -170,27 +159,16 @@ class CollectedRecording(EpisodeFile):
     def subtasks(self) -> tuple[tuple[int, str], ...]:
         """(frame, what is begun there), in order; empty where nobody said any."""
         found = []
-        for message in self._container.messages((SUBTASK,)):
-            frame = int(np.searchsorted(self._columns.time_ns, message.time_ns))
-            if frame == self.num_frames or self._columns.time_ns[frame] != message.time_ns:
+        for time_ns, text in self._read(SUBTASK, messages.read_string):
+            frame = int(np.searchsorted(self._columns.time_ns, time_ns))
+            if frame == self.num_frames or self._columns.time_ns[frame] != time_ns:
                 raise RecordingError(f"A subtask of the recording begins where no frame is: {self.path}")
-            with damage_as_recording_error(self.path):
-                found.append((frame, messages.read_string(message.data)))
+            found.append((frame, text))
         return tuple(found)
 
     def _stamps(self, topic: str) -> NDArray[np.int64]:
         """(N,) of the messages of a topic, one chunk of them in memory at a time: pictures may take gigabytes."""
         return np.fromiter((message.time_ns for message in self._container.messages((topic,))), dtype=np.int64)
-
-    def _feature(
-        self, topic: str, times: NDArray[np.int64], values: NDArray[Any], time_ns: NDArray[np.int64]
-    ) -> NDArray[Any]:
-        if not np.array_equal(times, time_ns):
-            raise RecordingError(
-                f"The recording has {len(times)} messages on {topic} at other times than its {len(time_ns)} "
-                f"frames: {self.path}"
-            )
-        return values
 
     def _picture_topic(self, camera: str) -> str:
         return video_topic(camera, self.video_settings(camera).codec)
@@ -199,12 +177,8 @@ class CollectedRecording(EpisodeFile):
         """The coded pictures of a camera in order; `frame_index` is their number, by which frames hold them."""
         codec = self.video_settings(camera).codec
         read = _READERS.get(codec, messages.read_compressed_image)
-        for number, message in enumerate(self._container.messages((self._picture_topic(camera),))):
-            with damage_as_recording_error(self.path):
-                data = read(message.data)
-            yield VideoPacket(
-                frame_index=number, time_ns=message.time_ns, data=data, is_keyframe=is_keyframe(codec, data)
-            )
+        for number, (time_ns, data) in enumerate(self._read(self._picture_topic(camera), read)):
+            yield VideoPacket(frame_index=number, time_ns=time_ns, data=data, is_keyframe=is_keyframe(codec, data))
 
     def images(self, camera: str) -> Iterator[Rgb]:
         """The decoded pictures of a camera, (H, W, 3) uint8 RGB, in order; RecordingError for a depth camera."""
@@ -249,10 +223,7 @@ class CollectedRecording(EpisodeFile):
 
     def digest(self) -> str:
         """SHA-256 (hex) of the content: metadata, numbers, stamps, coded pictures; not of what versions wrote it."""
-        described = to_plain(self.info)
-        del described["versions"], described["format_version"]
-        result = hashlib.sha256(json.dumps(described, sort_keys=True).encode())
-        result.update(b"no outcome" if self.outcome is None else to_json(self.outcome).encode())
+        result = self._digest_of_description()
         columns = self.columns()
         result.update(columns.time_ns.tobytes())
         for mapping in (columns.features, columns.stamps, columns.pictures, columns.picture_stamps):

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.recording import messages
-from demorec.recording.cdr import CdrWriter, Layout
+from demorec.recording.cdr import Layout, Slot, layout
 from demorec.scene.collected import CollectedFeature, CollectedInfo
 
 FRAMES = "/frames"
@@ -28,7 +28,7 @@ class FeatureStream:
     """The messages of a feature, one a frame.
 
     Attributes:
-        topic: Where.
+        topic: Where: "/observation/state".
         schema: ROS 2 type.
         layout: Of its messages, which hold D values.
         dtype: Of the feature.
@@ -48,22 +48,15 @@ class FeatureStream:
         return self.layout.decode_rows(rows).astype(self.dtype)
 
 
-def feature_topic(name: str) -> str:
-    """Where the vectors of a feature are: "/observation/state"."""
-    return "/" + name.replace(".", "/")
-
-
 def feature_streams(info: CollectedInfo) -> dict[str, FeatureStream]:
     """Feature -> its messages: sensor_msgs/JointState where there are joints, else std_msgs/Float64MultiArray."""
     streams = {}
     for feature in info.features:
-        has_joints = any(feature.joints)
+        schema = messages.JOINT_STATE if any(feature.joints) else messages.FLOAT64_ARRAY
         streams[feature.name] = FeatureStream(
-            topic=feature_topic(feature.name),
-            schema=messages.JOINT_STATE if has_joints else messages.FLOAT64_ARRAY,
-            layout=_joints_layout(feature)
-            if has_joints
-            else _array_layout(",".join(feature.names), len(feature.names)),
+            topic="/" + feature.name.replace(".", "/"),
+            schema=schema,
+            layout=_joints_layout(feature) if any(feature.joints) else _array_layout(schema, feature.names),
             dtype=feature.dtype,
         )
     return streams
@@ -72,30 +65,16 @@ def feature_streams(info: CollectedInfo) -> dict[str, FeatureStream]:
 def frames_layout(info: CollectedInfo) -> Layout:
     """Of `/frames`: std_msgs/Int64MultiArray, whose label names the columns."""
     columns = [feature.name for feature in info.features] + [camera.name for camera in info.cameras]
-    return _array_layout(",".join(columns), len(columns), is_integer=True)
+    return _array_layout(messages.INT64_ARRAY, columns)
 
 
 def _joints_layout(feature: CollectedFeature) -> Layout:
     """Velocity and effort are empty: they are not known, and zeros would be invented."""
-    message = CdrWriter()
-    message.header("")
-    message.u32(len(feature.names))
-    for name, joint in zip(feature.names, feature.joints, strict=True):
-        message.text(joint or name)
-    message.u32(len(feature.names))
-    message.value_slot(len(feature.names))
-    for _ in range(2):  # velocity, effort
-        message.u32(0)
-    return message.layout()
+    names = tuple(joint or name for name, joint in zip(feature.names, feature.joints, strict=True))
+    return layout(messages.JOINT_STATE, (Slot.TIME, ""), names, (Slot.VALUE,) * len(names), (), ())
 
 
-def _array_layout(label: str, count: int, *, is_integer: bool = False) -> Layout:
-    message = CdrWriter()
-    message.u32(1)  # dimensions
-    message.text(label)
-    message.u32(count)
-    message.u32(count)  # stride
-    message.u32(0)  # data_offset
-    message.u32(count)
-    message.value_slot(count)
-    return message.layout("<i8" if is_integer else "<f8")
+def _array_layout(schema: str, columns: Sequence[str]) -> Layout:
+    count = len(columns)
+    dimension = (",".join(columns), count, count)
+    return layout(schema, ((dimension,), 0), (Slot.VALUE,) * count)

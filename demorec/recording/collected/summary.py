@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from demorec.recording.collected.reader import CollectedRecording
-from demorec.recording.summary import StreamSummary
+from demorec.recording.summary import StreamSummary, common_facts
 from demorec.recording.video import VideoSettings
 from demorec.scene.collected import NO_PICTURE, Origin
 
@@ -78,19 +78,12 @@ def summarize_collected(path: Path) -> CollectedSummary:
         info, outcome, columns = recording.info, recording.outcome, recording.columns()
         seconds = float(columns.time_ns[-1] - columns.time_ns[0]) / 1e9 if columns.num_frames else 0.0
         return CollectedSummary(
-            path=str(path),
-            bytes=path.stat().st_size,
-            format_version=info.format_version,
-            episode_index=info.episode_index,
-            instruction=info.instruction,
+            **common_facts(recording),
             robot=info.robot,
             has_urdf=bool(info.urdf),
-            success=None if outcome is None else outcome.success,
             is_recovered=recording.is_recovered,
             reason="" if outcome is None else outcome.reason,
             drops={} if outcome is None else outcome.drops,
-            frames=columns.num_frames,
-            fps=info.fps,
             seconds=seconds,
             rate=(columns.num_frames - 1) / seconds if seconds else 0.0,
             features=tuple(
@@ -116,11 +109,4 @@ def summarize_collected(path: Path) -> CollectedSummary:
                 )
                 for camera in info.cameras
             ),
-            streams=tuple(
-                StreamSummary(topic=topic, type=kind, messages=count)
-                for topic, (kind, count) in recording.topics.items()
-            ),
-            origin=info.origin,
-            digest=recording.digest(),
-            versions=info.versions,
         )

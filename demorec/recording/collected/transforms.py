@@ -11,7 +11,7 @@ from demorec.geometry import Array, Pose
 from demorec.recording.streams import transforms_layout
 from demorec.recording.transforms import RERUN_ROOT, WORLD, MovingJoints, Row, camera_frame
 from demorec.scene.collected import CollectedFeature, CollectedFrame, CollectedInfo, Vector
-from demorec.scene.urdf import Urdf, joint_motion
+from demorec.scene.urdf import Urdf
 
 
 class JointPositions:
@@ -45,24 +45,19 @@ class CollectedTree:
 
     Attributes:
         static: Rows that never change.
-        layout: Of the messages of those that do.
+        is_moving: Whether any joint is known to move.
     """
 
     def __init__(self, info: CollectedInfo) -> None:
         urdf = Urdf.parse(info.urdf)
         self._positions = JointPositions(info.features)
-        observed = {name: index for index, name in enumerate(self._positions.joints)}
-        moving = [joint for joint in urdf.joints if joint.kind != "fixed" and joint.name in observed]
-        self._moving = MovingJoints(moving, [observed[joint.name] for joint in moving])
-        self.layout = transforms_layout([(joint.parent, joint.child) for joint in moving])
+        self._joints = MovingJoints(urdf, self._positions.joints)
+        self._layout = transforms_layout(self._joints.moving)
+        self.is_moving = bool(self._joints.moving)
         self.static: tuple[Row, ...] = (
             (RERUN_ROOT, WORLD, Pose()),
             (WORLD, urdf.root, Pose()),
-            *(
-                (joint.parent, joint.child, joint.parent_from_joint @ joint_motion(joint, 0.0))
-                for joint in urdf.joints
-                if joint not in moving
-            ),
+            *self._joints.static,
             *(
                 (camera.mount or urdf.root, camera_frame(camera.name), camera.mount_from_camera)
                 for camera in info.cameras
@@ -70,15 +65,10 @@ class CollectedTree:
             ),
         )
 
-    @property
-    def is_still(self) -> bool:
-        """Whether nothing is known to move."""
-        return self.layout.num_values == 0
-
     def encode(self, frames: Sequence[CollectedFrame]) -> list[bytes]:
         """tf2_msgs/TFMessage of each frame, at its time."""
         names = frames[0].samples
         features = {name: np.array([frame.samples[name].vector for frame in frames]) for name in names}
-        values = self._moving.values(self._positions.of(features))
+        values = self._joints.values(self._positions.of(features))
         times = np.array([frame.time_ns for frame in frames], dtype=np.int64)
-        return self.layout.encode(times, values.reshape(len(frames), -1))
+        return self._layout.encode(times, values.reshape(len(frames), -1))
