@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 
@@ -17,6 +17,7 @@ from demorec.safety.user_modules import modules_of
 from demorec.scene.assets import allow_models, model_name
 from demorec.scene.camera_error import error_values
 from demorec.scene.episode import EpisodeInfo
+from demorec.scene.robot import RobotSpec
 from demorec.scene.scene import CONTACT_BREAKING_THRESHOLD, FINGER_STIFFNESS, Camera, Scene
 from demorec.scene.variation import Ranges, resolve
 from demorec.seeding import Purpose, generator
@@ -109,16 +110,8 @@ def prepare(plan: EpisodePlan) -> Episode:
     scene = replace(scene, physics=physics)
     scene = vary_looks(vary_physics(scene, ranges, _rng(plan, "physics")), ranges, _rng(plan, "looks"))
     behaviour = draw_behaviour(ranges, _rng(plan, "behaviour"))
-    presets = [
-        (camera_name(name), task.camera_presets.get(name) or CAMERAS.load(name, config.modules))
-        for name in config.cameras
-    ]
     camera_rng = _rng(plan, "cameras")
-    cameras = vary_cameras(
-        tuple(preset.camera(name, robot, width=config.width, height=config.height) for name, preset in presets),
-        ranges,
-        camera_rng,
-    )
+    cameras = vary_cameras(tuple(_cameras(task, robot, config)), ranges, camera_rng)
     errors = calibration_errors(cameras, ranges, camera_rng)
     scene = replace(scene, cameras=tuple(_miscalibrated(camera, errors[camera.name]) for camera in cameras))
     info = EpisodeInfo(
@@ -145,6 +138,13 @@ def prepare(plan: EpisodePlan) -> Episode:
         true_from_recorded={name: error for name, error in errors.items() if error != Pose()},
         interjection=draw_interjection(scene, _rng(plan, "interjection")) if config.interject else None,
     )
+
+
+def _cameras(task: Task, robot: RobotSpec, config: GenerateConfig) -> Iterator[Camera]:
+    """The cameras that the config names, the task's own before those that everybody has."""
+    for name in config.cameras:
+        preset = task.camera_presets.get(name) or CAMERAS.load(name, config.modules)
+        yield preset.camera(camera_name(name), robot, width=config.width, height=config.height)
 
 
 def _with_model_names(scene: Scene, module: str) -> Scene:

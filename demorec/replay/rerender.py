@@ -29,7 +29,7 @@ from demorec.safety.files import make_folder
 from demorec.safety.user_modules import split_name
 from demorec.scene.assets import allow_models
 from demorec.scene.camera_error import told_error, true_camera
-from demorec.scene.episode import EpisodeInfo, Outcome
+from demorec.scene.episode import EpisodeColumns, EpisodeInfo, Outcome
 from demorec.scene.scene import Camera, Scene
 from demorec.scene.variation import Ranges, resolve
 from demorec.seeding import generator
@@ -261,8 +261,7 @@ def rerender(
         info, columns = recording.info, recording.columns()
         if columns.num_frames == 0:
             raise RecordingError(f"The recording has no frames: {source}")
-        view = new_view(info, options)
-        config = drawing_config(info, options)
+        view, config = new_view(info, options), drawing_config(info, options)
         RENDERERS.check_name(str(config.get("renderer", "raster")))
         video = from_plain(config.get("video", {}), VideoConfig)
         new_info = replace(
@@ -276,19 +275,12 @@ def rerender(
         was_there = not overwrite and _is_drawn(out, new_info, _outcome(recording))
         if not was_there:
             make_folder(out.parent)
-            world = RecordedWorld(
-                info.robot, view.scene, joint_position=columns.joint_position, object_poses=columns.object_poses
-            )
             with (
                 nullcontext(renderers) if renderers is not None else WarmRenderer() as warm,
                 EpisodeWriter(out, new_info, video=video, overwrite=overwrite) as writer,
             ):
                 painter = view_painter(warm.of(str(config.get("renderer", "raster"))), view, config)
-                painter.setup(world)
-                for frame in frames_of(recording, columns):
-                    world.frame = frame.frame_index
-                    writer.write(replace(frame, images=painter.images()))
-                writer.finish(_outcome(recording))
+                _write_drawn(writer, recording, columns, painter, view.scene)
         compared = _compare(recording, out, options)
     return RerenderReport(
         source=source,
@@ -299,6 +291,20 @@ def rerender(
         differing={name: frame for name, frame in compared.items() if frame is not None},
         was_there=was_there,
     )
+
+
+def _write_drawn(
+    writer: EpisodeWriter, recording: Recording, columns: EpisodeColumns, painter: Painter, scene: Scene
+) -> None:
+    """All frames of a recording with new pictures of the scene, and its outcome."""
+    world = RecordedWorld(
+        recording.info.robot, scene, joint_position=columns.joint_position, object_poses=columns.object_poses
+    )
+    painter.setup(world)
+    for frame in frames_of(recording, columns):
+        world.frame = frame.frame_index
+        writer.write(replace(frame, images=painter.images()))
+    writer.finish(_outcome(recording))
 
 
 def _is_drawn(out: Path, info: EpisodeInfo, outcome: Outcome) -> bool:
