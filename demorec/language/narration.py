@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from demorec.geometry import Array
 from demorec.language.interjections import interjection
 from demorec.language.kinds import KINDS, LanguageKind
-from demorec.language.questions import questions, traces
+from demorec.language.questions import asked_rows, questions, traces
 from demorec.language.referring import phrase_for
 from demorec.language.situation import Situations, Surroundings
 from demorec.language.subtasks import GoalWords, goal_words, memories, plan, subtask, tcp_motion
@@ -49,6 +49,8 @@ def narrate(
     rows: NDArray[np.intp],
     kinds: Collection[LanguageKind],
     cameras: Sequence[str] = (),
+    *,
+    about: Collection[int] | None = None,
 ) -> list[Statement]:
     """Everything of the wanted kinds, in the order of the rows; kinds of one row in the order of `KINDS`.
 
@@ -58,20 +60,22 @@ def narrate(
         rows: (T,) which of its frames the dataset has.
         kinds: What shall be said, as far as the recording has it.
         cameras: Those whose pictures may be spoken of.
+        about: The rows whose pictures are spoken of, None for all.
 
     Raises:
         RecordingError: The recording is damaged.
     """
     story = story_of(recording, columns)
     told = _Told(recording, columns, rows, story)
+    asked = {row: turn for row, turn in told.asked().items() if about is None or row in about}
     found: dict[LanguageKind, Callable[[], Iterator[Statement]]] = {
         "subtask": told.subtasks,
         "plan": told.plans,
         "memory": told.memories,
         "motion": told.motions,
         "task_aug": told.wordings,
-        "vqa": lambda: told.questions(cameras),
-        "trace": lambda: told.traces(cameras),
+        "vqa": lambda: told.questions(cameras, asked),
+        "trace": lambda: told.traces(cameras, asked),
         "interjection": told.interjections,
     }
     statements = [statement for kind in KINDS if kind in kinds for statement in found[kind]()]
@@ -185,16 +189,16 @@ class _Told:
         for text in task_wordings(self._scene, info.instruction, rng, is_dropped=self._story.is_dropped):
             yield Statement(row=0, kind="task_aug", role="user", text=text)
 
-    def _fps(self) -> int:
-        """Of the dataset."""
+    def asked(self) -> dict[int, int]:
+        """Of all pictures that are spoken of: row -> turn."""
         stride = int(self._rows[1] - self._rows[0]) if len(self._rows) > 1 else 1
-        return self._info.fps // stride
+        return asked_rows(len(self._rows), self._info.fps // stride)
 
-    def questions(self, cameras: Sequence[str]) -> Iterator[Statement]:
-        for item in questions(self._recording, self._columns, self._rows, cameras, fps=self._fps()):
+    def questions(self, cameras: Sequence[str], asked: Mapping[int, int]) -> Iterator[Statement]:
+        for item in questions(self._recording, self._columns, self._rows, cameras, asked):
             yield Statement(row=item.row, kind="vqa", role="user", text=item.text, camera=item.camera)
             yield Statement(row=item.row, kind="vqa", role="assistant", text=item.answer, camera=item.camera)
 
-    def traces(self, cameras: Sequence[str]) -> Iterator[Statement]:
-        for item in traces(self._recording, self._columns, self._rows, cameras, fps=self._fps()):
+    def traces(self, cameras: Sequence[str], asked: Mapping[int, int]) -> Iterator[Statement]:
+        for item in traces(self._recording, self._columns, self._rows, cameras, asked):
             yield Statement(row=item.row, kind="trace", role="assistant", text=item.answer, camera=item.camera)

@@ -7,7 +7,7 @@ asked only where the answer is beyond doubt: of what is visible enough, in words
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -104,13 +104,17 @@ class _View:
         return {name: phrase for name in large if (phrase := self.moment.phrase(name))}
 
 
-def asked_rows(rows: NDArray[np.intp], fps: int) -> list[int]:
-    """The rows of the dataset at which questions are asked: one a second."""
-    return list(range(0, len(rows), max(1, fps)))
+def asked_rows(num_rows: int, fps: int) -> dict[int, int]:
+    """The rows of the dataset at which questions are asked, one a second -> which question of a camera it is."""
+    return {row: turn for turn, row in enumerate(range(0, num_rows, max(1, fps)))}
 
 
 def questions(
-    recording: Recording, columns: EpisodeColumns, rows: NDArray[np.intp], cameras: Sequence[str], *, fps: int
+    recording: Recording,
+    columns: EpisodeColumns,
+    rows: NDArray[np.intp],
+    cameras: Sequence[str],
+    asked: Mapping[int, int],
 ) -> Iterator[Question]:
     """A question a second about each camera that has segmentation, of another kind each time, in order by camera.
 
@@ -118,19 +122,18 @@ def questions(
         recording, columns: The episode.
         rows: (T,) which of its frames the dataset has.
         cameras: Those of the dataset.
-        fps: Of the dataset.
+        asked: `asked_rows`, or some of them.
 
     Raises:
         RecordingError: The recording is damaged.
     """
-    scene, asked = recording.info.scene, asked_rows(rows, fps)
-    frames = rows[asked]
+    scene, frames = recording.info.scene, rows[list(asked)]
     chosen = {
         camera.name: (number, camera)
         for number, camera in enumerate(scene.cameras)
         if camera.name in cameras and recording.has_segmentation(camera.name)
     }
-    if not chosen:
+    if not chosen or not asked:
         return
     numbers, poses = body_labels(recording), {name: values[frames] for name, values in columns.object_poses.items()}
     moments = [_Moment(now=now) for now in Situations(scene).at_each(poses, len(frames))]
@@ -141,18 +144,20 @@ def questions(
         name: project_each(camera, columns.world_from_camera[name][frames], places)
         for name, (_, camera) in chosen.items()
     }
-    turns = {int(frame): turn for turn, frame in enumerate(frames)}
+    of_frame = {int(frame): index for index, frame in enumerate(frames)}
+    in_order = list(asked.items())
     found: dict[str, list[Question]] = {name: [] for name in chosen}
-    for name, frame, labels in recording.segmentation_at(list(chosen), turns):
-        (number, camera), turn = chosen[name], turns[frame]
+    for name, frame, labels in recording.segmentation_at(list(chosen), of_frame):
+        (number, camera), index = chosen[name], of_frame[frame]
+        row, turn = in_order[index]
         view = _View(
             camera=camera,
             seen=seen_things(labels, numbers),
-            moment=moments[turn],
-            middles=dict(zip(numbers, middles[name][turn], strict=True)),
+            moment=moments[index],
+            middles=dict(zip(numbers, middles[name][index], strict=True)),
         )
         if (told := _ask(view, turn + number)) is not None:
-            found[name].append(Question(row=asked[turn], camera=name, text=told[0], answer=json.dumps(told[1])))
+            found[name].append(Question(row=row, camera=name, text=told[0], answer=json.dumps(told[1])))
     for of_camera in found.values():
         yield from of_camera
 
@@ -259,21 +264,23 @@ _KINDS: tuple[Callable[[_View, int], tuple[str, dict[str, Any]] | None], ...] = 
 
 
 def traces(
-    recording: Recording, columns: EpisodeColumns, rows: NDArray[np.intp], cameras: Sequence[str], *, fps: int
+    recording: Recording,
+    columns: EpisodeColumns,
+    rows: NDArray[np.intp],
+    cameras: Sequence[str],
+    asked: Mapping[int, int],
 ) -> Iterator[Trace]:
     """The next second of the TCP in each camera's picture, once a second, in order by camera.
 
     Points are where the picture of that moment would show the TCP; the trace ends where it leaves the picture, and
     there is none where it begins outside. Arguments as of `questions`.
     """
-    info = recording.info
+    info, frames = recording.info, rows[list(asked)]
     steps = np.linspace(0.0, _TRACE_SECONDS * info.fps, _TRACE_POINTS + 1).round().astype(int)
     world_from_tcp = info.scene.robot.world_from_base.apply(columns.base_from_tcp[:, :3])
     for camera in info.scene.cameras:
-        if camera.name not in cameras:
+        if camera.name not in cameras or not asked:
             continue
-        asked = asked_rows(rows, fps)
-        frames = rows[asked]
         tcp = world_from_tcp[np.minimum(frames[:, np.newaxis] + steps, columns.num_frames - 1)]
         projected = project_each(camera, columns.world_from_camera[camera.name][frames], tcp)
         pixels, inside = pixels_of(camera, projected)

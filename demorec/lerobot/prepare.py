@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -108,8 +108,16 @@ def transcoded_cameras(recording: AnyRecording, options: ExportOptions) -> tuple
     return tuple(f"{camera}, {reason}" for camera, reason in reasons.items() if reason)
 
 
-def prepare_episode(recording: AnyRecording, options: ExportOptions, *, code_depth: bool = True) -> PreparedEpisode:
-    """Read a recording into memory, as the dataset wants it; depth videos, which must be coded, only with `code_depth`.
+def prepare_episode(
+    recording: AnyRecording, options: ExportOptions, *, code_depth: bool = True, about: Collection[int] | None = None
+) -> PreparedEpisode:
+    """Read a recording into memory, as the dataset wants it.
+
+    Args:
+        recording: Of a simulated or of a collected episode.
+        options: How.
+        code_depth: Whether depth videos, which must be coded, are made.
+        about: The rows whose pictures are spoken of, if language is asked for; None for all.
 
     Raises:
         ConfigError: A kind of picture is missing that was asked for.
@@ -142,7 +150,7 @@ def prepare_episode(recording: AnyRecording, options: ExportOptions, *, code_dep
         videos=videos,
         video_info={key: wanted[key].info or {} for key in videos},
         pixels=pixels,
-        language=_language(recording, columns, options, fps=recording.info.fps // stride),
+        language=_language(recording, columns, options, about),
         facts=_facts(recording, columns, options),
     )
     return PreparedEpisode(
@@ -152,7 +160,9 @@ def prepare_episode(recording: AnyRecording, options: ExportOptions, *, code_dep
     )
 
 
-def _language(recording: Recording, columns: FeatureColumns, options: ExportOptions, *, fps: int) -> EpisodeLanguage:
+def _language(
+    recording: Recording, columns: FeatureColumns, options: ExportOptions, about: Collection[int] | None
+) -> EpisodeLanguage:
     """What the dataset shall say about the recording; nothing unless it was asked for."""
     if options.language is None:
         return EpisodeLanguage()
@@ -162,7 +172,8 @@ def _language(recording: Recording, columns: FeatureColumns, options: ExportOpti
             "Questions about pictures (vqa) need recordings with segmentation (generate --segmentation), leave them "
             f"out: {recording.path}"
         )
-    return episode_language(narrate(recording, columns.recorded, columns.rows, options.spoken, cameras), fps=fps)
+    told = narrate(recording, columns.recorded, columns.rows, options.spoken, cameras, about=about)
+    return episode_language(told, fps=recording.info.fps // frame_stride(recording.info.fps, options.fps))
 
 
 def _facts(recording: Recording, columns: FeatureColumns, options: ExportOptions) -> dict[str, Any]:

@@ -152,10 +152,17 @@ def _verify(root: Path, samples: tuple[VerifiedEpisode, ...], options: ExportOpt
 def _compare_episode(
     dataset: Any, sample: VerifiedEpisode, recording: AnyRecording, options: ExportOptions, number: int
 ) -> int:
-    expected = prepare_episode(recording, options, code_depth=False).data
-    first = int(dataset.meta.episodes[sample.episode_index]["dataset_from_index"])
+    first, length = (
+        int(dataset.meta.episodes[sample.episode_index][name]) for name in ("dataset_from_index", "length")
+    )
     # The last frame, where offsets add up, and one more that differs from episode to episode.
-    moments = sorted({(number * 37) % expected.num_frames, expected.num_frames - 1})
+    moments = sorted({(number * 37) % length, length - 1})
+    expected = prepare_episode(recording, options, code_depth=False, about=moments).data
+    if expected.num_frames != length:
+        raise ExportError(
+            f"The new dataset was dropped: episode {sample.episode_index} has {length} frames, the recording gives "
+            f"{expected.num_frames}: {sample.recording}"
+        )
     for moment in moments:
         try:
             item = dataset[first + moment]

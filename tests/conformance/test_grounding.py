@@ -16,8 +16,9 @@ from support.language import NOUNS, language_of, meant, phrases
 from demorec.errors import ConfigError
 from demorec.geometry import rotation_from_quat
 from demorec.language.masks import outline_area, run_lengths
-from demorec.lerobot import dataset_digest
+from demorec.lerobot import ExportOptions, dataset_digest
 from demorec.lerobot.boxes import coco_string
+from demorec.lerobot.prepare import prepare_episode
 from demorec.recording import Recording
 from demorec.scene.scene import Camera, Shape
 
@@ -152,6 +153,22 @@ def test_answers_are_true(dataset: Path, truth: Truth) -> None:
             is_on = np.abs(offset[:2]).max() < 0.04 and 0 < offset[2] < 0.04
             assert answer["relation"] == ("on" if is_on else "left_of" if x < u else "right_of")
             assert is_on or abs(x - u) > 0.05 * 128
+
+
+def test_a_picture_alone_is_asked_the_same(run: Path, dataset: Path) -> None:
+    """What is prepared of two rows, as the verification does it, is what the dataset has there."""
+    (frames,) = language_of(dataset)
+    (path,) = (run / "episodes").glob("*.mcap")
+    step, last = 30, len(frames) - 1
+    with Recording(path) as recording:
+        options = ExportOptions(language=())
+        told = prepare_episode(recording, options, code_depth=False, about=[2 * step, last]).data.language
+    there = {row: events for row, (_, events) in enumerate(frames) if events}
+    assert len(there) > 3
+    assert {row: [entry.to_json() for entry in entries] for row, entries in told.events.items()} == {
+        row: there[row] for row in (2 * step, last) if row in there
+    }
+    assert [entry.to_json() for entry in told.persistent] == frames[0][0]
 
 
 def test_traces_are_where_the_tcp_will_be(dataset: Path, truth: Truth) -> None:
