@@ -92,14 +92,14 @@ def _message_findings(stream: Stream) -> Iterator[tuple[str, str]]:
 
 def _time_findings(line: Timeline) -> Iterator[tuple[str, str]]:
     late = int(np.sum(np.diff(line.stream.log_ns) < 0))
-    known = line.stamps_ns[line.stamps_ns > 0]
+    is_known = line.stamps_ns > 0
+    known = line.stamps_ns[is_known]
     backwards = int(np.sum(np.diff(known) < 0))
     if late or backwards:
         yield "order", f"{max(late, backwards)} messages come before earlier ones"
     if repeated := line.num_repeated:
-        same = int(
-            np.sum((np.diff(known) == 0) & (np.diff(line.stream.checksums.astype(np.int64)[-len(known) :]) == 0))
-        )
+        checksums = line.stream.checksums[is_known].astype(np.int64)
+        same = int(np.sum((np.diff(known) == 0) & (np.diff(checksums) == 0)))
         yield "duplicates", f"{repeated} messages have the time of another one, {same} of them the same bytes as well"
     if not line.is_regular:
         return

@@ -135,7 +135,7 @@ def language_arrays(language: EpisodeLanguage, frames: int) -> dict[str, pa.Arra
     state = _structs(language.persistent, _STATE)
     # In two steps, since each costs by the number of its parts; `take` costs three times as much.
     several = pa.concat_arrays([state] * _AT_ONCE)
-    often = pa.concat_arrays([several] * (frames // _AT_ONCE) + [state] * (frames % _AT_ONCE))
+    often = pa.concat_arrays([state[:0], *[several] * (frames // _AT_ONCE), *[state] * (frames % _AT_ONCE)])
     steps = pa.array(np.arange(frames + 1, dtype=np.int32) * np.int32(len(state)))
     return {
         PERSISTENT: pa.ListArray.from_arrays(steps, often),

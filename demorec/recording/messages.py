@@ -219,7 +219,7 @@ def read_pixel_statistics(data: bytes) -> PixelStatistics:
     _, values = CdrReader(data).values(INT64_ARRAY)
     if len(values) != 1 + 3 * 256 or not ((values >= 0) & (values < _MOST_PIXELS)).all():
         raise ValueError("a histogram of other numbers than counts")
-    return PixelStatistics(num_images=int(values[0]), counts=values[1:].reshape(3, 256))
+    return PixelStatistics(num_images=int(values[0]), counts=values[1:].reshape(3, 256).copy())
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

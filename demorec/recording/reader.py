@@ -233,10 +233,11 @@ class RecordingReader(EpisodeFile[Outcome, metadata.CameraStreams]):
 
     def segment_labels(self) -> dict[int, str]:
         """Label in the files -> name, as of `segment_names`."""
-        packed = self._packed_labels.get(channels.LABELS) or self._container.blocks((channels.LABELS,))[channels.LABELS]
-        for message in packed.messages():
+        if packed := self._packed_labels.get(channels.LABELS):
             with damage_as_recording_error(self.path):
-                return messages.read_label_info(message)
+                return messages.read_label_info(next(packed.messages()))
+        for _, names in self._read(channels.LABELS, messages.read_label_info):
+            return names
         return {}
 
     def _pictures[P](self, topic: str, read: Callable[[bytes], P]) -> Iterator[P]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -52,6 +53,23 @@ def test_a_fault_is_named(name: str, notes: bags.Notes, tmp_path: Path) -> None:
         (report,) = import_bags([bag], tmp_path / "robot.toml", run).reports
         assert FAULTS[name].kind in {finding.kind for finding in report.findings}
         assert len(list(run.glob("episodes/*.mcap"))) == 1
+
+
+def test_copies_are_counted_beside_messages_without_a_time(notes: bags.Notes, tmp_path: Path) -> None:
+    """Every third message twice, and no time in the last header, which the duplicates do not belong to."""
+    topic = "/follower/joint_states"
+    twice = hurt(notes, "duplicated messages")
+    last = max(note.log_ns for note in twice if note.topic == topic)
+    unstamped = bags.changed(twice, topic, lambda k, note: replace(note, header_ns=0) if note.log_ns == last else note)
+    bag = bags.write_mcap(unstamped, tmp_path / "bag.mcap")
+    mapping = read_mapping(bag_mappings.write_mapping(MAPPING, tmp_path / "robot.toml"))
+    found = {
+        finding.kind: finding.text for finding in all_findings(Timelines(read_streams(open_bag(bag), mapping), mapping))
+    }
+    copies = len(twice) - len(notes)
+    assert copies > 10
+    assert f"{copies} messages have the time of another one, {copies} of them the same bytes" in found["duplicates"]
+    assert "1 of " in found["unstamped"]
 
 
 def test_a_bag_that_is_cut_off_is_named(notes: bags.Notes, tmp_path: Path) -> None:

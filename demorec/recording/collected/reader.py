@@ -87,7 +87,9 @@ class CollectedRecording(EpisodeFile[CollectedOutcome, VideoSettings]):
     def _with_urdf(self, info: CollectedInfo, sha256: str) -> CollectedInfo:
         if not sha256:
             return info
-        urdf = ["", *(text for _, text in self._read(description_topic(), messages.read_string))][-1]
+        urdf = ""
+        for _, urdf in self._read(description_topic(), messages.read_string):
+            pass  # the last one holds
         if metadata.urdf_sha256(urdf) != sha256:
             raise RecordingError("The URDF of the recording is not the one that its metadata tells of")
         described = dataclasses.replace(info, urdf=urdf)
