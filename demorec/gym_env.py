@@ -277,8 +277,10 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
 
     def close(self) -> None:
         """Free the simulator and the renderers; harmless when called twice."""
-        self._workshop.close()
-        self._viewers.close()
+        try:
+            self._workshop.close()
+        finally:
+            self._viewers.close()
         self._viewer = self._session = self._situation = None
 
     # ------------------------------------------------------------------------------------------------ parts

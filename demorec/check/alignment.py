@@ -22,9 +22,11 @@ def measured_lag(before: Array, after: Array) -> tuple[float, float] | None:
     Least squares over whole lags from -5 to 5, all columns together, each on the scale of its speed and up to a
     constant, with a parabola through the best lag and its neighbours. None when nothing moves.
     """
+    if len(before) < 4 * MAX_LAG:
+        return None
     speed = np.sqrt((np.diff(before, axis=0) ** 2).mean(axis=0))
     moving = speed > 1e-5
-    if len(before) < 4 * MAX_LAG or not moving.any():
+    if not moving.any():
         return None
     x, y = before[:, moving] / speed[moving], after[:, moving] / speed[moving]
     core = slice(MAX_LAG, len(x) - MAX_LAG)

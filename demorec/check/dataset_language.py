@@ -20,7 +20,7 @@ from demorec.check.dataset import Dataset
 from demorec.language.kinds import STATES
 from demorec.language.questions import ANSWERS
 from demorec.language.referring import references
-from demorec.language.situation import COLORS, Surroundings, place_of, situation
+from demorec.language.situation import COLOR_WORDS, Surroundings, place_of, situation
 from demorec.lerobot.boxes import BOXES_DIR, read_boxes
 from demorec.lerobot.language import COLUMNS, SpokenEpisode
 from demorec.scene.episode import CORRECTED_PHASE, MISTAKEN_PHASE, EpisodeInfo
@@ -226,7 +226,7 @@ def _named(text: str, start: Surroundings) -> set[str]:
 def _colored(text: str, start: Surroundings) -> Iterator[tuple[str, str]]:
     """(colour, noun) of each phrase of a text that has both."""
     nouns = sorted({noun for thing in start.things for noun in thing.nouns}, key=len, reverse=True)
-    pattern = re.compile(rf"\b({'|'.join(COLORS)}) ({'|'.join(map(re.escape, nouns))})\b")
+    pattern = re.compile(rf"\b({'|'.join(COLOR_WORDS)}) ({'|'.join(map(re.escape, nouns))})\b")
     for match in pattern.finditer(text.lower()):
         yield match[1], match[2]
 

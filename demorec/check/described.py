@@ -12,14 +12,13 @@ import numpy as np
 from demorec.check.base import Found, Measurement, NotMeasured, alignment_check, outcome_check
 from demorec.check.episode import CheckedEpisode
 from demorec.errors import ConfigError
+from demorec.language.situation import COLOR_WORDS
 from demorec.plain import digest, from_plain
 from demorec.scene.episode import POLICY_PHASE
 from demorec.scene.scene import Scene
 from demorec.scene.variation import Ranges, resolve
 from demorec.tables import ROBOTS, camera_name, load_robot
 
-COLOR_WORDS = frozenset(("red", "green", "blue", "yellow", "orange", "purple", "black", "white", "grey"))
-"""Words for colours in instructions."""
 _MARGIN = 1e-9
 """By how much a drawn number may be beyond its range: it was turned and scaled."""
 _SIGMAS = 8.0

@@ -149,13 +149,13 @@ def _infos(subjects: Sequence[Subject]) -> Iterator[EpisodeInfo]:
     from demorec.check.dataset import Dataset
     from demorec.recording import Recording
 
-    recordings, datasets = _split(subjects)
-    for path in recordings:
-        if path.parent.name != "failed":
-            with Recording(path) as recording:
+    _, datasets = _split(subjects)
+    for subject in subjects:
+        if subject.kind == "recording" and subject.path.parent.name != "failed":
+            with Recording(subject.path) as recording:
                 yield recording.info
-    for path in datasets:
-        yield from Dataset(path).infos
+        elif subject.kind == "dataset" and subject.path in datasets:
+            yield from Dataset(subject.path).infos
 
 
 def _replays(paths: Sequence[Path], count: int, allowed: tuple[str, ...]) -> Iterator[tuple[ReplayReport, bool]]:

@@ -124,6 +124,9 @@ class _Timed:
     def __getattr__(self, name: str) -> Any:
         return self._counted(getattr(self._timed, name))
 
+    def close(self) -> None:
+        """Nothing: whoever made it does that."""
+
 
 @contextmanager
 def _scratch_folder(folder: Path) -> Iterator[Path]:

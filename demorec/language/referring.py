@@ -12,7 +12,7 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
 
-from demorec.language.situation import COLORS, NamedThing, Surroundings
+from demorec.language.situation import COLOR_WORDS, NamedThing, Surroundings
 
 MIN_GAP = 0.04
 """By how much, metres, one thing must be farther to a side, or nearer, than the next one to be called so."""
@@ -73,7 +73,7 @@ def phrase_for(name: str, situation: Surroundings) -> str:
 def _grammar(known: frozenset[str]) -> re.Pattern[str]:
     nouns = "|".join(sorted((re.escape(noun) for noun in known), key=len)[::-1])
     return re.compile(
-        rf"\b(?P<article>the|every) (?:(?P<order>{'|'.join(_IN_FRONT)}) )?(?:(?P<color>{'|'.join(COLORS)}) )?"
+        rf"\b(?P<article>the|every) (?:(?P<order>{'|'.join(_IN_FRONT)}) )?(?:(?P<color>{'|'.join(COLOR_WORDS)}) )?"
         rf"(?P<noun>{nouns})\b(?: (?P<behind>{'|'.join(_BEHIND)})\b)?"
     )
 

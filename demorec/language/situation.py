@@ -12,7 +12,8 @@ import numpy as np
 from demorec.geometry import Array, Pose
 from demorec.scene.scene import Body, Goal, Scene
 
-COLORS = ("red", "green", "blue", "yellow", "orange", "purple", "black", "white", "grey")
+COLOR_WORDS = ("red", "green", "blue", "yellow", "orange", "purple", "black", "white", "grey")
+"""Words for colours in instructions and names."""
 _NOUNS = {"jenga": "wooden plank", "lego": "toy brick"}
 """Words for things whose names say less."""
 _SYNONYMS = {
@@ -124,7 +125,7 @@ def situation(scene: Scene, world_from_object: Mapping[str, Array] | None = None
 
 def nouns_of(body: Body) -> tuple[str, ...]:
     """What a body may be called: by its name, less colour and number, and by its shape."""
-    words = [word for word in body.name.split("_") if not word.isdigit() and word not in (*COLORS, "other")]
+    words = [word for word in body.name.split("_") if not word.isdigit() and word not in (*COLOR_WORDS, "other")]
     noun = " ".join(_NOUNS.get(word, word) for word in words) or "object"
     nouns = _SYNONYMS.get(noun, (noun,))
     x, y, z = body.shape.extents

@@ -33,9 +33,9 @@ class Workshop:
         if self._world is None or key != self._key:
             self.close()
             self._world, self._key = make_world(info), key
-        return self._world, self._renderers.of(
-            str(info.config.get("renderer", "raster"))
-        ) if info.scene.cameras else None
+        name = str(info.config.get("renderer", "raster"))
+        renderer = self._renderers.of(name) if info.scene.cameras else None
+        return self._world, renderer
 
     def close(self) -> None:
         """Free both; harmless when called twice."""

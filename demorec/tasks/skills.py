@@ -41,8 +41,8 @@ ARRIVAL_TOLERANCE, ARRIVAL_SECONDS = 0.006, 0.34
 still held the arm a centimetre off, a policy would learn that a centimetre off is good enough."""
 LOST_WIDTH = 0.012
 """Opening, metres, below which the hand holds nothing."""
-TRANSPORT_HEIGHT = 0.10
-"""Above the goal, metres."""
+LEAST_ABOVE_GOAL = 0.10
+"""Metres of the TCP above the goal on its way there; it stays at `lift_height` where that is higher."""
 ABOVE_M, ABOVE_RAD = 0.01, 0.35
 """How far the hand may be beside where it is going to be lowered to, so that it need not rise and come again."""
 CARRIED_ABOVE_M = 0.04
@@ -379,7 +379,7 @@ class Expert:
 
     def _transport_height(self, place: Pose) -> float:
         """Height of the TCP, m, on the way to a place: never lower than now."""
-        return float(max(self.tcp_target().position[2], place.position[2] + TRANSPORT_HEIGHT))
+        return float(max(self.tcp_target().position[2], place.position[2] + LEAST_ABOVE_GOAL))
 
     def _is_full(self) -> bool:
         return self.world.arm.gripper_width() > LOST_WIDTH

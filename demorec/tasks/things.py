@@ -108,6 +108,6 @@ def make_thing(
 
 
 def words_for(body: Body) -> str:
-    """What a thing is called: "red cube", "duck"."""
-    kind = next(part for part in body.name.split("_") if part in THINGS)
-    return f"{body.color_name} {THINGS[kind].noun}".strip()
+    """What a thing is called: "red cube", "duck"; what is of no known kind by its own name."""
+    kinds = [THINGS[part].noun for part in body.name.split("_") if part in THINGS]
+    return f"{body.color_name} {kinds[0]}".strip() if kinds else body.name.replace("_", " ")

@@ -6,7 +6,6 @@ the rows in which one does are left to it, and what stands in many rows one afte
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -32,7 +31,7 @@ class Statements:
         self._table = table
         self._lists: pa.ChunkedArray = table.with_format("arrow")[:].column(self._name)
         self._first = _first_alike(self._lists)
-        self._read_once = lru_cache(_MOST_KEPT)(self._read)
+        self._kept: dict[int, list[Statement]] = {}
 
     def take(self, rows: NDArray[np.int64]) -> list[list[Statement] | None]:
         """What stands in the given rows (B,)."""
@@ -42,7 +41,11 @@ class Statements:
         first = int(self._first[row])
         if first < 0:
             return self._read(row)
-        return [dict(statement) for statement in self._read_once(first) or ()]  # whoever gets it may change it
+        if first not in self._kept:
+            if len(self._kept) >= _MOST_KEPT:
+                del self._kept[next(iter(self._kept))]
+            self._kept[first] = self._read(first) or []
+        return [dict(statement) for statement in self._kept[first]]  # whoever gets it may change it
 
     def _read(self, row: int) -> list[Statement] | None:
         said = self._lists[row].values

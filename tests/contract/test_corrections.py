@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -79,7 +80,7 @@ def roll_out(folder: Path, policy: Any, rules: TakeOver, *, action: ActionKind) 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(rollouts, "Policy", lambda *args, **kwargs: policy)
         patch.setattr(rollouts, "find_checkpoint", lambda path: path)
-        rollouts._stage.cache_clear()
+        patch.setattr(rollouts, "_stage", functools.lru_cache(rollouts._stage.__wrapped__))
         attempt = make_rollout(EpisodePlan(config=settings.config, episode_index=3), folder)
     return attempt, folder / attempt.file
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 from pathlib import Path
 from typing import Any
@@ -43,7 +44,7 @@ def test_a_rollout_is_recorded_as_it_was_and_replays_to_the_bit(
     policy = Waving()
     monkeypatch.setattr(rollouts, "Policy", lambda *_, **__: policy)
     monkeypatch.setattr(rollouts, "find_checkpoint", lambda path: path)
-    rollouts._stage.cache_clear()
+    monkeypatch.setattr(rollouts, "_stage", functools.lru_cache(rollouts._stage.__wrapped__))
     settings = Settings(
         policy="p",
         policy_type="waving",

@@ -204,9 +204,13 @@ def test_too_large_workers_are_refused(tmp_path: Path, cluster: object) -> None:
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1:1", "nowhere.invalid:6379", "127.0.0.1:99999"])
-def test_an_unreachable_cluster_is_told_at_once(tmp_path: Path, address: str) -> None:
-    with pytest.raises(ConfigError, match=r"cannot be reached .* give the address that `ray start --head` has printed"):
-        on_ray._knock(address)
+def test_an_unreachable_cluster_is_told_at_once(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ray.is_initialized", lambda: False)
+    with (
+        pytest.raises(ConfigError, match=r"cannot be reached .* give the address that `ray start --head` has printed"),
+        on_ray.connected(address, 1),
+    ):
+        pass
 
 
 def test_an_unreachable_cluster_leaves_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

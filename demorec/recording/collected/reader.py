@@ -88,8 +88,8 @@ class CollectedRecording(EpisodeFile[CollectedOutcome, VideoSettings]):
         if not sha256:
             return info
         urdf = ""
-        for _, urdf in self._read(description_topic(), messages.read_string):
-            pass  # the last one holds
+        for _, text in self._read(description_topic(), messages.read_string):
+            urdf = text  # the last one holds
         if metadata.urdf_sha256(urdf) != sha256:
             raise RecordingError("The URDF of the recording is not the one that its metadata tells of")
         described = dataclasses.replace(info, urdf=urdf)
