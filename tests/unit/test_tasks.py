@@ -25,11 +25,28 @@ from demorec.tasks import skills
 from demorec.tasks.grasping import grasp_yaws, grasps_beside, hand_down, hand_yaw, raised, symmetric_yaws
 from demorec.tasks.sampling import WORKSPACE, Region, Sampler
 from demorec.tasks.script import Behaviour
+from demorec.tasks.things import words_for
 from demorec.tasks.waiting import lasting
 
 
 def sampler(seed: int = 0) -> Sampler:
     return Sampler(np.random.default_rng(seed))
+
+
+@pytest.mark.parametrize(
+    ("name", "color", "words"),
+    [("cube_2", "red", "red cube"), ("duck", "", "duck"), ("tea_pot_lid", "blue", "tea pot lid")],
+)
+def test_things_have_words_whatever_they_are_called(name: str, color: str, words: str) -> None:
+    body = Body(
+        name=name,
+        role="object",
+        shape=Shape(kind="box", size=(0.04, 0.04, 0.04)),
+        world_from_body=Pose(),
+        mass=0.1,
+        color_name=color,
+    )
+    assert words_for(body) == words
 
 
 def test_points_keep_their_distance_and_stay_inside() -> None:
