@@ -6,6 +6,7 @@ import dataclasses
 import math
 import tomllib
 import typing
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,7 +49,7 @@ class Part:
     next: str = ""
 
 
-class AnyMapping:
+class AnyMapping(ABC):
     """A mapping, of whatever kind of file."""
 
     @property
@@ -56,9 +57,9 @@ class AnyMapping:
         """16 hex digits of all it says."""
         return digest(self)
 
+    @abstractmethod
     def problems(self) -> Iterator[str]:
         """What is impossible in it, whatever the file."""
-        raise NotImplementedError
 
 
 def feature_problems(features: Mapping[str, Sequence[Part]]) -> Iterator[str]:
