@@ -177,31 +177,44 @@ class ExportEpisode(ABC):
         return np.arange(0, self.recording.num_frames, self.recording.info.fps // self.fps)
 
     @cached_property
-    def columns(self) -> Mapping[str, NDArray[np.generic]]:
-        """Feature -> (T, D) float32, (T,) of scalars: all that is offered, in the order of `names`, then `scalars`.
+    def vectors(self) -> Mapping[str, NDArray[np.floating[Any]]]:
+        """Feature of `names` that the dataset shall have -> (T, D), as precise as the recording has it.
 
         Raises:
-            ExportError: The recording has no frames, or a number that is not finite in float32.
+            ExportError: The recording has no frames, or a number that is not finite.
             RecordingError: It is damaged.
         """
-        columns: dict[str, NDArray[np.generic]] = {}
-        for name, values in self._vectors().items():
+        vectors = {name: values for name, values in self._vectors().items() if self.options.takes(name)}
+        for name, values in vectors.items():
+            self._check_finite(name, values)
+        return vectors
+
+    @cached_property
+    def singles(self) -> Mapping[str, NDArray[np.generic]]:
+        """The same as float32, and (T,) of the scalars; ExportError for a number that float32 does not hold, too."""
+        found: dict[str, NDArray[np.generic]] = {}
+        for name, values in self.vectors.items():
             with np.errstate(over="ignore"):
-                columns[name] = single = values.astype(np.float32)
-            if len(wrong := np.flatnonzero(~np.isfinite(single).all(axis=1))):
-                raise ExportError(
-                    f"The feature {name} is not finite, or too large for float32, in frame {int(self.rows[wrong[0]])}: "
-                    f"leave the recording out: {self.recording.path}"
-                )
-        return columns | self._scalars()
+                found[name] = single = values.astype(np.float32)
+            self._check_finite(name, single)
+        return found | {name: values for name, values in self.scalar_columns.items() if self.options.takes(name)}
+
+    def _check_finite(self, name: str, values: NDArray[np.floating[Any]]) -> None:
+        if len(wrong := np.flatnonzero(~np.isfinite(values).all(axis=1))):
+            why = "too large for float32" if values.dtype == np.float32 else "not finite"
+            raise ExportError(
+                f"The feature {name} is {why} in frame {int(self.rows[wrong[0]])}, leave the recording out: "
+                f"{self.recording.path}"
+            )
 
     @abstractmethod
     def _vectors(self) -> Mapping[str, NDArray[np.floating[Any]]]:
-        """Feature -> (T, D), of the wanted ones at least."""
+        """Feature -> (T, D)."""
 
+    @property
     @abstractmethod
-    def _scalars(self) -> Mapping[str, NDArray[np.generic]]:
-        """Scalar -> (T,)."""
+    def scalar_columns(self) -> Mapping[str, NDArray[np.generic]]:
+        """Feature of `scalars` -> (T,)."""
 
     @abstractmethod
     def numbers(self, camera: ExportCamera) -> NDArray[np.int64]:
@@ -272,7 +285,8 @@ class _Simulated(ExportEpisode):
     @property
     def urdf(self) -> str:
         """As the recording describes the arm."""
-        return self.simulated.recording.description()
+        recording = self.simulated.recording
+        return recording.description() if channels.description_topic() in recording.topics else ""
 
     @property
     def joints(self) -> Mapping[str, tuple[str, ...]]:
@@ -337,14 +351,19 @@ class _Simulated(ExportEpisode):
                 privileged=self.options.privileged,
                 state=self._state,
                 sensed=self._sensed,
+                dtype=np.float64,
             )
         )
         if COMMAND in self.names:
             vectors[COMMAND] = command_vectors(self.simulated.columns, action_rows)
-        vectors[ACTION] = action_vectors(self.simulated.columns, info.scene, self.options.action, action_rows)
+        vectors[ACTION] = action_vectors(
+            self.simulated.columns, info.scene, self.options.action, action_rows, dtype=np.float64
+        )
         return vectors
 
-    def _scalars(self) -> Mapping[str, NDArray[np.generic]]:
+    @cached_property
+    def scalar_columns(self) -> Mapping[str, NDArray[np.generic]]:
+        """As its name says."""
         outcome, is_last = self.simulated.recording.outcome, self.rows == self.rows[-1]
         success = outcome is not None and outcome.success
         found: dict[str, NDArray[np.generic]] = {
@@ -482,9 +501,11 @@ class _External(ExportEpisode):
         return numbers
 
     def _vectors(self) -> Mapping[str, NDArray[np.floating[Any]]]:
-        return {name: values for name, values in self._recording.columns().features.items() if self.options.takes(name)}
+        return self._recording.columns().features
 
-    def _scalars(self) -> Mapping[str, NDArray[np.generic]]:
+    @cached_property
+    def scalar_columns(self) -> Mapping[str, NDArray[np.generic]]:
+        """As its name says."""
         return {DONE: self.rows == self.rows[-1]}
 
 

@@ -105,9 +105,7 @@ class Profile:
     @classmethod
     def of(cls, episode: ExportEpisode) -> Profile:
         """That of an episode."""
-        return cls(
-            traits=tuple(episode.traits()), depth_left_out=episode.depth_left_out, is_silent=episode.is_silent
-        )
+        return cls(traits=tuple(episode.traits()), depth_left_out=episode.depth_left_out, is_silent=episode.is_silent)
 
     def differences(self, other: Profile) -> tuple[str, ...]:
         """How `other` differs, in words."""

@@ -28,7 +28,17 @@ from demorec.lerobot.reader import read_tasks
 from demorec.lerobot.robots import ROBOTS_DIR
 from demorec.lerobot.thumbnails import THUMBNAILS_PATH, write_thumbnails
 from demorec.lerobot.writer import write_text
-from demorec.scene.features import ACTION, COMMAND, EE_POSE, ENVIRONMENT_STATE, IMAGE_PREFIX, SENSED, STATE, VELOCITY, ActionKind
+from demorec.scene.features import (
+    ACTION,
+    COMMAND,
+    EE_POSE,
+    ENVIRONMENT_STATE,
+    IMAGE_PREFIX,
+    SENSED,
+    STATE,
+    VELOCITY,
+    ActionKind,
+)
 
 SECOND_CARD_PATH = f"{SIDECAR_DIR}/README.md"
 """Where the card goes if the dataset has a README.md that demorec did not write."""
@@ -180,7 +190,12 @@ def _robot_section(root: Path) -> Iterable[str]:
 
 
 def _meaning(key: str, item: Feature, about: CardFacts) -> str:
-    if not about.is_simulated and not key.startswith(IMAGE_PREFIX) and key not in AUTOMATIC_FEATURES and key != "next.done":
+    if (
+        not about.is_simulated
+        and not key.startswith(IMAGE_PREFIX)
+        and key not in AUTOMATIC_FEATURES
+        and key != "next.done"
+    ):
         return "as it was recorded"
     if key == ACTION:
         return _ACTION_MEANING[about.options.action]

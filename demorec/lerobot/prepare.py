@@ -89,7 +89,6 @@ def prepare_episode(
         RecordingError: It is damaged.
     """
     wanted = dataset_features(episode, options)
-    columns = {name: values for name, values in episode.columns.items() if name in wanted}
     videos = coded_videos(episode, reasons_to_transcode(episode), options.transcode)
     pixels = {}
     for camera in episode.cameras:
@@ -104,7 +103,7 @@ def prepare_episode(
             episode.numbers(camera)  # says what is missing
     data = EpisodeData(
         task=episode.recording.info.instruction,
-        columns=columns,
+        columns=episode.singles,
         videos=videos,
         video_info={key: wanted[key].info or {} for key in videos},
         pixels=pixels,
@@ -118,16 +117,12 @@ def prepare_episode(
     )
 
 
-def _language(
-    episode: ExportEpisode, options: ExportOptions, about: Collection[int] | None
-) -> EpisodeLanguage:
+def _language(episode: ExportEpisode, options: ExportOptions, about: Collection[int] | None) -> EpisodeLanguage:
     """What the dataset shall say about the episode; nothing unless it was asked for."""
     if options.language is None:
         return EpisodeLanguage()
     if (simulated := episode.simulated) is None:
-        stated = [
-            Statement(row=frame, kind="subtask", role="assistant", text=text) for frame, text in episode.subtasks
-        ]
+        stated = [Statement(row=frame, kind="subtask", role="assistant", text=text) for frame, text in episode.subtasks]
         return episode_language(stated, fps=episode.fps)
     recording = simulated.recording
     cameras = [camera for camera in recording.cameras if options.takes(IMAGE_PREFIX + camera)]

@@ -23,8 +23,8 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from demorec.geometry import Array
 from demorec.export.episode import ExportEpisode, Simulated
+from demorec.geometry import Array
 from demorec.lerobot.attempts import ATTEMPT_SCHEMA, AttemptRecord
 from demorec.lerobot.layout import SIDECAR_ATTEMPTS_PATH, SIDECAR_CAMERAS_PATH, SIDECAR_EPISODES_PATH, FilePosition
 from demorec.lerobot.parquet import RollingParquet, vector_array
@@ -143,6 +143,8 @@ class EpisodeRecord:
             config={} if simulated is None else simulated.recording.info.config,
             robot=robot_of(episode),
         )
+
+
 def _simulated_row(simulated: Simulated, rows: NDArray[np.intp]) -> dict[str, Any]:
     """What is known of a simulated episode; it failed where its recording ends without an outcome."""
     info, columns, outcome = simulated.recording.info, simulated.columns, simulated.recording.outcome

@@ -53,7 +53,7 @@ def _lead(recording: AnyRecording, camera: str, number: int) -> int:
 
 
 def dataset_settings(episode: ExportEpisode, camera: ExportCamera, video: VideoConfig, reason: str) -> VideoSettings:
-    """How the images of a camera are coded in the dataset: as recorded, or, for a `reason`, as they will be transcoded."""
+    """How a camera's images are encoded in the dataset: as recorded, or, for a `reason`, as they will be transcoded."""
     settings = episode.recording.video_settings(camera.name)
     if reason:
         return make_encoder(video=video, width=settings.width, height=settings.height, fps=episode.fps).settings

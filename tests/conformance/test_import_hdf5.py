@@ -194,8 +194,8 @@ def test_our_own_file_comes_back_to_the_bit(tmp_path: Path) -> None:
             np.testing.assert_array_equal(found["action"], demo["actions"][:])
             np.testing.assert_array_equal(found["observation.ee_pose"][:, :3], demo["obs/robot0_eef_pos"][:])
             state = np.hstack([original.joint_position[:, :7], original.gripper_width[:, np.newaxis]])
-            np.testing.assert_array_equal(found["observation.state"], state.astype(np.float32))
-            assert [feature.dtype for feature in info.features] == ["float32"] * len(info.features)
+            np.testing.assert_array_equal(found["observation.state"], state)
+            assert [feature.dtype for feature in info.features] == ["float64"] * len(info.features)
             assert info.features[0].joints[:7] == simulated.info.robot.joint_names[:7]
 
 
@@ -207,8 +207,9 @@ def test_our_own_file_of_collected_episodes_comes_back(tmp_path: Path) -> None:
     _, run = imported(tmp_path / "a.hdf5")
     with CollectedRecording(recordings(run)[0]) as recording:
         for name in ("observation.state", "observation.force", "action"):
-            expected = [frame.samples[name].vector.astype(np.float32) for frame in given.frames]
-            np.testing.assert_array_equal(recording.columns().features[name], np.array(expected))
+            expected = np.array([frame.samples[name].vector for frame in given.frames])
+            assert recording.columns().features[name].dtype == expected.dtype
+            np.testing.assert_array_equal(recording.columns().features[name], expected)
         assert [feature.names for feature in recording.info.features if feature.name == "action"] == [
             ("shoulder.pos", "elbow.pos", "gripper.pos")
         ]
