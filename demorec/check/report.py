@@ -11,6 +11,7 @@ from demorec.check.base import Check, Group, Level, Result, Scope
 from demorec.check.collected import NOT_APPLICABLE
 from demorec.check.dataset import Dataset
 from demorec.check.episode import CheckedEpisode
+from demorec.check.motion import Motions
 from demorec.check.run import CheckedRun
 from demorec.errors import check_option, resource_error
 from demorec.processes import SPAWN
@@ -162,6 +163,7 @@ def check_subject(subject: Subject, options: CheckOptions) -> SubjectReport:
         with CollectedRecording(subject.path) as recording:
             gates = ("collected_opens", "collected_readable")
             found = _run(options.checks("collected"), recording, gates, recording.columns)
+            found += _run(options.checks("motion"), Motions(recording), (), recording.columns)
         found += [check.skipped(NOT_APPLICABLE) for check in checks]
     elif subject.kind == "recording":
         with CheckedEpisode(subject.path) as episode:
@@ -174,6 +176,7 @@ def check_subject(subject: Subject, options: CheckOptions) -> SubjectReport:
     else:
         dataset = Dataset(subject.path)
         found = _run(checks, dataset, ("dataset_readable",), lambda: dataset.rows)
+        found += _run(options.checks("motion"), Motions(dataset), (), lambda: dataset.rows)
     results = tuple(replace(result, detail=_within(subject.path, result.detail)) for result in found)
     return SubjectReport(**vars(subject), results=results)
 
@@ -210,7 +213,7 @@ def _run(checks: Sequence[Check], subject: object, gates: tuple[str, ...], read:
         if check.name == "opens" and result.level == "fail":
             results += [other.blocked() for other in checks if other is not check]
             break
-    if unreadable and all(result.level in ("pass", "skip") for result in results):
+    if gates and unreadable and all(result.level in ("pass", "skip") for result in results):
         # No chosen check looks at what is broken; it must not pass for that.
         gate = CHECKS.load(gates[-1])
         results.append(gate.run(subject))
