@@ -1,0 +1,106 @@
+"""Which of the vectors in a bag become the state and the action of a suggested mapping."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from demorec.ingest.candidates import Vector
+
+
+@dataclass(frozen=True, kw_only=True)
+class Choice:
+    """What a mapping takes, and what it offers.
+
+    Attributes:
+        state, action: Their parts, in order; an empty action is the next state.
+        others: All other vectors.
+        warnings: What the user has to decide, a sentence each.
+    """
+
+    state: tuple[Vector, ...]
+    action: tuple[Vector, ...]
+    others: tuple[Vector, ...]
+    warnings: tuple[str, ...]
+
+
+def choose_features(vectors: Sequence[Vector]) -> Choice:
+    """The state and the action: joints if there are any, otherwise poses and velocities in space."""
+    usable = [vector for vector in vectors if vector.is_sure and vector.rate_hz and vector.kind != "numbers"]
+    measured = [vector for vector in usable if vector.role != "action"]
+    commands = [vector for vector in usable if vector.role == "action"]
+    state = _joints([vector for vector in measured if vector.role == "state"])
+    unsaid = [vector for vector in measured if vector.kind == "arm" and not vector.role]
+    if len(unsaid) == 1 and not _has(state, "arm"):
+        state = [*unsaid, *state]
+    has_arm = _has(state, "arm")
+    if all(vector.kind == "gripper" or vector.has_wheels for vector in state):
+        state = [*state, *_of_robot(measured)]
+    action = _joints(commands)
+    if not has_arm and not _has(action, "arm"):
+        action = [*(vector for vector in commands if vector.kind in ("pose", "twist")), *action]
+    warnings = []
+    if all(vector.kind == "gripper" for vector in state):
+        warnings.append(_lacking(state, vectors))
+        state = []
+    elif all(vector.kind == "gripper" for vector in action):
+        action = []  # the arm's command is missing, and the next state has the gripper's opening as well
+    taken = {id(vector) for vector in (*state, *action)}
+    others = tuple(vector for vector in vectors if id(vector) not in taken)
+    return Choice(state=tuple(state), action=tuple(action), others=others, warnings=tuple(warnings))
+
+
+def _lacking(grippers: Sequence[Vector], vectors: Sequence[Vector]) -> str:
+    found = "no topic is known to say what the robot does"
+    if grippers:
+        labels = [label for vector in grippers for label in vector.labels]
+        found = f"the only joints that are known to be measured are a gripper's ({', '.join(labels[:4])})"
+    advice = "take the topics that do from the commented lines" if vectors else "the bag holds no topic of numbers"
+    return f"The arm is left out: {found}; {advice}, or the import refuses this mapping."
+
+
+def _has(vectors: Iterable[Vector], kind: str) -> bool:
+    return any(vector.kind == kind for vector in vectors)
+
+
+def _joints(vectors: Sequence[Vector]) -> list[Vector]:
+    """The joints among them, none twice: those of arms and bases, then those of grippers."""
+    bodies = _distinct([vector for vector in vectors if vector.kind in ("arm", "base")])
+    grippers = [vector for vector in vectors if vector.kind == "gripper"]
+    if any(vector.has_gripper for vector in bodies):
+        known = {label for vector in bodies for label in vector.labels}
+        grippers = [vector for vector in grippers if vector.layout.joints and not known & set(vector.labels)]
+    return [*bodies, *_distinct(grippers)]
+
+
+def _distinct(vectors: Sequence[Vector]) -> list[Vector]:
+    """Those that say something else than the others, in the order given."""
+    chosen: list[Vector] = []
+    for vector in sorted(vectors, key=_rank):
+        if not any(_are_same(vector, other) for other in chosen):
+            chosen.append(vector)
+    return sorted(chosen, key=vectors.index)
+
+
+def _rank(vector: Vector) -> tuple[bool, bool, int, int]:
+    return not vector.is_leader, not vector.layout.joints, -len(vector.labels), len(vector.words)
+
+
+def _are_same(one: Vector, other: Vector) -> bool:
+    """Whether two vectors are likely the same joints told twice: a relay, a merged topic, a driver's own message."""
+    if one.topic == other.topic:
+        return False
+    joints, others = set(one.layout.joints), set(other.layout.joints)
+    if joints and others and not joints & others:
+        return False
+    # Two arms have topics of the same kind that differ by a word each: left and right, 1 and 2.
+    are_pair = bool({*one.words} - {*other.words}) and bool({*other.words} - {*one.words})
+    are_alike = (one.type, one.field, one.is_leader, joints) == (other.type, other.field, other.is_leader, others)
+    return not (are_pair and are_alike)
+
+
+def _of_robot(measured: Sequence[Vector]) -> list[Vector]:
+    """Poses and velocities of a robot, or the only ones that there are."""
+    found = [vector for vector in measured if vector.kind in ("pose", "twist")]
+    named = [vector for vector in found if vector.is_robot]
+    return named or (found if len({vector.topic for vector in found}) == 1 else [])
