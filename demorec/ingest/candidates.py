@@ -47,6 +47,7 @@ _POSITION = {"q", "qpos", "position", "positions", "pos", "joint", "joints", "an
 _DESIRED = {"desired", "target", "command", "commanded", "cmd", "goal", "reference", "ref", "setpoint", "d", "des"}
 _MEASURED = {"measured", "actual", "present", "feedback"}
 _PARTS = {"state", "states", "arm", "left", "right", "robot", "gripper", "hand", "finger", "fingers", "current", "rad"}
+_GRIPPER_FIELD = {"gripper", "finger", "hand", "left", "right", "width", "opening"}
 _ANY_COMMAND = {"cmd", "command", "commands", "action", "actions", "joint", "velocity", "velocities"}
 """Words of a field that is a command though it holds no positions."""
 _MAX_NESTED, _MAX_FIELDS = 4, 100
@@ -66,7 +67,7 @@ class Vector:
         prefix: In front of each name.
         told: The first numbers.
         rate_hz: Of the messages that hold it; 0 for fewer than two.
-        longest_s: Without any.
+        age_s: How old a message may have to be for a row to have one, where that is more than usual; 0 elsewhere.
     """
 
     topic: str
@@ -80,7 +81,7 @@ class Vector:
     prefix: str = ""
     told: str = ""
     rate_hz: float = 0.0
-    longest_s: float = 0.0
+    age_s: float = 0.0
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -194,6 +195,8 @@ def _numbers(values: Mapping[str, Any], place: str = "") -> Iterator[tuple[str, 
         if isinstance(item, int | float | np.ndarray) and 0 < np.size(item) <= MAX_ELEMENTS:
             yield path, np.size(item)
         elif isinstance(item, Mapping) and place.count(".") < _MAX_NESTED:
+            if not {"x", "y"} & set(item) and all(isinstance(value, int | float) for value in item.values()):
+                yield path, len(item)  # a field for each joint
             yield from _numbers(item, f"{path}.")
         elif isinstance(item, list) and 0 < len(item) <= MAX_ELEMENTS and isinstance(item[0], Mapping):
             for inner, value in item[0].items():
@@ -209,6 +212,7 @@ def _positions(empty: Vector, values: Values) -> Iterator[Vector]:
         words = _words(path.rpartition(".")[2])
         beside = _words(path) - words
         is_position = words & _POSITION and not words - _POSITION - _DESIRED - _MEASURED - _PARTS
+        is_position = is_position or (size == 1 and words & {"gripper", "width"} and words <= _GRIPPER_FIELD)
         if not is_position or beside & {"error", "cartesian", "tcp", "elbow", "imu", "pose"}:
             continue
         called = values.get("name")

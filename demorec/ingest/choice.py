@@ -35,7 +35,7 @@ def choose_features(vectors: Sequence[Vector]) -> Choice:
         state = [*unsaid, *state]
     has_arm = _has(state, "arm")
     if all(vector.kind == "gripper" or vector.has_wheels for vector in state):
-        state = [*state, *_of_robot(measured)]
+        state = sorted([*state, *_of_robot(measured)], key=lambda vector: vector.kind == "gripper")
     action = _joints(commands)
     if not has_arm and not _has(action, "arm"):
         action = [*(vector for vector in commands if vector.kind in ("pose", "twist")), *action]

@@ -65,7 +65,7 @@ class AnyMapping(ABC):
 def feature_problems(features: Mapping[str, Sequence[Part]]) -> Iterator[str]:
     """What is impossible in features, whatever their parts are taken from."""
     if STATE not in features:
-        yield f"there is no feature {STATE!r}"
+        yield f'there is no feature {STATE!r}: write [[features."{STATE}"]] and what it is taken from'
     for name, parts in features.items():
         if "/" in name or not name or name.startswith("observation.images"):
             yield f"a feature cannot be called {name!r}"

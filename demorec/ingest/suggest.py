@@ -37,7 +37,6 @@ _MAX_PUBLISHERS = 64
 """Of a topic, by the names in their messages."""
 _MAX_OFFERED = 24
 """Sources that are commented out."""
-_MAX_AGE_S = Clock(fps=1).max_age_s
 _TASK = re.compile(r"(?<!sub)(?<!sub[_/-])task|instruction|prompt")
 _STOP_WORDS = {"camera", "cam", "color", "image", "raw", "rect", "compressed", "rgb", "cameras", "images", "video"}
 _DEPTH_WORDS = {"depth", "aligned", "to", "compresseddepth", "registered"}
@@ -213,9 +212,14 @@ def _vectors(name: str, topic: _Topic) -> Iterator[Vector]:
 
 def _timed(vector: Vector, parts: Sequence[Sequence[int]]) -> Vector:
     times = np.sort(np.concatenate([np.asarray(part) for part in parts]))
-    seconds = float(times[-1] - times[0]) / NS
-    longest = float(np.diff(times).max(initial=0)) / NS
-    return replace(vector, rate_hz=(len(times) - 1) / seconds if seconds > 0 else 0.0, longest_s=longest)
+    steps = np.diff(times) / NS
+    if not steps.any():
+        return vector
+    usual = float(np.median(steps))
+    is_regular = np.mean((steps > 0.3 * usual) & (steps < 1.7 * usual)) > 0.6  # else it is sent when it changes
+    needed = 2 * usual if is_regular else float(steps.max())
+    age = math.ceil(needed * 10) / 10 if needed > Clock(fps=1).max_age_s else 0.0
+    return replace(vector, rate_hz=len(steps) / float(steps.sum()), age_s=age)
 
 
 def _cameras(topics: Mapping[str, _Topic]) -> dict[str, str]:
@@ -290,7 +294,7 @@ def _features(choice: Choice) -> Iterator[str]:
     if not choice.state:
         yield from ("", "# No topic says that it is the robot's state: take one of these.")
     yield from _chosen("action", choice.action)
-    if choice.state and not choice.action:
+    if not choice.action:
         yield from ("", "# No topic says that it is a command, so the next state is the action.")
         yield from ("[[features.action]]", 'next = "observation.state"')
     poses = [vector for vector in choice.others if vector.kind == "pose" and vector.role != "action"]
@@ -333,5 +337,5 @@ def _source(feature: str, vector: Vector, *, prefix: str) -> Iterator[str]:
         yield f"names = [{', '.join(map(quoted, vector.names))}]"
     if prefix or vector.prefix:
         yield f"prefix = {quoted(prefix + vector.prefix)}"
-    if vector.role == "action" and vector.longest_s > _MAX_AGE_S:
-        yield f"max_age_s = {math.ceil(vector.longest_s * 10) / 10:.1f}  # it is not sent all the time"
+    if vector.age_s:
+        yield f"max_age_s = {vector.age_s:.1f}  # its messages are that far apart"
