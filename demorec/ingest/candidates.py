@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -17,6 +18,7 @@ from demorec.ingest.fields import (
     FieldError,
     OtherPublisherError,
     SourceLayout,
+    SourceReader,
     follow,
     layout_of,
     numbers_in,
@@ -33,7 +35,7 @@ _ACTION = re.compile(rf"{_LEADER}|command|cmd|target|desired|goal|setpoint|(?<![
 _STATE = re.compile(r"follower|puppet|measured|actual|feedback|joint_?states?|joints/state|robot_?state|lowstate")
 _COMMAND_TYPE = re.compile(r"(Cmds?|Commands?|Goal|Target|Jog|Action|JointTrajectory)$")
 _STATE_TYPE = re.compile(r"(?<!^Joint)(States?|StateList|StateRTMsg)$")
-_GRIPPER = re.compile(r"gripper|finger|jaw|claw|knuckle|(?<![a-z])(hand|robotiq)(?![a-z])")
+_GRIPPER = re.compile(r"gripper|finger|jaw|claw|knuckle|(?<![a-z])(?:hand(?!le|eye|held)|robotiq)")
 _WHEEL = re.compile(r"wheel|caster|steer")
 _BASE = re.compile(rf"{_WHEEL.pattern}|(?<![a-z])(hip|knee|thigh|calf|ankle|foot|hx|hy|kn)(?![a-z])")
 _ROBOT_POSE = re.compile(
@@ -113,11 +115,17 @@ class Vector:
         """Whether an element is called like a gripper's joint."""
         return any(_GRIPPER.search(label.lower()) for label in self.labels)
 
-    def of_joints(self, joints: Sequence[str]) -> Vector:
-        """A part of it."""
+    def of_joints(self, joints: Sequence[str], messages: Iterable[Values]) -> Vector:
+        """A part of it, which some of the messages may hold."""
         layout = replace(self.layout, names=tuple(joints), joints=tuple(joints))
         leads = self.role == "state" and all(re.search(_LEADER, joint.lower()) for joint in joints)
-        return replace(self, layout=layout, kind=_kind_of(joints), role="action" if leads else self.role)
+        role = "action" if leads else self.role
+        source = Source(topic=self.topic, field=self.field, joints=tuple(joints))
+        for values in messages:
+            with suppress(FieldError, OtherPublisherError):
+                told = first_numbers(SourceReader(source, layout).read(values))
+                return replace(self, layout=layout, kind=_kind_of(joints), role=role, told=told)
+        return replace(self, layout=layout, kind=_kind_of(joints), role=role, told="")
 
 
 def vectors_of(topic: str, type_name: str, values: Values) -> Iterator[Vector]:

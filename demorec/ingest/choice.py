@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 from demorec.ingest.candidates import Vector
 
+_SIDES = {"left", "right", "l", "r"}
+
 
 @dataclass(frozen=True, kw_only=True)
 class Choice:
@@ -31,7 +33,8 @@ def choose_features(vectors: Sequence[Vector]) -> Choice:
     commands = [vector for vector in usable if vector.role == "action"]
     state = _joints([vector for vector in measured if vector.role == "state"])
     unsaid = [vector for vector in measured if vector.kind == "arm" and not vector.role]
-    if len(unsaid) == 1 and not _has(state, "arm"):
+    robots = {tuple(word for word in vector.words if word not in _SIDES) for vector in unsaid}
+    if len(robots) == 1 and not _has(state, "arm"):
         state = [*unsaid, *state]
     has_arm = _has(state, "arm")
     if all(vector.kind == "gripper" or vector.has_wheels for vector in state):
@@ -55,8 +58,10 @@ def _lacking(grippers: Sequence[Vector], vectors: Sequence[Vector]) -> str:
     if grippers:
         labels = [label for vector in grippers for label in vector.labels]
         found = f"the only joints that are known to be measured are a gripper's ({', '.join(labels[:4])})"
-    advice = "take the topics that do from the commented lines" if vectors else "the bag holds no topic of numbers"
-    return f"The arm is left out: {found}; {advice}, or the import refuses this mapping."
+    advice = (
+        "take the topics that do from the lines that are commented out" if vectors else "the bag has none of numbers"
+    )
+    return f"The arm is left out: {found}. The import refuses this mapping as it is: {advice}."
 
 
 def _has(vectors: Iterable[Vector], kind: str) -> bool:

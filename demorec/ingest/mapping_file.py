@@ -80,7 +80,9 @@ def _part_problems(place: str, name: str, part: Part, features: Mapping[str, Seq
         yield f"{place} has other sources beside next"
     if part.next:
         known = [other for other in features if other != name]
-        if part.next not in known:
+        if part.next == STATE and STATE not in features:
+            pass  # said already
+        elif part.next not in known:
             yield f"{place} follows {part.next!r}, which is no feature.{nearest_match(part.next, known)}".rstrip(".")
         elif any(other.next for other in features[part.next]):
             yield f"{place} follows {part.next!r}, which follows another feature itself"

@@ -205,7 +205,7 @@ def _vectors(name: str, topic: _Topic) -> Iterator[Vector]:
                 groups.setdefault(of, []).append(joint)
         times = list(topic.publishers.values())
         for of, joints in groups.items():
-            yield _timed(vector.of_joints(joints), [times[place] for place in of])
+            yield _timed(vector.of_joints(joints, topic.values), [times[place] for place in of])
         if not groups:
             yield _timed(vector, times)
 
@@ -295,9 +295,14 @@ def _features(choice: Choice) -> Iterator[str]:
         yield from ("", "# No topic says that it is the robot's state: take one of these.")
     yield from _chosen("action", choice.action)
     if not choice.action:
-        yield from ("", "# No topic says that it is a command, so the next state is the action.")
+        offers = any(vector.role == "action" for vector in choice.others)
+        found = (
+            "No topic is sure to be the command (see those below)" if offers else "No topic says that it is a command"
+        )
+        yield from ("", f"# {found}, so the next state is the action.")
         yield from ("[[features.action]]", 'next = "observation.state"')
     poses = [vector for vector in choice.others if vector.kind == "pose" and vector.role != "action"]
+    poses = [vector for vector in poses if vector.is_robot] or poses
     is_sure = bool(choice.state) and len({vector.topic for vector in poses}) == 1 and poses[0].field == "pose"
     for vector in poses if is_sure else ():
         yield from _source("observation.ee_pose", vector, prefix="")
@@ -330,7 +335,7 @@ def _prefix(vector: Vector, chosen: Sequence[Vector]) -> str:
 def _source(feature: str, vector: Vector, *, prefix: str) -> Iterator[str]:
     key = feature if "." not in feature else quoted(feature)
     yield from ("", f"[[features.{key}]]", f"topic = {quoted(vector.topic)}")
-    yield f"field = {quoted(vector.field)}  # first: {vector.told}"
+    yield f"field = {quoted(vector.field)}" + (f"  # first: {vector.told}" if vector.told else "")
     if vector.layout.joints:
         yield f"joints = [{', '.join(map(quoted, vector.layout.joints))}]"
     if vector.names:

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support import bags
-from support.layouts import LAYOUTS, Layout, Part
+from support.layout_topics import Layout, Part
+from support.layouts import LAYOUTS, UR
 
 from demorec.cli import main
 from demorec.recording import CollectedRecording
@@ -98,3 +99,39 @@ def test_the_fault_of_a_gripper_alone_is_loud(tmp_path: Path, capsys: pytest.Cap
     mapping = tmp_path / "robot.toml"
     mapping.write_text(text)
     assert _run("import", bag, "--mapping", mapping, "--out", tmp_path / "run") != 0
+
+
+@pytest.mark.parametrize("way", ["its publisher ends", "messages name fewer"])
+def test_a_joint_that_stops_coming_is_a_finding(way: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    notes = LAYOUTS["two publishers"].notes()
+    late = bags.EPOCH_NS + bags.NS
+    arm, grip = UR[-1], "robotiq_85_left_knuckle_joint"
+    lost = grip if way == "its publisher ends" else arm
+
+    def without(note: bags.Note) -> bags.Note | None:
+        if note.topic != "/joint_states" or note.header_ns < late or lost not in note.body["name"]:
+            return note
+        left = [k for k, name in enumerate(note.body["name"]) if name != lost]
+        names, position = note.body["name"], note.body["position"]
+        return bags.with_body(note, name=[names[k] for k in left], position=position[left]) if left else None
+
+    bag = bags.write_mcap([left for note in notes if (left := without(note)) is not None], tmp_path / "bag.mcap")
+    assert _run("import", "--suggest", bag) == 0
+    mapping = tmp_path / "robot.toml"
+    mapping.write_text(capsys.readouterr().out)
+    assert _run("import", bag, "--mapping", mapping, "--out", tmp_path / "run") == 0
+    told = capsys.readouterr().out
+    assert f"early_end: observation.state ({lost}): /joint_states: '{lost}' stop" in told
+    assert "Nothing odd was found." not in told
+
+
+def test_a_leader_is_never_the_state(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Not even where nothing else is there."""
+    notes = [note for note in LAYOUTS["two publishers"].notes() if note.topic != "/joint_states"]
+    bag = bags.write_mcap(notes, tmp_path / "bag.mcap")
+    assert _run("import", "--suggest", bag) == 0
+    text, warned = capsys.readouterr()
+    assert "The arm is left out" in warned
+    features = tomllib.loads(text)["features"]
+    assert "observation.state" not in features
+    assert [source["topic"] for source in features["action"]] == ["/lead_arm/joint_states"]
