@@ -30,8 +30,10 @@ from demorec.ingest.ros_types import Values
 from demorec.ingest.words import first_numbers
 
 Kind = Literal["arm", "gripper", "base", "pose", "twist", "numbers"]
-_LEADER = r"leader|master|gello|teleop|(?<![a-z])(?:lead|haptic|spacemouse|operator)(?![a-z])"
-_ACTION = re.compile(rf"{_LEADER}|command|cmd|target|desired|goal|setpoint|(?<![a-z])actions?(?![a-z])")
+_LEADER = r"leader|master|gello|teleop|(?<![a-z])(?:lead|haptic|spacemouse|operator|vr|oculus)(?![a-z])"
+_ACTION = re.compile(
+    rf"{_LEADER}|command|cmd|target|desired|goal|setpoint|(?<![a-z])(?:actions?|ref|reference)(?![a-z])"
+)
 _STATE = re.compile(r"follower|puppet|measured|actual|feedback|joint_?states?|joints/state|robot_?state|lowstate")
 _COMMAND_TYPE = re.compile(r"(Cmds?|Commands?|Goal|Target|Jog|Action|JointTrajectory)$")
 _STATE_TYPE = re.compile(r"(?<!^Joint)(States?|StateList|StateRTMsg)$")
@@ -53,6 +55,8 @@ _GRIPPER_FIELD = {"gripper", "finger", "hand", "left", "right", "width", "openin
 _ANY_COMMAND = {"cmd", "command", "commands", "action", "actions", "joint", "velocity", "velocities"}
 """Words of a field that is a command though it holds no positions."""
 _MAX_NESTED, _MAX_FIELDS = 4, 100
+_MAX_UNKNOWN = 3
+"""Fields that are offered of a message whose topic or type says what it is for, but none of whose fields does."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,9 +145,11 @@ def vectors_of(topic: str, type_name: str, values: Values) -> Iterator[Vector]:
         place = (vector.kind == "gripper", vector.role)
         yield replace(vector, is_sure=vector.is_sure and place not in seen)
         seen.add(place)
-    has_joints = bool(seen)
-    for vector in (*_in_space(empty, values), *_plain(empty, values)):
-        yield replace(vector, is_sure=vector.is_sure and not has_joints)
+    others = [*_in_space(empty, values), *_plain(empty, values)]
+    if not found and not others and empty.role:
+        paths = [path for path, size in _numbers(values) if size > 1 or empty.role == "action"]
+        others = [vector for path in paths[:_MAX_UNKNOWN] for vector in _made(empty, values, path)]
+    yield from (replace(vector, is_sure=not found) for vector in others)
 
 
 def transforms_of(topic: str, type_name: str, messages: Iterable[Values]) -> Iterator[Vector]:
@@ -260,21 +266,22 @@ def _plain(empty: Vector, values: Values) -> Iterator[Vector]:
     """The numbers of std_msgs: what they are, the topic alone says."""
     data, lower = values.get("data"), empty.topic.lower()
     is_vector = isinstance(data, np.ndarray) and data.dtype.kind == "f"
-    if "encoding" in values or "format" in values or not (is_vector or isinstance(data, float)):
+    is_gripper = bool(_GRIPPER.search(lower)) and not _OTHER_NUMBERS.search(lower)
+    if "encoding" in values or "format" in values:
         return
-    kind: Kind = "numbers"
-    if _GRIPPER.search(lower) and not _OTHER_NUMBERS.search(lower):
-        kind = "gripper"
-    elif is_vector and (empty.role == "action" or (empty.role and not _OTHER_NUMBERS.search(lower))):
-        kind = "arm"
-    role = empty.role or ("state" if kind == "gripper" else "")
+    if not (is_vector or isinstance(data, float) or (is_gripper and isinstance(data, int))):  # or a boolean
+        return
+    are_joints = is_vector and (empty.role == "action" or (empty.role and not _OTHER_NUMBERS.search(lower)))
+    kind: Kind = "gripper" if is_gripper else "arm" if are_joints else "numbers"
+    role = empty.role or ("state" if is_gripper else "")
     names = () if is_vector else ("_".join(empty.words) or "data",)
     yield from (replace(vector, kind=kind, role=role, names=names) for vector in _made(empty, values, "data"))
 
 
 def _in_space(empty: Vector, values: Values) -> Iterator[Vector]:
     """The first pose and the first velocity in space."""
-    for kind, place, pair in _pairs(values, ""):
+    first = {kind: (place, pair) for kind, place, pair in reversed([*_pairs(values, "")])}
+    for kind, (place, pair) in first.items():
         fields = [place] if place else pair
         for field in fields:
             prefix = "" if place else f"{field}."

@@ -17,13 +17,13 @@ class Choice:
     Attributes:
         state, action: Their parts, in order; an empty action is the next state.
         others: All other vectors.
-        warnings: What the user has to decide, a sentence each.
+        warning: That the robot's arm is not in it; "" where it is.
     """
 
     state: tuple[Vector, ...]
     action: tuple[Vector, ...]
     others: tuple[Vector, ...]
-    warnings: tuple[str, ...]
+    warning: str
 
 
 def choose_features(vectors: Sequence[Vector]) -> Choice:
@@ -42,15 +42,15 @@ def choose_features(vectors: Sequence[Vector]) -> Choice:
     action = _joints(commands)
     if not has_arm and not _has(action, "arm"):
         action = [*(vector for vector in commands if vector.kind in ("pose", "twist")), *action]
-    warnings = []
+    warning = ""
     if all(vector.kind == "gripper" for vector in state):
-        warnings.append(_lacking(state, vectors))
+        warning = _lacking(state, vectors)
         state = []
     elif all(vector.kind == "gripper" for vector in action):
         action = []  # the arm's command is missing, and the next state has the gripper's opening as well
     taken = {id(vector) for vector in (*state, *action)}
     others = tuple(vector for vector in vectors if id(vector) not in taken)
-    return Choice(state=tuple(state), action=tuple(action), others=others, warnings=tuple(warnings))
+    return Choice(state=tuple(state), action=tuple(action), others=others, warning=warning)
 
 
 def _lacking(grippers: Sequence[Vector], vectors: Sequence[Vector]) -> str:

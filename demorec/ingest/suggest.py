@@ -10,6 +10,7 @@ import json
 import math
 import re
 from array import array
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -80,7 +81,7 @@ def suggested_mapping(path: Path, tell: Callable[[str], None]) -> list[str]:
 
     Args:
         path: Of the bag.
-        tell: Called with each thing that the user has to decide before the mapping can be used.
+        tell: Called with what the user has to decide before the mapping can be used.
 
     Raises:
         ConfigError: There is no bag.
@@ -94,9 +95,9 @@ def suggested_mapping(path: Path, tell: Callable[[str], None]) -> list[str]:
     cameras = _cameras(topics)
     choice = choose_features([vector for name, topic in sorted(topics.items()) for vector in _vectors(name, topic)])
     lines = [f"# A mapping for {path.name}, suggested from what is in it; docs/import.md explains every key.", "#"]
-    for warning in choice.warnings:
-        tell(warning)
-        lines += [f"# ATTENTION: {warning}", "#"]
+    if choice.warning:
+        tell(choice.warning)
+        lines += [f"# ATTENTION: {choice.warning}", "#"]
     lines += [f"# {problem}" for problem in problems[:5]]
     lines += list(_listed(topics))
     robot = re.sub(r"[^A-Za-z0-9_]+", "_", bag.name).strip("_") or "robot"
@@ -145,10 +146,11 @@ def _look_into(topic: _Topic, message: BagMessage, decoder: BagDecoder) -> None:
 
 def _names(vector: Vector, values: Values) -> tuple[str, ...]:
     """Those of the joints in a message whose first fields hold them."""
-    if vector.layout.names_steps is None or len(vector.layout.names_steps) > 1:
-        return ()
+    steps = vector.layout.names_steps
+    if steps is None or (len(steps) > 1 and isinstance(values.get(str(steps[0])), Mapping)):
+        return ()  # a robot's own message has one publisher
     try:
-        names, numbers = follow(values, vector.layout.names_steps), follow(values, vector.layout.steps)
+        names, numbers = follow(values, steps), follow(values, vector.layout.steps)
     except ValueError:
         return ()
     is_whole = isinstance(names, list) and len(names) == np.size(numbers) == len(set(names))
@@ -307,6 +309,7 @@ def _features(choice: Choice) -> Iterator[str]:
     for vector in poses if is_sure else ():
         yield from _source("observation.ee_pose", vector, prefix="")
     offered = [vector for vector in choice.others if not (is_sure and vector in poses)]
+    offered.sort(key=lambda vector: vector.field.startswith("transforms["))
     for vector in offered[:_MAX_OFFERED]:
         name = {"state": "observation.state", "action": "action"}.get(vector.role, "observation.extra")
         name = "observation.state" if not choice.state and not vector.role else name
@@ -317,13 +320,13 @@ def _features(choice: Choice) -> Iterator[str]:
 
 
 def _chosen(feature: str, vectors: Sequence[Vector]) -> Iterator[str]:
-    labels = [label for vector in vectors for label in vector.labels]
-    are_double = len(set(labels)) < len(labels)
-    prefixes = {vector.topic: _prefix(vector, vectors) for vector in vectors}
+    labels = Counter(label for vector in vectors for label in vector.labels)
+    double = [vector for vector in vectors if any(labels[label] > 1 for label in vector.labels)]
+    prefixes = {vector.topic: _prefix(vector, double) for vector in double}
     are_told_apart = len(set(prefixes.values())) == len(prefixes)
     for place, vector in enumerate(vectors, 1):
-        prefix = prefixes[vector.topic] if are_told_apart else f"{place}_"
-        yield from _source(feature, vector, prefix=prefix if are_double else "")
+        prefix = prefixes.get(vector.topic, "") if are_told_apart else f"{place}_"
+        yield from _source(feature, vector, prefix=prefix if vector in double else "")
 
 
 def _prefix(vector: Vector, chosen: Sequence[Vector]) -> str:
