@@ -52,8 +52,9 @@ _DESIRED = {"desired", "target", "command", "commanded", "cmd", "goal", "referen
 _MEASURED = {"measured", "actual", "present", "feedback"}
 _PARTS = {"state", "states", "arm", "left", "right", "robot", "gripper", "hand", "finger", "fingers", "current", "rad"}
 _GRIPPER_FIELD = {"gripper", "finger", "hand", "left", "right", "width", "opening"}
-_ANY_COMMAND = {"cmd", "command", "commands", "action", "actions", "joint", "velocity", "velocities"}
+_ANY_COMMAND = {"cmd", "command", "commands", "action", "actions", "values", "joint", "velocity", "velocities"}
 """Words of a field that is a command though it holds no positions."""
+_TIMES = {"header", "timestamp", "stamp", "ts", "time"}
 _MAX_NESTED, _MAX_FIELDS = 4, 100
 _MAX_UNKNOWN = 3
 """Fields that are offered of a message whose topic or type says what it is for, but none of whose fields does."""
@@ -204,7 +205,7 @@ def _numbers(values: Mapping[str, Any], place: str = "") -> Iterator[tuple[str, 
     """(path, how many) of the numbers in a message; of a list of messages, of the same field of each."""
     for key, item in list(values.items())[:_MAX_FIELDS]:
         path = f"{place}{key}"
-        if key == "header" or not re.fullmatch(r"\w+", key) or isinstance(item, bool):
+        if key in _TIMES or not re.fullmatch(r"\w+", key) or isinstance(item, bool):
             continue
         if isinstance(item, int | float | np.ndarray) and 0 < np.size(item) <= MAX_ELEMENTS:
             yield path, np.size(item)
@@ -280,7 +281,9 @@ def _plain(empty: Vector, values: Values) -> Iterator[Vector]:
 
 def _in_space(empty: Vector, values: Values) -> Iterator[Vector]:
     """The first pose and the first velocity in space."""
-    first = {kind: (place, pair) for kind, place, pair in reversed([*_pairs(values, "")])}
+    first: dict[Kind, tuple[str, tuple[str, str]]] = {}
+    for kind, place, pair in _pairs(values, ""):
+        first.setdefault(kind, (place, pair))
     for kind, (place, pair) in first.items():
         fields = [place] if place else pair
         for field in fields:
@@ -299,5 +302,5 @@ def _pairs(values: Mapping[str, Any], place: str) -> Iterator[tuple[Kind, str, t
             yield kind, place, pair
             return
     for key, item in values.items():
-        if isinstance(item, Mapping) and key != "header" and place.count(".") < 1 and re.fullmatch(r"\w+", key):
+        if isinstance(item, Mapping) and key not in _TIMES and place.count(".") < 1 and re.fullmatch(r"\w+", key):
             yield from _pairs(item, f"{place}.{key}" if place else key)

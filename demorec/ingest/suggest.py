@@ -266,7 +266,7 @@ def _subtasks(topics: Mapping[str, _Topic]) -> Iterator[str]:
 
 
 def _is_text(topic: _Topic) -> bool:
-    return any(isinstance(values.get("data"), str) for values in topic.values)
+    return any(isinstance(values.get("data"), str) and _head(values) is None for values in topic.values)
 
 
 def _clock(topics: Mapping[str, _Topic], cameras: Mapping[str, str], vectors: Sequence[Vector]) -> list[str]:

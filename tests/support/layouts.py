@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rosbags.rosbag2 import StoragePlugin
@@ -81,6 +82,32 @@ def _mcap(notes: Notes, path: Path) -> Path:
 
 def _ros1(notes: Notes, path: Path) -> Path:
     return bags.write_mcap(notes, path / "bag.mcap", is_ros1=True)
+
+
+def _foxglove(notes: Notes, path: Path) -> Path:
+    """An MCAP file of Foxglove's own protobuf messages, by its SDK."""
+    import foxglove
+    from foxglove.channels import CompressedImageChannel, JointStatesChannel
+    from foxglove.messages import CompressedImage, JointState, JointStates, Timestamp
+
+    context = foxglove.Context()
+    with foxglove.open_mcap(path / "bag.mcap", context=context):
+        channels: dict[str, Any] = {}
+        for note in notes:
+            stamp = Timestamp(*divmod(note.header_ns, NS))
+            if "position" in note.body:
+                pairs = zip(note.body["name"], note.body["position"].tolist(), strict=True)
+                states = [JointState(name=name, position=position) for name, position in pairs]
+                channel = channels.get(note.topic) or JointStatesChannel(note.topic, context=context)
+                channel.log(JointStates(timestamp=stamp, joints=states), log_time=note.log_ns)
+            else:
+                channel = channels.get(note.topic) or CompressedImageChannel(note.topic, context=context)
+                image = CompressedImage(
+                    timestamp=stamp, frame_id=note.frame_id, format="jpeg", data=note.body["data"].tobytes()
+                )
+                channel.log(image, log_time=note.log_ns)
+            channels[note.topic] = channel
+    return path / "bag.mcap"
 
 
 def _sqlite(notes: Notes, path: Path) -> Path:
@@ -192,6 +219,12 @@ LAYOUTS: dict[str, Layout] = {
         state=(joint_part("/follower/joint_states", OMX),),
         action=(joint_part("/leader/joint_states", OMX),),
         write=_sqlite,
+    ),
+    "Foxglove's own messages": Layout(
+        topics=(*_two_publishers(), joints("/teleop/joint_states", UR, shift=0.1), camera("/camera/front")),
+        state=(joint_part("/joint_states", UR), joint_part("/joint_states", ("robotiq_85_left_knuckle_joint",))),
+        action=(joint_part("/teleop/joint_states", UR),),
+        write=_foxglove,
     ),
     "Unitree": Layout(
         topics=(
