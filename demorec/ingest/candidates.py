@@ -15,8 +15,6 @@ from typing import Any, Literal
 import numpy as np
 
 from demorec.ingest.fields import (
-    FieldError,
-    OtherPublisherError,
     SourceLayout,
     SourceReader,
     follow,
@@ -127,7 +125,7 @@ class Vector:
         role = "action" if leads else self.role
         source = Source(topic=self.topic, field=self.field, joints=tuple(joints))
         for values in messages:
-            with suppress(FieldError, OtherPublisherError):
+            with suppress(ValueError):
                 told = first_numbers(SourceReader(source, layout).read(values))
                 return replace(self, layout=layout, kind=_kind_of(joints), role=role, told=told)
         return replace(self, layout=layout, kind=_kind_of(joints), role=role, told="")
@@ -177,7 +175,7 @@ def _made(empty: Vector, values: Values, path: str) -> Iterator[Vector]:
     try:
         layout = layout_of(Source(topic=empty.topic, field=path), values)
         parts = [np.ravel(item) for _, item in numbers_in(follow(values, layout.steps))]
-    except (FieldError, OtherPublisherError):
+    except ValueError:  # it has none, or one of another shape
         return
     yield replace(empty, field=path, layout=layout, told=first_numbers(np.concatenate(parts)))
 
@@ -215,8 +213,8 @@ def _numbers(values: Mapping[str, Any], place: str = "") -> Iterator[tuple[str, 
             yield from _numbers(item, f"{path}.")
         elif isinstance(item, list) and 0 < len(item) <= MAX_ELEMENTS and isinstance(item[0], Mapping):
             for inner, value in item[0].items():
-                if inner == "positions" and np.size(value):
-                    yield f"{path}[0].positions", np.size(value)
+                if inner == "positions" and isinstance(value, np.ndarray) and value.size:
+                    yield f"{path}[0].positions", value.size
                 elif isinstance(value, int | float) and not isinstance(value, bool):
                     yield f"{path}.{inner}", len(item)
 

@@ -191,9 +191,10 @@ def layout_of(source: Source, values: Values) -> SourceLayout:
     names_steps = _names_path(source, values, steps, found)
     named = _names_at(values, names_steps) if names_steps is not None else None
     if source.joints:
-        if named is None and not set(source.joints) & _all_names(values, steps):
-            raise OtherPublisherError("it names none of the joints")
         if named is None:
+            others = {name for _, names in _names_beside(values, steps) for name in names}
+            if others and not others & {*source.joints}:
+                raise OtherPublisherError("it names none of the joints")
             raise FieldError(f"the elements of {source.field!r} have no names, pick them by elements = [0, 1, ...]")
         if missing := [joint for joint in source.joints if joint not in named]:
             problem = f"there is no joint {missing[0]!r}.{nearest_match(missing[0], named)}".rstrip(".")
@@ -236,10 +237,6 @@ def _names_beside(values: Values, steps: tuple[Step, ...]) -> Iterator[tuple[tup
             continue
         if isinstance(names, list) and all(isinstance(name, str) for name in names):
             yield place, names
-
-
-def _all_names(values: Values, steps: tuple[Step, ...]) -> set[str]:
-    return {name for _, names in _names_beside(values, steps) for name in names}
 
 
 def _names_at(values: Values, steps: tuple[Step, ...]) -> list[str]:

@@ -254,7 +254,8 @@ def _joint_findings(regular: Sequence[Timeline]) -> Iterator[Finding]:
     """Joints that stop coming while others of their topic, or the same ones from another publisher, go on."""
     for line in regular:
         joints = line.stream.layout.joints if line.stream.layout else ()
-        others = [other for other in regular if other.stream.topic == line.stream.topic]
+        key = (line.stream.topic, line.is_header)
+        others = [other for other in regular if (other.stream.topic, other.is_header) == key]
         early = max(int(other.times_ns[-1]) for other in others) - int(line.times_ns[-1])
         if joints and early > _GAP * line.period_ns:
             told = f"{joints[0]!r}" + (f" and {len(joints) - 1} more joints" if len(joints) > 1 else "")

@@ -150,11 +150,11 @@ def _names(vector: Vector, values: Values) -> tuple[str, ...]:
     if steps is None or (len(steps) > 1 and isinstance(values.get(str(steps[0])), Mapping)):
         return ()  # a robot's own message has one publisher
     try:
-        names, numbers = follow(values, steps), follow(values, vector.layout.steps)
+        names, count = follow(values, steps), np.size(follow(values, vector.layout.steps))
     except ValueError:
         return ()
-    is_whole = isinstance(names, list) and len(names) == np.size(numbers) == len(set(names))
-    return tuple(names) if is_whole else ()
+    are_texts = isinstance(names, list) and all(isinstance(name, str) for name in names)
+    return tuple(names) if are_texts and len(names) == count == len(set(names)) else ()
 
 
 def _head(values: Values) -> PictureHead | None:

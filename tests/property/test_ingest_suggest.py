@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import tempfile
 import tomllib
 import unicodedata
@@ -12,8 +13,9 @@ from pathlib import Path
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from mcap.writer import Writer
 from support import bags
-from support.bags import EPOCH_NS, Note, Notes
+from support.bags import EPOCH_NS, Note
 
 from demorec.cli import main
 from demorec.ingest.words import quoted
@@ -37,13 +39,11 @@ ODD = [
 ]
 
 
-def _suggested(notes: Notes) -> str:
-    with tempfile.TemporaryDirectory() as folder:
-        bag = bags.write_mcap(notes, Path(folder) / "bag.mcap")
-        out = io.StringIO()
-        with redirect_stdout(out), redirect_stderr(io.StringIO()), pytest.raises(SystemExit) as ended:
-            main(["import", "--suggest", str(bag)])
-        assert not ended.value.code
+def _suggestion(bag: Path) -> str:
+    out, err = io.StringIO(), io.StringIO()
+    with redirect_stdout(out), redirect_stderr(err), pytest.raises(SystemExit) as ended:
+        main(["import", "--suggest", str(bag)])
+    assert not ended.value.code, err.getvalue()
     return out.getvalue()
 
 
@@ -62,7 +62,8 @@ def test_a_suggestion_is_toml_and_names_what_is_there(topic: str, joints: list[s
     notes += [
         Note(topic=f"{topic}{frame}", type="std_msgs/msg/String", log_ns=moments[0], header_ns=0, body={"data": frame})
     ]
-    text = _suggested(bags.in_order(notes))
+    with tempfile.TemporaryDirectory() as folder:
+        text = _suggestion(bags.write_mcap(bags.in_order(notes), Path(folder) / "bag.mcap"))
     assert not {unicodedata.category(sign) for sign in text.replace("\n", "")} & {"Cc", "Cf", "Zl", "Zp"}
     mapping = tomllib.loads(text)
     (camera,) = mapping["cameras"].values()
@@ -73,6 +74,35 @@ def test_a_suggestion_is_toml_and_names_what_is_there(topic: str, joints: list[s
         line.removeprefix("# ") for line in text.split("\n") if line.startswith(("# [[", "# topic", "# field"))
     )
     tomllib.loads(plain)
+
+
+WORDS = st.sampled_from(
+    ["q", "position", "orientation", "name", "points", "positions", "transforms", "child_frame_id", "transform", "data",
+     "linear", "angular", "gripper", "x", "command", "header", "stamp", "joint_names", "actual", "desired"]
+)  # fmt: skip
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=3),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(WORDS, inner, max_size=4),
+    max_leaves=12,
+)
+
+
+@settings(deadline=None, max_examples=150)
+@given(st.lists(st.dictionaries(WORDS, JSON, max_size=5), min_size=1, max_size=4), st.sampled_from(["/state", "/cmd"]))
+@example([{"name": ["a"], "position": [1.0]}, {"name": [[1], {}], "position": [[1.0], [2.0, 3.0]]}], "/state")
+@example([{"position": [[1.0], [2.0, 3.0]], "points": [{"positions": [[1], []]}, 3]}], "/cmd")
+def test_messages_of_any_shape_are_suggested_or_left_out(messages: list[dict[str, object]], topic: str) -> None:
+    """JSON has any shape, and no two messages need the same."""
+    with tempfile.TemporaryDirectory() as folder:
+        bag = Path(folder) / "bag.mcap"
+        with bag.open("wb") as file:
+            writer = Writer(file)
+            writer.start()
+            channel = writer.register_channel(topic, "json", writer.register_schema("State", "jsonschema", b"{}"))
+            for number, message in enumerate(messages):
+                writer.add_message(channel, EPOCH_NS + number, json.dumps(message).encode(), EPOCH_NS + number)
+            writer.finish()
+        tomllib.loads(_suggestion(bag))
 
 
 @given(st.text())

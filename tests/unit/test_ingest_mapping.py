@@ -129,6 +129,15 @@ def test_joints_that_nobody_lists_are_those_of_the_first_message_by_name() -> No
     assert list(reader.others) == ["c", "d"]
 
 
+def test_a_publisher_of_velocities_alone_is_another_one() -> None:
+    """Wheels have no positions, and are no reason to refuse the arm whose messages come later."""
+    source = Source(topic="/j", field="position", joints=("a",))
+    with pytest.raises(OtherPublisherError):
+        layout_of(source, {"name": ["wheel"], "position": np.empty(0), "velocity": np.array([1.0])})
+    with pytest.raises(FieldError, match="have no names"):
+        layout_of(source, {"position": np.array([1.0])})
+
+
 def test_names_that_are_not_unique_name_nothing() -> None:
     source = Source(topic="/j", field="position")
     first = {"name": ["", ""], "position": np.array([1.0, 2.0])}
