@@ -32,7 +32,7 @@ _LEADER = r"leader|master|gello|teleop|(?<![a-z])(?:lead|haptic|spacemouse|opera
 _ACTION = re.compile(
     rf"{_LEADER}|command|cmd|target|desired|goal|setpoint|(?<![a-z])(?:actions?|ref|reference)(?![a-z])"
 )
-_STATE = re.compile(r"follower|puppet|measured|actual|feedback|joint_?states?|joints/state|robot_?state|lowstate")
+_STATE = re.compile(r"follower|puppet|measured|actual|feedback|lowstate|(?<![a-z])(?:joint|robot)?states?(?![a-z])")
 _COMMAND_TYPE = re.compile(r"(Cmds?|Commands?|Goal|Target|Jog|Action|JointTrajectory)$")
 _STATE_TYPE = re.compile(r"(?<!^Joint)(States?|StateList|StateRTMsg)$")
 _GRIPPER = re.compile(r"gripper|finger|jaw|claw|knuckle|(?<![a-z])(?:hand(?!le|eye|held)|robotiq)")
@@ -44,6 +44,7 @@ _ROBOT_POSE = re.compile(
 _OTHER_NUMBERS = re.compile(
     r"force|wrench|torque|effort|velocit|tactile|temperature|imu|(?<![a-z])(vel|current)(?![a-z])"
 )
+_CARTESIAN = re.compile(r"cartesian|(?<![a-z])(?:tcp|ee|eef|pose)(?![a-z])")
 _WORD = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])")
 _POSITION = {"q", "qpos", "position", "positions", "pos", "joint", "joints", "angle", "angles"}
 _DESIRED = {"desired", "target", "command", "commanded", "cmd", "goal", "reference", "ref", "setpoint", "d", "des"}
@@ -70,7 +71,7 @@ class Vector:
         is_sure: Whether nothing in the message suits that role better.
         names: Of the elements, where neither the message nor the field has a good one.
         prefix: In front of each name.
-        told: The first numbers.
+        first: The first numbers.
         rate_hz: Of the messages that hold it; 0 for fewer than two.
         age_s: How old a message may have to be for a row to have one, where that is more than usual; 0 elsewhere.
     """
@@ -84,7 +85,7 @@ class Vector:
     is_sure: bool = True
     names: tuple[str, ...] = ()
     prefix: str = ""
-    told: str = ""
+    first: str = ""
     rate_hz: float = 0.0
     age_s: float = 0.0
 
@@ -97,6 +98,12 @@ class Vector:
     def words(self) -> list[str]:
         """Of its topic."""
         return [word for word in re.split(r"[^A-Za-z0-9]+", self.topic) if word]
+
+    @property
+    def is_other(self) -> bool:
+        """Whether its topic is, for a vector of numbers, that of another quantity than joint positions."""
+        lower = self.topic.lower()
+        return bool(_CARTESIAN.search(lower) or _OTHER_NUMBERS.search(lower))
 
     @property
     def is_leader(self) -> bool:
@@ -126,9 +133,9 @@ class Vector:
         source = Source(topic=self.topic, field=self.field, joints=tuple(joints))
         for values in messages:
             with suppress(ValueError):
-                told = first_numbers(SourceReader(source, layout).read(values))
-                return replace(self, layout=layout, kind=_kind_of(joints), role=role, told=told)
-        return replace(self, layout=layout, kind=_kind_of(joints), role=role, told="")
+                first = first_numbers(SourceReader(source, layout).read(values))
+                return replace(self, layout=layout, kind=_kind_of(joints), role=role, first=first)
+        return replace(self, layout=layout, kind=_kind_of(joints), role=role, first="")
 
 
 def vectors_of(topic: str, type_name: str, values: Values) -> Iterator[Vector]:
@@ -177,7 +184,7 @@ def _made(empty: Vector, values: Values, path: str) -> Iterator[Vector]:
         parts = [np.ravel(item) for _, item in numbers_in(follow(values, layout.steps))]
     except ValueError:  # it has none, or one of another shape
         return
-    yield replace(empty, field=path, layout=layout, told=first_numbers(np.concatenate(parts)))
+    yield replace(empty, field=path, layout=layout, first=first_numbers(np.concatenate(parts)))
 
 
 def _role(topic: str, type_name: str) -> str:
@@ -270,7 +277,9 @@ def _plain(empty: Vector, values: Values) -> Iterator[Vector]:
         return
     if not (is_vector or isinstance(data, float) or (is_gripper and isinstance(data, int))):  # or a boolean
         return
-    are_joints = is_vector and (empty.role == "action" or (empty.role and not _OTHER_NUMBERS.search(lower)))
+    may_be_joints = not _OTHER_NUMBERS.search(lower) and not _CARTESIAN.search(lower)
+    says_joints = empty.role or _words(empty.topic) & _POSITION
+    are_joints = is_vector and (empty.role == "action" or (may_be_joints and says_joints))
     kind: Kind = "gripper" if is_gripper else "arm" if are_joints else "numbers"
     role = empty.role or ("state" if is_gripper else "")
     names = () if is_vector else ("_".join(empty.words) or "data",)

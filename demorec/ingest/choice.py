@@ -8,6 +8,18 @@ from dataclasses import dataclass
 from demorec.ingest.candidates import Vector
 
 _SIDES = {"left", "right", "l", "r"}
+_QUANTITIES = {
+    "joint",
+    "joints",
+    "position",
+    "positions",
+    "pos",
+    "velocity",
+    "velocities",
+    "cartesian",
+    "torque",
+    "pose",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,8 +99,9 @@ def _distinct(vectors: Sequence[Vector]) -> list[Vector]:
     return sorted(chosen, key=vectors.index)
 
 
-def _rank(vector: Vector) -> tuple[bool, bool, int, int]:
-    return not vector.is_leader, not vector.layout.joints, -len(vector.labels), len(vector.words)
+def _rank(vector: Vector) -> tuple[bool, bool, bool, int, int]:
+    is_named = bool(vector.layout.joints)
+    return not vector.is_leader, not is_named, vector.is_other, -len(vector.labels), len(vector.words)
 
 
 def _are_same(one: Vector, other: Vector) -> bool:
@@ -98,8 +111,9 @@ def _are_same(one: Vector, other: Vector) -> bool:
     joints, others = set(one.layout.joints), set(other.layout.joints)
     if joints and others and not joints & others:
         return False
-    # Two arms have topics of the same kind that differ by a word each: left and right, 1 and 2.
-    are_pair = bool({*one.words} - {*other.words}) and bool({*other.words} - {*one.words})
+    # Two arms have topics of the same kind that differ by a word each: left and right, 1 and 2; so do two quantities.
+    only, only_other = {*one.words} - {*other.words}, {*other.words} - {*one.words}
+    are_pair = bool(only and only_other) and not (only | only_other) & _QUANTITIES
     are_alike = (one.type, one.field, one.is_leader, joints) == (other.type, other.field, other.is_leader, others)
     return not (are_pair and are_alike)
 

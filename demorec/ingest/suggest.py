@@ -338,7 +338,7 @@ def _prefix(vector: Vector, chosen: Sequence[Vector]) -> str:
 def _source(feature: str, vector: Vector, *, prefix: str) -> Iterator[str]:
     key = feature if "." not in feature else quoted(feature)
     yield from ("", f"[[features.{key}]]", f"topic = {quoted(vector.topic)}")
-    yield f"field = {quoted(vector.field)}" + (f"  # first: {vector.told}" if vector.told else "")
+    yield f"field = {quoted(vector.field)}" + (f"  # first: {vector.first}" if vector.first else "")
     if vector.layout.joints:
         yield f"joints = [{', '.join(map(quoted, vector.layout.joints))}]"
     if vector.names:

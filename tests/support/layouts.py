@@ -334,5 +334,24 @@ LAYOUTS: dict[str, Layout] = {
         ),
         cameras=2,
     ),
+    "topics of numbers": Layout(
+        topics=(
+            multi_array("/robot_state/joint_positions", 7), multi_array("/robot_state/cartesian_position", 6),
+            scalar("/robot_state/gripper_position"), multi_array("/action/joint_velocity", 7, shift=2.0),
+            multi_array("/action/joint_position", 7, shift=0.1), scalar("/action/gripper_position", shift=0.1),
+            raw_camera("/cameras/wrist/image_raw"),
+        ),
+        state=(
+            Part(topic="/robot_state/joint_positions", names=[f"data_{k}" for k in range(7)], numbers=field_of("data")),
+            Part(topic="/robot_state/gripper_position", names=("robot_state_gripper_position",),
+                 numbers=lambda body: [body["data"]]),
+        ),
+        action=(
+            Part(topic="/action/joint_position", names=[f"data_{k}" for k in range(7)], numbers=field_of("data")),
+            Part(topic="/action/gripper_position", names=("action_gripper_position",),
+                 numbers=lambda body: [body["data"]]),
+        ),
+        write=_sqlite,
+    ),
 }  # fmt: skip
 """Name -> layout."""
