@@ -48,9 +48,11 @@ _CARTESIAN = re.compile(r"cartesian|(?<![a-z])(?:tcp|ee|eef|pose)(?![a-z])")
 _WORD = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])")
 _POSITION = {"q", "qpos", "position", "positions", "pos", "joint", "joints", "angle", "angles"}
 _DESIRED = {"desired", "target", "command", "commanded", "cmd", "goal", "reference", "ref", "setpoint", "d", "des"}
-_MEASURED = {"measured", "actual", "present", "feedback"}
-_PARTS = {"state", "states", "arm", "left", "right", "robot", "gripper", "hand", "finger", "fingers", "current", "rad"}
-_GRIPPER_FIELD = {"gripper", "finger", "hand", "left", "right", "width", "opening"}
+_MEASURED = {"measured", "actual", "present", "feedback", "follower", "puppet"}
+_LEADING = {"leader", "master"}
+_SIDES = {"left", "right", "l", "r"}
+_PARTS = _SIDES | {"state", "states", "arm", "robot", "gripper", "hand", "finger", "fingers", "current", "rad"}
+_GRIPPER_FIELD = _SIDES | {"gripper", "finger", "hand", "width", "opening"} | _LEADING | _MEASURED
 _ANY_COMMAND = {"cmd", "command", "commands", "action", "actions", "values", "joint", "velocity", "velocities"}
 """Words of a field that is a command though it holds no positions."""
 _TIMES = {"header", "timestamp", "stamp", "ts", "time"}
@@ -97,7 +99,12 @@ class Vector:
     @property
     def words(self) -> list[str]:
         """Of its topic."""
-        return [word for word in re.split(r"[^A-Za-z0-9]+", self.topic) if word]
+        return _split(self.topic)
+
+    @property
+    def place(self) -> list[str]:
+        """The words of its topic and field."""
+        return [*self.words, *_split(self.field)]
 
     @property
     def is_other(self) -> bool:
@@ -146,9 +153,9 @@ def vectors_of(topic: str, type_name: str, values: Values) -> Iterator[Vector]:
     found = [*_positions(empty, values)]
     if not found and empty.role == "action":
         found = [*_any_command(empty, values)][:1]
-    seen: set[tuple[bool, str]] = set()
+    seen: set[tuple[bool, str, frozenset[str]]] = set()
     for vector in sorted(found, key=_doubt):
-        place = (vector.kind == "gripper", vector.role)
+        place = (vector.kind == "gripper", vector.role, frozenset(_words(vector.field) & _SIDES))
         yield replace(vector, is_sure=vector.is_sure and place not in seen)
         seen.add(place)
     others = [*_in_space(empty, values), *_plain(empty, values)]
@@ -184,7 +191,9 @@ def _made(empty: Vector, values: Values, path: str) -> Iterator[Vector]:
         parts = [np.ravel(item) for _, item in numbers_in(follow(values, layout.steps))]
     except ValueError:  # it has none, or one of another shape
         return
-    yield replace(empty, field=path, layout=layout, first=first_numbers(np.concatenate(parts)))
+    count = len(layout.names)
+    names = tuple(f"joint_{number}" for number in range(count)) if len(set(layout.names)) < count else ()
+    yield replace(empty, field=path, layout=layout, names=names, first=first_numbers(np.concatenate(parts)))
 
 
 def _role(topic: str, type_name: str) -> str:
@@ -200,6 +209,10 @@ def _kind_of(joints: Sequence[str]) -> Kind:
     if all(_GRIPPER.search(joint.lower()) for joint in joints):
         return "gripper"
     return "base" if all(_BASE.search(joint.lower()) for joint in joints) else "arm"
+
+
+def _split(place: str) -> list[str]:
+    return [word for word in re.split(r"[^A-Za-z0-9]+", place) if word]
 
 
 def _words(path: str) -> set[str]:
@@ -231,7 +244,7 @@ def _positions(empty: Vector, values: Values) -> Iterator[Vector]:
     for path, size in _numbers(values):
         words = _words(path.rpartition(".")[2])
         beside = _words(path) - words
-        is_position = words & _POSITION and not words - _POSITION - _DESIRED - _MEASURED - _PARTS
+        is_position = words & _POSITION and not words - _POSITION - _DESIRED - _MEASURED - _LEADING - _PARTS
         is_position = is_position or (size == 1 and words & {"gripper", "width"} and words <= _GRIPPER_FIELD)
         if not is_position or beside & {"error", "cartesian", "tcp", "elbow", "imu", "pose"}:
             continue
@@ -247,8 +260,11 @@ def _positions(empty: Vector, values: Values) -> Iterator[Vector]:
             else:
                 continue
             is_single = "[0]" not in path or len(follow(values, parse_path(path.partition("[0]")[0]))) == 1
-            if (words | beside) & _DESIRED and empty.role != "action":
-                vector, is_single = replace(vector, role="action"), False
+            if (words | beside) & _MEASURED:
+                vector = replace(vector, role="state")
+            elif (words | beside) & (_DESIRED | _LEADING) and empty.role != "action":
+                is_single = is_single and bool((words | beside) & _LEADING)
+                vector = replace(vector, role="action")
             yield replace(vector, is_sure=is_single)
 
 

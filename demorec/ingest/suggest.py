@@ -10,7 +10,6 @@ import json
 import math
 import re
 from array import array
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -320,19 +319,15 @@ def _features(choice: Choice) -> Iterator[str]:
 
 
 def _chosen(feature: str, vectors: Sequence[Vector]) -> Iterator[str]:
-    labels = Counter(label for vector in vectors for label in vector.labels)
-    double = [vector for vector in vectors if any(labels[label] > 1 for label in vector.labels)]
-    prefixes = {vector.topic: _prefix(vector, double) for vector in double}
-    are_told_apart = len(set(prefixes.values())) == len(prefixes)
-    for place, vector in enumerate(vectors, 1):
-        prefix = prefixes.get(vector.topic, "") if are_told_apart else f"{place}_"
-        yield from _source(feature, vector, prefix=prefix if vector in double else "")
-
-
-def _prefix(vector: Vector, chosen: Sequence[Vector]) -> str:
-    """The words of a topic that the others of the same feature do not have."""
-    shared = set.intersection(*(set(other.words) for other in chosen))
-    return "_".join(word for word in vector.words if word not in shared) + "_"
+    """The sources of a feature; where names clash, with words in front by which their topics and fields differ."""
+    prefixes = []
+    for vector in vectors:
+        rivals = [set(other.place) for other in vectors if vector is not other and {*vector.labels} & {*other.labels}]
+        own = [word for word in vector.place if word not in set.intersection(*rivals, set(vector.place))]
+        prefixes.append("_".join(own) + "_" if rivals else "")
+    names = [prefix + label for prefix, vector in zip(prefixes, vectors, strict=True) for label in vector.labels]
+    for number, (prefix, vector) in enumerate(zip(prefixes, vectors, strict=True), 1):
+        yield from _source(feature, vector, prefix=prefix if len(set(names)) == len(names) else f"{number}_")
 
 
 def _source(feature: str, vector: Vector, *, prefix: str) -> Iterator[str]:

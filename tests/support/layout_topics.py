@@ -55,6 +55,10 @@ DEFINITIONS = {
     ),
     "my_arm_msgs/msg/ArmState": "std_msgs/Header header\nfloat64[6] q\nfloat64[6] dq\nfloat64[6] tau\n",
     "my_arm_msgs/msg/ArmCommand": "std_msgs/Header header\nfloat32[6] position\nfloat32[6] stiffness\n",
+    "my_arm_msgs/msg/Arms": (
+        "float64[6] leader_positions\nfloat64[6] follower_positions\nfloat64 leader_gripper\nfloat64 follower_gripper\n"
+    ),
+    "my_arm_msgs/msg/Teleoperation": "std_msgs/Header header\nmy_arm_msgs/Arms left\nmy_arm_msgs/Arms right\n",
     "droid_msgs/msg/RobotState": (
         "std_msgs/Header header\nfloat64[6] cartesian_position\nfloat64 gripper_position\nfloat64[7] joint_positions\n"
         "float64[7] joint_velocities\nfloat64[7] joint_torques_computed\n"

@@ -76,6 +76,21 @@ def _dynamixels(time: int) -> Body:
     ]}  # fmt: skip
 
 
+def _in_one_message(arm: str) -> Part:
+    sides = ("left", "right")
+    return Part(
+        topic="/teleoperation",
+        names=(
+            *(f"{side}_{arm}_positions_{k}" for side in sides for k in range(6)),
+            *(f"{side}_{arm}_gripper" for side in sides),
+        ),
+        numbers=lambda body: [
+            *(number for side in sides for number in body[side][f"{arm}_positions"]),
+            *(body[side][f"{arm}_gripper"] for side in sides),
+        ],
+    )
+
+
 def _mcap(notes: Notes, path: Path) -> Path:
     return bags.write_mcap(notes, path / "bag.mcap")
 
@@ -279,6 +294,17 @@ LAYOUTS: dict[str, Layout] = {
         action=(Part(topic="/arm/sent", names=[f"position_{k}" for k in range(6)],
                      numbers=lambda body: np.float32(body["position"])),),
         write=_mcap,
+    ),
+    "all in one message": Layout(
+        topics=(
+            Topic(name="/teleoperation", type="my_arm_msgs/msg/Teleoperation", rate=60, body=lambda time, number: {
+                side: {"leader_positions": motion(time, 6, shift=k + 0.1), "follower_positions": motion(time, 6),
+                       "leader_gripper": 0.5 + number / 256, "follower_gripper": 0.25 + number / 256}
+                for k, side in enumerate(("left", "right"))}),
+            camera("/head/image/compressed"),
+        ),
+        state=(_in_one_message("follower"),),
+        action=(_in_one_message("leader"),),
     ),
     "two arms in namespaces": Layout(
         topics=(
