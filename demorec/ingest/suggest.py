@@ -293,7 +293,7 @@ def _services(topics: Mapping[str, _Topic]) -> Iterator[str]:
 def _features(choice: Choice) -> Iterator[str]:
     yield from _chosen("observation.state", choice.state)
     if not choice.state:
-        yield from ("", "# No topic says that it is the robot's state: take one of these.")
+        yield from ("", "# No topic is known to hold the robot's state.")
     yield from _chosen("action", choice.action)
     if not choice.action:
         offers = any(vector.role == "action" for vector in choice.others)
