@@ -68,11 +68,10 @@ class Import:
                 "runs/demo. A bag of that name is given with its folder."
             )
         if self.suggest:
-            if is_hdf5:
-                from demorec.ingest.hdf5_suggest import suggested_hdf5_mapping as suggested
-            else:
-                from demorec.ingest.suggest import suggested_mapping as suggested
-            say(*suggested(files[0]))
+            from demorec.ingest.hdf5_suggest import suggested_hdf5_mapping
+            from demorec.ingest.suggest import suggested_mapping
+
+            say(*(suggested_hdf5_mapping(files[0]) if is_hdf5 else suggested_mapping(files[0], tell)))
             return 0
         if self.mapping is None or self.out is None:
             example = f"hdf5 {files[0]} --suggest > demo.toml" if is_hdf5 else f"--suggest {files[0]} > robot.toml"
