@@ -179,10 +179,9 @@ class _Dataset:
             if spoken.num_rows != place.length:
                 raise BagError(f"Episode {place.episode_index} has other rows than its table says: {self.root}")
             for row in spoken.persistent:
-                text, begin = row.get("content"), row.get("timestamp")
-                is_subtask = row.get("style") == "subtask" and isinstance(text, str) and isinstance(begin, float)
-                frame = begin * self.info.fps if is_subtask else -1
-                if not 0 <= frame < place.length:
+                text, begin = str(row.get("content")), row.get("timestamp")
+                frame = begin * self.info.fps if isinstance(begin, float) else -1
+                if row.get("style") != "subtask" or not 0 <= frame < place.length:
                     self.left_out[PERSISTENT] = "all but its subtasks"
                 elif len(text) > MAX_SUBTASK or not text.isprintable():
                     self.left_out[PERSISTENT] = f"a subtask is no single line of at most {MAX_SUBTASK} characters"
