@@ -55,8 +55,9 @@ class StoredArray:
         is_ragged: Whether each row is as long as it likes: files in a dataset of variable length.
     """
 
-    def __init__(self, file: Path, place: str, dataset: h5py.Dataset) -> None:
+    def __init__(self, file: Path, place: str, dataset: h5py.Dataset, limits: Limits) -> None:
         self.place = place
+        self._limits, self._unpacked = limits, 0
         self.shape: tuple[int, ...] = dataset.shape
         self.is_ragged = dataset.dtype.kind == "O"
         self.dtype: np.dtype[np.generic] = np.dtype(np.uint8) if self.is_ragged else dataset.dtype
@@ -69,6 +70,9 @@ class StoredArray:
         """Rows from `begin` to before `end`; Hdf5Error when they cannot be read."""
         with _errors_told(f"{self.place} cannot be read", self._file):
             rows: NDArray[np.generic] = self._dataset[begin:end]
+            if self.is_ragged:  # rows may share their bytes
+                self._unpacked += sum(map(len, rows))
+                self._limits.check_total(self._unpacked)
         return rows
 
     def rows(self) -> Iterator[NDArray[np.generic]]:
@@ -174,7 +178,7 @@ class ForeignFile(Closing):
                 self._limits.check_total(sum(self._claimed.values()))
         if reason:
             raise Hdf5Error(f"{place} cannot be used, since {reason}: {self.path}")
-        return StoredArray(self.path, place, found)
+        return StoredArray(self.path, place, found, self._limits)
 
     def names(self, place: str) -> list[str]:
         """A dataset of texts, as robomimic's masks are.

@@ -159,11 +159,12 @@ def _read_dataset(found: h5py.h5d.DatasetID) -> None:
     if not found.shape or not (is_chunked or is_text or is_ragged):
         return
     dataset = h5py.Dataset(found)
-    if is_ragged:  # every row has a place of its own in the file
+    if is_ragged:  # every row has a place of its own in the file, unless it was made to share one
+        left = Path(dataset.file.filename).stat().st_size
         for index in range(len(dataset) if dataset.ndim == 1 else 0):
             with _errors_ignored():
-                dataset[index]
-            if time.process_time() > _WALK_SECONDS:
+                left -= len(dataset[index])
+            if left < 0 or time.process_time() > _WALK_SECONDS:
                 return
         return
     if is_text:
