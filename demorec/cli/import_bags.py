@@ -114,8 +114,10 @@ class Import:
         from demorec.ingest.hdf5_import import import_hdf5
 
         result = import_hdf5(files, mapping, out, video=self.video)
-        unnamed = f"The mapping does not name, and so the run does not have: {', '.join(result.left_out)}."
-        _say_made(result, out, [unnamed] if result.left_out else [])
+        left_out = [f"{name} is left out: {reason}." for name, reason in result.left_out.items() if reason]
+        if unnamed := [name for name, reason in result.left_out.items() if not reason]:
+            left_out.append(f"The mapping does not name, and so the run does not have: {', '.join(unnamed)}.")
+        _say_made(result, out, left_out)
 
 
 def _say_made(result: FramesImport, out: Path, left_out: Sequence[str]) -> None:

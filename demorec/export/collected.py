@@ -1,4 +1,4 @@
-"""What every exporter writes of a collected episode: its frames as they came, in float32, and whole pictures."""
+"""What every exporter writes of a collected episode: its frames as they came, and whole pictures."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class CollectedData:
 
     Attributes:
         recorded: All of its numbers.
-        features: Feature -> (T, D) float32; (T,) bool for DONE.
+        features: Feature -> (T, D) in its own dtype; (T,) bool for DONE.
         pictures: Camera, depth cameras included -> (T,) numbers of the pictures that the frames show.
     """
 
@@ -82,24 +82,14 @@ def collected_data(recording: CollectedRecording, options: CommonOptions) -> Col
 
     Raises:
         ConfigError: As `check_options`.
-        ExportError: It has no frames, a number that float32 does not hold, or frames without a picture.
+        ExportError: It has no frames, or frames without a picture.
         RecordingError: It is damaged.
     """
     check_options(recording, options)
     if recording.num_frames == 0:
         raise ExportError(f"The recording has no frames: {recording.path}")
     columns = recording.columns()
-    features: dict[str, NDArray[np.generic]] = {}
-    for name, values in columns.features.items():
-        if not options.takes(name):
-            continue
-        with np.errstate(over="ignore"):
-            features[name] = values.astype(np.float32)
-        if len(wrong := np.flatnonzero(~np.isfinite(values.astype(np.float32)).all(axis=1))):
-            raise ExportError(
-                f"The feature {name} is too large for float32 in frame {int(wrong[0])}, leave the recording out: "
-                f"{recording.path}"
-            )
+    features = {name: values for name, values in columns.features.items() if options.takes(name)}
     features[DONE] = np.arange(columns.num_frames) == columns.num_frames - 1
     return CollectedData(
         recorded=columns,

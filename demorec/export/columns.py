@@ -1,4 +1,4 @@
-"""The numbers of a recording as every exporter writes them: which frames, which features, in float32."""
+"""The numbers of a recording as every exporter writes them: which frames, which features."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from demorec.scene.features import (
     IMAGE_PREFIX,
     ObservationRows,
     StateKind,
+    VectorType,
     action_vectors,
     observation_vectors,
 )
@@ -36,7 +37,7 @@ class FeatureColumns:
     Attributes:
         recorded: All of its numbers, every frame.
         rows: (T,) which of these frames the dataset has.
-        features: Feature -> (T, D) float32; (T,) float32 for REWARD, (T,) bool for DONE, SUCCESS and INTERVENTION.
+        features: Feature -> (T, D); (T,) float32 for REWARD, (T,) bool for DONE, SUCCESS and INTERVENTION.
     """
 
     recorded: EpisodeColumns
@@ -72,8 +73,10 @@ def check_feature_names(options: CommonOptions, offered: Collection[str]) -> Non
             )
 
 
-def feature_columns(recording: Recording, options: CommonOptions, *, state: StateKind = "joint") -> FeatureColumns:
-    """All numbers that recordings and options give, whichever of them `options.features` names.
+def feature_columns(
+    recording: Recording, options: CommonOptions, *, state: StateKind = "joint", dtype: VectorType = np.float32
+) -> FeatureColumns:
+    """All numbers that recordings and options give, whichever of them `options.features` names, vectors as `dtype`.
 
     With frames left out, an observation is that of the first frame of its group and an action the last one of it:
     where the robot shall be when the next observation is taken.
@@ -103,9 +106,10 @@ def feature_columns(recording: Recording, options: CommonOptions, *, state: Stat
             info.scene,
             privileged=options.privileged,
             state=state,
+            dtype=dtype,
         )
     )
-    features[ACTION] = action_vectors(columns, info.scene, options.action, action_rows)
+    features[ACTION] = action_vectors(columns, info.scene, options.action, action_rows, dtype=dtype)
     for name, values in features.items():
         if len(wrong := np.flatnonzero(~np.isfinite(values.astype(np.float64)).all(axis=1))):
             raise ExportError(

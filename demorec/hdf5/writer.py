@@ -82,7 +82,7 @@ class RobomimicWriter:
         info, options = recording.info, self.options
         names = observation_names(info.robot, info.scene, privileged=options.privileged)
         self._check_feature_names(recording, names)
-        columns = feature_columns(recording, options)
+        columns = feature_columns(recording, options, dtype=np.float64)
         demo.attrs["num_samples"] = len(columns.rows)
         demo.attrs["instruction"] = info.instruction
         demo.attrs["episode_index"], demo.attrs["attempt"] = info.episode_index, info.attempt

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.config import VideoConfig
+from demorec.errors import ExportError
 from demorec.export.collected import (
     check_options,
     collected_data,
@@ -102,7 +103,7 @@ def prepare_collected(
     Depth videos, which must be coded, are made only with `code_depth`.
 
     Raises:
-        ExportError: It has no frames, or frames without pictures.
+        ExportError: It has no frames, a number that float32 does not hold, or frames without pictures.
         RecordingError: It is damaged.
     """
     wanted = collected_features(recording, options)
@@ -127,13 +128,27 @@ def prepare_collected(
         )
     episode = EpisodeData(
         task=recording.info.instruction,
-        columns=data.features,
+        columns={name: _single(name, values, recording) for name, values in data.features.items()},
         videos=videos,
         video_info={key: wanted[key].info or {} for key in videos},
         pixels=pixels,
         language=_language(recording, options),
     )
     return episode, _sidecar_row(recording)
+
+
+def _single(name: str, values: NDArray[np.generic], recording: CollectedRecording) -> NDArray[np.generic]:
+    """(T, D) float32 of a feature's numbers; booleans stay."""
+    if values.dtype == bool:
+        return values
+    with np.errstate(over="ignore"):
+        found = values.astype(np.float32)
+    if len(wrong := np.flatnonzero(~np.isfinite(found).all(axis=1))):
+        raise ExportError(
+            f"The feature {name} is too large for float32 in frame {int(wrong[0])}, leave the recording out: "
+            f"{recording.path}"
+        )
+    return found
 
 
 def _language(recording: CollectedRecording, options: ExportOptions) -> EpisodeLanguage:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import reprlib
+import shlex
 import string
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -191,9 +192,7 @@ class DatasetInfo:
             data = read_json(path)
             version = data.pop("codebase_version")
             if version != CODEBASE_VERSION:
-                raise ExportError(
-                    f"The dataset has format {version}, expected {CODEBASE_VERSION}; LeRobot can convert it: {root}"
-                )
+                raise ExportError(_other_version(version, root))
             data.pop("splits", None)
             features = {name: Feature.from_json(entry) for name, entry in data.pop("features").items()}
             known = {name: data.pop(name) for name in list(data) if name in _INFO_FIELDS}
@@ -227,6 +226,24 @@ class DatasetInfo:
         for template in (self.data_path, self.video_path):
             if template is not None:
                 _check_template(template)
+
+
+def _other_version(version: object, root: Path) -> str:
+    """What to do with a dataset of another version of the format, in a sentence; the command is LeRobot 0.6.1's."""
+    found = f"The dataset has format {reprlib.repr(version).strip("'")}, expected {CODEBASE_VERSION}"
+    if version == "v2.1":
+        root = root.resolve()
+        arguments = f"--repo-id {shlex.quote(f'local/{root.name}')} --root {shlex.quote(str(root))} --push-to-hub false"
+        # The converter deletes what has these names, or puts it in the dataset's place.
+        taken = [name for name in (f"{root.name}_old", f"{root.name}_v30") if (root.parent / name).exists()]
+        return (
+            f"{found}; {f'move {" and ".join(taken)} away first, then ' if taken else ''}LeRobot converts it in its "
+            f"place and leaves the old one beside it, as {root.name}_old: python -m "
+            f"lerobot.scripts.convert_dataset_v21_to_v30 {arguments}"
+        )
+    if str(version).startswith(("v1.", "v2.")):
+        found += "; LeRobot 0.6 converts from v2.1 on, so bring it to v2.1 with the LeRobot that wrote it"
+    return f"{found}: {root}"
 
 
 def _is_count(value: object, low: int, high: int) -> bool:

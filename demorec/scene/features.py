@@ -3,7 +3,7 @@
 A policy trained on an exported dataset meets the same numbers in closed loop only if both come from the same
 arithmetic. So everything here works on rows (T frames, or one) with additions, multiplications, divisions and
 square roots alone: IEEE 754 rounds these the same on every CPU and for every array length, unlike the
-vectorised sines of NumPy. The result is rounded to float32 once, at the end.
+vectorised sines of NumPy. The result is rounded once, at the end, where float32 is asked for.
 
 Frames: everything is expressed in the robot's base frame (the world's, where the robot stands at its origin).
 """
@@ -23,7 +23,8 @@ from demorec.scene.episode import EpisodeColumns, Observation
 from demorec.scene.robot import RobotSpec
 from demorec.scene.scene import Goal, Scene
 
-Vectors = NDArray[np.float32]
+Vectors = NDArray[np.float32] | NDArray[np.float64]
+VectorType = type[np.float32] | type[np.float64]
 
 STATE = "observation.state"
 VELOCITY = "observation.velocity"
@@ -109,9 +110,15 @@ def observation_names(
 
 
 def observation_vectors(
-    rows: ObservationRows, robot: RobotSpec, scene: Scene, *, privileged: bool = False, state: StateKind = "joint"
+    rows: ObservationRows,
+    robot: RobotSpec,
+    scene: Scene,
+    *,
+    privileged: bool = False,
+    state: StateKind = "joint",
+    dtype: VectorType = np.float32,
 ) -> dict[str, Vectors]:
-    """Feature name -> (T, D) float32.
+    """Feature name -> (T, D) numbers of that type.
 
     - `observation.state`: arm joint positions (rad), gripper opening (m); with `state` "joint_ee" the seven numbers of
       `observation.ee_pose` behind them, for policies that take no second vector (LeRobot's ACT).
@@ -123,13 +130,13 @@ def observation_vectors(
     arm = len(robot.arm_joints)
     tcp = _continuous(rows.base_from_tcp)
     features = {
-        STATE: _float32([rows.joint_position[:, :arm], rows.gripper_width, *([tcp] if state == "joint_ee" else [])]),
-        VELOCITY: _float32([rows.joint_velocity[:, :arm], _gripper_velocity(rows, robot)]),
-        EE_POSE: _float32([tcp]),
+        STATE: [rows.joint_position[:, :arm], rows.gripper_width, *([tcp] if state == "joint_ee" else [])],
+        VELOCITY: [rows.joint_velocity[:, :arm], _gripper_velocity(rows, robot)],
+        EE_POSE: [tcp],
     }
     if privileged:
-        features[ENVIRONMENT_STATE] = _float32(_environment_columns(rows, robot, scene))
-    return features
+        features[ENVIRONMENT_STATE] = _environment_columns(rows, robot, scene)
+    return {name: _joined(columns, dtype) for name, columns in features.items()}
 
 
 # ---------------------------------------------------------------------------------------------- environment state
@@ -274,9 +281,14 @@ def action_names(robot: RobotSpec, kind: ActionKind) -> tuple[str, ...]:
 
 
 def action_vectors(
-    columns: EpisodeColumns, scene: Scene, kind: ActionKind, rows: NDArray[np.intp] | slice = slice(None)
+    columns: EpisodeColumns,
+    scene: Scene,
+    kind: ActionKind,
+    rows: NDArray[np.intp] | slice = slice(None),
+    *,
+    dtype: VectorType = np.float32,
 ) -> Vectors:
-    """(T, D) float32, the expert's wanted commands; the last component is always the absolute gripper opening (m).
+    """(T, D) numbers, the expert's wanted commands; the last component is always the absolute gripper opening (m).
 
     - `joint`: absolute joint targets, rad.
     - `joint_increment`: joint target minus the one of the frame before; the first minus the scene's initial joint
@@ -294,24 +306,25 @@ def action_vectors(
         scene: Of the episode.
         kind: Which form.
         rows: Frames whose actions are wanted; increments are taken between these.
+        dtype: Of the numbers.
     """
     gripper = columns.action_gripper[rows]
     if kind == "joint":
-        return _float32([columns.action_joint_target[rows], gripper])
+        return _joined([columns.action_joint_target[rows], gripper], dtype)
     if kind == "joint_increment":
         targets, commands = columns.action_joint_target[rows], columns.command_joint_target[rows]
         increments = targets - np.concatenate([np.array([scene.robot.joint_position]), targets[:-1]])
         increments[1:] += _noise_share(columns.time_ns[rows]) * (targets[:-1] - commands[:-1])
-        return _float32([increments, gripper])
+        return _joined([increments, gripper], dtype)
     poses, executed = columns.action_base_from_tcp[rows], columns.command_base_from_tcp[rows]
     if kind == "ee":
-        return _float32([_continuous(poses), gripper])
+        return _joined([_continuous(poses), gripper], dtype)
     before = np.concatenate([columns.base_from_tcp[:1], poses[:-1]])
     shifts, turns = poses[:, :3] - before[:, :3], _rotation_vectors(before[:, 3:], poses[:, 3:])
     share = _noise_share(columns.time_ns[rows])
     shifts[1:] += share * (poses[:-1, :3] - executed[:-1, :3])
     turns[1:] += share * _rotation_vectors(executed[:-1, 3:], poses[:-1, 3:])
-    return _float32([shifts, turns, gripper])
+    return _joined([shifts, turns, gripper], dtype)
 
 
 def _noise_share(time_ns: NDArray[np.int64]) -> float:
@@ -354,9 +367,10 @@ def _rotation_vectors(before: Array, after: Array) -> Array:
 # ---------------------------------------------------------------------------------------------- arithmetic on rows
 
 
-def _float32(columns: Iterable[Array]) -> Vectors:
+def _joined(columns: Iterable[Array], dtype: VectorType) -> Vectors:
     parts = [part[:, np.newaxis] if part.ndim == 1 else part for part in columns]
-    return np.concatenate(parts, axis=1).astype(np.float32)
+    joined: Array = np.concatenate(parts, axis=1)
+    return joined if dtype is np.float64 else joined.astype(np.float32)
 
 
 def _repeat(values: tuple[float, ...], count: int) -> Array:

@@ -167,7 +167,9 @@ def test_info_of_a_dataset_of_an_older_format_says_so(
     info = tmp_path / "d" / "meta" / "info.json"
     info.write_text(info.read_text().replace("v3.0", "v2.1"))
     assert run("info", tmp_path / "d") == 0
-    assert "The dataset has format v2.1, expected v3.0; LeRobot can convert it" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "The dataset has format v2.1, expected v3.0; LeRobot converts it" in told
+    assert "python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id local/d --root" in told
 
 
 @pytest.mark.parametrize(

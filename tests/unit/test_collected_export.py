@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import av
+import h5py
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
@@ -47,6 +48,18 @@ def test_numbers_are_those_of_the_recordings(tmp_path: Path) -> None:
     card = (tmp_path / "d" / "README.md").read_text()
     assert "2 demonstrations of two_joints, collected" in card
     assert "scripted" not in card
+
+
+def test_numbers_that_float32_does_not_hold_are_refused_where_it_is_written(tmp_path: Path) -> None:
+    """LeRobot's datasets have float32, robomimic's files whatever was recorded."""
+    given = complete(num_frames=5)
+    given.frames[2].samples["observation.force"].vector[1] = 1e300
+    run = run_of(tmp_path / "run", given)
+    with pytest.raises(ExportError, match=r"observation\.force is too large for float32 in frame 2"):
+        export(run, tmp_path / "d")
+    export(run, tmp_path / "d.hdf5", "hdf5")
+    with h5py.File(tmp_path / "d.hdf5") as file:
+        assert file["data/demo_0/obs/force"][2, 1] == 1e300
 
 
 def test_packets_go_into_the_dataset_as_they_are(tmp_path: Path) -> None:

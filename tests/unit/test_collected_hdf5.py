@@ -34,7 +34,8 @@ def test_numbers_and_pictures_are_those_of_the_recordings(tmp_path: Path) -> Non
             given, demo = make_collected(cameras=(TOP,), num_frames=20, episode_index=index), file[f"data/demo_{index}"]
             vectors = {"obs/state": STATE.name, "obs/force": FORCE.name, "actions": "action"}
             for place, name in vectors.items():
-                expected = np.array([frame.samples[name].vector.astype(np.float32) for frame in given.frames])
+                expected = np.array([frame.samples[name].vector for frame in given.frames])
+                assert demo[place].dtype == expected.dtype
                 np.testing.assert_array_equal(demo[place][:], expected)
             assert json.loads(demo["obs/force"].attrs["names"]) == ["x", "y", "z"]
             with CollectedRecording(run / "episodes" / f"episode_{index:06d}.mcap") as recording:

@@ -39,20 +39,20 @@ def test_numbers_are_those_of_the_recording(run: Path, tmp_path: Path) -> None:
             assert demo.attrs["num_samples"] == columns.num_frames
             assert (demo.attrs["episode_index"], demo.attrs["success"]) == (index, True)
             observed = {name: data[()] for name, data in demo["obs"].items()}
-            single = {
+            recorded = {
                 "robot0_joint_pos": columns.joint_position[:, :7],
                 "robot0_gripper_qpos": columns.gripper_width[:, np.newaxis],
                 "robot0_joint_vel": columns.joint_velocity[:, :7],
                 "robot0_gripper_qvel": columns.joint_velocity[:, 7:].sum(axis=1, keepdims=True),
                 "robot0_eef_pos": columns.base_from_tcp[:, :3],
             }
-            for name, expected in single.items():
-                assert observed[name].dtype == np.float32
-                np.testing.assert_array_equal(observed[name], expected.astype(np.float32), err_msg=name)
+            for name, expected in recorded.items():
+                assert observed[name].dtype == np.float64
+                np.testing.assert_array_equal(observed[name], expected, err_msg=name)
             same = (observed["robot0_eef_quat"] * columns.base_from_tcp[:, 3:]).sum(axis=1)
-            np.testing.assert_allclose(np.abs(same), 1, atol=1e-6)  # either sign is the same rotation
+            np.testing.assert_allclose(np.abs(same), 1, atol=1e-12)  # either sign is the same rotation
             target = np.column_stack([columns.action_joint_target, columns.action_gripper])
-            np.testing.assert_array_equal(demo["actions"][()], target.astype(np.float32))
+            np.testing.assert_array_equal(demo["actions"][()], target)
             state = [columns.joint_position, columns.joint_velocity, *columns.object_poses.values()]
             np.testing.assert_array_equal(demo["states"][()], np.concatenate(state, axis=1))
             last = [0] * (columns.num_frames - 1) + [1]
@@ -95,7 +95,7 @@ def test_fewer_frames(run: Path, tmp_path: Path) -> None:
         demo, columns = file["data/demo_0"], source.columns()
         assert demo.attrs["num_samples"] == 2
         np.testing.assert_array_equal(demo["states"][:, :9], columns.joint_position[[0, 3]])
-        np.testing.assert_array_equal(demo["actions"][:, :7], columns.action_joint_target[[2, 4]].astype(np.float32))
+        np.testing.assert_array_equal(demo["actions"][:, :7], columns.action_joint_target[[2, 4]])
         np.testing.assert_array_equal(demo["obs/front_image"][1], source.image("front", 3))
         assert file["data"].attrs["fps"] == 10
 
@@ -265,5 +265,5 @@ def test_robomimic_reads_it(run: Path, tmp_path: Path) -> None:
         with recording(run, index) as source:
             item, columns = read[1], source.columns()
             np.testing.assert_array_equal(item["obs"]["front_image"][0], source.image("front", 1))
-        np.testing.assert_array_equal(item["obs"]["robot0_eef_pos"], columns.base_from_tcp[1:4, :3].astype(np.float32))
+        np.testing.assert_array_equal(item["obs"]["robot0_eef_pos"], columns.base_from_tcp[1:4, :3])
         np.testing.assert_array_equal(item["actions"][:, :7], columns.action_joint_target[1:4].astype(np.float32))

@@ -1,0 +1,147 @@
+"""A LeRobot v2.1 dataset, written by PyArrow and av as that format was, is refused with a command that converts it."""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from numpy.typing import NDArray
+from support.commands import exit_code
+
+from demorec.recording import CollectedRecording
+
+CAMERA = "observation.images.top"
+LENGTHS = (6, 5)
+FPS = 10
+
+
+def state(episode: int) -> NDArray[np.float32]:
+    return (np.arange(2 * LENGTHS[episode]).reshape(-1, 2) + 100 * episode).astype(np.float32)
+
+
+def statistics(values: NDArray[Any]) -> dict[str, list[float]]:
+    rows = values.astype(np.float64).reshape(len(values), -1)
+    found = {"min": rows.min(0), "max": rows.max(0), "mean": rows.mean(0), "std": rows.std(0)}
+    return {**{name: row.tolist() for name, row in found.items()}, "count": [len(rows)]}
+
+
+def write_video(path: Path, length: int) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=FPS, options={"g": "2", "bf": "0"})
+        stream.width = stream.height = 64
+        stream.pix_fmt = "yuv420p"
+        for number in range(length):
+            picture = np.full((64, 64, 3), 20 * number + 10, np.uint8)
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+        container.mux(stream.encode(None))
+
+
+def write_v21(root: Path) -> Path:
+    """A file of rows and a video for each episode, and tables in JSON lines."""
+    (root / "meta").mkdir(parents=True)
+    (root / "data" / "chunk-000").mkdir(parents=True)
+    tables: dict[str, list[dict[str, Any]]] = {"episodes": [], "episodes_stats": []}
+    for episode, length in enumerate(LENGTHS):
+        count = np.arange(length)
+        columns: dict[str, NDArray[Any]] = {
+            "observation.state": state(episode),
+            "action": state(episode) + 1,
+            "timestamp": (count / FPS).astype(np.float32),
+            "frame_index": count,
+            "episode_index": np.full(length, episode),
+            "index": count + sum(LENGTHS[:episode]),
+            "task_index": np.zeros(length, np.int64),
+        }
+        vector = pa.list_(pa.float32(), 2)
+        arrays = {
+            name: pa.array(rows.tolist(), vector) if rows.ndim == 2 else pa.array(rows)
+            for name, rows in columns.items()
+        }
+        pq.write_table(pa.table(arrays), root / f"data/chunk-000/episode_{episode:06d}.parquet")
+        write_video(root / f"videos/chunk-000/{CAMERA}/episode_{episode:06d}.mp4", length)
+        stats: dict[str, Any] = {name: statistics(rows) for name, rows in columns.items()}
+        stats[CAMERA] = {**{name: [[[0.5]]] * 3 for name in ("min", "max", "mean", "std")}, "count": [length]}
+        tables["episodes"].append({"episode_index": episode, "tasks": ["push it"], "length": length})
+        tables["episodes_stats"].append({"episode_index": episode, "stats": stats})
+    tables["tasks"] = [{"task_index": 0, "task": "push it"}]
+    for name, rows in tables.items():
+        (root / "meta" / f"{name}.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    video = {"video.fps": FPS, "video.codec": "h264", "video.pix_fmt": "yuv420p", "has_audio": False}
+    numbers = {"observation.state": ("float32", 2), "action": ("float32", 2), "timestamp": ("float32", 1)}
+    integers = dict.fromkeys(("frame_index", "episode_index", "index", "task_index"), ("int64", 1))
+    features: dict[str, Any] = {
+        name: {"dtype": dtype, "shape": [count], "names": None}
+        for name, (dtype, count) in {**numbers, **integers}.items()
+    }
+    features[CAMERA] = {"dtype": "video", "shape": [64, 64, 3], "names": ["height", "width", "channels"], "info": video}
+    totals = {"episodes": len(LENGTHS), "frames": sum(LENGTHS), "tasks": 1, "videos": len(LENGTHS), "chunks": 1}
+    info = {
+        "codebase_version": "v2.1",
+        "robot_type": "so100",
+        **{f"total_{name}": count for name, count in totals.items()},
+        "chunks_size": 1000,
+        "fps": FPS,
+        "splits": {"train": f"0:{len(LENGTHS)}"},
+        "data_path": "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet",
+        "video_path": "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4",
+        "features": features,
+    }
+    (root / "meta" / "info.json").write_text(json.dumps(info))
+    return root
+
+
+def refusal(root: Path, capsys: pytest.CaptureFixture[str]) -> str:
+    assert exit_code("import", "lerobot", root, "--out", root.with_name("run")) == 1
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1
+    return err.strip()
+
+
+@pytest.mark.slow
+def test_the_command_in_the_refusal_converts_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    root = write_v21(tmp_path / "my cups")
+    told = refusal(root, capsys)
+    assert "The dataset has format v2.1, expected v3.0" in told
+    assert f"beside it, as {root.name}_old" in told
+    program, *arguments = shlex.split(told[told.index("python -m ") :])
+    assert program == "python"
+    environment = os.environ | {"HF_HOME": str(tmp_path / "hf"), "HF_HUB_OFFLINE": "1"}
+    subprocess.run([sys.executable, *arguments], check=True, env=environment, capture_output=True, timeout=300)
+    assert (tmp_path / "my cups_old" / "meta" / "episodes.jsonl").exists()
+    assert exit_code("import", "lerobot", root, "--out", tmp_path / "run") == 0
+    for episode, path in enumerate(sorted((tmp_path / "run/episodes").glob("*.mcap"))):
+        with CollectedRecording(path) as recording:
+            np.testing.assert_array_equal(recording.columns().features["observation.state"], state(episode))
+            levels = [int(picture.mean().round()) for picture in recording.images("top")]
+            np.testing.assert_allclose(levels, 20 * np.arange(LENGTHS[episode]) + 10, atol=2)
+
+
+def test_what_the_converter_would_delete_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """It takes what is called ..._old for what a former conversion left, and puts it in the dataset's place."""
+    root = write_v21(tmp_path / "cups")
+    assert "python -m lerobot.scripts.convert_dataset_v21_to_v30" in refusal(root, capsys)
+    (tmp_path / "cups_old").mkdir()
+    assert "move cups_old away first" in refusal(root, capsys)
+
+
+@pytest.mark.parametrize(("version", "advice"), [("v2.0", "bring it to v2.1 with"), ("v9.0", "expected v3.0: ")])
+def test_other_versions_have_no_command(
+    version: str, advice: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = write_v21(tmp_path / "cups")
+    path = root / "meta" / "info.json"
+    path.write_text(path.read_text().replace("v2.1", version))
+    told = refusal(root, capsys)
+    assert advice in told
+    assert "python -m" not in told
