@@ -178,7 +178,7 @@ def collected_stuck(recording: CollectedRecording) -> Found:
     changing = {name for name, values in features.items() if np.ptp(values, axis=0).any()}
     if "action" in features and "action" not in changing:
         return NotMeasured(why="the actions do not change")
-    stuck = [name for name in features if name not in changing and name != "action"]
+    stuck = [name for name in features if name not in changing and name.startswith("observation.")]
     return Measurement(value=len(stuck), detail=", ".join(stuck))
 
 

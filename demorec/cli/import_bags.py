@@ -68,11 +68,10 @@ class Import:
                 "runs/demo. A bag of that name is given with its folder."
             )
         if self.suggest:
-            if is_hdf5:
-                from demorec.ingest.hdf5_suggest import suggested_hdf5_mapping as suggested
-            else:
-                from demorec.ingest.suggest import suggested_mapping as suggested
-            say(*suggested(files[0]))
+            from demorec.ingest.hdf5_suggest import suggested_hdf5_mapping
+            from demorec.ingest.suggest import suggested_mapping
+
+            say(*(suggested_hdf5_mapping(files[0]) if is_hdf5 else suggested_mapping(files[0], tell)))
             return 0
         if self.mapping is None or self.out is None:
             example = f"hdf5 {files[0]} --suggest > demo.toml" if is_hdf5 else f"--suggest {files[0]} > robot.toml"
@@ -115,8 +114,10 @@ class Import:
         from demorec.ingest.hdf5_import import import_hdf5
 
         result = import_hdf5(files, mapping, out, video=self.video)
-        unnamed = f"The mapping does not name, and so the run does not have: {', '.join(result.left_out)}."
-        _say_made(result, out, [unnamed] if result.left_out else [])
+        left_out = [f"{name} is left out: {reason}." for name, reason in result.left_out.items() if reason]
+        if unnamed := [name for name, reason in result.left_out.items() if not reason]:
+            left_out.append(f"The mapping does not name, and so the run does not have: {', '.join(unnamed)}.")
+        _say_made(result, out, left_out)
 
 
 def _say_made(result: FramesImport, out: Path, left_out: Sequence[str]) -> None:

@@ -52,12 +52,15 @@ class StoredArray:
         place: Its name in the file.
         shape: Of all rows.
         dtype: Of a number: integer, float or bool.
+        is_ragged: Whether each row is as long as it likes: files in a dataset of variable length.
     """
 
-    def __init__(self, file: Path, place: str, dataset: h5py.Dataset) -> None:
+    def __init__(self, file: Path, place: str, dataset: h5py.Dataset, limits: Limits) -> None:
         self.place = place
+        self._limits, self._unpacked = limits, 0
         self.shape: tuple[int, ...] = dataset.shape
-        self.dtype: np.dtype[np.generic] = dataset.dtype
+        self.is_ragged = dataset.dtype.kind == "O"
+        self.dtype: np.dtype[np.generic] = np.dtype(np.uint8) if self.is_ragged else dataset.dtype
         self._file, self._dataset = file, dataset
 
     def __len__(self) -> int:
@@ -67,6 +70,9 @@ class StoredArray:
         """Rows from `begin` to before `end`; Hdf5Error when they cannot be read."""
         with _errors_told(f"{self.place} cannot be read", self._file):
             rows: NDArray[np.generic] = self._dataset[begin:end]
+            if self.is_ragged:  # rows may share their bytes
+                self._unpacked += sum(map(len, rows))
+                self._limits.check_total(self._unpacked)
         return rows
 
     def rows(self) -> Iterator[NDArray[np.generic]]:
@@ -80,6 +86,8 @@ class StoredArray:
         return _attribute(self._dataset, name, self.place, self._file)
 
     def _rows_at_once(self) -> int:
+        if self.is_ragged:  # how long a row is, only reading it says
+            return 1
         row = max(1, math.prod(self.shape[1:]) * self.dtype.itemsize)
         chunk = self._dataset.chunks[0] if self._dataset.chunks else 1
         step = chunk * max(1, _BLOCK_BYTES // (chunk * row))
@@ -155,8 +163,8 @@ class ForeignFile(Closing):
         """A text, number or boolean that is an attribute of a group or dataset; None when it has none of that name."""
         return _attribute(self._find(place), name, _shown(place), self.path)
 
-    def array(self, place: str) -> StoredArray:
-        """A dataset of rows.
+    def array(self, place: str, *, may_be_ragged: bool = False) -> StoredArray:
+        """A dataset of rows, with `may_be_ragged` also one of bytes of variable length.
 
         Raises:
             Hdf5Error: There is none, it holds no plain numbers, has no rows, was never written, leads out of the file,
@@ -164,13 +172,13 @@ class ForeignFile(Closing):
         """
         found = self._find(place)
         with _errors_told(f"{place} cannot be read", self.path):
-            reason = _why_unusable(found)
+            reason = _why_unusable(found, may_be_ragged)
             if not reason:
                 self._claimed[place] = found.nbytes
                 self._limits.check_total(sum(self._claimed.values()))
         if reason:
             raise Hdf5Error(f"{place} cannot be used, since {reason}: {self.path}")
-        return StoredArray(self.path, place, found)
+        return StoredArray(self.path, place, found, self._limits)
 
     def names(self, place: str) -> list[str]:
         """A dataset of texts, as robomimic's masks are.
@@ -212,11 +220,12 @@ class ForeignFile(Closing):
         return "group" if kind is h5py.Group else "dataset" if kind is h5py.Dataset else "other"
 
 
-def _why_unusable(found: h5py.Group | h5py.Dataset) -> str:
+def _why_unusable(found: h5py.Group | h5py.Dataset, may_be_ragged: bool) -> str:
     """Why the numbers of a dataset are not read, in words; "" when they are."""
     if not isinstance(found, h5py.Dataset):
         return "it is a group"
-    if found.dtype.kind not in "fiub" or found.dtype.itemsize > 8:
+    is_ragged = may_be_ragged and found.ndim == 1 and h5py.check_vlen_dtype(found.dtype) == np.uint8
+    if not is_ragged and (found.dtype.kind not in "fiub" or found.dtype.itemsize > 8):
         return f"it holds {found.dtype.name if found.dtype.kind != 'O' else 'objects'}, no plain numbers"
     if not found.shape:
         return "it has no rows"

@@ -3,7 +3,8 @@
 HDF5 2.0 believes the lengths that a damaged file claims for its texts: it copies gigabytes of what is behind them in
 memory, or crashes, and on some files it never ends. So a process that can be spared walks through the file before we
 open it: through all that `demorec.hdf5.foreign` is asked for, and of numbers in chunks through the first and last rows,
-since those between them are found in the same way. What the library refuses with an error is told when it is read.
+since those between them are found in the same way (rows of variable length are not). What the library refuses with an
+error is told when it is read.
 """
 
 from __future__ import annotations
@@ -154,9 +155,18 @@ def _read_dataset(found: h5py.h5d.DatasetID) -> None:
     if is_chunked:
         found.get_num_chunks()
     is_text = found.get_type().get_class() == h5py.h5t.STRING
-    if not found.shape or not (is_chunked or is_text):
+    is_ragged = found.get_type().get_class() == h5py.h5t.VLEN
+    if not found.shape or not (is_chunked or is_text or is_ragged):
         return
     dataset = h5py.Dataset(found)
+    if is_ragged:  # every row has a place of its own in the file, unless it was made to share one
+        left = Path(dataset.file.filename).stat().st_size
+        for index in range(len(dataset) if dataset.ndim == 1 else 0):
+            with _errors_ignored():
+                left -= len(dataset[index])
+            if left < 0 or time.process_time() > _WALK_SECONDS:
+                return
+        return
     if is_text:
         kind = h5py.check_string_dtype(dataset.dtype)
         if dataset.ndim == 1 and len(dataset) <= MAX_OBJECTS and kind is not None and (kind.length or 0) <= MAX_NAME:

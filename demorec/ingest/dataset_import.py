@@ -6,21 +6,28 @@ The same command again goes on: episodes that are there are not written.
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
+import pyarrow as pa
 
 from demorec.config import VideoConfig
-from demorec.errors import ConfigError
+from demorec.errors import ConfigError, in_words
 from demorec.ingest.channel import BagError
-from demorec.ingest.dataset_pictures import DatasetCamera, ImageCamera, VideoCamera
+from demorec.ingest.dataset_pictures import DatasetCamera, DepthCamera, ImageCamera, VideoCamera
 from demorec.ingest.frames_writer import FramesImport, write_frames
+from demorec.lerobot.data_stats import column_numbers
+from demorec.lerobot.depth import DepthScale
+from demorec.lerobot.files import open_table
+from demorec.lerobot.language import COLUMNS, PERSISTENT, spoken_episodes
 from demorec.lerobot.layout import AUTOMATIC_FEATURES, DatasetInfo, Feature
 from demorec.lerobot.paths import INFO_PATH
 from demorec.lerobot.reader import EpisodePlace, RowReader, episode_places, read_tasks
+from demorec.recording.collected.frame_check import MAX_SUBTASK
 from demorec.runs.collected import open_collected_run
 from demorec.runs.find import expect
 from demorec.runs.run_file import sha256_of
@@ -38,6 +45,13 @@ _SUCCESS = "next.success"
 _TIME_TOLERANCE_S = 1e-4
 """By which LeRobot lets a row's time be off the grid."""
 _UNNAMED_ROBOT = "unknown"
+_RECORDED: Mapping[str, Literal["float32", "float64"]] = {
+    **dict.fromkeys(("bool", "int8", "uint8", "int16", "uint16", "float16", "float32"), "float32"),
+    **dict.fromkeys(("int32", "uint32", "int64", "uint64", "float64"), "float64"),
+}
+"""Type of a column -> the type that holds all its numbers, of the largest integers only those up to `_EXACT`."""
+_EXACT = 2**53
+"""Up to which float64 holds every whole number."""
 
 
 def import_lerobot(root: Path, out: Path, *, video: VideoConfig | None = None) -> FramesImport:
@@ -69,6 +83,7 @@ def import_lerobot(root: Path, out: Path, *, video: VideoConfig | None = None) -
                     success=success,
                     video=video or VideoConfig(),
                     leads={name: camera.lead(place) for name, camera in dataset.cameras.items()},
+                    subtasks=dataset.subtasks.get(place.episode_index),
                 )
                 num_new += 1
     return FramesImport(
@@ -102,14 +117,18 @@ class _Dataset:
                 camera = name.removeprefix(IMAGE_PREFIX).removeprefix("observation.").replace(".", "_")
                 if camera in self.cameras:
                     raise ConfigError(f"Two cameras of the dataset would be called {camera!r}: {root}")
-                kind = VideoCamera if feature.is_video else ImageCamera
+                kind = DepthCamera if feature.is_depth else VideoCamera if feature.is_video else ImageCamera
                 self.cameras[camera] = kind(root, info, name, self.places)
+            elif feature.dtype in ("int64", "uint64") and name not in AUTOMATIC_FEATURES and not _is_exact(root, name):
+                self.left_out[name] = "it has whole numbers that float64 cannot hold"
             elif name not in AUTOMATIC_FEATURES and name != _SUCCESS:
                 self.features.append(_feature(name, feature))
         columns = [*(feature.name for feature in self.features), "timestamp", "task_index"]
         columns += [_SUCCESS] if _SUCCESS in info.features else []
         if missing := [name for name in columns if name not in info.features]:
             raise BagError(f"The dataset has no {', '.join(missing)}: {root}")
+        spoken = {name for name, feature in info.features.items() if feature.dtype == "language"}
+        self.subtasks = self._read_subtasks() if spoken >= set(COLUMNS) else {}
         self._tasks = read_tasks(root)
         self._reader = RowReader(root, replace(info, features={name: info.features[name] for name in columns}))
         self._digest = functools.cache(sha256_of)
@@ -142,13 +161,34 @@ class _Dataset:
             origin=Origin(kind="import", files=tuple(self._files(place))),
             versions={"demorec": version("demorec"), "av": version("av")},
         )
+        vectors: dict[str, Vector] = {}
         for feature in self.features:
-            if columns[feature.name].dtype != feature.dtype:
-                raise BagError(
-                    f"The column {feature.name} holds {columns[feature.name].dtype}, not {feature.dtype}: {self.root}"
-                )
+            found, told = columns[feature.name], self.info.features[feature.name].dtype
+            if found.dtype != told:
+                raise BagError(f"The column {feature.name} holds {found.dtype}, not {told}: {self.root}")
+            vectors[feature.name] = found.astype(feature.dtype)
         success = bool(columns[_SUCCESS][-1, 0]) if _SUCCESS in columns and place.length else None
-        return info, {feature.name: columns[feature.name] for feature in self.features}, success
+        return info, vectors, success
+
+    def _read_subtasks(self) -> dict[int, dict[int, str]]:
+        """Episode -> frame -> what is begun there; what else is said is left out."""
+        said: dict[int, dict[int, str]] = {}
+        del self.left_out[PERSISTENT]
+        for place, spoken in zip(self.places, spoken_episodes(self.root), strict=False):
+            texts = said.setdefault(place.episode_index, {})
+            if spoken.num_rows != place.length:
+                raise BagError(f"Episode {place.episode_index} has other rows than its table says: {self.root}")
+            for row in spoken.persistent:
+                text, begin = str(row.get("content")), row.get("timestamp")
+                frame = begin * self.info.fps if isinstance(begin, float) else -1
+                if row.get("style") != "subtask" or not 0 <= frame < place.length:
+                    self.left_out[PERSISTENT] = "all but its subtasks"
+                elif len(text) > MAX_SUBTASK or not text.isprintable():
+                    self.left_out[PERSISTENT] = f"a subtask is no single line of at most {MAX_SUBTASK} characters"
+                    return {}
+                else:
+                    texts[round(frame)] = text
+        return said
 
     def _files(self, place: EpisodePlace) -> Iterator[SourceFile]:
         """What an episode was read from, by its place in the dataset."""
@@ -169,11 +209,22 @@ def _why_left_out(name: str, feature: Feature) -> str:
     if name.startswith("next."):
         return "recordings of other robots have no place for it"
     if feature.is_depth:
-        return "recordings of other robots have no place for depth"
-    if feature.dtype not in ("video", "image", "float32", "float64"):
-        return f"it is {feature.dtype}, and recordings of other robots hold float32 and float64"
+        return _why_no_distances(feature)
+    if feature.dtype not in ("video", "image", *_RECORDED):
+        return f"it is {feature.dtype}, and recordings of other robots hold numbers"
     if feature.is_numeric and feature.dtype != "image" and len(feature.shape) > 1:
         return f"it is an array of {'x'.join(map(str, feature.shape))}, and recordings of other robots hold vectors"
+    return ""
+
+
+def _why_no_distances(feature: Feature) -> str:
+    """Why the distances of a depth feature cannot be read, "" when they can."""
+    if not feature.is_video:
+        return "its depth is in images, and depth is read from videos"
+    try:
+        DepthScale.of(feature.info or {})
+    except ValueError as error:
+        return str(error)
     return ""
 
 
@@ -182,6 +233,17 @@ def _feature(name: str, feature: Feature) -> CollectedFeature:
     names = tuple(name.replace(",", " ") for name in feature.names or ())
     if len(names) != count or len(set(names)) != count or not all(text and text.isprintable() for text in names):
         names = tuple(str(number) for number in range(count))
-    return CollectedFeature(
-        name=name, dtype="float32" if feature.dtype == "float32" else "float64", names=names, source=name
-    )
+    return CollectedFeature(name=name, dtype=_RECORDED[feature.dtype], names=names, source=name)
+
+
+def _is_exact(root: Path, name: str) -> bool:
+    """Whether float64 holds all whole numbers of a column; BagError when they cannot be read."""
+    for path in sorted((root / "data").glob("*/*.parquet")):
+        try:
+            for batch in open_table(path, [name]).iter_batches(batch_size=4096, columns=[name]):
+                numbers = column_numbers(batch.column(name))
+                if ((numbers > _EXACT) | (numbers < -_EXACT)).any():
+                    return False
+        except (OSError, ValueError, TypeError, pa.ArrowException) as error:
+            raise BagError(f"The column {name} cannot be read ({in_words(error)}): {path}") from error
+    return True

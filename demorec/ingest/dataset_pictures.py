@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, cast
 
 import av
 import numpy as np
@@ -25,9 +25,10 @@ from demorec.ingest.channel import BagError
 from demorec.ingest.frames_writer import Picture
 from demorec.lerobot.files import check_video, open_table
 from demorec.lerobot.layout import VIDEO_PATH, DatasetInfo
-from demorec.lerobot.packets import PACKET_CODECS, PacketCodec, access_units
+from demorec.lerobot.packets import PACKET_CODECS, PacketCodec, access_units, episode_distances
 from demorec.lerobot.reader import EpisodePlace
 from demorec.recording.video import is_keyframe
+from demorec.scene.collected import Kept
 
 
 class DatasetCamera(ABC):
@@ -42,14 +43,14 @@ class DatasetCamera(ABC):
     Attributes:
         key: Of the feature.
         width, height: Pixels.
-        kept: The codec of packets that stay as they are; "" for pixels, which are coded once.
+        kept: The codec of packets that stay as they are, or "32FC1" of distances; "" for pixels, which are coded once.
         told: What becomes of the pictures, in words.
     """
 
     key: str
     width: int
     height: int
-    kept: Literal[""] | PacketCodec = ""
+    kept: Kept = ""
     told: str
 
     @abstractmethod
@@ -62,6 +63,8 @@ class DatasetCamera(ABC):
     @abstractmethod
     def pictures(self, place: EpisodePlace) -> Iterator[Picture]:
         """Its `lead`, then one a frame of the episode: a packet where they are kept, else (H, W, 3) uint8 RGB.
+
+        Of distances (H, W) float32 metres, 0 where nothing was measured.
 
         Raises:
             BagError, ExportError: They cannot be read, are of another size, or end too early.
@@ -180,6 +183,23 @@ def _opened(path: Path) -> Iterator[tuple[av.container.InputContainer, av.video.
             yield container, stream
     except (OSError, IndexError, av.FFmpegError) as error:
         raise BagError(f"The video cannot be read ({in_words(error)}): {path}") from error
+
+
+class DepthCamera(DatasetCamera):
+    """Distances in mp4 files, as codes: what LeRobot and our own exports make of them."""
+
+    kept = "32FC1"
+    told = "the distances of its codes, in metres (32FC1)"
+
+    def __init__(self, root: Path, info: DatasetInfo, key: str, places: Sequence[EpisodePlace]) -> None:
+        self.key = key
+        self._root, self._info = root, info
+        self.height, self.width = info.features[key].shape[:2]
+        next(self.pictures(places[0]))
+
+    def pictures(self, place: EpisodePlace) -> Iterator[NDArray[np.float32]]:
+        """As of `DatasetCamera`."""
+        return episode_distances(self._root, self._info, self.key, place)
 
 
 class ImageCamera(DatasetCamera):

@@ -159,12 +159,15 @@ class SourceLayout:
 
     Attributes:
         names: Of the elements of the feature.
+        joints: What messages call these elements, which may stand at another place in each; empty where elements have
+            no names, or one name is that of several.
         steps: Path of the numbers.
         names_steps: Path of the names beside them; None where elements have none.
         quaternions: First element of each x, y, z, w among them.
     """
 
     names: tuple[str, ...]
+    joints: tuple[str, ...]
     steps: tuple[Step, ...]
     names_steps: tuple[Step, ...] | None
     quaternions: tuple[int, ...]
@@ -189,6 +192,9 @@ def layout_of(source: Source, values: Values) -> SourceLayout:
     named = _names_at(values, names_steps) if names_steps is not None else None
     if source.joints:
         if named is None:
+            others = {name for _, names in _names_beside(values, steps) for name in names}
+            if others and not others & {*source.joints}:
+                raise OtherPublisherError("it names none of the joints")
             raise FieldError(f"the elements of {source.field!r} have no names, pick them by elements = [0, 1, ...]")
         if missing := [joint for joint in source.joints if joint not in named]:
             problem = f"there is no joint {missing[0]!r}.{nearest_match(missing[0], named)}".rstrip(".")
@@ -199,12 +205,14 @@ def layout_of(source: Source, values: Values) -> SourceLayout:
         if outside := [index for index in source.elements if index >= len(labels)]:
             raise FieldError(f"there is no element {outside[0]} among the {len(labels)} of {source.field!r}")
         labels = [labels[index] for index in source.elements] if source.elements else labels
+    is_named = bool(source.joints) or (named is not None and len(set(named)) == len(named))
     if source.names and len(source.names) != len(labels):
         raise FieldError(f"names has {len(source.names)} names for the {len(labels)} elements of {source.field!r}")
     if source.limits and len(source.limits) != len(labels):
         raise FieldError(f"limits has {len(source.limits)} rows for the {len(labels)} elements of {source.field!r}")
     return SourceLayout(
         names=tuple(source.prefix + name for name in source.names or labels),
+        joints=tuple(labels) if is_named else (),
         steps=steps,
         names_steps=names_steps,
         quaternions=() if source.joints else _quaternions(labels),
@@ -214,16 +222,21 @@ def layout_of(source: Source, values: Values) -> SourceLayout:
 def _names_path(source: Source, values: Values, steps: tuple[Step, ...], found: Any) -> tuple[Step, ...] | None:
     if source.names_field:
         return parse_path(source.names_field)
-    places: list[tuple[Step, ...]] = [(*steps[:-1], name) for name in _NAME_FIELDS]
-    places += [(name,) for name in _NAME_FIELDS]
-    for place in places:
+    for place, names in _names_beside(values, steps):
+        if len(names) == np.size(found):
+            return place
+    return None
+
+
+def _names_beside(values: Values, steps: tuple[Step, ...]) -> Iterator[tuple[tuple[Step, ...], list[str]]]:
+    """Path and texts of each list of names that may be those of the numbers at a path."""
+    for place in dict.fromkeys([*((*steps[:-1], name) for name in _NAME_FIELDS), *((name,) for name in _NAME_FIELDS)]):
         try:
             names = follow(values, place)
         except (FieldError, OtherPublisherError):
             continue
-        if isinstance(names, list) and len(names) == np.size(found) and all(isinstance(name, str) for name in names):
-            return place
-    return None
+        if isinstance(names, list) and all(isinstance(name, str) for name in names):
+            yield place, names
 
 
 def _names_at(values: Values, steps: tuple[Step, ...]) -> list[str]:
@@ -252,12 +265,18 @@ def _quaternions(labels: Sequence[str]) -> tuple[int, ...]:
 
 
 class SourceReader:
-    """Reads the vector of a source from message after message."""
+    """Reads the vector of a source from message after message.
+
+    Attributes:
+        others: Names in messages beside those of the first one, where the source takes all that there are.
+    """
 
     def __init__(self, source: Source, layout: SourceLayout) -> None:
         self._source = source
         self._layout = layout
         self._orders: dict[tuple[str, ...], list[int]] = {}
+        self._takes_all = not source.joints and not source.elements
+        self.others: dict[str, None] = {}
 
     def read(self, values: Values) -> NDArray[np.floating[Any]]:
         """(D,) float32 or float64, in the unit of the bag.
@@ -270,7 +289,7 @@ class SourceReader:
         parts = [found] if isinstance(found, np.ndarray) else [item for _, item in numbers_in(found)]
         vector = _joined(parts)
         source = self._source
-        if source.joints:
+        if self._layout.joints:
             assert self._layout.names_steps is not None
             names = tuple(_names_at(values, self._layout.names_steps))
             order = self._orders.get(names) or self._order_of(names)
@@ -286,12 +305,15 @@ class SourceReader:
         return vector
 
     def _order_of(self, names: tuple[str, ...]) -> list[int]:
-        missing = [joint for joint in self._source.joints if joint not in names]
-        if missing and len(missing) == len(self._source.joints):
+        joints = self._layout.joints
+        if self._takes_all and len(self.others) < MAX_ELEMENTS:
+            self.others |= dict.fromkeys(name for name in names if name not in joints)
+        missing = [joint for joint in joints if joint not in names]
+        if missing and len(missing) == len(joints):
             raise OtherPublisherError("it names none of the joints")
         if missing:
             raise FieldError(f"the joint {missing[0]!r} is missing")
-        order = [names.index(joint) for joint in self._source.joints]
+        order = [names.index(joint) for joint in joints]
         if len(self._orders) < 1000:
             self._orders[names] = order
         return order

@@ -68,6 +68,7 @@ def _findings(bag: Timelines, lines: Sequence[Timeline]) -> Iterator[Finding]:
             yield _of(line.stream, kind, text)
     for problem in bag.streams.problems:
         yield Finding(kind="cut_off", stream="", text=problem)
+    yield from _joint_findings([line for line in lines if line.is_regular])
     yield from _extent_findings([line for line in lines if line.is_regular])
     yield from _offset_findings(lines)
     yield from _camera_findings(bag.streams)
@@ -247,6 +248,18 @@ def _picture_findings(line: Timeline) -> Iterator[tuple[str, str]]:
         keyframes = np.flatnonzero(stream.heads.are_keyframes)
         first = int(keyframes[0]) if len(keyframes) else len(stream.heads)
         yield "keyframe", f"its first {first} pictures cannot be decoded, since no keyframe is before them"
+
+
+def _joint_findings(regular: Sequence[Timeline]) -> Iterator[Finding]:
+    """Joints that stop coming while others of their topic, or the same ones from another publisher, go on."""
+    for line in regular:
+        joints = line.stream.layout.joints if line.stream.layout else ()
+        key = (line.stream.topic, line.is_header)
+        others = [other for other in regular if (other.stream.topic, other.is_header) == key]
+        early = max(int(other.times_ns[-1]) for other in others) - int(line.times_ns[-1])
+        if joints and early > _GAP * line.period_ns:
+            told = f"{joints[0]!r}" + (f" and {len(joints) - 1} more joints" if len(joints) > 1 else "")
+            yield _of(line.stream, "early_end", f"{told} stop {early / NS:.2f} s before other joints of the topic")
 
 
 def _extent_findings(regular: Sequence[Timeline]) -> Iterator[Finding]:

@@ -45,6 +45,7 @@ def write_frames(
     success: bool | None,
     video: VideoConfig,
     leads: Mapping[str, int] | None = None,
+    subtasks: Mapping[int, str] | None = None,
 ) -> None:
     """Record an episode of a run at `info.fps`: whole, or not at all.
 
@@ -56,6 +57,7 @@ def write_frames(
         success: How it ended; None when nobody said.
         video: How pixels are coded.
         leads: Camera -> how many of its pictures come before the first frame; 0 where not given.
+        subtasks: Frame -> what the robot begins to do with it.
 
     Raises:
         ConfigError: The run holds episodes of another kind.
@@ -75,7 +77,8 @@ def write_frames(
             time_ns = frame_time_ns(begin + count, info.fps)
             shown = {name: writer.picture(name, time_ns, next(images)) for name, images in pictures.items()}
             samples = {name: Sample(stamp_ns=time_ns, vector=vector) for name, vector in vectors.items()}
-            writer.write(CollectedFrame(time_ns=time_ns, samples=samples, pictures=shown))
+            subtask = (subtasks or {}).get(count, "")
+            writer.write(CollectedFrame(time_ns=time_ns, samples=samples, pictures=shown, subtask=subtask))
             count += 1
         writer.finish(CollectedOutcome(success=success, num_frames=count))
     except BaseException:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import reprlib
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -21,8 +21,9 @@ from demorec.ingest.frames_writer import FramesImport, write_frames
 from demorec.ingest.hdf5_episodes import episode_places, found_attribute, rate_of, success_of, task_of
 from demorec.ingest.hdf5_features import Hdf5FitError, StoredFeature
 from demorec.ingest.hdf5_mapping import Hdf5Mapping
-from demorec.ingest.hdf5_pictures import StoredCamera, picture_lengths
+from demorec.ingest.hdf5_pictures import StoredCamera, is_camera, picture_lengths
 from demorec.ingest.mapping_file import read_mapping_file
+from demorec.ingest.words import quoted
 from demorec.recording.collected.validity import what_is_wrong
 from demorec.runs.collected import differences, open_collected_run
 from demorec.runs.find import expect
@@ -65,7 +66,9 @@ def import_hdf5(
             for place in places:
                 plans.append(_Plan(file, place, mapping, urdf, source, len(plans)))
                 _make_alike(plans[-1], plans[0])
-            left_out = left_out or _unnamed(file, places[0], mapping)
+            left_out = {**_unnamed(file, places[0], mapping), **left_out}
+    if any(plan.has_last for plan in plans):
+        left_out["the last observation of each episode"] = "no action follows it"
     return FramesImport(
         num_episodes=len(plans),
         num_frames=sum(plan.num_frames for plan in plans),
@@ -79,8 +82,8 @@ class _Stored:
     """An episode in an opened file; Hdf5FitError when its datasets do not fit the mapping."""
 
     def __init__(self, file: ForeignFile, place: str, mapping: Hdf5Mapping) -> None:
-        def array(name: str) -> StoredArray:
-            return file.array("/".join(filter(None, (place, name.strip("/")))))
+        def array(name: str, *, may_be_ragged: bool = False) -> StoredArray:
+            return file.array("/".join(filter(None, (place, name.strip("/")))), may_be_ragged=may_be_ragged)
 
         self.features: list[StoredFeature] = []
         for name, parts in mapping.features.items():
@@ -88,21 +91,25 @@ class _Stored:
             used = mapping.features[following] if following else parts
             arrays = [array(part.dataset) for part in used]
             self.features.append(StoredFeature(name, used, arrays, shift=1 if following else 0))
-        vectors = [column.array for feature in self.features for column in feature.columns]
-        self.num_rows = num_rows = len(vectors[0])
-        cameras = {name: (camera, array(camera.dataset)) for name, camera in mapping.cameras.items()}
-        for stored in (*vectors, *(pictures for _, pictures in cameras.values())):
-            if len(stored) != num_rows:
-                raise Hdf5FitError(
-                    f"{stored.place} has {len(stored)} rows, other datasets of the episode have {num_rows}"
-                )
+        cameras = {
+            name: (camera, array(camera.dataset, may_be_ragged=True)) for name, camera in mapping.cameras.items()
+        }
+        observed = [pictures for _, pictures in cameras.values()]
+        others: list[StoredArray] = []
+        for feature in self.features:
+            arrays = others if not feature.name.startswith("observation.") else observed
+            arrays += [] if feature.shift else [column.array for column in feature.columns]
+        self.num_rows = num_rows = _num_rows(observed, others)
+        self.has_last = len(observed[0]) > num_rows
         told = file.attribute(place, "num_samples")
         if told is not None and told != num_rows:
             raise Hdf5FitError(
                 f"{place or 'the episode'} has {num_rows} rows, but its attribute num_samples says {reprlib.repr(told)}"
             )
-        lengths = picture_lengths(array(_LENGTHS), num_rows) if file.has(f"{place}/{_LENGTHS}") else None
-        self.num_frames = num_rows - max(feature.shift for feature in self.features)
+        files = [pictures for _, pictures in cameras.values() if len(pictures.shape) == 2]
+        is_told = files and file.has(f"{place}/{_LENGTHS}")
+        lengths = picture_lengths(array(_LENGTHS), len(files[0])) if is_told else None
+        self.num_frames = min(num_rows, len(observed[0]) - max(feature.shift for feature in self.features))
         if self.num_frames < 1:
             raise Hdf5FitError(f"{place or 'the episode'} has {num_rows} rows, too few for a frame")
         self.cameras = [
@@ -115,6 +122,21 @@ class _Stored:
         columns = [feature.vectors(self.num_frames) for feature in self.features]
         for vectors in zip(*columns, strict=True):
             yield {feature.name: vector for feature, vector in zip(self.features, vectors, strict=True)}
+
+
+def _num_rows(observed: Sequence[StoredArray], others: Sequence[StoredArray]) -> int:
+    """Of an episode: observations may have one more than actions, what the last action led to.
+
+    Raises:
+        Hdf5FitError: They have other numbers of rows.
+    """
+    num_rows = len((others or observed)[0])
+    has_last = len(observed[0]) == num_rows + 1
+    for arrays, wanted in ((others, num_rows), (observed, num_rows + has_last)):
+        for array in arrays:
+            if len(array) != wanted:
+                raise Hdf5FitError(f"{array.place} has {len(array)} rows, other datasets of the episode have {wanted}")
+    return num_rows
 
 
 def _write(plans: Sequence[_Plan], mapping: Hdf5Mapping, out: Path, video: VideoConfig) -> int:
@@ -159,7 +181,7 @@ class _Plan:
             )
             if wrong := what_is_wrong(self.info):
                 raise Hdf5FitError("; ".join(wrong))
-            self.num_frames = episode.num_frames
+            self.num_frames, self.has_last = episode.num_frames, episode.has_last
             self.success = success_of(file, place, mapping, episode.num_rows)
             self.told = {camera.name: f"{camera.width}x{camera.height}, {camera.told}" for camera in episode.cameras}
 
@@ -173,14 +195,29 @@ def _make_alike(plan: _Plan, first: _Plan) -> None:
 
 
 def _unnamed(file: ForeignFile, place: str, mapping: Hdf5Mapping) -> dict[str, str]:
-    """Datasets that the mapping does not name; groups of which it names none, as one."""
+    """Datasets that the mapping does not name; groups of which it names none, as one.
+
+    Raises:
+        Hdf5Error: There are cameras among them, of which it does not say that they shall be left out.
+    """
     used = {name.partition("/")[0] for name in mapping.datasets}
     found: dict[str, str] = {}
+    cameras: dict[str, None] = {}
     for dataset in file.datasets(place):
         name = dataset.removeprefix(place).lstrip("/")
         if name not in mapping.datasets and name != _LENGTHS:
             group = name.partition("/")[0]
-            found[name if group in used else group] = ""
+            shown = name if group in used else group
+            found[shown] = ""
+            if not mapping.leaves_out(name):
+                with suppress(Hdf5Error):  # what cannot be read is none
+                    cameras |= {shown: None} if is_camera(file.array(dataset, may_be_ragged=True)) else {}
+    if cameras:
+        raise Hdf5Error(
+            f"The mapping does not name the cameras in {', '.join(cameras)} of {place or 'the file'}: give them a "
+            f"[cameras.NAME] each, or write above its tables leave_out = [{', '.join(map(quoted, cameras))}]: "
+            f"{file.path}"
+        )
     return found
 
 

@@ -32,8 +32,9 @@ class CameraDataset:
     """A camera's pictures.
 
     Attributes:
-        dataset: Where they are, below the episode's group: (T, H, W, 3) uint8, or (T, N) uint8 with a JPEG file in
-            each row, padded with zeros; of a depth camera (T, H, W) or (T, H, W, 1), uint16 mm or float32 m.
+        dataset: Where they are, below the episode's group: (T, H, W, 3) or (T, 3, H, W), uint8 or floats from 0 to 1 or
+            to 255; or a JPEG file in each row, (T, N) uint8 padded with zeros or (T,) of variable length; of a depth
+            camera (T, H, W) or (T, H, W, 1), uint16 mm or float32 m.
         colors: Order of the colours; in JPEG files it is red first by the format itself, but OpenCV writes them of
             pixels that it takes to have blue first.
     """
@@ -107,6 +108,7 @@ class Hdf5Mapping(AnyMapping):
         robot, task, clock, episodes: As described there.
         features: Name of a feature -> its parts, in order.
         cameras: Name of a camera -> its pictures.
+        leave_out: Datasets, or groups of them, whose pictures shall not be imported.
     """
 
     robot: Hdf5Robot
@@ -115,6 +117,11 @@ class Hdf5Mapping(AnyMapping):
     episodes: Hdf5Episodes = field(default_factory=Hdf5Episodes)
     features: Mapping[str, tuple[DatasetPart, ...]]
     cameras: Mapping[str, CameraDataset] = field(default_factory=dict)
+    leave_out: tuple[str, ...] = ()
+
+    def leaves_out(self, dataset: str) -> bool:
+        """Whether it says that a dataset, or a group that holds it, shall not be imported."""
+        return any(f"{dataset}/".startswith(f"{name.strip('/')}/") for name in self.leave_out)
 
     @property
     def datasets(self) -> frozenset[str]:
@@ -132,6 +139,8 @@ class Hdf5Mapping(AnyMapping):
         if ACTION not in self.features:
             yield "there is no feature 'action': name its dataset, or next = \"observation.state\""
         yield from camera_name_problems(self.cameras)
+        for name in sorted(filter(self.leaves_out, self.datasets)):
+            yield f"leave_out leaves out {name!r}, which the mapping names"
         task = self.task
         if (bool(task.text.strip()) + bool(task.attribute) + task.file_name) != 1:
             yield "[task] needs one of text, attribute and file_name"

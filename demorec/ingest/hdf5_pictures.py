@@ -1,4 +1,4 @@
-"""The pictures of a camera in an HDF5 file: JPEG files, pixels and distances as they are."""
+"""The pictures of a camera in an HDF5 file: JPEG files and distances as they are, pixels in any order of their axes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,9 @@ from demorec.ingest.picture_messages import PictureHead, decode_picture, picture
 from demorec.ingest.ros_types import Values
 from demorec.scene.collected import CollectedCamera, Kept
 
-_JPEG_END = b"\xff\xd9"
+_LEAST_SIDE = 16
+"""Pixels, below which arrays of floats are no pictures unless the mapping says so."""
+_JPEG, _JPEG_END = b"\xff\xd8\xff", b"\xff\xd9"
 
 
 class StoredCamera:
@@ -47,14 +49,15 @@ class StoredCamera:
     ) -> None:
         self.name = name
         self._camera, self._array, self._lengths = camera, array, lengths
+        self._scale = 0.0
         self.kept: Kept = ""
         shape = array.shape
         form = picture_form(array)
         if form is None:
             found = f"{array.dtype.name} of {'x'.join(map(str, shape))}"
             raise Hdf5FitError(
-                f"{array.place} is {found}, pictures are uint8 of rows, height, width and 3 colours, or rows of JPEG, "
-                "distances uint16 or float32 of rows, height and width"
+                f"{array.place} is {found}, pictures are uint8 or floats of rows, height, width and 3 colours, or of "
+                "rows, 3 colours, height and width, or rows of JPEG, distances uint16 or float32 of rows, height, width"
             )
         self._form = form
         if form == "jpeg":
@@ -67,10 +70,13 @@ class StoredCamera:
             self.kept = "16UC1" if array.dtype.itemsize == 2 else "32FC1"
             self.told = f"distances ({self.kept}) kept as they are"
         else:
-            self.height, self.width = shape[1:3]
+            self.height, self.width = shape[1:3] if shape[3] == 3 else shape[2:]
             self.told = f"pixels{'' if camera.colors == 'rgb' else ' with red and blue exchanged'}, coded once"
         if not 1 <= self.width * self.height <= MAX_PIXELS:
             raise Hdf5FitError(f"{array.place} has {self.width}x{self.height} pixels, allowed are 1 to {MAX_PIXELS}")
+        if form == "pixels" and array.dtype.kind == "f":
+            self._scale = _float_scale(array)
+            self.told = f"{array.dtype.name} from 0 to {255 / self._scale:g} to 8 bits, {self.told}"
 
     def described(self) -> CollectedCamera:
         """The camera as recordings know it."""
@@ -90,7 +96,9 @@ class StoredCamera:
                 yield row.reshape(self.height, self.width).astype(row.dtype.newbyteorder("="), copy=False)
                 continue
             if self._form == "pixels":
-                yield self._ordered(row.astype(np.uint8, copy=False))
+                picture = row if row.shape[2] == 3 else row.transpose(1, 2, 0)
+                scaled = np.rint(picture.astype(np.float64) * self._scale) if self._scale else picture
+                yield self._ordered(np.ascontiguousarray(scaled, dtype=np.uint8))
                 continue
             data, head = self._head(row, number)
             if (head.width, head.height) != (self.width, self.height):
@@ -125,11 +133,43 @@ class StoredCamera:
             raise Hdf5FitError(f"{self._array.place} cannot be used in row {number}, since {error}") from error
 
 
+def _float_scale(array: StoredArray) -> float:
+    """What pixels that are floats are multiplied with: 255 where none is above 1; Hdf5FitError for other numbers."""
+    lowest, highest = 0.0, 0.0
+    for number, row in enumerate(array.rows()):
+        values = row.astype(np.float64)
+        if not np.isfinite(values).all():
+            raise Hdf5FitError(f"{array.place} has pixels that are not finite in row {number}")
+        lowest, highest = min(lowest, float(values.min())), max(highest, float(values.max()))
+    if lowest < 0 or highest > 255:
+        raise Hdf5FitError(
+            f"{array.place} has pixels from {lowest:g} to {highest:g}, floats are read from 0 to 1 or from 0 to 255"
+        )
+    return 255.0 if highest <= 1 else 1.0
+
+
+def is_camera(array: StoredArray) -> bool:
+    """Whether a dataset holds pictures, JPEG files or, by its name, distances.
+
+    Raises:
+        Hdf5Error: Its first row cannot be read.
+    """
+    form, place = picture_form(array), array.place.rpartition("/")[2]
+    if form == "jpeg":
+        return len(array) > 0 and array.read(0, 1)[0].tobytes().startswith(_JPEG)
+    if form == "pixels" and array.dtype.kind == "f":  # points and transforms are arrays like these
+        first = array.read(0, min(1, len(array))).astype(np.float64)
+        return min(sorted(array.shape[1:])[1:]) >= _LEAST_SIDE and bool(((first >= 0) & (first <= 255)).all())
+    return form == "pixels" or (form == "depth" and "depth" in place)
+
+
 def picture_form(array: StoredArray) -> Literal["pixels", "jpeg", "depth"] | None:
     """What the rows of a dataset can be as pictures; None for numbers that are none."""
     shape, kind = array.shape, array.dtype
-    if kind == np.uint8:
-        return "jpeg" if len(shape) == 2 else "pixels" if len(shape) == 4 and shape[3] == 3 else None
+    if array.is_ragged or (kind == np.uint8 and len(shape) == 2):
+        return "jpeg"
+    if len(shape) == 4 and (kind == np.uint8 or kind.kind == "f") and 3 in (shape[1], shape[3]):
+        return "pixels"
     is_flat = len(shape) == 3 or (len(shape) == 4 and shape[3] == 1)
     return "depth" if is_flat and (kind.kind, kind.itemsize) in (("u", 2), ("f", 4)) else None
 

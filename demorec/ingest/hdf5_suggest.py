@@ -15,12 +15,13 @@ from demorec.errors import without_path
 from demorec.hdf5.foreign import ForeignFile, Hdf5Error, StoredArray
 from demorec.ingest.hdf5_episodes import episode_places, found_attribute, told_rate
 from demorec.ingest.hdf5_mapping import Hdf5Episodes
-from demorec.ingest.hdf5_pictures import picture_form
+from demorec.ingest.hdf5_pictures import is_camera
 from demorec.ingest.words import SHOWN, first_numbers, quoted, task_in_name, unique_name
 from demorec.runs.find import expect
 from demorec.scene.features import EE_POSE, ENVIRONMENT_STATE, STATE, VELOCITY
 
 _ROBOMIMIC, _OBSERVATIONS = "data", "obs"
+_FOLDERS = (f"{_OBSERVATIONS}/", "observations/")
 _ALOHA_FPS = 50
 """ALOHA's recorders take a row every `DT = 0.02` seconds; nothing in their files says so."""
 _ALOHA_JOINTS = ("waist", "shoulder", "elbow", "forearm_roll", "wrist_angle", "wrist_rotate", "gripper")
@@ -41,30 +42,26 @@ _PARTS = {
 
 
 class _Contents:
-    """An episode of a file: its datasets by their names below it, and why others cannot be used."""
+    """An episode of a file: its datasets by their names below it, which are cameras, and why others cannot be used."""
 
     def __init__(self, file: ForeignFile, place: str) -> None:
         self.file, self.place = file, place
         self.arrays: dict[str, StoredArray] = {}
+        self.cameras: list[str] = []
         self.unusable: list[str] = []
         for dataset in file.datasets(place):
             try:
-                self.arrays[dataset.removeprefix(place).lstrip("/")] = file.array(dataset)
+                name, array = dataset.removeprefix(place).lstrip("/"), file.array(dataset, may_be_ragged=True)
+                if is_camera(array):
+                    self.cameras.append(name)
+                self.arrays[name] = array
             except Hdf5Error as error:
                 self.unusable.append(without_path(error, file.path))
 
-    def is_camera(self, name: str) -> bool:
-        """Whether a dataset holds pictures, JPEG files or, by its name, distances."""
-        form = picture_form(self.arrays[name])
-        return (
-            form == "pixels"
-            or (form == "jpeg" and "images" in name.split("/"))
-            or (form == "depth" and "depth" in name)
-        )
-
     def is_vector(self, name: str) -> bool:
         """Whether it holds rows of numbers."""
-        return len(self.arrays[name].shape) <= 2 and not self.is_camera(name)
+        array = self.arrays[name]
+        return len(array.shape) <= 2 and not array.is_ragged and name not in self.cameras
 
 
 def suggested_hdf5_mapping(path: Path) -> list[str]:
@@ -87,7 +84,7 @@ def suggested_hdf5_mapping(path: Path) -> list[str]:
         places = episode_places(file, episodes)
         contents = _Contents(file, places[0])
         lines = [f"# A mapping for {path.name}, suggested from what is in it; docs/import.md explains every key.", "#"]
-        lines += [*_listed(contents, len(places)), ""]
+        lines += [*_listed(contents, len(places)), *_last_row(contents, is_aloha), "", *_left_out(contents)]
         lines += ["[robot]", f"name = {quoted(_robot(contents, is_aloha))}", *_model(contents), ""]
         lines += ["[task]", *_task(contents, path), ""]
         lines += ["[clock]", *_clock(contents, is_aloha), ""]
@@ -101,11 +98,28 @@ def _listed(contents: _Contents, count: int) -> Iterator[str]:
     where = f"{contents.place}, the first of {count} episodes" if contents.place else "the file, which is an episode"
     yield f"# What is in {where}:"
     for name, array in contents.arrays.items():
-        yield f"#   {name}  {array.dtype.name} {'x'.join(map(str, array.shape))}"
+        length = " of variable length" if array.is_ragged else ""
+        yield f"#   {name}  {array.dtype.name} {'x'.join(map(str, array.shape))}{length}"
         if contents.is_vector(name) and array.shape[0]:
             yield f"#     {_first_row(contents, array)}"
     for reason in contents.unusable:
         yield f"#   {reason}"
+
+
+def _last_row(contents: _Contents, is_aloha: bool) -> Iterator[str]:
+    """Where observations have one row more than actions, what becomes of it."""
+    action = contents.arrays.get("action" if is_aloha else "actions")
+    observed = [len(array) for name, array in contents.arrays.items() if name.startswith(_FOLDERS)]
+    if action is not None and observed and min(observed) == len(action) + 1:
+        yield "# The last observation of each episode is left out: no action follows it."
+
+
+def _left_out(contents: _Contents) -> Iterator[str]:
+    """The key that leaves out cameras that are no observations, as those of next_obs."""
+    others = dict.fromkeys(name.partition("/")[0] for name in contents.cameras if not name.startswith(_FOLDERS))
+    if others:
+        yield f"leave_out = [{', '.join(map(quoted, others))}]  # has cameras that are not imported"
+        yield ""
 
 
 def _first_row(contents: _Contents, array: StoredArray) -> str:
@@ -211,11 +225,11 @@ def _parts(feature: str, names: Sequence[str], contents: _Contents) -> Iterator[
 
 def _cameras(contents: _Contents) -> Iterator[str]:
     taken: list[str] = []
-    for name in contents.arrays:
-        if not contents.is_camera(name) or not name.startswith((f"{_OBSERVATIONS}/", "observations/")):
+    for name in contents.cameras:
+        if not name.startswith(_FOLDERS):
             continue
         camera = unique_name(_word(name.rpartition("/")[2].removesuffix("_image")), taken)
         taken.append(camera)
         yield from ("", f"[cameras.{camera}]", f"dataset = {quoted(name)}")
-        if len(contents.arrays[name].shape) == 2:
+        if len(contents.arrays[name].shape) <= 2:
             yield '# colors = "bgr"  # where red and blue are exchanged in the pictures, as recorders with OpenCV do'

@@ -182,7 +182,7 @@ class BagMapping(AnyMapping):
     subtasks: Subtasks = field(default_factory=Subtasks)
     clock: Clock
     episodes: Episodes = field(default_factory=Episodes)
-    features: Mapping[str, tuple[Source, ...]]
+    features: Mapping[str, tuple[Source, ...]] = field(default_factory=dict)
     cameras: Mapping[str, CameraSource] = field(default_factory=dict)
 
     @property

@@ -65,7 +65,7 @@ class AnyMapping(ABC):
 def feature_problems(features: Mapping[str, Sequence[Part]]) -> Iterator[str]:
     """What is impossible in features, whatever their parts are taken from."""
     if STATE not in features:
-        yield f"there is no feature {STATE!r}"
+        yield f'there is no feature {STATE!r}: write [[features."{STATE}"]] and what it is taken from'
     for name, parts in features.items():
         if "/" in name or not name or name.startswith("observation.images"):
             yield f"a feature cannot be called {name!r}"
@@ -80,7 +80,9 @@ def _part_problems(place: str, name: str, part: Part, features: Mapping[str, Seq
         yield f"{place} has other sources beside next"
     if part.next:
         known = [other for other in features if other != name]
-        if part.next not in known:
+        if part.next == STATE and STATE not in features:
+            pass  # said already
+        elif part.next not in known:
             yield f"{place} follows {part.next!r}, which is no feature.{nearest_match(part.next, known)}".rstrip(".")
         elif any(other.next for other in features[part.next]):
             yield f"{place} follows {part.next!r}, which follows another feature itself"

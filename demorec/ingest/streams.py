@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import zlib
 from array import array
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -35,11 +36,13 @@ from demorec.ingest.mapping import BagMapping, Source
 from demorec.ingest.picture_messages import PictureHeads, picture_head
 from demorec.ingest.ros_types import Values
 from demorec.ingest.service_calls import CallReader, ServiceCall
+from demorec.ingest.words import quoted
 from demorec.registry import nearest_match
 
 NO_STAMP = -(2**63)
 _MAX_TEXT = 10_000
 _MAX_URDF = 4 << 20
+_SHOWN_JOINTS = 40
 
 
 @dataclass(kw_only=True, eq=False)
@@ -221,6 +224,26 @@ class BagDecoder:
         return decoder(message.data)
 
 
+def _label(feature: str, source: Source, sources: Sequence[Source]) -> str:
+    """The name of a feature, and the joints where several of its sources are of one topic."""
+    if not source.joints or sum(other.topic == source.topic for other in sources) == 1:
+        return feature
+    return f"{feature} ({', '.join(source.joints[:2])}{', ...' if len(source.joints) > 2 else ''})"
+
+
+def _unnamed_joints(stream: _Growing, others: Sequence[str]) -> str:
+    """What to write where a source takes whatever its topic names, and that is not the same in all messages."""
+    assert stream.layout is not None
+    lists = " and one with ".join(
+        f"joints = [{', '.join(map(quoted, joints[:_SHOWN_JOINTS]))}{', ...' if len(joints) > _SHOWN_JOINTS else ''}]"
+        for joints in (stream.layout.joints, others)
+    )
+    return (
+        f"{stream.label} takes all joints of {stream.topic}, whose messages do not name the same ones, as those of two "
+        f"publishers: write a source with {lists}, or leave the latter out"
+    )
+
+
 def read_streams(bag: Bag, mapping: BagMapping) -> BagStreams:
     """Read a bag from its front to its end.
 
@@ -240,7 +263,7 @@ class _Reading:
         self._mapping = mapping
         self._decoder = BagDecoder()
         self._sources = {
-            (name, index): _Growing(label=name, topic=source.topic, source=source)
+            (name, index): _Growing(label=_label(name, source, sources), topic=source.topic, source=source)
             for name, sources in mapping.features.items()
             for index, source in enumerate(sources)
             if source.topic
@@ -329,6 +352,8 @@ class _Reading:
             if stream.topic in self._counts and stream.topic not in self._refused and not stream.log_ns:
                 reason = stream.first_problem or stream.first_refusal
                 problems.append(f"{stream.label} cannot be taken from {stream.topic} ({stream.type}): {reason}")
+            if stream.reader is not None and (others := list(stream.reader.others)):
+                problems.append(_unnamed_joints(stream, others))
         problems += self._double_names()
         for camera in self._cameras.values():
             if camera.heads and not camera.heads.are_keyframes.any():

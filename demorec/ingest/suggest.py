@@ -1,26 +1,30 @@
 """A mapping from what is in a bag: the likely choices made, the doubtful ones commented out, everything listed.
 
-The words that people give their topics are what there is to go by: a follower, a puppet and a measured state are what
-the robot does, a leader, a master and a command what it shall do. A topic that says neither is not guessed at.
+What a topic's words say of its numbers is in `candidates`, what is taken of them in `choice`. A topic whose words say
+neither what the robot does nor what it shall do is not guessed at, unless it is the only one.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from array import array
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from demorec.ingest.bag import Bag, open_bag
+from demorec.ingest.candidates import Vector, transforms_of, vectors_of
 from demorec.ingest.channel import BagError, BagMessage
+from demorec.ingest.choice import Choice, choose_features
 from demorec.ingest.clock import NS
 from demorec.ingest.decoding import UnknownEncodingError
-from demorec.ingest.fields import FieldError, OtherPublisherError, SourceLayout, follow, layout_of, stamp_of
-from demorec.ingest.mapping import Source
+from demorec.ingest.fields import FieldError, follow, stamp_of
+from demorec.ingest.mapping import Clock
 from demorec.ingest.picture_messages import VIDEO_FORMATS, PictureHead, picture_head
 from demorec.ingest.ros_types import Values
 from demorec.ingest.streams import BagDecoder
@@ -29,11 +33,11 @@ from demorec.scene.collected import DEPTH_UNITS
 
 _KEPT = 64
 """Messages of a topic that are looked into."""
-_ACTION = re.compile(r"leader|master|gello|command|cmd|target|desired|goal|teleop|/action")
-_STATE = re.compile(r"follower|puppet|measured|joint_states?$|joints/state$|robot_state")
+_MAX_PUBLISHERS = 64
+"""Of a topic, by the names in their messages."""
+_MAX_OFFERED = 24
+"""Sources that are commented out."""
 _TASK = re.compile(r"(?<!sub)(?<!sub[_/-])task|instruction|prompt")
-_POSE_TYPES = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/PoseStamped", "foxglove.PoseInFrame")
-_VECTOR_FIELDS = ("position", "positions", "joints.position", "points[0].positions", "data")
 _STOP_WORDS = {"camera", "cam", "color", "image", "raw", "rect", "compressed", "rgb", "cameras", "images", "video"}
 _DEPTH_WORDS = {"depth", "aligned", "to", "compresseddepth", "registered"}
 _CAMERA_WORD = re.compile(r"[^a-z0-9]+")
@@ -48,6 +52,8 @@ class _Topic:
         count: Of them.
         first_ns, last_ns: When they were recorded.
         values: Of the first ones.
+        vectors: Numbers in them that a feature may be made of.
+        publishers: Names of joints in a message -> when such messages were recorded, nanoseconds; () where none are.
         has_stamp: Whether these have headers with a time.
         problem: Why none can be read; "".
     """
@@ -57,6 +63,8 @@ class _Topic:
     first_ns: int = 0
     last_ns: int = 0
     values: list[Values] = field(default_factory=list)
+    vectors: list[Vector] = field(default_factory=list)
+    publishers: dict[tuple[str, ...], array[int]] = field(default_factory=dict)
     has_stamp: bool = True
     problem: str = ""
 
@@ -67,19 +75,12 @@ class _Topic:
         return (self.count - 1) / seconds if self.count > 1 and seconds > 0 else 0.0
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Vector:
-    """A topic that could be part of a feature."""
-
-    topic: str
-    field: str
-    layout: SourceLayout
-    role: str
-    rate_hz: float
-
-
-def suggested_mapping(path: Path) -> list[str]:
+def suggested_mapping(path: Path, tell: Callable[[str], None]) -> list[str]:
     """The lines of a mapping for a bag, with what is in it as comments.
+
+    Args:
+        path: Of the bag.
+        tell: Called with what the user has to decide before the mapping can be used.
 
     Raises:
         ConfigError: There is no bag.
@@ -91,8 +92,11 @@ def suggested_mapping(path: Path) -> list[str]:
     if not topics:
         raise BagError(f"The bag holds no messages: {path}")
     cameras = _cameras(topics)
-    vectors = [vector for name, topic in sorted(topics.items()) for vector in _vectors(name, topic)]
+    choice = choose_features([vector for name, topic in sorted(topics.items()) for vector in _vectors(name, topic)])
     lines = [f"# A mapping for {path.name}, suggested from what is in it; docs/import.md explains every key.", "#"]
+    if choice.warning:
+        tell(choice.warning)
+        lines += [f"# ATTENTION: {choice.warning}", "#"]
     lines += [f"# {problem}" for problem in problems[:5]]
     lines += list(_listed(topics))
     robot = re.sub(r"[^A-Za-z0-9_]+", "_", bag.name).strip("_") or "robot"
@@ -100,8 +104,8 @@ def suggested_mapping(path: Path) -> list[str]:
     lines += ["", "[robot]", f"name = {quoted(robot)}"]
     lines += [f"urdf_topic = {quoted(model)}" if model else '# urdf = "robot.urdf"']
     lines += ["", "[task]", *_task(topics, bag)]
-    lines += ["", "[clock]", *_clock(topics, cameras, vectors)]
-    lines += [*_services(topics), *_subtasks(topics), *_features(vectors), *_poses(topics)]
+    lines += ["", "[clock]", *_clock(topics, cameras, [*choice.state, *choice.action])]
+    lines += [*_services(topics), *_subtasks(topics), *_features(choice)]
     for camera, topic in cameras.items():
         lines += ["", f"[cameras.{camera}]", f"topic = {quoted(topic)}", *_info_topic(topic, topics)]
     return lines
@@ -114,8 +118,10 @@ def _topics(bag: Bag, problems: list[str]) -> dict[str, _Topic]:
         topic = topics.setdefault(message.channel.topic, _Topic(type=message.channel.type, first_ns=message.log_ns))
         topic.count += 1
         topic.first_ns, topic.last_ns = min(topic.first_ns, message.log_ns), max(topic.last_ns, message.log_ns)
-        if len(topic.values) < _KEPT and not topic.problem:
+        if (len(topic.values) < _KEPT or any(topic.publishers)) and not topic.problem:
             _look_into(topic, message, decoder)
+        else:
+            topic.publishers.setdefault((), array("q")).append(message.log_ns)
     return topics
 
 
@@ -128,8 +134,26 @@ def _look_into(topic: _Topic, message: BagMessage, decoder: BagDecoder) -> None:
     except (ValueError, RecursionError, OverflowError, TypeError):
         return
     topic.has_stamp = topic.has_stamp and bool(stamp_of(values))
-    if len(topic.values) < 2 or _head(values) is None:
+    if len(topic.values) < 2 or (len(topic.values) < _KEPT and _head(values) is None):
         topic.values.append(values)
+        if not topic.vectors and _head(values) is None:
+            topic.vectors = list(vectors_of(message.channel.topic, topic.type, values))
+    names = next((names for vector in topic.vectors if (names := _names(vector, values))), ())
+    if names in topic.publishers or len(topic.publishers) < _MAX_PUBLISHERS:
+        topic.publishers.setdefault(names, array("q")).append(message.log_ns)
+
+
+def _names(vector: Vector, values: Values) -> tuple[str, ...]:
+    """Those of the joints in a message whose first fields hold them."""
+    steps = vector.layout.names_steps
+    if steps is None or (len(steps) > 1 and isinstance(values.get(str(steps[0])), Mapping)):
+        return ()  # a robot's own message has one publisher
+    try:
+        names, count = follow(values, steps), np.size(follow(values, vector.layout.steps))
+    except ValueError:
+        return ()
+    are_texts = isinstance(names, list) and all(isinstance(name, str) for name in names)
+    return tuple(names) if are_texts and len(names) == count == len(set(names)) else ()
 
 
 def _head(values: Values) -> PictureHead | None:
@@ -171,22 +195,32 @@ def _short(value: Any) -> str:
     )
 
 
-def _vectors(name: str, topic: _Topic) -> Iterator[_Vector]:
-    """The joint positions, or other numbers, that a topic holds."""
-    if not topic.values or _head(topic.values[0]) is not None:
-        return
-    for path in _VECTOR_FIELDS:
-        try:
-            layout = layout_of(Source(topic=name, field=path), topic.values[0])
-            found = follow(topic.values[0], layout.steps)
-        except (FieldError, OtherPublisherError):
-            continue
-        if not isinstance(found, np.ndarray) or not len(found) or (path == "data" and not topic.rate_hz):
-            continue
-        lower = name.lower()
-        role = "action" if _ACTION.search(lower) else "state" if _STATE.search(lower) else ""
-        yield _Vector(topic=name, field=path, layout=layout, role=role, rate_hz=topic.rate_hz)
-        return
+def _vectors(name: str, topic: _Topic) -> Iterator[Vector]:
+    """The numbers of a topic, those of several publishers apart: joints that always come together stay together."""
+    yield from transforms_of(name, topic.type, topic.values)
+    for vector in topic.vectors:
+        groups: dict[frozenset[int], list[str]] = {}
+        if vector.layout.joints and any(topic.publishers):
+            for joint in dict.fromkeys(joint for names in topic.publishers for joint in names):
+                of = frozenset(place for place, names in enumerate(topic.publishers) if joint in names)
+                groups.setdefault(of, []).append(joint)
+        times = list(topic.publishers.values())
+        for of, joints in groups.items():
+            yield _timed(vector.of_joints(joints, topic.values), [times[place] for place in of])
+        if not groups:
+            yield _timed(vector, times)
+
+
+def _timed(vector: Vector, parts: Sequence[Sequence[int]]) -> Vector:
+    times = np.sort(np.concatenate([np.asarray(part) for part in parts]))
+    steps = np.diff(times) / NS
+    if not steps.any():
+        return vector
+    usual = float(np.median(steps))
+    is_regular = np.mean((steps > 0.3 * usual) & (steps < 1.7 * usual)) > 0.6  # else it is sent when it changes
+    needed = 2 * usual if is_regular else float(steps.max())
+    age = math.ceil(needed * 10) / 10 if needed > Clock(fps=1).max_age_s else 0.0
+    return replace(vector, rate_hz=len(steps) / float(steps.sum()), age_s=age)
 
 
 def _cameras(topics: Mapping[str, _Topic]) -> dict[str, str]:
@@ -231,10 +265,10 @@ def _subtasks(topics: Mapping[str, _Topic]) -> Iterator[str]:
 
 
 def _is_text(topic: _Topic) -> bool:
-    return any(isinstance(values.get("data"), str) for values in topic.values)
+    return any(isinstance(values.get("data"), str) and _head(values) is None for values in topic.values)
 
 
-def _clock(topics: Mapping[str, _Topic], cameras: Mapping[str, str], vectors: Sequence[_Vector]) -> list[str]:
+def _clock(topics: Mapping[str, _Topic], cameras: Mapping[str, str], vectors: Sequence[Vector]) -> list[str]:
     rates = {name: topics[topic].rate_hz for name, topic in cameras.items() if topics[topic].rate_hz}
     rate = min(rates.values(), default=min([30.0, *(vector.rate_hz for vector in vectors if vector.rate_hz)]))
     lines = [f"fps = {max(1, round(rate))}"]
@@ -256,47 +290,55 @@ def _services(topics: Mapping[str, _Topic]) -> Iterator[str]:
         yield f"# topic = {quoted(name)}"
 
 
-def _features(vectors: Sequence[_Vector]) -> Iterator[str]:
-    states = [vector for vector in vectors if vector.role == "state"]
-    actions = [vector for vector in vectors if vector.role == "action"]
-    others = [vector for vector in vectors if not vector.role]
-    if not states and len(others) == 1:
-        states, others = others, []
-    for name, chosen in (("observation.state", states), ("action", actions)):
-        labels = [label for vector in chosen for label in vector.layout.names]
-        are_double = len(set(labels)) < len(labels)
-        for vector in chosen:
-            yield from _source(name, vector, prefix=_prefix(vector, chosen) if are_double else "")
-        if not chosen and name == "observation.state":
-            yield from ("", "# No topic says that it is the robot's state: take one of those above.")
-        elif not chosen:
-            yield from ("", "# No topic says that it is a command, so the next state is the action.")
-            yield from ("[[features.action]]", 'next = "observation.state"')
-    for vector in others:
-        for line in _source("observation.extra", vector, prefix=""):
+def _features(choice: Choice) -> Iterator[str]:
+    yield from _chosen("observation.state", choice.state)
+    if not choice.state:
+        yield from ("", "# No topic is known to hold the robot's state.")
+    yield from _chosen("action", choice.action)
+    if not choice.action:
+        offers = any(vector.role == "action" for vector in choice.others)
+        found = (
+            "No topic is sure to be the command (see those below)" if offers else "No topic says that it is a command"
+        )
+        yield from ("", f"# {found}, so the next state is the action.")
+        yield from ("[[features.action]]", 'next = "observation.state"')
+    poses = [vector for vector in choice.others if vector.kind == "pose" and vector.role != "action"]
+    poses = [vector for vector in poses if vector.is_robot] or poses
+    is_sure = bool(choice.state) and len({vector.topic for vector in poses}) == 1 and poses[0].field == "pose"
+    for vector in poses if is_sure else ():
+        yield from _source("observation.ee_pose", vector, prefix="")
+    offered = [vector for vector in choice.others if not (is_sure and vector in poses)]
+    offered.sort(key=lambda vector: vector.field.startswith("transforms["))
+    for vector in offered[:_MAX_OFFERED]:
+        name = {"state": "observation.state", "action": "action"}.get(vector.role, "observation.extra")
+        name = "observation.state" if not choice.state and not vector.role else name
+        for line in _source(name, vector, prefix=""):
             yield f"# {line}" if line else ""
+    if len(offered) > _MAX_OFFERED:
+        yield f"# and {len(offered) - _MAX_OFFERED} more"
 
 
-def _prefix(vector: _Vector, chosen: Sequence[_Vector]) -> str:
-    """The words of a topic that the others of the same feature do not have."""
-    words = [word for word in re.split(r"[^A-Za-z0-9]+", vector.topic) if word]
-    shared = set.intersection(*(set(re.split(r"[^A-Za-z0-9]+", other.topic)) for other in chosen))
-    return "_".join(word for word in words if word not in shared) + "_"
+def _chosen(feature: str, vectors: Sequence[Vector]) -> Iterator[str]:
+    """The sources of a feature; where names clash, with words in front by which their topics and fields differ."""
+    prefixes = []
+    for vector in vectors:
+        rivals = [set(other.place) for other in vectors if vector is not other and {*vector.labels} & {*other.labels}]
+        own = [word for word in vector.place if word not in set.intersection(*rivals, set(vector.place))]
+        prefixes.append("_".join(own) + "_" if rivals else "")
+    names = [prefix + label for prefix, vector in zip(prefixes, vectors, strict=True) for label in vector.labels]
+    for number, (prefix, vector) in enumerate(zip(prefixes, vectors, strict=True), 1):
+        yield from _source(feature, vector, prefix=prefix if len(set(names)) == len(names) else f"{number}_")
 
 
-def _source(feature: str, vector: _Vector, *, prefix: str) -> Iterator[str]:
-    key = feature if "." not in feature else f'"{feature}"'
-    yield from ("", f"[[features.{key}]]", f"topic = {quoted(vector.topic)}", f"field = {quoted(vector.field)}")
-    if vector.layout.names_steps is not None:
-        yield f"joints = [{', '.join(quoted(name) for name in vector.layout.names)}]"
-    if prefix:
-        yield f"prefix = {quoted(prefix)}"
-
-
-def _poses(topics: Mapping[str, _Topic]) -> Iterator[str]:
-    found = [name for name, topic in sorted(topics.items()) if topic.type in _POSE_TYPES and topic.values]
-    is_sure = len(found) == 1 and topics[found[0]].rate_hz > 0
-    for name in found:
-        mark = "" if is_sure else "# "
-        yield from ("", f'{mark}[[features."observation.ee_pose"]]', f"{mark}topic = {quoted(name)}")
-        yield f'{mark}field = "pose"'
+def _source(feature: str, vector: Vector, *, prefix: str) -> Iterator[str]:
+    key = feature if "." not in feature else quoted(feature)
+    yield from ("", f"[[features.{key}]]", f"topic = {quoted(vector.topic)}")
+    yield f"field = {quoted(vector.field)}" + (f"  # first: {vector.first}" if vector.first else "")
+    if vector.layout.joints:
+        yield f"joints = [{', '.join(map(quoted, vector.layout.joints))}]"
+    if vector.names:
+        yield f"names = [{', '.join(map(quoted, vector.names))}]"
+    if prefix or vector.prefix:
+        yield f"prefix = {quoted(prefix + vector.prefix)}"
+    if vector.age_s:
+        yield f"max_age_s = {vector.age_s:.1f}  # its messages are that far apart"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Container
 from typing import Any
@@ -35,5 +34,18 @@ def first_numbers(numbers: NDArray[Any]) -> str:
 
 
 def quoted(text: str) -> str:
-    """A TOML string."""
-    return json.dumps(text, ensure_ascii=False)
+    """A TOML string that has no character which a terminal obeys, whatever the text; surrogates, which TOML cannot
+    hold, become U+FFFD.
+    """
+    return f'"{"".join(map(_in_toml, text))}"'
+
+
+def _in_toml(character: str) -> str:
+    if character in '"\\':
+        return f"\\{character}"
+    if character.isprintable():
+        return character
+    code = ord(character)
+    if 0xD800 <= code < 0xE000:
+        return "\ufffd"
+    return f"\\u{code:04x}" if code < 0x10000 else f"\\U{code:08x}"

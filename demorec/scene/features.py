@@ -430,8 +430,8 @@ def _rotation_vectors(before: Array, after: Array) -> Array:
 
 def _joined(columns: Iterable[Array], dtype: VectorType) -> Vectors:
     parts = [part[:, np.newaxis] if part.ndim == 1 else part for part in columns]
-    joined = np.concatenate(parts, axis=1)
-    return joined.astype(np.float32) if dtype is np.float32 else joined
+    joined: Array = np.concatenate(parts, axis=1)
+    return joined if dtype is np.float64 else joined.astype(np.float32)
 
 
 def _repeat(values: tuple[float, ...], count: int) -> Array:

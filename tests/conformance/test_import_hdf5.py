@@ -306,6 +306,160 @@ def test_pictures_are_read_by_whole_chunks(tmp_path: Path, monkeypatch: pytest.M
     assert all(before[1] == after[0] for before, after in pairwise(asked))
 
 
+def test_jpeg_of_variable_length_stays_as_it_is(tmp_path: Path) -> None:
+    """Rows as h5py's `vlen_dtype` makes them, in one stretch and in chunks."""
+    file = write_aloha(tmp_path / "episode_0.hdf5")
+    given = [jpeg(picture, 60 + 4 * row) for row, picture in enumerate(pictures(8, 3))]
+    with h5py.File(file, "r+") as opened:
+        images = opened["observations/images"]
+        for camera, chunks in zip(ALOHA_CAMERAS, (None, (3,)), strict=True):
+            del images[camera]
+            stored = images.create_dataset(camera, (8,), h5py.vlen_dtype(np.uint8), chunks=chunks)
+            for row, data in enumerate(given):
+                stored[row] = np.frombuffer(data, np.uint8)
+    result, run = imported(file)
+    assert result.cameras == dict.fromkeys(ALOHA_CAMERAS, "64x48, jpeg kept as it is")
+    with CollectedRecording(recordings(run)[0]) as recording:
+        for camera in ALOHA_CAMERAS:
+            assert [packet.data for packet in recording.packets(camera)] == given
+    mapping = file.with_suffix(".toml")
+    mapping.write_text(mapping.read_text().replace('"observations/qvel"', '"observations/images/cam_high"'))
+    with pytest.raises(Hdf5Error, match="cam_high cannot be used, since it holds objects, no plain numbers"):
+        import_hdf5([file], mapping, tmp_path / "other")
+
+
+def test_rows_that_share_their_bytes_are_bounded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file, count = write_aloha(tmp_path / "episode_0.hdf5", count=200), 200
+    data = np.frombuffer(jpeg(np.random.default_rng(0).integers(0, 255, (96, 128, 3)).astype(np.uint8), 95), np.uint8)
+    with h5py.File(file, "r+") as opened:
+        for camera in ALOHA_CAMERAS:
+            del opened[f"observations/images/{camera}"]
+        kind = h5py.vlen_dtype(np.uint8)
+        stored = opened.create_dataset("observations/images/cam_high", (count,), kind, chunks=(count,))
+        stored[:] = [data] * count
+        opened.flush()
+        _, chunk = stored.id.read_direct_chunk((0,))
+        stored.id.write_direct_chunk((0,), chunk[:16] * count)
+    assert count * len(data) > 1 << 20
+    mapping = suggested(file)
+    monkeypatch.setenv("DEMOREC_UNPACKED_MB", "1")
+    monkeypatch.setattr("demorec.recording.limits._RATIO", 0)
+    assert exit_code("import", "hdf5", file, "--mapping", mapping, "--out", tmp_path / "run") == 1
+    assert "would unpack to" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("kind", ["uint8", "float32", "float64", "float16", "255"])
+@pytest.mark.parametrize("has_channels_first", [False, True])
+def test_pixels_of_other_forms_are_those_of_the_usual_one(kind: str, has_channels_first: bool, tmp_path: Path) -> None:
+    """The same pictures as uint8 of height, width, RGB make the same recording, but for the words about it."""
+    found = []
+    for folder in ("usual", "other"):
+        file = write_aloha(tmp_path / folder / "episode_0.hdf5")
+        with h5py.File(file, "r+") as opened:
+            for camera in ALOHA_CAMERAS if folder == "other" else ():
+                images = opened[f"observations/images/{camera}"][:]
+                if kind != "uint8":
+                    images = images.astype("float32") if kind == "255" else (images / 255).astype(kind)
+                del opened[f"observations/images/{camera}"]
+                shown = images.transpose(0, 3, 1, 2) if has_channels_first else images
+                opened[f"observations/images/{camera}"] = shown
+        result, run = imported(file)
+        with CollectedRecording(recordings(run)[0]) as recording:
+            found.append([[packet.data for packet in recording.packets(camera)] for camera in ALOHA_CAMERAS])
+    assert found[0] == found[1]
+    told = {"uint8": "64x48, pixels", "255": "64x48, float32 from 0 to 255"}.get(kind, f"64x48, {kind} from 0 to 1")
+    assert all(words.startswith(told) for words in result.cameras.values())
+
+
+def _one_observation_more(file: Path) -> None:
+    """A row more in all that was observed, as recorders write it that observe before and after each action."""
+    with h5py.File(file, "r+") as opened:
+        for name in ("qpos", "qvel", *(f"images/{camera}" for camera in ALOHA_CAMERAS)):
+            values = opened[f"observations/{name}"][:]
+            del opened[f"observations/{name}"]
+            opened[f"observations/{name}"] = np.concatenate([values, values[:1]])
+
+
+def test_one_observation_more_than_actions_is_left_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    found = []
+    for folder in ("usual", "other"):
+        file = write_aloha(tmp_path / folder / "episode_0.hdf5")
+        if folder == "other":
+            _one_observation_more(file)
+        run = file.with_name("run")
+        assert exit_code("import", "hdf5", file, "--mapping", suggested(file), "--out", run) == 0
+        with CollectedRecording(recordings(run)[0]) as recording:
+            columns = recording.columns()
+            packets = [[packet.data for packet in recording.packets(camera)] for camera in ALOHA_CAMERAS]
+            found.append((columns.time_ns.tolist(), packets, {n: v.tolist() for n, v in columns.features.items()}))
+        told = "the last observation of each episode is left out: no action follows it." in capsys.readouterr().out
+        assert told == ("The last observation of each episode" in file.with_suffix(".toml").read_text())
+        assert told == (folder == "other")
+    assert found[0] == found[1]
+
+
+def test_with_one_observation_more_the_last_action_is_the_last_state(tmp_path: Path) -> None:
+    file = write_aloha(tmp_path / "episode_0.hdf5")
+    _one_observation_more(file)
+    _, run = imported(file, changes={'dataset = "action"': 'next = "observation.state"'})
+    with h5py.File(file) as opened, CollectedRecording(recordings(run)[0]) as recording:
+        np.testing.assert_array_equal(recording.columns().features["action"], opened["observations/qpos"][1:])
+
+
+@pytest.mark.parametrize("camera", ["jpeg", "pixels", "depth", "floats", "next"])
+def test_a_camera_is_left_out_only_where_the_mapping_says_so(
+    camera: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = write_robomimic(tmp_path / "demo.hdf5")
+    mapping = suggested(file)
+    assert 'leave_out = ["next_obs"]' in mapping.read_text()
+    name = "next_obs" if camera == "next" else f"obs/{camera}"
+    with h5py.File(file, "r+") as opened:
+        for demo, length in zip(DEMOS, ROBOMIMIC_LENGTHS, strict=True):
+            data = np.frombuffer(jpeg(pictures(1, 0)[0], 50), np.uint8)
+            values = {
+                "jpeg": np.tile(data, (length, 1)),
+                "pixels": pictures(length, 0),
+                "depth": np.ones((length, HEIGHT, WIDTH), np.float32),
+                "floats": (pictures(length, 0) / 255).transpose(0, 3, 1, 2),
+            }
+            if camera in values:
+                opened[f"data/{demo}/obs/{camera}"] = values[camera]
+    if camera == "next":
+        mapping.write_text(mapping.read_text().replace('leave_out = ["next_obs"]', ""))
+    _refused(file, mapping, f"does not name the cameras in {name} of data/demo_0", capsys)
+    text = mapping.read_text().replace('leave_out = ["next_obs"]', "")
+    mapping.write_text(f'leave_out = ["next_obs", "{name}"]\n{text}')
+    assert name in import_hdf5([file], mapping, tmp_path / "run").left_out
+
+
+def test_what_is_no_camera_needs_no_word(tmp_path: Path) -> None:
+    """Points, transforms, masks and vectors of bytes are arrays like pictures."""
+    file = write_robomimic(tmp_path / "demo.hdf5")
+    mapping = suggested(file)
+    rng = np.random.default_rng(0)
+    others = {
+        "points": rng.normal(size=(7, 32, 32, 3)), "transforms": rng.uniform(0, 1, (7, 3, 4, 4)),
+        "mask": rng.integers(0, 3, (7, 48, 64)).astype(np.uint8), "bytes": rng.integers(0, 9, (7, 40)).astype(np.uint8),
+        "heights": rng.uniform(0, 1, (7, 48, 64)).astype(np.float32),
+    }  # fmt: skip
+    with h5py.File(file, "r+") as opened:
+        for name, values in others.items():
+            opened[f"data/demo_0/obs/{name}"] = values
+    left_out = import_hdf5([file], mapping, tmp_path / "run").left_out
+    assert {f"obs/{name}" for name in others} <= set(left_out)
+    again = "\n".join(suggested_hdf5_mapping(file))
+    assert not any(f"[cameras.{name}]" in again for name in others)
+
+
+def test_a_camera_cannot_be_named_and_left_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = write_robomimic(tmp_path / "demo.hdf5")
+    mapping = suggested(file, {'leave_out = ["next_obs"]': 'leave_out = ["obs", "next_obs"]'})
+    _refused(file, mapping, "leave_out leaves out 'obs/agentview_image', which the mapping names", capsys)
+
+
 def _soft_link(file: h5py.File) -> None:
     del file["data/demo_1/actions"]
     file["data/demo_1/actions"] = h5py.SoftLink("/data/demo_0/actions")
@@ -347,6 +501,14 @@ def _without_masked(file: h5py.File) -> None:
     file["mask/train"] = np.array(["demo_7"], dtype="S")
 
 
+def _pictures(images: NDArray[np.generic]) -> Callable[[h5py.File], None]:
+    def change(file: h5py.File) -> None:
+        del file["data/demo_1/obs/agentview_image"]
+        file["data/demo_1/obs/agentview_image"] = images
+
+    return change
+
+
 def _attribute(place: str, name: str, value: object) -> Callable[[h5py.File], None]:
     return lambda file: file[place].attrs.__setitem__(name, value)
 
@@ -355,7 +517,8 @@ FAULTS: dict[str, tuple[Callable[[h5py.File], object], str]] = {
     "no such key": (lambda file: file["data/demo_1/obs"].move("object", "objekt"), "Did you mean 'objekt'"),
     "no episodes": (lambda file: [file.__delitem__(f"data/{name}") for name in DEMOS], "no episodes in data"),
     "other lengths": (
-        _replaced("actions", lambda group, name: group.__setitem__(name, np.zeros((4, 7)))), "demo_1/actions has 4 rows"
+        _replaced("actions", lambda group, name: group.__setitem__(name, np.zeros((3, 7)))),
+        "demo_1/obs/agentview_image has 5 rows, other datasets of the episode have 3",
     ),
     "num_samples": (_attribute("data/demo_1", "num_samples", 9), "num_samples says 9"),
     "nan": (_set("data/demo_1/obs/object", 3, float("nan")), "data/demo_1/obs/object is nan in row 3 (object_0)"),
@@ -374,13 +537,10 @@ FAULTS: dict[str, tuple[Callable[[h5py.File], object], str]] = {
     "another width": (
         _replaced("actions", lambda group, name: group.__setitem__(name, np.zeros((5, 8)))), "The episodes differ"
     ),
-    "pictures of floats": (
-        lambda file: (
-            file.__delitem__("data/demo_1/obs/agentview_image"),
-            file.__setitem__("data/demo_1/obs/agentview_image", np.zeros((5, 8, 8, 3))),
-        ),
-        "pictures are uint8",
-    ),
+    "pictures of integers": (_pictures(np.zeros((5, 8, 8, 3), np.int32)), "pictures are uint8 or floats"),
+    "pictures of one colour": (_pictures(np.zeros((5, 8, 8, 1), np.uint8)), "pictures are uint8 or floats"),
+    "pictures from -1": (_pictures(np.linspace(-1, 1, 5 * 192).reshape(5, 8, 8, 3)), "has pixels from -1 to 1, floats"),
+    "pictures of nan": (_pictures(np.full((5, 8, 8, 3), np.nan)), "not finite in row 0"),
     "soft link": (_soft_link, "data/demo_1/actions is a link"),
     "external link": (_external_link, "data/demo_1 is a link"),
     "masked external link": (_external_link, "data/demo_1 is a link"),

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from rerun.chunk import RrdReader
@@ -17,6 +18,7 @@ from support.export import export
 
 from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.errors import ConfigError
+from demorec.lerobot import dataset_digest
 from demorec.recording import CollectedRecording, CollectedWriter, recover
 
 pytestmark = pytest.mark.usefixtures("hf_datasets_cache")
@@ -58,6 +60,46 @@ def rows_of(dataset: Path) -> list[dict[str, Any]]:
     (file,) = sorted((dataset / "data").rglob("*.parquet"))
     found: list[dict[str, Any]] = pq.read_table(file).to_pylist()
     return found
+
+
+def test_a_dataset_brings_its_subtasks_back(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert imported(texts("/subtask", SAID), SUBTASKS, tmp_path) == 0
+    export(tmp_path / "run", tmp_path / "a", language=("subtask",))
+    assert exit_code("import", "lerobot", tmp_path / "a", "--out", tmp_path / "again") == 0
+    assert "language_persistent" not in capsys.readouterr().out
+    told = []
+    for run in ("run", "again"):
+        with CollectedRecording(recordings(tmp_path / run)[0]) as opened:
+            told.append(opened.subtasks)
+    assert len(told[0]) == 3
+    assert told[0] == told[1]
+    export(tmp_path / "again", tmp_path / "b", language=("subtask",))
+    assert dataset_digest(tmp_path / "b") == dataset_digest(tmp_path / "a")
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [({"style": "memory"}, "all but its subtasks"), ({"content": "a\nb"}, "a subtask is no single line")],
+)
+def test_what_else_a_dataset_says_is_left_out(
+    change: dict[str, str], expected: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert imported(texts("/subtask", SAID), SUBTASKS, tmp_path) == 0
+    export(tmp_path / "run", tmp_path / "a", language=("subtask",))
+    (file,) = sorted((tmp_path / "a" / "data").rglob("*.parquet"))
+    table = pq.read_table(file)
+    place = table.schema.get_field_index("language_persistent")
+    rows = table.column(place).to_pylist()
+    for row in rows:
+        row[1] |= change
+    fields = list(table.schema.field(place).type.value_type)[:4]
+    plain = pa.list_(pa.struct([(field.name, field.type) for field in fields]))
+    kept = [[{field.name: entry[field.name] for field in fields} for entry in row] for row in rows]
+    pq.write_table(table.set_column(place, "language_persistent", pa.array(kept, plain)), file)
+    assert exit_code("import", "lerobot", tmp_path / "a", "--out", tmp_path / "again") == 0
+    assert f"language_persistent is left out: {expected}" in capsys.readouterr().out
+    with CollectedRecording(recordings(tmp_path / "again")[0]) as opened:
+        assert len(opened.subtasks) == (2 if "style" in change else 0)
 
 
 def test_a_dataset_has_exactly_what_was_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -14,20 +14,21 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from numpy.typing import NDArray
-from support.export import data_table, export
-from support.training import CAMERA, write_by_lerobot
+from support.export import data_table, export, info, make_run
+from support.training import CAMERA, DEPTH, write_by_lerobot
 
 from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.cli import main
 from demorec.errors import ConfigError, DemorecError
 from demorec.ingest.dataset_import import import_lerobot
+from demorec.lerobot import dataset_digest
 from demorec.playback.sources import find_episodes
 from demorec.recording import CollectedRecording
 from demorec.runs.collected import load_collected_run
 
 pytestmark = pytest.mark.usefixtures("hf_datasets_cache")
 LENGTHS = (14, 9, 11)
-VECTORS = ("observation.state", "observation.single", "action")
+VECTORS = ("observation.state", "observation.single", "observation.counts", "observation.touch", "action")
 NAME = CAMERA.removeprefix("observation.images.")
 
 
@@ -78,6 +79,7 @@ def test_numbers_and_tasks_are_those_of_the_dataset(imported: tuple[str, Path, P
                 expected = columns_of(dataset, name)[begin:end].astype(columns.features[name].dtype)
                 np.testing.assert_array_equal(columns.features[name], expected)
             assert columns.features["observation.single"].dtype == np.float64
+            assert columns.features["observation.counts"].max() > 2**25  # which float32 would round
             assert recording.info.instruction == ("push it", "pull it")[number % 2]
             assert columns.time_ns.tolist() == [round(index * 1e9 / 30) for index in range(LENGTHS[number])]
             begin = end
@@ -162,8 +164,6 @@ def test_the_same_command_again_goes_on(imported: tuple[str, Path, Path], tmp_pa
 def test_our_own_dataset_comes_back_to_the_bit(tmp_path: Path) -> None:
     from support.collected import TOP, make_collected, write_collected
 
-    from demorec.lerobot import dataset_digest
-
     (tmp_path / "run" / "episodes").mkdir(parents=True)
     for index, length in enumerate((20, 33)):
         given = make_collected(cameras=(TOP,), num_frames=length, episode_index=index, success=None)
@@ -173,6 +173,83 @@ def test_our_own_dataset_comes_back_to_the_bit(tmp_path: Path) -> None:
     assert (result.num_episodes, result.cameras) == (2, {"top": "h264 kept as it is"})
     export(tmp_path / "again", tmp_path / "b")
     assert dataset_digest(tmp_path / "b") == dataset_digest(tmp_path / "a")
+
+
+def codes_of(dataset: Path, key: str) -> list[NDArray[np.uint16]]:
+    """All depth pictures of a camera in order, by av."""
+    codes: list[NDArray[np.uint16]] = []
+    for file in sorted((dataset / "videos" / key).rglob("*.mp4")):
+        with av.open(str(file)) as container:
+            codes += [frame.to_ndarray(format="gray12le").astype(np.uint16) for frame in container.decode(video=0)]
+    return codes
+
+
+def test_distances_are_those_of_the_dataset(tmp_path: Path) -> None:
+    """LeRobot says what its codes stand for, and writes the same ones when they come back."""
+    from lerobot.datasets.depth_utils import dequantize_depth
+
+    write_by_lerobot(tmp_path / "d", LENGTHS, depth=True)
+    codes = codes_of(tmp_path / "d", DEPTH)
+    result = import_lerobot(tmp_path / "d", tmp_path / "run")
+    name = DEPTH.removeprefix("observation.images.")
+    assert DEPTH not in result.left_out
+    assert name in result.cameras
+    found = []
+    for file in recordings(tmp_path / "run"):
+        with CollectedRecording(file) as recording:
+            assert recording.depth_cameras == (name,)
+            found += list(recording.distances(name))
+    assert len(found) == sum(LENGTHS)
+    for number, (metres, code) in enumerate(zip(found, codes, strict=True)):
+        expected = dequantize_depth(code, output_unit="m", output_tensor=False)
+        np.testing.assert_allclose(metres, np.squeeze(expected), atol=1e-5, err_msg=str(number))
+
+
+def test_what_an_export_says_of_distances_comes_back(tmp_path: Path) -> None:
+    """Every code of the generator's depth, that of holes among them, and then the whole dataset."""
+    export(make_run(tmp_path / "simulated", (4, 6), depth=True), tmp_path / "a", depth=True)
+    import_lerobot(tmp_path / "a", tmp_path / "run")
+    export(tmp_path / "run", tmp_path / "b", depth=True)
+    keys = [name for name, feature in info(tmp_path / "a")["features"].items() if feature["shape"][-1] == 1][:2]
+    assert [key for key in keys if key.endswith("_depth")] == keys
+    for key in keys:
+        before, after = codes_of(tmp_path / "a", key), codes_of(tmp_path / "b", key)
+        assert any(code.min() == 0 for code in before)
+        assert [code.tolist() for code in after] == [code.tolist() for code in before]
+    import_lerobot(tmp_path / "b", tmp_path / "again")
+    export(tmp_path / "again", tmp_path / "c", depth=True)
+    assert dataset_digest(tmp_path / "c") == dataset_digest(tmp_path / "b")
+
+
+def test_depth_of_another_scale_is_read_by_it_and_without_one_left_out(tmp_path: Path) -> None:
+    export(make_run(tmp_path / "simulated", (4,), depth=True), tmp_path / "d", depth=True)
+    path = tmp_path / "d" / "meta" / "info.json"
+    described = json.loads(path.read_text())
+    key = next(name for name in described["features"] if name.endswith("_depth"))
+    described["features"][key]["info"] |= {"video.depth_min": 0.0, "video.depth_max": 4.095, "video.use_log": False}
+    path.write_text(json.dumps(described))
+    import_lerobot(tmp_path / "d", tmp_path / "run")
+    with CollectedRecording(recordings(tmp_path / "run")[0]) as recording:
+        found = list(recording.distances(key.removeprefix("observation.images.")))
+    np.testing.assert_allclose(found, np.array(codes_of(tmp_path / "d", key)) / 1000, atol=1e-6)
+    del described["features"][key]["info"]["video.shift"]
+    path.write_text(json.dumps(described))
+    assert "scale of depth" in import_lerobot(tmp_path / "d", tmp_path / "other").left_out[key]
+
+
+def test_whole_numbers_that_no_recording_holds_are_left_out(imported: tuple[str, Path, Path], tmp_path: Path) -> None:
+    _, dataset, _ = imported
+    shutil.copytree(dataset, tmp_path / "d")
+    file = sorted((tmp_path / "d" / "data").rglob("*.parquet"))[-1]
+    table = pq.read_table(file)
+    place = table.schema.get_field_index("observation.counts")
+    rows = table.column(place).to_pylist()
+    rows[-1][0] = 2**53 + 1
+    kind = table.schema.field(place)
+    pq.write_table(table.set_column(place, kind, pa.array(rows, type=kind.type)), file)
+    told = import_lerobot(tmp_path / "d", tmp_path / "run").left_out
+    assert told["observation.counts"] == "it has whole numbers that float64 cannot hold"
+    assert "observation.touch" not in told
 
 
 def _off_the_grid(dataset: Path) -> None:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import functools
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
@@ -25,7 +25,7 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, ti
 from numpy.typing import NDArray
 from PIL import Image
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 NS = 1_000_000_000
 EPOCH_NS = 1_760_000_000 * NS
@@ -267,6 +267,15 @@ def _store(*, is_ros1: bool = False) -> Any:
     return get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
 
 
+def register(definitions: Mapping[str, str]) -> None:
+    """Have the writers know types that are not ROS's own: name -> definition."""
+    types: dict[str, Any] = {}
+    for name, text in definitions.items():
+        types |= get_types_from_msg(text, name)
+    for store in (_store(), _store(is_ros1=False), _store(is_ros1=True)):
+        store.register({name: found for name, found in types.items() if name not in store.fielddefs})
+
+
 def ros_message(note: Note, *, is_ros1: bool = False) -> Any:
     """A message of `rosbags`."""
     store = _store(is_ros1=is_ros1)
@@ -291,13 +300,16 @@ def _filled(store: Any, name: str, body: dict[str, Any], is_ros1: bool) -> Any:
                 values[key] = _filled(store, rest, given or {}, is_ros1)
         elif kind == Nodetype.BASE:
             values[key] = given if given is not None else "" if rest[0] == "string" else 0
-        elif given is not None and rest[0][0] == Nodetype.BASE and rest[0][1][0] != "string":
-            values[key] = np.asarray(given).reshape(-1)
+        elif rest[0][0] == Nodetype.NAME:
+            items = given or [{}] * (rest[1] if kind == Nodetype.ARRAY else 0)
+            values[key] = [_filled(store, rest[0][1], item, is_ros1) for item in items]
+        elif given is not None and rest[0][1][0] != "string":
+            values[key] = np.asarray(given, rest[0][1][0]).reshape(-1)
         elif rest[0][1][0] == "string":
             values[key] = given or []
         else:
             length = rest[1] if kind == Nodetype.ARRAY else 0
-            values[key] = np.zeros(length, rest[0][1][0]) if rest[0][0] == Nodetype.BASE else given or []
+            values[key] = np.zeros(length, rest[0][1][0])
     return store.types[name](**values)
 
 

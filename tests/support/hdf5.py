@@ -72,6 +72,7 @@ def jpeg(picture: NDArray[np.uint8], quality: int) -> bytes:
 def write_aloha(path: Path, *, count: int = 8, is_compressed: bool = False, seed: int = 0) -> Path:
     """An episode of ALOHA: qpos, qvel, images, action; mobile ALOHA's base_action, and its JPEG files if compressed."""
     rng = np.random.default_rng(seed)
+    path.parent.mkdir(exist_ok=True)
     with h5py.File(path, "w", rdcc_nbytes=2 << 20) as file:
         file.attrs["sim"] = False
         observations = file.create_group("observations")

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.collected import TOP, Episode, make_collected, write_collected
+from support.collected import FORCE, TOP, Episode, make_collected, write_collected
 
 from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.cli import main
@@ -136,6 +136,20 @@ def test_a_good_episode_passes(tmp_path: Path) -> None:
     assert "fail" not in found.values()
     assert "warn" not in found.values()
     assert found["penetration"] == "skip"
+
+
+def test_a_label_that_never_changes_is_no_stuck_sensor(tmp_path: Path) -> None:
+    """LeRobot's `intervention` is false in most episodes."""
+    episode = steady()
+    features = (*episode.info.features[:2], replace(FORCE, name="intervention"))
+    frames = []
+    for frame in episode.frames:
+        samples = dict(frame.samples)
+        force = samples.pop(FORCE.name)
+        samples["intervention"] = replace(force, vector=np.zeros(3))
+        frames.append(replace(frame, samples=samples))
+    episode = replace(episode, info=replace(episode.info, features=features), frames=frames)
+    assert levels(write_collected(tmp_path / "a.mcap", episode))["collected_stuck"] == "pass"
 
 
 @pytest.mark.parametrize("fault", FAULTS)

@@ -11,7 +11,15 @@ from support import bag_mappings, bags
 from demorec.errors import ConfigError
 from demorec.ingest.bag import open_bag
 from demorec.ingest.channel import BagError
-from demorec.ingest.fields import FieldError, SourceReader, converted, follow, layout_of, parse_path
+from demorec.ingest.fields import (
+    FieldError,
+    OtherPublisherError,
+    SourceReader,
+    converted,
+    follow,
+    layout_of,
+    parse_path,
+)
 from demorec.ingest.mapping import Source, read_mapping
 from demorec.ingest.streams import read_streams
 
@@ -107,6 +115,45 @@ def test_joints_are_found_by_name_in_whatever_order() -> None:
         reader.read({"name": ["b"], "position": np.array([1.0])})
     with pytest.raises(FieldError, match="1 values have 2 names"):
         reader.read({"name": ["a", "b"], "position": np.array([1.0])})
+
+
+def test_joints_that_nobody_lists_are_those_of_the_first_message_by_name() -> None:
+    source = Source(topic="/j", field="position", prefix="left_")
+    first = {"name": ["a", "b"], "position": np.array([1.0, 2.0])}
+    layout = layout_of(source, first)
+    assert layout.names == ("left_a", "left_b")
+    reader = SourceReader(source, layout)
+    assert reader.read({"name": ["b", "a"], "position": np.array([3.0, 4.0])}).tolist() == [4.0, 3.0]
+    with pytest.raises(OtherPublisherError, match="none of the joints"):
+        reader.read({"name": ["c", "d"], "position": np.array([5.0, 6.0])})
+    assert list(reader.others) == ["c", "d"]
+
+
+def test_a_publisher_of_velocities_alone_is_another_one() -> None:
+    """Wheels have no positions, and are no reason to refuse the arm whose messages come later."""
+    source = Source(topic="/j", field="position", joints=("a",))
+    with pytest.raises(OtherPublisherError):
+        layout_of(source, {"name": ["wheel"], "position": np.empty(0), "velocity": np.array([1.0])})
+    with pytest.raises(FieldError, match="have no names"):
+        layout_of(source, {"position": np.array([1.0])})
+
+
+def test_names_that_are_not_unique_name_nothing() -> None:
+    source = Source(topic="/j", field="position")
+    first = {"name": ["", ""], "position": np.array([1.0, 2.0])}
+    assert SourceReader(source, layout_of(source, first)).read(first).tolist() == [1.0, 2.0]
+
+
+def test_a_source_without_a_list_is_refused_where_publishers_differ(tmp_path: Path) -> None:
+    notes = bags.so101(0.3)
+    notes += bags.joints("/follower/joint_states", ("wheel_left", "wheel_right"), bags.times(50, 0.3, seed=9))
+    bag = open_bag(bags.write_mcap(bags.in_order(notes), tmp_path / "bag.mcap"))
+    mapping = read_mapping(bag_mappings.write_mapping(bag_mappings.SO101, tmp_path / "robot.toml"))
+    told = r"takes all joints of /follower/joint_states.*joints = \["
+    with pytest.raises(BagError, match=told) as caught:
+        read_streams(bag, mapping)
+    assert '"wheel_left", "wheel_right"' in str(caught.value)
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
