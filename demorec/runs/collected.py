@@ -182,6 +182,8 @@ class CollectedFolder:
         """The number of the next episode: above all that are there, finished or not."""
         numbers = [line.episode_index for line in self.episodes]
         for path in (self.path / EPISODES).glob("episode_*"):
+            if path.suffix == ".part" and not path.stat().st_size:
+                continue  # of an episode that was opened, and given no frame: the next one takes its place
             digits = path.name.removeprefix("episode_").partition(".")[0]
             numbers.append(int(digits) if digits.isdecimal() else -1)
         return max(numbers, default=-1) + 1
