@@ -98,7 +98,7 @@ def test_failures_stay_out_and_unknown_outcomes_do_not(tmp_path: Path) -> None:
 @pytest.mark.parametrize("exporter", ["lerobot", "hdf5"])
 def test_a_failure_that_stays_out_blocks_nothing(tmp_path: Path, exporter: str) -> None:
     """Failed episodes without an image, of other cameras and features, and of another rate."""
-    failed = {"episode_index": 1, "num_frames": 5, "success": False}
+    failed: dict[str, Any] = {"episode_index": 1, "num_frames": 5, "success": False}
     without = complete(**failed)
     without = replace(without, frames=[replace(frame, pictures={}) for frame in without.frames], pictures={"top": []})
     blind = make_collected(cameras=(), **failed | {"episode_index": 2})

@@ -23,7 +23,7 @@ from demorec import Recorder
 from demorec.config import VideoConfig
 from demorec.errors import ConfigError, DemorecError, RecordingError
 from demorec.recorder.coder import Coder
-from demorec.recording import CollectedRecording, video
+from demorec.recording import CollectedRecording
 from demorec.recording.collected.writer import CollectedWriter
 from demorec.runs.collected import load_collected_run
 from demorec.scene.collected import NO_PICTURE, CollectedCamera, CollectedFeature
@@ -249,7 +249,8 @@ def test_odd_sizes_are_recorded_by_the_codec_that_is_advised(tmp_path: Path) -> 
     with recorder(tmp_path / "run", cameras=cameras, video=VideoConfig(codec="jpeg")) as run, run.episode() as episode:
         episode.write([0.0], [0.0], images={"top": pixels})
     with recording_of(tmp_path / "run") as found:
-        assert np.abs(found.image("top", 0).astype(int) - pixels).max() <= 3
+        (image,) = found.images("top")
+        assert np.abs(image.astype(int) - pixels).max() <= 3
     with pytest.raises(ConfigError, match=r"65x47 pixels cannot be h264 video.* of which no LeRobot dataset"):
         export(tmp_path / "run", tmp_path / "dataset")
     assert export(tmp_path / "run", tmp_path / "d.hdf5", "hdf5").num_frames == 1
@@ -266,7 +267,7 @@ def test_file_and_encoders_are_open_before_the_first_frame(
             raise AssertionError("opened by the first frame")
 
         with monkeypatch.context() as patched:
-            patched.setattr(video.av, "CodecContext", SimpleNamespace(create=opens))
+            patched.setattr("demorec.recording.video.av.CodecContext", SimpleNamespace(create=opens))
             patched.setattr(foxglove, "open_mcap", opens)
             for index in range(3):
                 episode.write([float(index)], images={"top": PIXELS})
