@@ -7,7 +7,7 @@ off is made whole when the folder is opened again, and nothing that is there is 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -212,14 +212,21 @@ class CollectedFolder:
         with CollectedRecording(path) as recording:
             if recording.info == info and recording.outcome is not None:
                 return True
-        raise ConfigError(f"Another recording is there already: choose another --out: {path}")
+        raise ConfigError(
+            f"Another recording is there already: import what the interrupted call was given, or choose another --out: "
+            f"{path}"
+        )
 
     def add(self, recording: Path) -> CollectedEpisode:
         """Take a finished recording into run.json."""
         line = collected_line(recording)
-        self.episodes.append(line)
-        self.save()
+        self.extend([line])
         return line
+
+    def extend(self, lines: Iterable[CollectedEpisode]) -> None:
+        """Take finished recordings into run.json, by their `collected_line`."""
+        self.episodes += lines
+        self.save()
 
     def save(self, *, ended: bool = False) -> None:
         """Write run.json, if there is anything to tell."""
