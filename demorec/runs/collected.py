@@ -190,15 +190,19 @@ class CollectedFolder:
 
     def path_of(self, episode_index: int) -> Path:
         """Where the recording of an episode goes."""
-        return self.path / EPISODES / recording_name(episode_index, 0, success=True)
+        return episode_path(self.path, episode_index)
+
+    def kind(self) -> CollectedInfo | None:
+        """Description of the last episode, which new ones must be like; None of an empty run."""
+        if not self.episodes:
+            return None
+        with CollectedRecording(self.path / self.episodes[-1].file) as recording:
+            return recording.info
 
     def check_fits(self, info: CollectedInfo) -> None:
         """Raise ConfigError with everything in which a new episode differs from the last one that is there."""
-        if not self.episodes:
-            return
-        with CollectedRecording(self.path / self.episodes[-1].file) as recording:
-            different = differences(recording.info, info)
-        if different:
+        kind = self.kind()
+        if kind is not None and (different := differences(kind, info)):
             raise ConfigError(
                 f"The run holds episodes of another kind ({'; '.join(different)}): record into another folder: "
                 f"{self.path}"
@@ -225,15 +229,13 @@ class CollectedFolder:
 
     def extend(self, lines: Iterable[CollectedEpisode]) -> None:
         """Take finished recordings into run.json, by their `collected_line`."""
-        self.episodes += lines
+        self.episodes = sorted([*self.episodes, *lines], key=lambda line: line.episode_index)
         self.save()
 
     def save(self, *, ended: bool = False) -> None:
         """Write run.json, if there is anything to tell."""
-        if not self.episodes:
+        if (info := self.kind()) is None:
             return
-        with CollectedRecording(self.path / self.episodes[-1].file) as recording:
-            info = recording.info
         session = replace(self._session, ended=_now()) if ended else self._session
         run = CollectedRun(
             robot=info.robot, fps=info.fps, episodes=tuple(self.episodes), sessions=(*self._sessions, session)
@@ -285,6 +287,11 @@ def _refuse_strangers(path: Path) -> None:
     ]
     if strangers:
         raise ConfigError(f"The folder holds files that are of no run ({shown(strangers)}): choose another: {path}")
+
+
+def episode_path(run: Path, episode_index: int) -> Path:
+    """Where the recording of an episode goes."""
+    return run / EPISODES / recording_name(episode_index, 0, success=True)
 
 
 def collected_line(file: Path) -> CollectedEpisode:
