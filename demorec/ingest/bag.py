@@ -100,23 +100,26 @@ def bags_in(path: Path) -> list[Path]:
     They are rosbag2 folders, MCAP and .db3 files, and those files in folders in it whose metadata.yaml was lost. A
     folder that holds none of them is given back itself.
     """
-    if not path.is_dir() or _is_marked(path):
+    if not path.is_dir() or os.path.lexists(path / METADATA) or (path / INFO_PATH).is_file():
         return [path]
     found: list[Path] = []
-    for entry in sorted(path.iterdir(), key=_natural):
-        if entry.is_dir():
-            found += [entry] if (entry / METADATA).is_file() else _bag_files(entry)
-        elif entry.name.endswith(_SUFFIXES):
+    for entry in _entries(path):
+        if not entry.is_dir():
+            found += [entry] if entry.name.endswith(_SUFFIXES) else []
+        elif os.path.lexists(entry / METADATA):
             found.append(entry)
+        else:
+            found += [file for file in _entries(entry) if file.name.endswith(_SUFFIXES)]
     return found or [path]
 
 
-def _is_marked(folder: Path) -> bool:
-    return (folder / METADATA).exists() or (folder / INFO_PATH).is_file()
-
-
-def _bag_files(folder: Path) -> list[Path]:
-    return sorted((entry for entry in folder.iterdir() if entry.name.endswith(_SUFFIXES)), key=_natural)
+def _entries(folder: Path) -> list[Path]:
+    try:
+        return sorted(folder.iterdir(), key=_natural)
+    except OSError as error:
+        raise resource_error(error, folder) or BagError(
+            f"The folder cannot be read ({error.strerror}): {folder}"
+        ) from error
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:

@@ -22,6 +22,10 @@ Files = tuple[tuple[str, str], ...]
 """Name and SHA-256 of each of a bag's files."""
 
 
+_MAX_REASON = 1000
+"""Characters: an error may quote what a bag holds."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class ImportResult:
     """What an import made.
@@ -143,7 +147,7 @@ class Batch:
             raise error
         known = isinstance(error, DemorecError)
         self._skipped[path] = (
-            without_path(error, path) if known else f"unexpected {type(error).__name__}, please report it"
+            without_path(error, path)[:_MAX_REASON] if known else f"unexpected {type(error).__name__}, please report it"
         )
         self._advance()
 

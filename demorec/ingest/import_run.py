@@ -32,6 +32,7 @@ from demorec.ingest.pipeline import processes
 from demorec.ingest.report import BagReport, EpisodeReport, stream_reports
 from demorec.ingest.rows import EpisodeRows, NoRowsError, Timelines
 from demorec.ingest.streams import BagDecoder, read_streams
+from demorec.recording.video import size_problem
 from demorec.runs.collected import (
     CollectedEpisode,
     collected_line,
@@ -159,6 +160,9 @@ class _Import:
 
     def _episode(self, lines: Timelines, rows: EpisodeRows, index: int) -> PlannedEpisode:
         plans = {name: picture_plan(camera, lines.lines[name]) for name, camera in rows.cameras.items()}
+        for name, plan in plans.items():
+            if not plan.kept and (problem := size_problem(self.video, plan.head.width, plan.head.height)):
+                raise BagError(f"The images of {name} ({plan.topic}) cannot be recorded: {problem}: {self.bag.path}")
         topic = self.mapping.robot.urdf_topic
         urdf = urdf_in_bag(self.bag, lines.streams, topic) if topic else self.urdf
         try:
