@@ -40,7 +40,7 @@ class Import:
     Examples:
       demorec import --suggest monday.mcap > robot.toml
       demorec import monday.mcap tuesday/ --mapping robot.toml --out runs/robot
-      demorec import bags/ --mapping robot.toml --out runs/robot --skip-bad --workers 4
+      demorec import bags/ --mapping robot.toml --out runs/robot --skip-bad
       demorec import lerobot datasets/cups --out runs/cups
       demorec import hdf5 demo.hdf5 --suggest > demo.toml
       demorec import hdf5 demo.hdf5 --mapping demo.toml --out runs/demo

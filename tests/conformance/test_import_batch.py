@@ -236,6 +236,21 @@ def test_what_is_no_bad_bag_stops_a_batch(tmp_path: Path, monkeypatch: pytest.Mo
     assert import_bags([bag], mapping, run, skip_bad=True).num_new == 1
 
 
+def test_info_says_which_episodes_were_dropped(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    leader = "/leader/joint_states"
+    notes = bags.changed(bags.so101(2.0), leader, lambda k, note: None if 60 <= k < 80 else note)
+    bag = bags.write_mcap(bags.in_order(notes), tmp_path / "bag.mcap")
+    cut = '[episodes]\ncut = "times"\ntimes_s = [[0.1, 0.8], [1.0, 1.9]]\n'
+    text = DROPPING.replace("[cameras.front]", cut + "[cameras.front]")
+    mapping, run = bag_mappings.write_mapping(text, tmp_path / "robot.toml"), tmp_path / "run"
+    assert _demorec("import", bag, "--mapping", mapping, "--out", run) == 0
+    capsys.readouterr()
+    assert _demorec("info", run) == 0
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("bag.mcap")]
+    assert "episode from 1.00 to 1.90 s" in line
+    assert f"action ({leader}) is up to" in line
+
+
 def test_the_same_bag_twice_is_imported_once(tmp_path: Path) -> None:
     first = _bag(tmp_path / "a.mcap")
     second = tmp_path / "b.mcap"
