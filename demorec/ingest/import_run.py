@@ -131,7 +131,7 @@ class _Import:
         lines = Timelines(streams, self.mapping)
         found = windows(self.bag, streams, list(lines.lines.values()), self.mapping)
         findings = all_findings(lines)
-        begin = min(window.begin_ns for window in found)
+        begin = min(int(line.times_ns[0]) for line in lines.lines.values() if len(line.times_ns))
         episodes: list[PlannedEpisode] = []
         reports: list[EpisodeReport] = []
         for window in found:

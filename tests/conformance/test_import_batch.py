@@ -115,9 +115,8 @@ def test_bad_bags_are_skipped_and_listed(
     folder, mapping = batch
     run = tmp_path / "run"
     assert _demorec("import", folder, "--mapping", mapping, "--out", run, "--skip-bad") == 1
-    told = capsys.readouterr()
-    assert told.err == ""
-    *_, header, _, _, _, _, _, _, _ = lines = told.out.splitlines()
+    lines = capsys.readouterr().out.splitlines()
+    header = lines[-len(BAD) - 1]
     assert header == f"Skipped {len(BAD)} of {2 * len(BAD)} bags:"
     for number, (line, (_, reason)) in enumerate(zip(lines[-len(BAD) :], BAD.values(), strict=True)):
         assert line.startswith(f"  {folder / f'run_{2 * number + 1}.mcap'}: ")
@@ -323,8 +322,8 @@ def test_a_killed_worker_is_told_in_one_sentence(batch: tuple[Path, Path], alone
         workers[0].kill()
         _, err = program.communicate()
     assert program.returncode == 1
-    assert "A process of the import ended without a word" in err
-    assert err.count("\n") == 1
+    (line,) = [line for line in err.splitlines() if not line.startswith("importing: ")]  # told of a slow import
+    assert "A process of the import ended without a word" in line
     import_bags([batch[0]], batch[1], tmp_path / "run", skip_bad=True)
     assert _content(tmp_path / "run") == _content(alone)
 
