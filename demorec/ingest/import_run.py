@@ -32,6 +32,8 @@ from demorec.ingest.pipeline import processes
 from demorec.ingest.report import BagReport, EpisodeReport, stream_reports
 from demorec.ingest.rows import EpisodeRows, NoRowsError, Timelines
 from demorec.ingest.streams import BagDecoder, read_streams
+from demorec.recording.collected.frame_check import MAX_STAMP_NS, MAX_SUBTASK
+from demorec.recording.collected.validity import what_is_wrong
 from demorec.recording.video import size_problem
 from demorec.runs.collected import (
     CollectedEpisode,
@@ -160,9 +162,6 @@ class _Import:
 
     def _episode(self, lines: Timelines, rows: EpisodeRows, index: int) -> PlannedEpisode:
         plans = {name: picture_plan(camera, lines.lines[name]) for name, camera in rows.cameras.items()}
-        for name, plan in plans.items():
-            if not plan.kept and (problem := size_problem(self.video, plan.head.width, plan.head.height)):
-                raise BagError(f"The images of {name} ({plan.topic}) cannot be recorded: {problem}: {self.bag.path}")
         topic = self.mapping.robot.urdf_topic
         urdf = urdf_in_bag(self.bag, lines.streams, topic) if topic else self.urdf
         try:
@@ -182,7 +181,28 @@ class _Import:
             versions={"demorec": version("demorec"), "av": version("av")},
         )
         subtasks = subtask_rows(self.bag, lines.streams, rows.window, rows.times_ns, self.mapping)
-        return PlannedEpisode(info=info, rows=rows, plans=plans, subtasks=subtasks)
+        episode = PlannedEpisode(info=info, rows=rows, plans=plans, subtasks=subtasks)
+        if wrong := list(self._problems(episode)):
+            raise BagError(f"The episode cannot be recorded: {'; '.join(wrong)}: {self.bag.path}")
+        return episode
+
+    def _problems(self, episode: PlannedEpisode) -> Iterator[str]:
+        """What no recording can hold, found before anything of the bag is written."""
+        yield from what_is_wrong(episode.info)
+        for name, plan in episode.plans.items():
+            if not plan.kept and (problem := size_problem(self.video, plan.head.width, plan.head.height)):
+                yield f"camera {name}: {problem}"
+        if any(len(text) > MAX_SUBTASK or not text.isprintable() for text in episode.subtasks.values()):
+            yield f"a subtask is no single line of at most {MAX_SUBTASK} characters"
+        times, features = episode.rows.times_ns, episode.rows.features.values()
+        for stamps in (
+            times,
+            *(times - one.ages_ns for one in features),
+            *(p.stamps_ns for p in episode.plans.values()),
+        ):
+            if len(stamps) and not 0 <= stamps.min() <= stamps.max() <= MAX_STAMP_NS:
+                yield f"a message is of the time {stamps.min() / NS:.0f} s, allowed are 0 to {MAX_STAMP_NS // NS} s"
+                return
 
     def _check_alike(self, episodes: Sequence[PlannedEpisode]) -> None:
         """ConfigError unless the episodes are of one kind."""

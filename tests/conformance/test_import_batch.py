@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -60,6 +61,16 @@ def _odd(notes: bags.Notes) -> bags.Notes:
     return bags.changed(notes, FRONT, lambda k, note: bags.with_body(note, data=data))
 
 
+def _named(notes: bags.Notes, name: str) -> bags.Notes:
+    names = [name, *bags.SO101_JOINTS[1:]]
+    return bags.changed(notes, "/follower/joint_states", lambda k, note: bags.with_body(note, name=names))
+
+
+def _recorded(note: bags.Note, time_ns: int) -> bags.Note:
+    """Recorded at that time instead of the epoch of the bags, without one in its header."""
+    return replace(note, log_ns=note.log_ns - bags.EPOCH_NS + time_ns, header_ns=0)
+
+
 def _moved(path: Path) -> Path:
     path.rename(path.with_name("aside"))
     return path
@@ -75,6 +86,14 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "another size": (lambda path: _bag(path, change=_resized), "camera front is 32x24 jpeg instead of 64x48 jpeg"),
     "odd size": (lambda path: _bag(path, change=_odd), "63x47 pixels cannot be h264 video, which needs even sizes"),
+    "escape codes": (
+        lambda path: _bag(path, change=lambda notes: _named(notes, "a\x1b[2J")),
+        "elements of the feature 'observation.state' is called 'a\\x1b[2J'",
+    ),
+    "year 2116": (
+        lambda path: _bag(path, change=lambda notes: [_recorded(note, 2**62) for note in notes]),
+        "a message is of the time 4611686018 s, allowed are 0 to 2147483647 s",
+    ),
     "nowhere": (
         lambda path: _moved(path).symlink_to("nowhere.mcap"),
         "There is no bag that could be read (No such file or directory)",
