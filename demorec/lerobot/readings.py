@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from demorec.export.columns import frame_stride
@@ -34,23 +34,24 @@ class Reading:
         path: The recording.
         attempt: For the success rates.
         outcome: As recorded; None where the recording ends before it.
+        prepared: The episode; None for a failed attempt that is left out, of which nothing that follows is read, so
+            that an export does not fail for what it leaves out.
         profile: What must agree with all the others.
         features, fps, robot: Of a dataset made from it.
-        transcoded: Cameras whose pictures had to be coded anew, with the reason.
-        is_collected: Whether the episode was collected, not simulated.
-        prepared: The episode; None for a failed attempt that is left out.
+        transcoded: Cameras whose images had to be encoded anew, with the reason.
+        is_collected: Whether the episode was recorded elsewhere, not simulated.
     """
 
     path: Path
     attempt: AttemptRecord
     outcome: Outcome | CollectedOutcome | None
-    profile: Profile
-    features: dict[str, Feature]
-    fps: int
-    robot: str
-    transcoded: tuple[str, ...]
-    is_collected: bool
-    prepared: PreparedEpisode | None
+    prepared: PreparedEpisode | None = None
+    profile: Profile = field(default_factory=Profile)
+    features: dict[str, Feature] = field(default_factory=dict)
+    fps: int = 0
+    robot: str = ""
+    transcoded: tuple[str, ...] = ()
+    is_collected: bool = False
 
 
 def read(source: ExportSource, options: ExportOptions) -> Reading | None:
@@ -65,18 +66,19 @@ def read(source: ExportSource, options: ExportOptions) -> Reading | None:
         if not is_wanted(recording, options):
             return None
         attempt = AttemptRecord.of(recording)
-        features = dataset_features(recording, options)
+        if not goes_in(source, recording, options):
+            return Reading(path=source.path, attempt=attempt, outcome=recording.outcome)
         return Reading(
             path=source.path,
             attempt=attempt,
             outcome=recording.outcome,
             profile=Profile.of(recording, options),
-            features=features,
+            features=dataset_features(recording, options),
             fps=info.fps // frame_stride(info.fps, options.fps),
             robot=info.robot if isinstance(info.robot, str) else info.robot.name,
             transcoded=transcoded_cameras(recording, options),
             is_collected=isinstance(recording, CollectedRecording),
-            prepared=prepare_episode(recording, options) if goes_in(source, recording, options) else None,
+            prepared=prepare_episode(recording, options),
         )
 
 
