@@ -115,7 +115,7 @@ def main() -> None:
         print(f"dropped        {drops} frames")
         for name, values in (("wall", wall), ("CPU", cpu)):
             middle, high = np.percentile(values, (50, 99))
-            print(f"write, {name:4}    p50 {middle:.2f} ms, p99 {high:.2f} ms")
+            print(f"write, {name:4}    first {values[0]:.2f} ms, p50 {middle:.2f} ms, p99 {high:.2f} ms")
         print(f"CPU in all     {busy:.2f} cores")
         print(f"size           {size / 1e6 / args.seconds:.1f} MB/s")
         print(f"kill -9        loses {lost_seconds(Path(temporary) / 'killed', args):.2f} s")

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from demorec.check.base import Found, Measurement, check
 
 if TYPE_CHECKING:
-    from demorec.ingest.report import BagReport
+    from demorec.ingest.import_file import ImportFile
 
 _TIMES = frozenset(
     ("clock_offset", "clock_jump", "clock_drift", "unstamped", "drops", "gap", "slow", "fps", "jitter", "order")
@@ -54,29 +54,29 @@ def import_numbers(folder: Path) -> Found:
 
 @import_check(
     group="run",
-    measures="episodes that an import dropped, since something was missing or too old",
+    measures="episodes that an import dropped, since something was missing or too old, and bags that it skipped",
 )
 def import_dropped(folder: Path) -> Found:
     """Every episode that the bags hold is in the run."""
-    if (bags := _bags(folder)) is None:
+    if (found := _import(folder)) is None:
         return None
-    dropped = [row for bag in bags for row in bag.episodes if row.episode_index is None]
-    return Measurement(value=len(dropped), detail="; ".join(row.reason for row in dropped[:_MOST_TOLD]))
+    dropped = [row.reason for bag in found.bags for row in bag.episodes if row.episode_index is None]
+    dropped += [f"{bag.name}: {bag.reason}" for bag in found.skipped]
+    return Measurement(value=len(dropped), detail="; ".join(dropped[:_MOST_TOLD]))
 
 
-def _bags(folder: Path) -> tuple[BagReport, ...] | None:
+def _import(folder: Path) -> ImportFile | None:
     from demorec.ingest.import_file import load_import_file
 
-    found = load_import_file(folder)
-    return None if found is None else found.bags
+    return load_import_file(folder)
 
 
 def _found(folder: Path, is_mine: Callable[[str], bool]) -> Found:
-    if (bags := _bags(folder)) is None:
+    if (found := _import(folder)) is None:
         return None
     told = [
         f"{bag.name}: {finding.kind}, {finding.stream}: {finding.text}".replace(", : ", ": ")
-        for bag in bags
+        for bag in found.bags
         for finding in bag.findings
         if is_mine(finding.kind)
     ]

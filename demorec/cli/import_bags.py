@@ -10,12 +10,14 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from demorec.cli.shared.output import counted, say, tell
+from demorec.cli.shared.progress import ProgressBar
 from demorec.config import VideoConfig
-from demorec.errors import ConfigError
+from demorec.errors import ConfigError, check_option
 
 if TYPE_CHECKING:
     from demorec.ingest.frames_writer import FramesImport
 
+MAX_WORKERS = 1000
 _LEROBOT, _HDF5 = Path("lerobot"), Path("hdf5")
 """As the first word: what follows is a dataset, or HDF5 files."""
 
@@ -26,7 +28,8 @@ class Import:
 
     A mapping (TOML) says which topics become which features; --suggest writes one from what is in a bag. Every row
     holds messages that are in the bag and says how old they are; what is missing or too old is an error, or drops the
-    episode, as the mapping says. Coded pictures stay as they are. The same command again goes on.
+    episode, as the mapping says. Coded pictures stay as they are. The same command again goes on. A folder without
+    metadata.yaml stands for the bags in it.
 
     A LeRobot dataset (v3.0, whoever wrote it) needs no mapping: its features keep their names, its numbers every bit,
     and its video packets stay as they are where each episode begins with a keyframe.
@@ -37,6 +40,7 @@ class Import:
     Examples:
       demorec import --suggest monday.mcap > robot.toml
       demorec import monday.mcap tuesday/ --mapping robot.toml --out runs/robot
+      demorec import bags/ --mapping robot.toml --out runs/robot --skip-bad
       demorec import lerobot datasets/cups --out runs/cups
       demorec import hdf5 demo.hdf5 --suggest > demo.toml
       demorec import hdf5 demo.hdf5 --mapping demo.toml --out runs/demo
@@ -49,18 +53,28 @@ class Import:
     """What of the bags or HDF5 files becomes what; their import needs it."""
     out: Path | None = None
     """The run to make or to continue; an import needs it."""
+    skip_bad: bool = False
+    """Leave out bags that cannot be read, or do not fit the mapping or the other bags, list them at the end and exit
+    with 1. Else the first of them ends the import, before anything of it is written."""
+    workers: int = 1
+    """Processes that read and write bags; the recordings are the same for any number."""
     suggest: bool = False
     """Write a mapping for the first bag or HDF5 file to standard output instead of importing."""
     video: Annotated[VideoConfig, arg(name="")] = field(default_factory=VideoConfig)
     """How pictures are coded that come as pixels."""
 
     def run(self) -> int:
-        """Import, or suggest a mapping, and say what was found."""
+        """Import, or suggest a mapping, and say what was found; 1 when bags were skipped."""
         if not self.bags:
             raise ConfigError("No bag is given: name one, e.g. demorec import --suggest monday.mcap.")
+        check_option("workers", self.workers, 1, MAX_WORKERS)
+        is_hdf5 = self.bags[0] == _HDF5
+        if (is_hdf5 or self.bags[0] == _LEROBOT) and (self.skip_bad or self.workers > 1):
+            raise ConfigError(
+                "Only bags can be skipped or imported by several workers: leave --skip-bad, --workers out."
+            )
         if self.bags[0] == _LEROBOT:
             return self._import_dataset()
-        is_hdf5 = self.bags[0] == _HDF5
         files = self.bags[1:] if is_hdf5 else self.bags
         if not files:
             raise ConfigError(
@@ -68,23 +82,37 @@ class Import:
                 "runs/demo. A bag of that name is given with its folder."
             )
         if self.suggest:
-            from demorec.ingest.hdf5_suggest import suggested_hdf5_mapping
-            from demorec.ingest.suggest import suggested_mapping
+            if is_hdf5:
+                from demorec.ingest.hdf5_suggest import suggested_hdf5_mapping
 
-            say(*(suggested_hdf5_mapping(files[0]) if is_hdf5 else suggested_mapping(files[0], tell)))
+                say(*suggested_hdf5_mapping(files[0]))
+            else:
+                from demorec.ingest.bag import bags_in
+                from demorec.ingest.suggest import suggested_mapping
+
+                say(*suggested_mapping(bags_in(files[0])[0], tell))
             return 0
         if self.mapping is None or self.out is None:
             example = f"hdf5 {files[0]} --suggest > demo.toml" if is_hdf5 else f"--suggest {files[0]} > robot.toml"
             raise ConfigError(f"An import needs --mapping and --out: demorec import {example} writes a mapping.")
         self.video.validate()
-        (self._import_hdf5 if is_hdf5 else self._import_bags)(files, self.mapping, self.out)
-        return 0
+        return (self._import_hdf5 if is_hdf5 else self._import_bags)(files, self.mapping, self.out)
 
-    def _import_bags(self, bags: Sequence[Path], mapping: Path, out: Path) -> None:
+    def _import_bags(self, bags: Sequence[Path], mapping: Path, out: Path) -> int:
         from demorec.ingest.import_run import import_bags
         from demorec.ingest.report import report_lines
 
-        result = import_bags(bags, mapping, out, video=self.video, tell=lambda report: say(*report_lines(report), ""))
+        with ProgressBar("importing", unit="bag") as bar:
+            result = import_bags(
+                bags,
+                mapping,
+                out,
+                video=self.video,
+                workers=self.workers,
+                skip_bad=self.skip_bad,
+                tell=lambda report: say(*report_lines(report), ""),
+                progress=bar.set,
+            )
         if result.num_new < len(result.reports):
             tell(f"{len(result.reports) - result.num_new} of {len(result.reports)} bags had been imported before.")
         episodes = [episode for report in result.reports for episode in report.episodes]
@@ -94,6 +122,11 @@ class Import:
         say(f"{counted(len(made), 'episode')}, {sum(row.num_frames for row in made)} frames{dropped}: {out}")
         odd = f"{counted(findings, 'finding')} in the bags, see above and demorec check."
         say(odd if findings else "Nothing odd was found.")
+        if not result.skipped:
+            return 0
+        say(f"Skipped {len(result.skipped)} of {counted(len(result.reports) + len(result.skipped), 'bag')}:")
+        say(*(f"  {path}: {reason}" for path, reason in result.skipped.items()))
+        return 1
 
     def _import_dataset(self) -> int:
         if len(self.bags) != 2 or self.out is None:
@@ -110,7 +143,7 @@ class Import:
         _say_made(result, self.out, [f"{name} is left out: {reason}." for name, reason in result.left_out.items()])
         return 0
 
-    def _import_hdf5(self, files: Sequence[Path], mapping: Path, out: Path) -> None:
+    def _import_hdf5(self, files: Sequence[Path], mapping: Path, out: Path) -> int:
         from demorec.ingest.hdf5_import import import_hdf5
 
         result = import_hdf5(files, mapping, out, video=self.video)
@@ -118,6 +151,7 @@ class Import:
         if unnamed := [name for name, reason in result.left_out.items() if not reason]:
             left_out.append(f"The mapping does not name, and so the run does not have: {', '.join(unnamed)}.")
         _say_made(result, out, left_out)
+        return 0
 
 
 def _say_made(result: FramesImport, out: Path, left_out: Sequence[str]) -> None:

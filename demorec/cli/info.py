@@ -172,8 +172,9 @@ def _run(path: Path) -> tuple[dict[str, Any], list[str]]:
 
     if is_collected_run(path):
         collected = load_collected_run(path)
+        left_out = _left_out(path)
         plain = {"kind": "collected run", "path": str(path), "digest": collected.digest, **to_plain(collected)}
-        return plain, _collected_run_lines(path, collected)
+        return plain | {"left_out": left_out}, [*_collected_run_lines(path, collected), *_left_out_lines(left_out)]
     run = load_run_file(path)
     plain = {
         "kind": "run",
@@ -244,6 +245,26 @@ def _collected_run_lines(path: Path, run: CollectedRun) -> list[str]:
         for line in run.episodes
     ]
     return [*aligned(facts), "", *aligned(rows)]
+
+
+def _left_out(path: Path) -> list[dict[str, str]]:
+    """What an import did not take into the run: episodes that it dropped and bags that it skipped, each with why."""
+    from demorec.ingest.import_file import load_import_file
+
+    if (imported := load_import_file(path)) is None:
+        return []
+    dropped = [
+        {"bag": bag.name, "what": f"episode from {row.begin_s:.2f} to {row.end_s:.2f} s", "reason": row.reason}
+        for bag in imported.bags
+        for row in bag.episodes
+        if row.episode_index is None
+    ]
+    return dropped + [{"bag": bag.name, "what": "the bag", "reason": bag.reason} for bag in imported.skipped]
+
+
+def _left_out_lines(left_out: list[dict[str, str]]) -> list[str]:
+    rows = [("left out of", "what", "reason"), *((row["bag"], row["what"], row["reason"]) for row in left_out)]
+    return ["", *aligned(rows)] if left_out else []
 
 
 def _dataset(path: Path) -> tuple[dict[str, Any], list[str]]:

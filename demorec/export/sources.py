@@ -98,7 +98,7 @@ class Profile:
         is_silent: Whether it is an external episode whose source states no subtask.
     """
 
-    traits: tuple[tuple[str, str], ...]
+    traits: tuple[tuple[str, str], ...] = ()
     depth_left_out: tuple[str, ...] = field(default=(), compare=False)
     is_silent: bool = field(default=False, compare=False)
 
@@ -151,7 +151,7 @@ class Intake:
             self._first = profile, path
             self.depth_left_out = profile.depth_left_out
         elif profile != self._first[0]:
-            _refuse_differences(*self._first, (source.path for source in self._found), self._options)
+            _refuse_differences(*self._first, self._found, self._options)
         self.num_taken += 1
         if profile.is_silent:
             self.silent.append(path.name)
@@ -179,16 +179,19 @@ class Intake:
             )
 
 
-def _refuse_differences(profile: Profile, reference: Path, paths: Iterable[Path], options: CommonOptions) -> None:
-    """Raise ConfigError with every difference between the reference and any of the recordings.
+def _refuse_differences(
+    profile: Profile, reference: Path, sources: Iterable[ExportSource], options: CommonOptions
+) -> None:
+    """Raise ConfigError with every difference between the reference and any of the recordings that go in.
 
     Called only when one is known to differ: then all headers are read, so that the user hears of everything at once.
     """
     files_by_difference: dict[str, list[str]] = {}
-    for path in paths:
-        with open_recording(path) as recording:
-            for difference in profile.differences(Profile.of(exported(recording, options))):
-                files_by_difference.setdefault(difference, []).append(path.name)
+    for source in sources:
+        with open_recording(source.path) as recording:
+            if is_wanted(recording, options) and goes_in(source, recording, options):
+                for difference in profile.differences(Profile.of(exported(recording, options))):
+                    files_by_difference.setdefault(difference, []).append(source.path.name)
     if files_by_difference:
         told = "; ".join(f"{difference} ({_some(files)})" for difference, files in files_by_difference.items())
         raise ConfigError(

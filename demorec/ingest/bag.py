@@ -7,6 +7,7 @@ each call of `messages`, in the memory of a chunk.
 from __future__ import annotations
 
 import os
+import re
 import stat
 import tempfile
 from collections.abc import Collection, Iterator
@@ -27,6 +28,8 @@ from demorec.runs.run_file import sha256_of
 from demorec.safety.files import MCAP_MAGIC, open_regular, read_text_limited
 
 METADATA = "metadata.yaml"
+_SUFFIXES = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
+"""Of files that a folder of bags holds; what else lies in it is nobody's bag."""
 _MAX_METADATA_BYTES = 4 << 20
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _COPY_BYTES = 1 << 20
@@ -91,6 +94,40 @@ class Bag:
         return message._replace(data=data)
 
 
+def bags_in(path: Path) -> list[Path]:
+    """The bag at a path, or, of a folder without metadata.yaml, the bags in it, in the natural order of their names.
+
+    They are rosbag2 folders, MCAP and .db3 files, and those files in folders in it whose metadata.yaml was lost. A
+    folder that holds none of them is given back itself.
+    """
+    if not path.is_dir() or os.path.lexists(path / METADATA) or (path / INFO_PATH).is_file():
+        return [path]
+    found: list[Path] = []
+    for entry in _entries(path):
+        if not entry.is_dir():
+            found += [entry] if entry.name.endswith(_SUFFIXES) else []
+        elif os.path.lexists(entry / METADATA):
+            found.append(entry)
+        else:
+            found += [file for file in _entries(entry) if file.name.endswith(_SUFFIXES)]
+    return found or [path]
+
+
+def _entries(folder: Path) -> list[Path]:
+    try:
+        return sorted(folder.iterdir(), key=_natural)
+    except OSError as error:
+        raise resource_error(error, folder) or BagError(
+            f"The folder cannot be read ({error.strerror}): {folder}"
+        ) from error
+
+
+def _natural(path: Path) -> list[tuple[int, str]]:
+    """So that run_2 comes before run_10."""
+    parts = re.findall(r"[0-9]+|[^0-9]+", path.name)
+    return [(int(part), "") if part[0] in "0123456789" else (-1, part) for part in parts] + [(-1, path.name)]
+
+
 def open_bag(path: Path) -> Bag:
     """The bag at a path; nothing of its messages is read.
 
@@ -145,7 +182,10 @@ def _folder(path: Path) -> Bag:
             raise ConfigError(
                 f"This is a LeRobot dataset, no bag: demorec import lerobot {path} --out RUN makes a run of it: {path}"
             ) from None
-        raise BagError(f"The folder holds no {METADATA}, so it is no bag of rosbag2: {path}") from None
+        raise BagError(
+            f"The folder holds no {METADATA}, so it is no bag of rosbag2, and no bags (rosbag2 folders, "
+            f"{', '.join('*' + suffix for suffix in _SUFFIXES)}): {path}"
+        ) from None
     except (OSError, UnicodeDecodeError, YAMLError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise BagError(f"The bag's {METADATA} cannot be read: {path}") from error
     if mode not in ("", "none") and compression != "zstd":

@@ -18,6 +18,19 @@ _MAX_BYTES = 256 << 20
 
 
 @dataclass(frozen=True, kw_only=True)
+class SkippedBag:
+    """A bag that an import left out.
+
+    Attributes:
+        name: Of the file or folder, without its place.
+        reason: Why, in words.
+    """
+
+    name: str
+    reason: str
+
+
+@dataclass(frozen=True, kw_only=True)
 class ImportFile:
     """The content of import.json.
 
@@ -26,12 +39,19 @@ class ImportFile:
         mapping: Of all bags.
         mapping_digest: Of it.
         bags: What was read, in order; those that are not whole yet are missing.
+        skipped: What was left out, when it was last given.
     """
 
     format: int = FORMAT
     mapping: BagMapping
     mapping_digest: str
     bags: tuple[BagReport, ...] = ()
+    skipped: tuple[SkippedBag, ...] = ()
+
+    @property
+    def num_episodes(self) -> int:
+        """That were made; the next one has this number."""
+        return sum(episode.episode_index is not None for bag in self.bags for episode in bag.episodes)
 
 
 def load_import_file(folder: Path) -> ImportFile | None:

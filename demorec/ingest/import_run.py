@@ -1,13 +1,15 @@
 """Bags become a run: every bag is read, judged as a whole, and only then written, episode by episode.
 
 The same command again goes on: bags that import.json knows are not read, episodes that are there are not written.
+Several processes may read and write; bags are numbered and taken into the run in their order.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 
@@ -15,7 +17,8 @@ import numpy as np
 
 from demorec.config import VideoConfig
 from demorec.errors import ConfigError
-from demorec.ingest.bag import Bag, open_bag
+from demorec.ingest.bag import Bag, bags_in
+from demorec.ingest.batch import Batch, ImportResult, Job, PlannedBag, files_of
 from demorec.ingest.channel import BagError
 from demorec.ingest.clock import NS, Int
 from demorec.ingest.description import described_camera, described_feature, urdf_in_bag, urdf_text
@@ -23,27 +26,24 @@ from demorec.ingest.episode_writer import ImportedEpisodeWriter, PlannedEpisode,
 from demorec.ingest.episodes import Window, subtask_rows, task_text, windows
 from demorec.ingest.fields import FieldError
 from demorec.ingest.findings import all_findings
-from demorec.ingest.import_file import ImportFile, load_import_file, save_import_file
+from demorec.ingest.import_file import ImportFile, load_import_file
 from demorec.ingest.mapping import BagMapping, read_mapping
+from demorec.ingest.pipeline import processes
 from demorec.ingest.report import BagReport, EpisodeReport, stream_reports
 from demorec.ingest.rows import EpisodeRows, NoRowsError, Timelines
 from demorec.ingest.streams import BagDecoder, read_streams
-from demorec.runs.collected import CollectedFolder, differences, open_collected_run
+from demorec.recording.collected.frame_check import MAX_STAMP_NS, MAX_SUBTASK
+from demorec.recording.collected.validity import what_is_wrong
+from demorec.recording.video import size_problem
+from demorec.runs.collected import (
+    CollectedEpisode,
+    collected_line,
+    differences,
+    episode_path,
+    open_collected_run,
+)
 from demorec.scene.collected import CollectedInfo, Origin, SourceFile
 from demorec.scene.urdf import Urdf
-
-
-@dataclass(frozen=True, kw_only=True)
-class ImportResult:
-    """What an import made.
-
-    Attributes:
-        reports: Of every bag, in the order in which they were given.
-        num_new: Bags that were read now; the others were there.
-    """
-
-    reports: tuple[BagReport, ...]
-    num_new: int
 
 
 def import_bags(
@@ -52,41 +52,69 @@ def import_bags(
     out: Path,
     *,
     video: VideoConfig | None = None,
+    workers: int = 1,
+    skip_bad: bool = False,
     tell: Callable[[BagReport], None] = lambda report: None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> ImportResult:
     """Import bags into a run, by a mapping.
 
     Args:
-        paths: Of bags: each is an episode, or several as the mapping says.
+        paths: Of bags, each of which is an episode, or several as the mapping says; or of folders of bags.
         mapping_path: Of the mapping.
         out: The run's folder; one that the same mapping began is continued.
-        video: How pictures are coded that come as pixels.
-        tell: Called with the report of each bag that was read now.
+        video: How images are encoded that come as pixels.
+        workers: Processes that read and write; the recordings are the same for any number of them.
+        skip_bad: Whether bags are left out that cannot be read, or do not fit the mapping or the other bags. Else the
+            first of them ends the import, before anything of it is written.
+        tell: Called with the report of each bag that was read now, in their order.
+        progress: Called with the number of bags that are done, and of all.
 
     Raises:
         ConfigError: The mapping is impossible, or the folder holds something else.
         BagError: A bag cannot be read, does not fit the mapping, or would give an episode with something missing.
         RecordingError: The disk is full or gone.
+        GenerationError: A process of the import was killed.
     """
     mapping = read_mapping(mapping_path)
-    urdf = urdf_text(mapping.robot.urdf, mapping_path)
-    bags = [open_bag(path) for path in paths]
-    known = load_import_file(out) or ImportFile(mapping=mapping, mapping_digest=mapping.digest)
+    recipe = _Recipe(mapping, urdf_text(mapping.robot.urdf, mapping_path), video or VideoConfig())
+    known = load_import_file(out)
+    if known is None or not known.bags:
+        known = ImportFile(mapping=mapping, mapping_digest=mapping.digest)
     if known.mapping_digest != mapping.digest:
         raise ConfigError(f"The run was imported by another mapping: choose another --out: {out}")
-    hashes = [tuple(bag.sha256s().items()) for bag in bags]
-    reports = {report.files: report for report in known.bags}
-    new = {files: bag for files, bag in zip(hashes, bags, strict=True) if files not in reports}
-    if new:
-        with open_collected_run(out, recovers=False) as folder:
-            for files, bag in new.items():
-                first = sum(episode.episode_index is not None for row in known.bags for episode in row.episodes)
-                report = _Import(bag, dict(files), mapping, urdf, folder, video or VideoConfig()).run(first)
-                known = replace(known, bags=(*known.bags, report))
-                save_import_file(known, out)
-                reports[files] = report
-                tell(report)
-    return ImportResult(reports=tuple(reports[files] for files in dict.fromkeys(hashes)), num_new=len(new))
+    given = list(dict.fromkeys(bag for path in paths for bag in bags_in(path)))
+    batch = Batch(given, known, skips=skip_bad, progress=progress)
+    with processes(workers) as pool:
+        new = batch.look(pool)
+        if new or (known.bags and batch.skipped_bags() != known.skipped):
+            with open_collected_run(out, recovers=False) as folder:
+                ahead = 1 if workers == 1 else 2 * workers
+                read, write = partial(_plan, recipe), partial(_write, recipe)
+                batch.run(new, folder, pool, ahead=ahead, read=read, write=write, tell=tell)
+    return batch.result()
+
+
+@dataclass(frozen=True)
+class _Recipe:
+    """What all bags have in common."""
+
+    mapping: BagMapping
+    urdf: str
+    video: VideoConfig
+
+
+def _plan(recipe: _Recipe, bag: Bag) -> PlannedBag:
+    """Read and judge a bag."""
+    return _Import(bag, dict(files_of(bag)), recipe.mapping, recipe.urdf, recipe.video).plan()
+
+
+def _write(recipe: _Recipe, job: Job) -> tuple[BagReport, list[CollectedEpisode]]:
+    """Write the episodes of a bag; its report, and their lines of run.json."""
+    files = dict(job.report.files)
+    _Import(job.bag, files, recipe.mapping, recipe.urdf, recipe.video).write(job.episodes, job.folder)
+    paths = [episode_path(job.folder, episode.info.episode_index) for episode in job.episodes]
+    return job.report, [collected_line(path) for path in paths]
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,16 +125,15 @@ class _Import:
     files: dict[str, str]
     mapping: BagMapping
     urdf: str
-    folder: CollectedFolder
     video: VideoConfig
 
-    def run(self, first_index: int) -> BagReport:
-        """Read, judge and write it."""
+    def plan(self) -> PlannedBag:
+        """Read and judge it."""
         streams = read_streams(self.bag, self.mapping)
         lines = Timelines(streams, self.mapping)
         found = windows(self.bag, streams, list(lines.lines.values()), self.mapping)
         findings = all_findings(lines)
-        begin = min(window.begin_ns for window in found)
+        begin = min(int(line.times_ns[0]) for line in lines.lines.values() if len(line.times_ns))
         episodes: list[PlannedEpisode] = []
         reports: list[EpisodeReport] = []
         for window in found:
@@ -119,12 +146,11 @@ class _Import:
                     raise BagError(f"The bag gives no whole episode: {error}{told}: {self.bag.path}") from error
                 reports.append(_report(window, begin, None, str(error)))
                 continue
-            episode = self._episode(lines, rows, first_index + len(episodes))
+            episode = self._episode(lines, rows, len(episodes))
             episodes.append(episode)
             reports.append(_report(window, begin, episode))
         self._check_alike(episodes)
-        self._write([episode for episode in episodes if not self.folder.has(episode.info)])
-        return BagReport(
+        report = BagReport(
             name=self.bag.path.name,
             files=tuple(self.files.items()),
             num_bytes=self.bag.num_bytes,
@@ -132,6 +158,7 @@ class _Import:
             findings=findings,
             episodes=tuple(reports),
         )
+        return PlannedBag(report=report, episodes=tuple(episodes))
 
     def _episode(self, lines: Timelines, rows: EpisodeRows, index: int) -> PlannedEpisode:
         plans = {name: picture_plan(camera, lines.lines[name]) for name, camera in rows.cameras.items()}
@@ -154,22 +181,41 @@ class _Import:
             versions={"demorec": version("demorec"), "av": version("av")},
         )
         subtasks = subtask_rows(self.bag, lines.streams, rows.window, rows.times_ns, self.mapping)
-        return PlannedEpisode(info=info, rows=rows, plans=plans, subtasks=subtasks)
+        episode = PlannedEpisode(info=info, rows=rows, plans=plans, subtasks=subtasks)
+        if wrong := list(self._problems(episode)):
+            raise BagError(f"The episode cannot be recorded: {'; '.join(wrong)}: {self.bag.path}")
+        return episode
+
+    def _problems(self, episode: PlannedEpisode) -> Iterator[str]:
+        """What no recording can hold, found before anything of the bag is written."""
+        yield from what_is_wrong(episode.info)
+        for name, plan in episode.plans.items():
+            if not plan.kept and (problem := size_problem(self.video, plan.head.width, plan.head.height)):
+                yield f"camera {name}: {problem}"
+        if any(len(text) > MAX_SUBTASK or not text.isprintable() for text in episode.subtasks.values()):
+            yield f"a subtask is no single line of at most {MAX_SUBTASK} characters"
+        times, features = episode.rows.times_ns, episode.rows.features.values()
+        for stamps in (
+            times,
+            *(times - one.ages_ns for one in features),
+            *(p.stamps_ns for p in episode.plans.values()),
+        ):
+            if len(stamps) and not 0 <= stamps.min() <= stamps.max() <= MAX_STAMP_NS:
+                yield f"a message is of the time {stamps.min() / NS:.0f} s, allowed are 0 to {MAX_STAMP_NS // NS} s"
+                return
 
     def _check_alike(self, episodes: Sequence[PlannedEpisode]) -> None:
-        """ConfigError unless the episodes are of the kind that the run holds, and of one kind."""
-        for episode in episodes[:1]:
-            self.folder.check_fits(episode.info)
+        """ConfigError unless the episodes are of one kind."""
         for episode in episodes[1:]:
             if different := differences(episodes[0].info, episode.info):
                 raise ConfigError(f"The bag's episodes differ ({'; '.join(different)}): {self.bag.path}")
 
-    def _write(self, episodes: list[PlannedEpisode]) -> None:
-        """Read the bag's pictures once more, and write each episode while they pass."""
+    def write(self, episodes: Sequence[PlannedEpisode], folder: Path) -> None:
+        """Read the bag's pictures once more, and write each episode into a run while they pass."""
         waiting = sorted(episodes, key=lambda episode: int(episode.rows.times_ns[0]))
         for episode in (episode for episode in waiting if not episode.plans):
-            with self._writer(episode) as writer:
-                self._finish(episode, writer)
+            with self._writer(episode, folder) as writer:
+                writer.finish()
         filmed = [episode for episode in waiting if episode.plans]
         if not filmed:
             return
@@ -181,7 +227,7 @@ class _Import:
                 for episode in beginning.get((topic, number), []):
                     if episode.info.episode_index not in begun:
                         begun.add(episode.info.episode_index)
-                        under_way.append((episode, stack.enter_context(self._writer(episode))))
+                        under_way.append((episode, stack.enter_context(self._writer(episode, folder))))
                 for pair in list(under_way):
                     episode, writer = pair
                     try:
@@ -189,17 +235,13 @@ class _Import:
                     except FieldError as error:
                         raise self._unusable(topic, error) from error
                     if writer.is_complete:
-                        self._finish(episode, writer)
+                        writer.finish()
                         under_way.remove(pair)
-            for episode, writer in under_way:
-                self._finish(episode, writer)
+            for _, writer in under_way:
+                writer.finish()
 
-    def _finish(self, episode: PlannedEpisode, writer: ImportedEpisodeWriter) -> None:
-        writer.finish()
-        self.folder.add(self.folder.path_of(episode.info.episode_index))
-
-    def _writer(self, episode: PlannedEpisode) -> ImportedEpisodeWriter:
-        path = self.folder.path_of(episode.info.episode_index)
+    def _writer(self, episode: PlannedEpisode, folder: Path) -> ImportedEpisodeWriter:
+        path = episode_path(folder, episode.info.episode_index)
         return ImportedEpisodeWriter(path, episode, video=self.video)
 
     def _pictures(self, episodes: Sequence[PlannedEpisode]) -> Iterator[tuple[str, int, dict[str, object]]]:

@@ -1,4 +1,4 @@
-"""Messages that hold a picture, as ROS and Foxglove define them: what is in them, without decoding it."""
+"""Messages that hold a picture, as ROS and Foxglove define them: what is in them, and whether they are whole."""
 
 from __future__ import annotations
 
@@ -94,7 +94,9 @@ def picture_head(values: Values) -> PictureHead:
     data = picture_bytes(values)
     name = str(values["format"]).lower()
     if "compresseddepth" in name:
-        return _checked(PictureHead("compressedDepth", *compressed_depth_head(str(values["format"]), data), True))
+        head = _checked(PictureHead("compressedDepth", *compressed_depth_head(str(values["format"]), data), True))
+        decode_compressed_depth(data)
+        return head
     if data.startswith((_JPEG, _PNG)):
         return _checked(_file_head("jpeg" if data.startswith(_JPEG) else "png", data))
     codec = _ALIASES.get(name, name)
@@ -117,12 +119,20 @@ def _file_head(kind: str, data: bytes) -> PictureHead:
     try:
         with Image.open(io.BytesIO(data), formats=(kind.upper(),)) as image:
             width, height = image.size
+            if kind == "png":  # what stays as it is, is not looked into; what will be decoded must be whole
+                _check_mode(image)
+                image.verify()
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise FieldError(f"its picture is damaged ({in_words(error)})") from error
     end = b"\xff\xd9" if kind == "jpeg" else b"IEND\xaeB`\x82"
     if end not in data[-64:]:  # some cameras pad their pictures
         raise FieldError("its picture is cut off")
     return PictureHead(kind, "", width, height, True)
+
+
+def _check_mode(image: Image.Image) -> None:
+    if image.mode not in ("RGB", "RGBA", "L", "P", "1"):
+        raise FieldError(f"its pixels are {image.mode!r}, which is no colour of 8 bits")
 
 
 def decode_picture(values: Values) -> NDArray[Any]:
@@ -133,8 +143,7 @@ def decode_picture(values: Values) -> NDArray[Any]:
         return decode_compressed_depth(picture_bytes(values))
     try:
         with Image.open(io.BytesIO(picture_bytes(values)), formats=("JPEG", "PNG")) as image:
-            if image.mode not in ("RGB", "RGBA", "L", "P", "1"):
-                raise FieldError(f"its pixels are {image.mode!r}, which is no colour of 8 bits")
+            _check_mode(image)
             return np.asarray(image.convert("RGB"))
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise FieldError(f"its picture cannot be decoded ({in_words(error)})") from error

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from demorec.export.episode import exported
@@ -34,23 +34,24 @@ class Reading:
         path: The recording.
         attempt: For the success rates.
         outcome: As recorded; None where the recording ends before it.
+        prepared: The episode; None for a failed attempt that is left out, of which nothing that follows is read, so
+            that an export does not fail for what it leaves out.
         profile: What must agree with all the others.
         features, fps, robot: Of a dataset made from it.
-        transcoded: Cameras whose pictures had to be coded anew, with the reason.
+        transcoded: Cameras whose images had to be encoded anew, with the reason.
         is_simulated: Whether demorec simulated the episode.
-        prepared: The episode; None for a failed attempt that is left out.
     """
 
     path: Path
     attempt: AttemptRecord
     outcome: Outcome | CollectedOutcome | None
-    profile: Profile
-    features: dict[str, Feature]
-    fps: int
-    robot: str
-    transcoded: tuple[str, ...]
-    is_simulated: bool
-    prepared: PreparedEpisode | None
+    prepared: PreparedEpisode | None = None
+    profile: Profile = field(default_factory=Profile)
+    features: dict[str, Feature] = field(default_factory=dict)
+    fps: int = 0
+    robot: str = ""
+    transcoded: tuple[str, ...] = ()
+    is_simulated: bool = False
 
 
 def read(source: ExportSource, options: ExportOptions) -> Reading | None:
@@ -64,20 +65,21 @@ def read(source: ExportSource, options: ExportOptions) -> Reading | None:
         if not is_wanted(recording, options):
             return None
         attempt = AttemptRecord.of(recording)
+        if not goes_in(source, recording, options):
+            return Reading(path=source.path, attempt=attempt, outcome=recording.outcome)
         episode = exported(recording, options)
-        features = dataset_features(episode, options)
         reasons = reasons_to_transcode(episode)
         return Reading(
             path=source.path,
             attempt=attempt,
             outcome=recording.outcome,
             profile=Profile.of(episode),
-            features=features,
+            features=dataset_features(episode, options),
             fps=episode.fps,
             robot=recording.info.robot_name,
             transcoded=tuple(f"{camera.name}, {reason}" for camera, reason in reasons.items() if reason),
             is_simulated=episode.simulated is not None,
-            prepared=prepare_episode(episode, options) if goes_in(source, recording, options) else None,
+            prepared=prepare_episode(episode, options),
         )
 
 

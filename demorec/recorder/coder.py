@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.recording import CollectedWriter
-from demorec.scene.collected import CollectedCamera, CollectedFrame
+from demorec.scene.collected import CollectedCamera, CollectedFrame, CollectedInfo
 
 WhenFull = Literal["error", "drop", "wait"]
 
@@ -70,6 +70,7 @@ class Coder:
 
     Attributes:
         writer: Of the episode; used by the thread alone until `end` returns.
+        info: What the episode is, to be set before the first frame is put.
         error: What ended the thread, if anything did.
         capacity: How many frames may wait.
     """
@@ -84,6 +85,7 @@ class Coder:
         waits: bool = False,
     ) -> None:
         self.writer, self._buffers, self._waits = writer, buffers, waits
+        self.info: CollectedInfo | None = None
         self.error: BaseException | None = None
         frame_bytes = sum(3 * camera.width * camera.height for camera in cameras)
         most = _MAX_WAITING_BYTES // max(frame_bytes, 1)
@@ -146,6 +148,9 @@ class Coder:
         self._flushed_at = time.monotonic()
 
     def _write(self, frame: CollectedFrame, pictures: WaitingPictures) -> None:
+        if self.info is not None:
+            self.writer.begin(self.info)
+            self.info = None
         new = [(camera, stamp, pixels) for camera, (stamp, pixels) in pictures.items() if pixels is not None]
         numbers = list(self._pool.map(lambda picture: self.writer.picture(*picture), new))
         for (camera, _, pixels), number in zip(new, numbers, strict=True):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from types import TracebackType
@@ -22,6 +23,7 @@ from demorec.recorder.vectors import NamedVectors, Vectors, as_declared, feature
 from demorec.recording import CollectedWriter
 from demorec.recording.collected.frame_check import CollectedCheck
 from demorec.recording.collected.validity import what_is_wrong
+from demorec.recording.video import size_problem
 from demorec.registry import nearest_match
 from demorec.runs.collected import CollectedFolder, open_collected_run
 from demorec.scene.collected import (
@@ -52,19 +54,22 @@ class RecordedEpisode:
         success: Whether it succeeded, for you to set; None when you do not say.
         drops: "frames" -> how many were dropped because the coder could not keep up, where that is allowed.
         num_frames: Frames that were taken.
-        is_open: Whether it takes more.
     """
 
-    def __init__(self, run: Recorder, episode_index: int, instruction: str) -> None:
+    def __init__(self, run: Recorder, info: CollectedInfo, coder: Coder) -> None:
         self.success: bool | None = None
         self.drops: dict[str, int] = {}
         self.num_frames = 0
         self._run = run
-        self._index, self._instruction = episode_index, instruction
-        self._coder: Coder | None = None
+        self._info = info
+        self._coder: Coder | None = coder
         self._features: dict[str, CollectedFeature] = {}
         self._picture_stamps: dict[str, int] = {}
-        self.is_open = True
+
+    @property
+    def is_open(self) -> bool:
+        """Whether it takes more frames."""
+        return self._coder is not None
 
     def __enter__(self) -> Self:
         return self
@@ -108,15 +113,15 @@ class RecordedEpisode:
             RecordingError: What was given cannot be recorded, the coder cannot keep up and drops are not allowed, or
                 the disk is full.
         """
-        if not self.is_open:
+        if self._coder is None:
             raise RecordingError("The episode has ended: begin another with recorder.episode().")
-        if self._coder is not None and self._coder.error is not None:
+        if self._coder.error is not None:
             raise _as_recording_error(self._coder.error)
         if time_ns is None:
             time_ns = self._run.clock()
         vectors = named_vectors(observation, action)
-        if self._coder is None:
-            info, self._coder = self._run.start(vectors, self._index, self._instruction)
+        if not self._features:
+            info = self._coder.info = self._run.described(self._info, vectors)
             self._check = CollectedCheck(info)
             self._features = {feature.name: feature for feature in info.features}
         samples = self._samples(vectors, time_ns, stamps or {})
@@ -196,6 +201,9 @@ class RecordedEpisode:
         coder = self._end()
         if coder is None:
             return None
+        if self.num_frames == 0:
+            coder.writer.discard()
+            return None
         if coder.error is not None:
             coder.writer.close()
             raise _as_recording_error(coder.error)
@@ -211,9 +219,8 @@ class RecordedEpisode:
             coder.writer.discard()
 
     def _end(self) -> Coder | None:
-        """Take no more frames; the coder, with all that came, if there was anything and nobody else has ended it."""
+        """Take no more frames; the coder, with all that came, if nobody else has ended it."""
         coder, self._coder = self._coder, None
-        self.is_open = False
         if coder is not None:
             coder.end()
         return coder
@@ -261,7 +268,7 @@ class Recorder(Closing):
     ) -> None:
         self._robot = robot_facts(robot)
         self._cameras = tuple(_camera(name, camera) for name, camera in (cameras or {}).items())
-        self._fps, self._task, self._features = fps, task, tuple(features)
+        self._fps, self._task, self._features = fps, _text(task), tuple(features)
         self._video = video or _REAL_TIME
         self._video.validate()
         self.clock, self.when_full = clock, when_full
@@ -278,6 +285,8 @@ class Recorder(Closing):
         placeholder = CollectedFeature(name="observation.state", names=("0",))
         asked = self._info(self._features or (placeholder,), 0, self._task or "placeholder")
         wrong = what_is_wrong(asked)
+        sizes = [size_problem(self._video, camera.width, camera.height) for camera in self._cameras]
+        wrong += list(filter(None, sizes))
         if self.when_full not in get_args(WhenFull):
             wrong.append(f"when_full is {self.when_full!r}, allowed are {', '.join(get_args(WhenFull))}")
         if wrong:
@@ -297,35 +306,38 @@ class Recorder(Closing):
         return len(self._folder.episodes)
 
     def episode(self, task: str = "") -> RecordedEpisode:
-        """Begin an episode.
+        """Begin an episode: its file and its encoders are opened now, so that no frame waits for that.
 
         Args:
             task: Of this episode, in place of the recorder's.
 
         Raises:
-            RecordingError: One is being recorded already.
+            RecordingError: One is being recorded already, or the disk is full.
             ConfigError: There is no task text.
         """
         if self._open is not None and self._open.is_open:
             raise RecordingError(
                 "An episode is being recorded already: end it first, one robot does one thing at a time."
             )
-        instruction = task or self._task
+        instruction = _text(task) or self._task
         if not instruction.strip():
             raise ConfigError("The episode has no task text: give Recorder(task=...) or recorder.episode(task=...).")
-        self._open = RecordedEpisode(self, self._folder.next_index, instruction)
+        info = self._info(self._features, self._folder.next_index, instruction)
+        path = self._folder.path_of(info.episode_index)
+        writer = CollectedWriter(path, info, video=self._video, begins=False)
+        coder = Coder(writer, self._buffers, cameras=info.cameras, fps=info.fps, waits=self.when_full == "wait")
+        self._open = RecordedEpisode(self, info, coder)
         return self._open
 
     # ------------------------------------------------------------------------------- for the episode
 
-    def start(self, vectors: NamedVectors, episode_index: int, instruction: str) -> tuple[CollectedInfo, Coder]:
-        """Begin an episode with these vectors; ConfigError when the run has episodes of another kind."""
-        info = self._info(self._features or features_of(vectors, self._robot), episode_index, instruction)
+    def described(self, info: CollectedInfo, vectors: NamedVectors) -> CollectedInfo:
+        """An episode whose first frame has these vectors; ConfigError when the run has episodes of another kind."""
+        info = replace(info, features=self._features or features_of(vectors, self._robot))
         if wrong := what_is_wrong(info):
             raise ConfigError(f"This cannot be recorded: {'; '.join(wrong)}.")
         self._folder.check_fits(info)
-        writer = CollectedWriter(self._folder.path_of(info.episode_index), info, video=self._video)
-        return info, Coder(writer, self._buffers, cameras=info.cameras, fps=info.fps, waits=self.when_full == "wait")
+        return info
 
     def add(self, recording: Path) -> None:
         """Take a finished recording into the run."""
@@ -342,6 +354,12 @@ class Recorder(Closing):
             cameras=self._cameras,
             versions={"demorec": version("demorec")},
         )
+
+
+def _text(task: object) -> str:
+    if not isinstance(task, str):
+        raise ConfigError(f"The task is {task!r}, it must be a text: say what the robot is asked to do.")
+    return task
 
 
 def _camera(name: str, camera: tuple[int, int] | CollectedCamera) -> CollectedCamera:

@@ -116,6 +116,19 @@ class Encoder(Protocol):
         """Return the packets that were held back."""
 
 
+def size_problem(video: VideoConfig, width: int, height: int) -> str:
+    """Why images of this size cannot be encoded so, and what can be done; "" when they can.
+
+    libx264 refuses odd sizes; for AV1 libswscale leaves the last column of colours of an odd width as its memory was.
+    """
+    if video.codec == "jpeg" or width % 2 == height % 2 == 0:
+        return ""
+    return (
+        f"images of {width}x{height} pixels cannot be {video.codec} video, which needs even sizes: cut or scale them, "
+        'or use the codec jpeg (--codec jpeg, VideoConfig(codec="jpeg")), of which no LeRobot dataset can be made'
+    )
+
+
 def make_encoder(video: VideoConfig, width: int, height: int, fps: int) -> Encoder:
     """An encoder as configured; RecordingError when this build of FFmpeg lacks the codec."""
     if video.codec == "jpeg":
@@ -135,6 +148,8 @@ class _StreamEncoder:
         else:
             # Low delay, one thread: frames leave in the order and at the pace in which they came.
             encoder, crf, preset, options = "libsvtav1", 30, "12", {"svtav1-params": "fast-decode=0:lp=1:pred-struct=1"}
+        if problem := size_problem(video, width, height):
+            raise ConfigError(f"{problem[0].upper()}{problem[1:]}.")
         self.settings = replace(
             settings_of_coded(video.codec, width, height, fps),
             encoder=encoder,

@@ -7,7 +7,7 @@ off is made whole when the folder is opened again, and nothing that is there is 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -182,21 +182,27 @@ class CollectedFolder:
         """The number of the next episode: above all that are there, finished or not."""
         numbers = [line.episode_index for line in self.episodes]
         for path in (self.path / EPISODES).glob("episode_*"):
+            if path.suffix == ".part" and not path.stat().st_size:
+                continue  # of an episode that was opened, and given no frame: the next one takes its place
             digits = path.name.removeprefix("episode_").partition(".")[0]
             numbers.append(int(digits) if digits.isdecimal() else -1)
         return max(numbers, default=-1) + 1
 
     def path_of(self, episode_index: int) -> Path:
         """Where the recording of an episode goes."""
-        return self.path / EPISODES / recording_name(episode_index, 0, success=True)
+        return episode_path(self.path, episode_index)
+
+    def kind(self) -> CollectedInfo | None:
+        """Description of the last episode, which new ones must be like; None of an empty run."""
+        if not self.episodes:
+            return None
+        with CollectedRecording(self.path / self.episodes[-1].file) as recording:
+            return recording.info
 
     def check_fits(self, info: CollectedInfo) -> None:
         """Raise ConfigError with everything in which a new episode differs from the last one that is there."""
-        if not self.episodes:
-            return
-        with CollectedRecording(self.path / self.episodes[-1].file) as recording:
-            different = differences(recording.info, info)
-        if different:
+        kind = self.kind()
+        if kind is not None and (different := differences(kind, info)):
             raise ConfigError(
                 f"The run holds episodes of another kind ({'; '.join(different)}): record into another folder: "
                 f"{self.path}"
@@ -210,21 +216,26 @@ class CollectedFolder:
         with CollectedRecording(path) as recording:
             if recording.info == info and recording.outcome is not None:
                 return True
-        raise ConfigError(f"Another recording is there already: choose another --out: {path}")
+        raise ConfigError(
+            f"Another recording is there already: import what the interrupted call was given, or choose another --out: "
+            f"{path}"
+        )
 
     def add(self, recording: Path) -> CollectedEpisode:
         """Take a finished recording into run.json."""
         line = collected_line(recording)
-        self.episodes.append(line)
-        self.save()
+        self.extend([line])
         return line
+
+    def extend(self, lines: Iterable[CollectedEpisode]) -> None:
+        """Take finished recordings into run.json, by their `collected_line`."""
+        self.episodes = sorted([*self.episodes, *lines], key=lambda line: line.episode_index)
+        self.save()
 
     def save(self, *, ended: bool = False) -> None:
         """Write run.json, if there is anything to tell."""
-        if not self.episodes:
+        if (info := self.kind()) is None:
             return
-        with CollectedRecording(self.path / self.episodes[-1].file) as recording:
-            info = recording.info
         session = replace(self._session, ended=_now()) if ended else self._session
         run = CollectedRun(
             robot=info.robot, fps=info.fps, episodes=tuple(self.episodes), sessions=(*self._sessions, session)
@@ -276,6 +287,11 @@ def _refuse_strangers(path: Path) -> None:
     ]
     if strangers:
         raise ConfigError(f"The folder holds files that are of no run ({shown(strangers)}): choose another: {path}")
+
+
+def episode_path(run: Path, episode_index: int) -> Path:
+    """Where the recording of an episode goes."""
+    return run / EPISODES / recording_name(episode_index, 0, success=True)
 
 
 def collected_line(file: Path) -> CollectedEpisode:

@@ -236,7 +236,7 @@ def test_h265_and_av1_stay_as_they_are(tmp_path: Path) -> None:
         assert {(head.width, head.height) for head in heads if head.is_keyframe} == {(bags.WIDTH, bags.HEIGHT)}
 
 
-def test_nothing_is_left_where_a_picture_cannot_be_decoded(tmp_path: Path) -> None:
+def test_a_picture_that_cannot_be_decoded_is_a_finding(tmp_path: Path) -> None:
     buffer = io.BytesIO()
     Image.fromarray(np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)).save(buffer, format="PNG")
     good, bad = bytearray(buffer.getvalue()), bytearray(buffer.getvalue())
@@ -246,10 +246,16 @@ def test_nothing_is_left_where_a_picture_cannot_be_decoded(tmp_path: Path) -> No
         "/follower/cam_front/image_raw/compressed",
         lambda k, note: bags.with_body(note, data=np.frombuffer(bad if k == 12 else good, np.uint8)),
     )
-    with pytest.raises(BagError, match="cannot be decoded") as caught:
-        import_bags([_so101(tmp_path, notes)], _mapping(tmp_path), tmp_path / "run")
-    assert str(caught.value).endswith(f": {tmp_path / 'bag.mcap'}")
-    assert not list((tmp_path / "run/episodes").iterdir())
+    (report,) = import_bags([_so101(tmp_path, notes)], _mapping(tmp_path), tmp_path / "run").reports
+    (finding,) = [finding for finding in report.findings if finding.kind == "malformed"]
+    assert finding.stream == "camera front"
+    assert "1 message" in finding.text
+    assert "damaged" in finding.text
+    with _open(tmp_path / "run") as recording:
+        assert (
+            bags.of_topic(notes, "/follower/cam_front/image_raw/compressed")[12].header_ns
+            not in recording.columns().picture_stamps["front"]
+        )
 
 
 def test_a_run_whose_recording_was_exchanged_is_refused(tmp_path: Path) -> None:

@@ -108,6 +108,27 @@ def test_failures_stay_out_and_unknown_outcomes_do_not(tmp_path: Path) -> None:
     assert "Of 1 episodes nobody said" in card
 
 
+@pytest.mark.parametrize("exporter", ["lerobot", "hdf5"])
+def test_a_failure_that_stays_out_blocks_nothing(tmp_path: Path, exporter: str) -> None:
+    """Failed episodes without an image, of other cameras and features, and of another rate."""
+    failed: dict[str, Any] = {"episode_index": 1, "num_frames": 5, "success": False}
+    without = complete(**failed)
+    without = replace(without, frames=[replace(frame, pictures={}) for frame in without.frames], pictures={"top": []})
+    blind = make_collected(cameras=(), **failed | {"episode_index": 2})
+    slow = complete(**failed | {"episode_index": 3})
+    slow = replace(slow, info=replace(slow.info, fps=20))
+    run = run_of(tmp_path / "run", complete(num_frames=5), without, blind, slow)
+    report = export(run, tmp_path / "d", exporter)
+    assert (report.num_episodes, report.num_frames, report.skipped_failures) == (1, 5, 3)
+    for options, error in (({}, "no picture of the camera top"), ({"episodes": "0,2"}, "cameras is none")):
+        with pytest.raises((ExportError, ConfigError), match=error):
+            export(run, tmp_path / "e", exporter, include_failures=True, **options)
+    other = run_of(tmp_path / "other", make_collected(cameras=(), num_frames=5))
+    with pytest.raises(ConfigError, match="cameras is none instead of top") as refused:
+        export([run, other], tmp_path / "e", exporter)
+    assert "fps is 20" not in str(refused.value)
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [

@@ -10,13 +10,17 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import foxglove
 import numpy as np
 import pytest
 from support.collected import URDF
+from support.export import export
 
 from demorec import Recorder
+from demorec.config import VideoConfig
 from demorec.errors import ConfigError, DemorecError, RecordingError
 from demorec.recorder.coder import Coder
 from demorec.recording import CollectedRecording
@@ -226,7 +230,10 @@ def test_bad_input_is_told_in_one_sentence_and_costs_one_frame(tmp_path: Path, w
         ({"cameras": {"top": 480}}, "must be \\(height, width\\)"),
         ({"cameras": {"to/p": (48, 64)}}, "called 'to/p'"),
         ({"cameras": {"top": CollectedCamera(name="tip", width=1, height=1)}}, "described as 'tip'"),
+        ({"cameras": {"top": (47, 64)}}, "64x47 pixels cannot be h264 video, which needs even sizes.* the codec jpeg"),
+        ({"cameras": {"top": (48, 65)}, "video": VideoConfig(codec="av1")}, "65x48 pixels cannot be av1 video"),
         ({"when_full": "panic"}, "allowed are error, drop, wait"),
+        ({"task": None}, "The task is None, it must be a text"),
     ],
 )
 def test_what_cannot_be_recorded_is_refused_before_a_folder_is_made(
@@ -235,6 +242,60 @@ def test_what_cannot_be_recorded_is_refused_before_a_folder_is_made(
     with pytest.raises(ConfigError, match=words):
         recorder(tmp_path / "run", **changes)
     assert not (tmp_path / "run").exists()
+
+
+def test_odd_sizes_are_recorded_by_the_codec_that_is_advised(tmp_path: Path) -> None:
+    cameras, pixels = {"top": (47, 65)}, np.full((47, 65, 3), 90, dtype=np.uint8)
+    with recorder(tmp_path / "run", cameras=cameras, video=VideoConfig(codec="jpeg")) as run, run.episode() as episode:
+        episode.write([0.0], [0.0], images={"top": pixels})
+    with recording_of(tmp_path / "run") as found:
+        (image,) = found.images("top")
+        assert np.abs(image.astype(int) - pixels).max() <= 3
+    with pytest.raises(ConfigError, match=r"65x47 pixels cannot be h264 video.* of which no LeRobot dataset"):
+        export(tmp_path / "run", tmp_path / "dataset")
+    assert export(tmp_path / "run", tmp_path / "d.hdf5", "hdf5").num_frames == 1
+
+
+@pytest.mark.parametrize("features", [(), (CollectedFeature(name="observation.state", names=("a",)),)])
+def test_file_and_encoders_are_open_before_the_first_frame(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, features: tuple[CollectedFeature, ...]
+) -> None:
+    with recorder(tmp_path / "run", cameras=TOP, features=features) as run, run.episode() as episode:
+        assert [path.name for path in (tmp_path / "run" / "episodes").iterdir()] == ["episode_000000.mcap.part"]
+
+        def opens(*arguments: object, **named: object) -> None:
+            raise AssertionError("opened by the first frame")
+
+        with monkeypatch.context() as patched:
+            patched.setattr("demorec.recording.video.av.CodecContext", SimpleNamespace(create=opens))
+            patched.setattr(foxglove, "open_mcap", opens)
+            for index in range(3):
+                episode.write([float(index)], images={"top": PIXELS})
+            episode.finish()
+    with recording_of(tmp_path / "run") as found:
+        assert found.columns().features["observation.state"].tolist() == [[0.0], [1.0], [2.0]]
+        assert len(list(found.images("top"))) == 3
+
+
+OPENED = """
+import os, sys
+from demorec import Recorder
+recorder = Recorder(sys.argv[1], robot="arm", cameras={"top": (48, 64)}, fps=50, task="wait")
+recorder.episode()
+os._exit(9)
+"""
+
+
+def test_an_episode_that_was_opened_and_killed_leaves_no_gap(tmp_path: Path) -> None:
+    for _ in range(2):
+        assert subprocess.run([sys.executable, "-c", OPENED, str(tmp_path / "run")], check=False).returncode == 9
+    with recorder(tmp_path / "run", robot="arm", cameras=TOP, fps=50) as run:
+        assert run.recovered == ()
+        with run.episode() as episode, pytest.raises(RecordingError, match="nan"):
+            episode.write([float("nan")])  # nothing was taken, so there is no episode
+        with run.episode() as episode:
+            episode.write([0.0])
+    assert [path.name for path in (tmp_path / "run" / "episodes").iterdir()] == ["episode_000000.mcap"]
 
 
 def test_folders_of_others_are_left_alone(tmp_path: Path) -> None:

@@ -75,6 +75,7 @@ class CollectedWriter(FileWriter[CollectedOutcome, _Pictures]):
         info: Written first.
         video: How pictures are coded that come as pixels.
         overwrite: Whether a recording of that name may be replaced.
+        begins: Whether all of `info` is known. Else only file and encoders are opened, and `begin` must follow.
 
     Raises:
         ConfigError: The description is impossible, or the file, or an unfinished one of that name, is there already and
@@ -83,41 +84,62 @@ class CollectedWriter(FileWriter[CollectedOutcome, _Pictures]):
     """
 
     def __init__(
-        self, path: Path, info: CollectedInfo, *, video: VideoConfig | None = None, overwrite: bool = False
+        self,
+        path: Path,
+        info: CollectedInfo,
+        *,
+        video: VideoConfig | None = None,
+        overwrite: bool = False,
+        begins: bool = True,
     ) -> None:
+        if begins:
+            self._describe(info)
+        self._cameras = {camera.name: _Pictures(camera, video or VideoConfig(), info.fps) for camera in info.cameras}
+        self._pending: list[CollectedFrame] = []
+        super().__init__(path, origin=info.origin, overwrite=overwrite)
+        if begins:
+            self._write_description()
+
+    def begin(self, info: CollectedInfo) -> None:
+        """Say what the episode is, of which only the cameras were known; before its first image and frame.
+
+        Raises:
+            ConfigError: The description is impossible.
+            RecordingError: The disk is full; nothing of the episode is left then.
+        """
+        self._describe(info)
+        self._write_description()
+
+    def _describe(self, info: CollectedInfo) -> None:
         if wrong := what_is_wrong(info):
             raise ConfigError(f"The episode cannot be recorded: {'; '.join(wrong)}.")
+        self._info = info
         self._check = CollectedCheck(info)
         self._streams = feature_streams(info)
         self._frames_layout = frames_layout(info)
         self._tree = CollectedTree(info) if info.urdf else None
-        self._info = info
-        self._cameras = {camera.name: _Pictures(camera, video or VideoConfig(), info.fps) for camera in info.cameras}
-        self._pending: list[CollectedFrame] = []
-        super().__init__(path, origin=info.origin, overwrite=overwrite)
+
+    def _write_description(self) -> None:
+        """Write what is said once, or leave nothing."""
         try:
-            self._begin()
+            settings = {name: camera.settings for name, camera in self._cameras.items()}
+            self._file.metadata(COLLECTED, metadata.collected_metadata(self._info, settings))
+            if self._tree is not None:
+                urdf = encode(messages.STRING, self._info.urdf)
+                self._file.log(description_topic(), messages.STRING, urdf, 0, latched=True)
+                static = messages.transforms(self._tree.static)
+                self._file.log(TF_STATIC, messages.TRANSFORMS, static, 0, latched=True)
+            for camera in self._info.cameras:
+                if camera.intrinsics is not None:
+                    size, intrinsics = (camera.height, camera.width), np.array(camera.intrinsics).reshape(3, 3)
+                    distortion = camera.distortion or (0.0,) * 5
+                    data = messages.camera_info(camera_frame(camera.name), size, intrinsics, distortion)
+                    topic = camera_topic(camera.name, "camera_info")
+                    self._file.log(topic, messages.CAMERA_INFO, data, 0, latched=True)
+            self._file.flush()
         except BaseException:
             self._file.discard()
             raise
-
-    def _begin(self) -> None:
-        """Write what is said once."""
-        settings = {name: camera.settings for name, camera in self._cameras.items()}
-        self._file.metadata(COLLECTED, metadata.collected_metadata(self._info, settings))
-        if self._tree is not None:
-            urdf = encode(messages.STRING, self._info.urdf)
-            self._file.log(description_topic(), messages.STRING, urdf, 0, latched=True)
-            static = messages.transforms(self._tree.static)
-            self._file.log(TF_STATIC, messages.TRANSFORMS, static, 0, latched=True)
-        for camera in self._info.cameras:
-            if camera.intrinsics is not None:
-                size, intrinsics = (camera.height, camera.width), np.array(camera.intrinsics).reshape(3, 3)
-                distortion = camera.distortion or (0.0,) * 5
-                data = messages.camera_info(camera_frame(camera.name), size, intrinsics, distortion)
-                topic = camera_topic(camera.name, "camera_info")
-                self._file.log(topic, messages.CAMERA_INFO, data, 0, latched=True)
-        self._file.flush()
 
     def picture(self, camera: str, stamp_ns: int, data: NDArray[Any] | bytes) -> int:
         """Add the next picture of a camera, and return its number, by which frames hold it.

@@ -1,0 +1,360 @@
+"""Many bags at once: a bad one stops no others, and neither processes nor interrupts change what is in the run."""
+
+from __future__ import annotations
+
+import errno
+import io
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+from PIL import Image
+from rosbags.rosbag2 import StoragePlugin
+from support import bag_mappings, bags
+
+from demorec.cli import main
+from demorec.errors import ConfigError, DemorecError
+from demorec.ingest import import_run
+from demorec.ingest.bag import Bag
+from demorec.ingest.channel import BagError
+from demorec.ingest.import_run import import_bags
+from demorec.ingest.mapping import BagMapping
+from demorec.ingest.report import BagReport
+from demorec.ingest.streams import BagStreams, read_streams
+from demorec.recording import CollectedRecording
+from demorec.runs.collected import load_collected_run
+from demorec.tables import CHECKS
+
+FRONT = "/follower/cam_front/image_raw/compressed"
+DROPPING = bag_mappings.SO101.replace("fps = 30", 'fps = 30\nwhen_old = "drop_episode"')
+"""A bad bag is no reason to drop an episode: it has none."""
+
+
+def _demorec(*words: str | Path) -> int:
+    with pytest.raises(SystemExit) as ended:
+        main([str(word) for word in words])
+    return int(ended.value.code or 0)
+
+
+def _bag(path: Path, seconds: float = 0.6, change: Callable[[bags.Notes], bags.Notes] = lambda notes: notes) -> Path:
+    return bags.write_mcap(change(bags.in_order(bags.so101(seconds))), path)
+
+
+def _resized(notes: bags.Notes) -> bags.Notes:
+    data = np.frombuffer(bags.jpeg(np.zeros((24, 32, 3), np.uint8)), np.uint8)
+    return bags.changed(notes, FRONT, lambda k, note: bags.with_body(note, data=data))
+
+
+def _odd(notes: bags.Notes) -> bags.Notes:
+    """PNG images, which are to be encoded, of a size that no video has."""
+    buffer = io.BytesIO()
+    Image.fromarray(np.zeros((47, 63, 3), np.uint8)).save(buffer, format="PNG")
+    data = np.frombuffer(buffer.getvalue(), np.uint8)
+    return bags.changed(notes, FRONT, lambda k, note: bags.with_body(note, data=data))
+
+
+def _named(notes: bags.Notes, name: str) -> bags.Notes:
+    names = [name, *bags.SO101_JOINTS[1:]]
+    return bags.changed(notes, "/follower/joint_states", lambda k, note: bags.with_body(note, name=names))
+
+
+def _recorded(note: bags.Note, time_ns: int) -> bags.Note:
+    """Recorded at that time instead of the epoch of the bags, without one in its header."""
+    return replace(note, log_ns=note.log_ns - bags.EPOCH_NS + time_ns, header_ns=0)
+
+
+def _moved(path: Path) -> Path:
+    path.rename(path.with_name("aside"))
+    return path
+
+
+BAD: dict[str, tuple[Callable[[Path], object], str]] = {
+    "empty": (lambda path: path.write_bytes(b""), "The bag is empty"),
+    "text": (lambda path: path.write_text("hello"), "This is no bag"),
+    "cut": (lambda path: path.write_bytes(path.read_bytes()[:2000]), "The bag holds no messages"),
+    "no camera": (
+        lambda path: _bag(path, change=lambda notes: [note for note in notes if note.topic != FRONT]),
+        f"there is no message of '{FRONT}'",
+    ),
+    "another size": (lambda path: _bag(path, change=_resized), "camera front is 32x24 jpeg instead of 64x48 jpeg"),
+    "odd size": (lambda path: _bag(path, change=_odd), "63x47 pixels cannot be h264 video, which needs even sizes"),
+    "escape codes": (
+        lambda path: _bag(path, change=lambda notes: _named(notes, "a\x1b[2J")),
+        "elements of the feature 'observation.state' is called 'a\\x1b[2J'",
+    ),
+    "year 2116": (
+        lambda path: _bag(path, change=lambda notes: [_recorded(note, 2**62) for note in notes]),
+        "a message is of the time 4611686018 s, allowed are 0 to 2147483647 s",
+    ),
+    "nowhere": (
+        lambda path: _moved(path).symlink_to("nowhere.mcap"),
+        "There is no bag that could be read (No such file or directory)",
+    ),
+}
+
+
+def _batch(folder: Path) -> tuple[Path, Path]:
+    """A folder of bags of which every other one is bad, each in another way, and a mapping."""
+    (folder / "bags").mkdir(parents=True)
+    for number, (spoil, _) in enumerate(BAD.values()):
+        _bag(folder / "bags" / f"run_{2 * number}.mcap", 0.5 + 0.1 * number)
+        spoil(_bag(folder / "bags" / f"run_{2 * number + 1}.mcap"))
+    return folder / "bags", bag_mappings.write_mapping(DROPPING, folder / "robot.toml")
+
+
+@pytest.fixture(scope="module")
+def batch(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    return _batch(tmp_path_factory.mktemp("batch"))
+
+
+def _content(run: Path) -> dict[str, bytes]:
+    """All that does not say who imported when."""
+    return {path.name: path.read_bytes() for path in [*run.glob("episodes/*"), run / "import.json"]}
+
+
+@pytest.fixture(scope="module")
+def alone(batch: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run that one process makes at once."""
+    run = tmp_path_factory.mktemp("alone") / "run"
+    import_bags([batch[0]], batch[1], run, skip_bad=True)
+    return run
+
+
+def test_bad_bags_are_skipped_and_listed(
+    batch: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, mapping = batch
+    run = tmp_path / "run"
+    assert _demorec("import", folder, "--mapping", mapping, "--out", run, "--skip-bad") == 1
+    lines = capsys.readouterr().out.splitlines()
+    header = lines[-len(BAD) - 1]
+    assert header == f"Skipped {len(BAD)} of {2 * len(BAD)} bags:"
+    for number, (line, (_, reason)) in enumerate(zip(lines[-len(BAD) :], BAD.values(), strict=True)):
+        assert line.startswith(f"  {folder / f'run_{2 * number + 1}.mcap'}: ")
+        assert reason in line
+    assert len(load_collected_run(run).episodes) == len(BAD)
+    for number in range(len(BAD)):
+        with CollectedRecording(run / "episodes" / f"episode_{number:06d}.mcap") as recording:
+            assert [file.name for file in recording.info.origin.files] == [f"run_{2 * number}.mcap"]
+    assert _demorec("info", run) == 0
+    shown = capsys.readouterr().out
+    assert _demorec("info", run, "--json") == 0
+    left_out = json.loads(capsys.readouterr().out)["left_out"]
+    for number, (_, reason) in enumerate(BAD.values()):
+        assert left_out[number]["bag"] == f"run_{2 * number + 1}.mcap"
+        assert reason in left_out[number]["reason"]
+        assert left_out[number]["reason"] in shown
+    judged = CHECKS.load("import_dropped").run(run)
+    assert judged.value == len(BAD)
+    assert "run_1.mcap: The bag is empty" in judged.detail
+
+
+@pytest.mark.parametrize("bad", sorted(BAD))
+def test_without_being_asked_the_first_bad_bag_is_refused(bad: str, tmp_path: Path) -> None:
+    first, second = _bag(tmp_path / "a.mcap"), _bag(tmp_path / "b.mcap")
+    spoil, reason = BAD[bad]
+    spoil(second)
+    mapping = bag_mappings.write_mapping(DROPPING, tmp_path / "robot.toml")
+    with pytest.raises(DemorecError) as refused:
+        import_bags([first, second], mapping, tmp_path / "run")
+    assert reason in str(refused.value)
+    assert not (tmp_path / "run/episodes/episode_000001.mcap").exists()
+
+
+def test_the_run_is_the_same_for_any_number_of_workers(batch: tuple[Path, Path], alone: Path, tmp_path: Path) -> None:
+    done: list[tuple[int, int]] = []
+    told: list[BagReport] = []
+    result = import_bags(
+        [batch[0]], batch[1], tmp_path / "run", workers=3, skip_bad=True, tell=told.append,
+        progress=lambda *counts: done.append(counts),
+    )  # fmt: skip
+    assert _content(tmp_path / "run") == _content(alone)
+    assert load_collected_run(tmp_path / "run").digest == load_collected_run(alone).digest
+    assert tuple(told) == result.reports
+    assert done == [(count, 2 * len(BAD)) for count in range(2 * len(BAD) + 1)]
+
+
+def test_an_interrupted_import_goes_on_to_the_same_run(batch: tuple[Path, Path], alone: Path, tmp_path: Path) -> None:
+    """Ctrl-C after each bag, with whatever number of processes before and after it."""
+    for moment in range(0, len(BAD), 3):
+        run, seen = tmp_path / f"run_{moment}", iter(range(100))
+
+        def interrupt(report: BagReport, moment: int = moment, seen: Iterator[int] = seen) -> None:
+            if next(seen) == moment:
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            import_bags([batch[0]], batch[1], run, skip_bad=True, tell=interrupt, workers=2 if moment == 3 else 1)
+        result = import_bags([batch[0]], batch[1], run, skip_bad=True)
+        assert result.num_new == len(BAD) - moment - 1
+        assert _content(run) == _content(alone)
+        assert load_collected_run(run).digest == load_collected_run(alone).digest
+
+
+def test_a_bag_that_was_repaired_is_imported_and_one_that_was_not_is_listed_again(tmp_path: Path) -> None:
+    folder, mapping = _batch(tmp_path)
+    run = tmp_path / "run"
+    import_bags([folder], mapping, run, skip_bad=True)
+    before = _content(run)
+    again = import_bags([folder], mapping, run, skip_bad=True)
+    assert (again.num_new, len(again.skipped)) == (0, len(BAD))
+    assert _content(run) == before
+    _bag(folder / "run_1.mcap", 1.3)
+    result = import_bags([folder], mapping, run, skip_bad=True, workers=2)
+    assert (result.num_new, len(result.skipped)) == (1, len(BAD) - 1)
+    assert folder / "run_1.mcap" not in result.skipped
+    after = _content(run)
+    assert {name: data for name, data in after.items() if name in before and name != "import.json"} == {
+        name: data for name, data in before.items() if name != "import.json"
+    }
+    with CollectedRecording(run / "episodes" / f"episode_{len(BAD):06d}.mcap") as recording:
+        assert [file.name for file in recording.info.origin.files] == ["run_1.mcap"]
+    skipped = json.loads((run / "import.json").read_text())["skipped"]
+    assert [bag["name"] for bag in skipped] == [f"run_{2 * number + 1}.mcap" for number in range(1, len(BAD))]
+
+
+def test_another_mapping_may_follow_one_that_fitted_no_bag(tmp_path: Path) -> None:
+    bag, run = _bag(tmp_path / "a.mcap"), tmp_path / "run"
+    mapping = bag_mappings.write_mapping(DROPPING.replace("/leader/", "/lead/"), tmp_path / "robot.toml")
+    assert list(import_bags([bag], mapping, run, skip_bad=True).skipped) == [bag]
+    bag_mappings.write_mapping(DROPPING, mapping)
+    assert import_bags([bag], mapping, run, skip_bad=True).num_new == 1
+    bag_mappings.write_mapping(DROPPING.replace("fps = 30", "fps = 15"), mapping)
+    with pytest.raises(ConfigError, match="imported by another mapping"):
+        import_bags([bag], mapping, run, skip_bad=True)
+
+
+def test_what_is_no_bad_bag_stops_a_batch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A mistyped name, a full disk, too little memory."""
+    bag, run = _bag(tmp_path / "a.mcap"), tmp_path / "run"
+    mapping = bag_mappings.write_mapping(DROPPING, tmp_path / "robot.toml")
+    with pytest.raises(ConfigError, match="There is no bag"):
+        import_bags([bag, tmp_path / "b.mcap"], mapping, run, skip_bad=True)
+    full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    for place, name, error, words in (
+        (import_run, "read_streams", MemoryError(), "too little memory"),
+        (os, "fsync", full, "No space left"),
+    ):
+
+        def fails(*arguments: object, error: Exception = error) -> None:
+            raise error
+
+        with monkeypatch.context() as patched:
+            patched.setattr(place, name, fails)
+            with pytest.raises(DemorecError, match=words):
+                import_bags([bag], mapping, run, skip_bad=True)
+    assert import_bags([bag], mapping, run, skip_bad=True).num_new == 1
+
+
+def test_info_says_which_episodes_were_dropped(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    leader = "/leader/joint_states"
+    notes = bags.changed(bags.so101(2.0), leader, lambda k, note: None if 60 <= k < 80 else note)
+    bag = bags.write_mcap(bags.in_order(notes), tmp_path / "bag.mcap")
+    cut = '[episodes]\ncut = "times"\ntimes_s = [[0.1, 0.8], [1.0, 1.9]]\n'
+    text = DROPPING.replace("[cameras.front]", cut + "[cameras.front]")
+    mapping, run = bag_mappings.write_mapping(text, tmp_path / "robot.toml"), tmp_path / "run"
+    assert _demorec("import", bag, "--mapping", mapping, "--out", run) == 0
+    capsys.readouterr()
+    assert _demorec("info", run) == 0
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("bag.mcap")]
+    assert "episode from 1.00 to 1.90 s" in line
+    assert f"action ({leader}) is up to" in line
+
+
+def test_the_same_bag_twice_is_imported_once(tmp_path: Path) -> None:
+    first = _bag(tmp_path / "a.mcap")
+    second = tmp_path / "b.mcap"
+    second.write_bytes(first.read_bytes())
+    mapping = bag_mappings.write_mapping(DROPPING, tmp_path / "robot.toml")
+    result = import_bags([first, first, second], mapping, tmp_path / "run")
+    assert len(result.reports) == 2  # by another name
+    (tmp_path / "c").mkdir()
+    copy = tmp_path / "c" / "a.mcap"
+    copy.write_bytes(first.read_bytes())
+    assert import_bags([copy, first], mapping, tmp_path / "other").num_new == 1
+
+
+def test_a_folder_stands_for_the_bags_in_it_in_their_natural_order(tmp_path: Path) -> None:
+    folder, notes = tmp_path / "day", bags.in_order(bags.so101(0.5))
+    folder.mkdir()
+    bags.write_mcap(notes, folder / "run_10.mcap")
+    bags.write_rosbag2(bags.in_order(bags.so101(0.6)), folder / "run_2")
+    bags.write_rosbag2(bags.in_order(bags.so101(0.7)), folder / "run_1", storage=StoragePlugin.SQLITE3)
+    bags.write_rosbag2(bags.in_order(bags.so101(0.8)), folder / "run_3")
+    (folder / "run_3" / "metadata.yaml").unlink()  # as after a crash of the recorder
+    (folder / "notes.txt").write_text("Tuesday")
+    (folder / "photos").mkdir()
+    mapping = bag_mappings.write_mapping(DROPPING, tmp_path / "robot.toml")
+    result = import_bags([folder], mapping, tmp_path / "run")
+    assert [report.name for report in result.reports] == ["run_1", "run_2", "run_3.mcap", "run_10.mcap"]
+    assert _demorec("import", "--suggest", folder) == 0
+    with pytest.raises(BagError, match=r"holds no metadata.yaml.* and no bags"):
+        import_bags([folder / "photos"], mapping, tmp_path / "run")
+
+
+def test_an_unexpected_error_skips_a_bag_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    good, bad = _bag(tmp_path / "a.mcap"), _bag(tmp_path / "b.mcap")
+    mapping = bag_mappings.write_mapping(DROPPING, tmp_path / "robot.toml")
+
+    def fails(bag: Bag, mapping: BagMapping) -> BagStreams:
+        if bag.path == bad:
+            raise KeyError("nobody thought of it")
+        return read_streams(bag, mapping)
+
+    monkeypatch.setattr(import_run, "read_streams", fails)
+    result = import_bags([bad, good], mapping, tmp_path / "run", skip_bad=True)
+    assert result.skipped == {bad: "unexpected KeyError, please report it"}
+    assert result.num_new == 1
+
+
+@pytest.mark.parametrize("kind", ["hdf5", "lerobot"])
+def test_only_bags_are_skipped(kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for flags in (["--skip-bad"], ["--workers", "2"]):
+        assert _demorec("import", kind, tmp_path / "x", "--mapping", "x", "--out", tmp_path / "run", *flags) == 2
+        assert "Only bags can be skipped" in capsys.readouterr().err
+
+
+def _importing(batch: tuple[Path, Path], run: Path) -> subprocess.Popen[str]:
+    words = ["import", str(batch[0]), "--mapping", str(batch[1]), "--out", str(run), "--skip-bad", "--workers", "2"]
+    pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
+    return subprocess.Popen([sys.executable, "-m", "demorec", *words], text=True, **pipes)  # type: ignore[call-overload,no-any-return]
+
+
+def _workers(program: subprocess.Popen[str]) -> list[psutil.Process]:
+    found = psutil.Process(program.pid).children()
+    return [process for process in found if any("spawn_main" in word for word in process.cmdline())]
+
+
+def test_a_killed_worker_is_told_in_one_sentence(batch: tuple[Path, Path], alone: Path, tmp_path: Path) -> None:
+    with _importing(batch, tmp_path / "run") as program:
+        while not (workers := _workers(program)):
+            assert program.poll() is None
+            time.sleep(0.005)
+        workers[0].kill()
+        _, err = program.communicate()
+    assert program.returncode == 1
+    (line,) = [line for line in err.splitlines() if not line.startswith("importing: ")]  # told of a slow import
+    assert "A process of the import ended without a word" in line
+    import_bags([batch[0]], batch[1], tmp_path / "run", skip_bad=True)
+    assert _content(tmp_path / "run") == _content(alone)
+
+
+def test_a_killed_import_goes_on_to_the_same_run(batch: tuple[Path, Path], alone: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    with _importing(batch, run) as program:
+        while not list(run.glob("episodes/*.mcap")) and program.poll() is None:
+            time.sleep(0.001)
+        workers = _workers(program)
+        program.kill()
+    psutil.wait_procs(workers, timeout=30)
+    import_bags([batch[0]], batch[1], run, skip_bad=True)
+    assert _content(run) == _content(alone)
+    assert load_collected_run(run).digest == load_collected_run(alone).digest
