@@ -21,6 +21,8 @@ NS = 1_000_000_000
 MISSING = 2**62
 """Age of what is not there."""
 MAX_ROWS = 10_000_000
+SKEW_S = 0.1
+"""Between the times of headers and of recording: a camera's exposure and transport take less."""
 _PHASES = 64
 """Moments of a period at which a grid may begin: a stream that jitters by a third of it leaves 21 of them free."""
 _ROUNDED_NS = 2_000

@@ -6,7 +6,7 @@ Nothing is repaired: a finding tells what the rows hold.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -14,18 +14,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.ingest.clock import NS, Int, Numbers, Timeline
-from demorec.ingest.mapping import BagMapping, Clock
+from demorec.ingest.clock import NS, SKEW_S, Int, Numbers, Timeline
+from demorec.ingest.mapping import BagMapping
 from demorec.ingest.mapping_file import ACTION, STATE
-from demorec.ingest.rows import Timelines
+from demorec.ingest.rows import RATE, EpisodeRows, Timelines
 from demorec.ingest.streams import NO_STAMP, BagStreams, Stream
 
 _JITTER = 0.25
 """Of a period: what nine of ten steps of a sensor stay within."""
 _GAP = 5.0
 """Periods without a message that are told as a gap; shorter ones are lost messages."""
-_SKEW_S = 0.1
-"""Between the times of headers and of recording: a camera's exposure and transport take less."""
 _STEP_S = 0.05
 """By which a clock must jump, or drift in a bag, to be told."""
 _STILL_S = 0.5
@@ -34,6 +32,14 @@ _FROZEN = 5
 """Pictures in a row with the same bytes: no camera without noise."""
 _SPIKE = 25.0
 """Times the usual step of an element."""
+_EPOCH_S = 1e8
+"""Between two clocks: three years. No clock is as wrong; one of the two counts from another beginning."""
+_SLOW = 1.15
+"""Periods of the rows, from which on a stream is called slower than they are."""
+_LOST = 1.6
+"""Periods, from which on a message is missing between two."""
+NOTE = "note"
+"""Kind of what is not odd, but good to know."""
 _FULL_TURNS = 4 * np.pi
 """Beyond which no joint angle is in rad."""
 
@@ -62,16 +68,18 @@ def all_findings(lines: Timelines) -> tuple[Finding, ...]:
 
 
 def _findings(bag: Timelines, lines: Sequence[Timeline]) -> Iterator[Finding]:
+    skews = _comparable_skews(lines)
     for line in lines:
-        found = (*_message_findings(line.stream), *_time_findings(line), *_clock_findings(line.skews_ns))
+        found = (*_message_findings(line.stream), *_time_findings(line), *_clock_findings(skews[line]))
         for kind, text in (*found, *_picture_findings(line), *_value_findings(line)):
             yield _of(line.stream, kind, text)
     for problem in bag.streams.problems:
         yield Finding(kind="cut_off", stream="", text=problem)
     yield from _extent_findings([line for line in lines if line.is_regular])
     yield from _offset_findings(lines)
+    yield from _mixed_findings(bag, lines)
     yield from _camera_findings(bag.streams)
-    yield from _rate_findings(lines, bag.mapping.clock)
+    yield from _slow_findings(lines, bag.mapping.clock.fps)
     yield from _unit_findings(bag.streams, bag.mapping)
     yield from _action_findings(bag.streams, bag.mapping)
 
@@ -106,25 +114,25 @@ def _time_findings(line: Timeline) -> Iterator[tuple[str, str]]:
     steps = np.diff(line.times_ns)
     gaps = np.flatnonzero(steps > _GAP * line.period_ns)
     lost = np.round(steps / line.period_ns).astype(np.int64) - 1
-    small = np.flatnonzero((lost > 0) & (steps <= _GAP * line.period_ns) & (steps > 1.6 * line.period_ns))
+    small = np.flatnonzero((lost > 0) & (steps <= _GAP * line.period_ns) & (steps > _LOST * line.period_ns))
     if len(gaps):
         longest = int(steps[gaps].max())
         begin = (line.times_ns[gaps[0]] - line.times_ns[0]) / NS
         yield "gap", f"{len(gaps)} gaps, the first at {begin:.2f} s, the longest of {longest / NS:.3f} s"
     if len(small):
         yield "drops", f"{int(lost[small].sum())} of {len(line.times_ns) + int(lost[small].sum())} messages are lost"
-    regular = steps[steps <= 1.6 * line.period_ns]
+    regular = steps[steps <= _LOST * line.period_ns]
     off = np.percentile(np.abs(regular - line.period_ns), 90) if len(regular) else 0.0
     if off > _JITTER * line.period_ns:
         yield "jitter", f"its steps of {line.period_ns / 1e6:.1f} ms are off by {off / 1e6:.1f} ms (one of ten by more)"
 
 
-def _clock_findings(skew: Int) -> Iterator[tuple[str, str]]:
+def _clock_findings(skew: Numbers) -> Iterator[tuple[str, str]]:
     """Of the difference between the times of recording and of headers."""
     if len(skew) < 8:
         return
     median = float(np.median(skew)) / NS
-    if abs(median) > _SKEW_S:
+    if abs(median) > SKEW_S:
         yield "clock_offset", f"its headers are {median:+.3f} s behind the times of recording"
     width = max(3, min(20, len(skew) // 4))
     smooth = np.array([np.median(part) for part in np.array_split(skew, max(2, len(skew) // width))]) / NS
@@ -136,6 +144,38 @@ def _clock_findings(skew: Int) -> Iterator[tuple[str, str]]:
         yield "clock_jump", f"its clock jumps by {-step:+.3f} s"
     elif abs(total) > _STEP_S and abs(total) > 0.7 * np.abs(np.diff(smooth)).sum():
         yield "clock_drift", f"its clock drifts by {-total:+.3f} s in the bag"
+
+
+def _comparable_skews(lines: Sequence[Timeline]) -> dict[Timeline, Numbers]:
+    """(K,) of each stream: time of recording minus that of the header, nanoseconds.
+
+    Where all headers count from another beginning than times of recording (simulated time), that difference says
+    nothing of a single stream: then it is the one to the difference of the stream that has most messages.
+    """
+    skews: dict[Timeline, Numbers] = {line: line.skews_ns.astype(np.float64) for line in lines}
+    known = [line for line in lines if len(line.skews_ns)]
+    if not known or any(abs(np.median(line.skews_ns)) < _EPOCH_S * NS for line in known):
+        return skews
+    usual = max(known, key=lambda line: len(line.skews_ns))
+    stamps = usual.stream.header_ns[usual.stream.header_ns > 0]
+    order = np.argsort(stamps, kind="stable")
+    for line in known:
+        own = line.stream.header_ns[line.stream.header_ns > 0]
+        skews[line] = line.skews_ns - np.interp(own, stamps[order], usual.skews_ns[order])
+    return skews
+
+
+def _mixed_findings(bag: Timelines, lines: Sequence[Timeline]) -> Iterator[Finding]:
+    """What goes by the time of recording where other streams go by headers, and these are of another clock."""
+    skews = [float(np.median(line.skews_ns)) / NS for line in lines if line.is_header]
+    if not skews or abs(usual := float(np.median(skews))) <= SKEW_S:
+        return
+    text = f'goes by times of recording, {usual:+.3f} s from the headers of the other streams: set clock.stamp = "log"'
+    for line in (line for line in lines if not line.is_header):
+        yield _of(line.stream, "clock_offset", text)
+    for topic, texts in bag.streams.texts.items():
+        if topic != bag.mapping.robot.urdf_topic and not all(each.is_header for each in texts):
+            yield Finding(kind="clock_offset", stream=topic, text=f"{topic}: {text}")
 
 
 def _value_findings(line: Timeline) -> Iterator[tuple[str, str]]:
@@ -269,7 +309,7 @@ def _offset_findings(lines: Sequence[Timeline]) -> Iterator[Finding]:
         return
     usual = float(np.median(list(skews.values())))
     for label, skew in skews.items():
-        if abs(skew - usual) > _SKEW_S:
+        if abs(skew - usual) > SKEW_S:
             text = f"its clock is off by {usual - skew:+.3f} s against that of the other streams"
             yield Finding(kind="clock_offset", stream=label, text=text)
 
@@ -310,17 +350,60 @@ def _claimed_by(name: str, streams: BagStreams) -> str:
 _COMMON = {"camera", "cam", "color", "image", "raw", "rect", "compressed", "optical", "frame", "link", "rgb", "depth"}
 
 
-def _rate_findings(lines: Sequence[Timeline], clock: Clock) -> Iterator[Finding]:
-    period = NS / clock.fps
-    for line in lines:
-        if line.is_regular and line.period_ns > 1.15 * period:
-            text = f"comes {NS / line.period_ns:.1f} times a second, rows {clock.fps} times"
-            yield _of(line.stream, "slow", text)
-    for line in lines:
-        if line.stream.topic == clock.rows != "grid" and abs(line.period_ns - period) > 0.05 * period:
-            text = f"rows follow {clock.rows} at {NS / line.period_ns:.1f} a second, fps says {clock.fps}"
-            yield Finding(kind="fps", stream=line.stream.label, text=text)
+def _slow_findings(lines: Iterable[Timeline], fps: int) -> Iterator[Finding]:
+    """Streams that are slower than the rows; cameras only where none has an image for each row."""
+    regular = [line for line in lines if line.is_regular]
+    slow = [line for line in regular if line.period_ns * fps > _SLOW * NS]
+    is_filmed = any(line.stream.heads and line not in slow for line in regular)
+    for line in slow:
+        rate = NS / line.period_ns
+        if not line.stream.heads:
+            yield _of(line.stream, "slow", f"comes {rate:.1f} times a second, rows {fps} times")
+        elif not is_filmed:
+            advice = f"use fps = {max(1, round(rate))}"
+            yield _of(line.stream, "slow", f"comes {rate:.1f} times a second, rows {fps} times: {advice}")
+
+
+def row_findings(lines: Timelines, episodes: Sequence[EpisodeRows]) -> Iterator[Finding]:
+    """What is odd in the rows that were made of a bag: their rate, and images that are in two of them or in none."""
+    fps = lines.mapping.clock.fps
+    for rows in episodes:
+        rate = NS / float(np.median(np.diff(rows.times_ns)))
+        if rows.follows and abs(rate - fps) > RATE * fps:
+            text = f"rows follow its messages, {rate:.1f} a second, fps says {fps}"
+            yield Finding(kind="fps", stream=rows.follows, text=text)
             break
+    for name in lines.mapping.cameras if episodes else ():
+        yield from _use_findings(name, lines, episodes)
+
+
+def _use_findings(name: str, lines: Timelines, episodes: Sequence[EpisodeRows]) -> Iterator[Finding]:
+    """What becomes of a camera's images: a finding where rows could show more of them, else a note."""
+    line, clock = lines.lines[name], lines.mapping.clock
+    num_repeated = num_free = num_skipped = num_images = 0
+    for rows in episodes:
+        shown = lines.chosen(name, rows.times_ns).index
+        steps = np.diff(shown)
+        after = np.minimum(shown[:-1][steps == 0] + 1, len(line.times_ns) - 1)
+        waits = line.times_ns[after] - line.times_ns[after - 1]
+        num_repeated += len(waits)
+        num_free += max(0, int(np.sum(waits <= _LOST * line.period_ns)) - 1)  # an episode may begin at an image's end
+        num_skipped += int(np.maximum(steps - 1, 0).sum())
+        num_images += int(shown[-1] - shown[0]) + 1
+    num_rows = sum(len(rows.times_ns) for rows in episodes)
+    rate = NS / max(line.period_ns, 1)
+    repeats = f"{100 * num_repeated / num_rows:.3g} % of the rows show the image before"
+    skips = f"{100 * num_skipped / num_images:.3g} % of its images are in no row"
+    if min(num_free, num_skipped):  # where a row repeats and another skips, other rows would lose nothing
+        advice = 'use rows = "camera"'
+        if abs(rate - clock.fps) > max(RATE * clock.fps, 0.5):
+            advice = f"use fps = {max(1, round(rate))}"
+        elif clock.rows == "camera":
+            advice = "they come too unevenly beside those of the camera that rows follow"
+        yield _of(line.stream, "repeats", f"{repeats} and {skips}: {advice}")
+    elif max(num_free / num_rows, num_skipped / num_images) > RATE:
+        told = repeats if num_free else skips
+        yield _of(line.stream, NOTE, f"{told}, since it comes {rate:.1f} times a second and rows {clock.fps} times")
 
 
 def _unit_findings(streams: BagStreams, mapping: BagMapping) -> Iterator[Finding]:

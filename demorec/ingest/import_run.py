@@ -22,7 +22,7 @@ from demorec.ingest.description import described_camera, described_feature, urdf
 from demorec.ingest.episode_writer import ImportedEpisodeWriter, PlannedEpisode, picture_plan
 from demorec.ingest.episodes import Window, subtask_rows, task_text, windows
 from demorec.ingest.fields import FieldError
-from demorec.ingest.findings import all_findings
+from demorec.ingest.findings import all_findings, row_findings
 from demorec.ingest.import_file import ImportFile, load_import_file, save_import_file
 from demorec.ingest.mapping import BagMapping, read_mapping
 from demorec.ingest.report import BagReport, EpisodeReport, stream_reports
@@ -110,6 +110,9 @@ class _Import:
         episodes: list[PlannedEpisode] = []
         reports: list[EpisodeReport] = []
         for window in found:
+            if window.discarded:
+                reports.append(_report(window, begin, None, f"its marker says {window.discarded!r}"))
+                continue
             try:
                 rows = lines.rows(window)
             except NoRowsError as error:
@@ -129,7 +132,7 @@ class _Import:
             files=tuple(self.files.items()),
             num_bytes=self.bag.num_bytes,
             streams=tuple(stream_reports(lines, [episode.rows for episode in episodes])),
-            findings=findings,
+            findings=(*findings, *row_findings(lines, [episode.rows for episode in episodes])),
             episodes=tuple(reports),
         )
 
@@ -235,10 +238,11 @@ def _first_pictures(episodes: Iterable[PlannedEpisode]) -> dict[tuple[str, int],
 
 def _report(window: Window, zero_ns: int, episode: PlannedEpisode | None, reason: str = "") -> EpisodeReport:
     """Of a window of a bag that begins at `zero_ns`, and the episode that comes of it, or why none does."""
-    begin_ns, end_ns, count, trimmed_ns = window.begin_ns, window.end_ns, 0, (0, 0)
+    begin_ns, end_ns, count, trimmed_ns, follows = window.begin_ns, window.end_ns, 0, (0, 0), ""
     if episode is not None:
         times = episode.rows.times_ns
         begin_ns, end_ns, count, trimmed_ns = int(times[0]), int(times[-1]), len(times), episode.rows.trimmed_ns
+        follows = episode.rows.follows
     return EpisodeReport(
         episode_index=None if episode is None else episode.info.episode_index,
         begin_s=(begin_ns - zero_ns) / NS,
@@ -248,4 +252,6 @@ def _report(window: Window, zero_ns: int, episode: PlannedEpisode | None, reason
         trimmed_s=(trimmed_ns[0] / NS, trimmed_ns[1] / NS),
         pictures={} if episode is None else {name: plan.told for name, plan in episode.plans.items()},
         reason=reason,
+        discarded=window.discarded,
+        follows=follows,
     )

@@ -123,8 +123,8 @@ class Clock:
 
     Attributes:
         fps: Rows a second; that of the dataset.
-        rows: "camera": a row for each image of the slowest camera of those that give `fps` images a second (a grid where
-            none does); "grid": evenly spaced; or a topic: a row for each of its messages.
+        rows: "camera": a row for each image of the slowest camera of those that give `fps` images a second (where none
+            does, a grid); "grid": evenly spaced; or a topic: a row for each of its messages.
         stamp: Whether a message's time is that of its header, or when it was recorded.
         sample: The last message before the row, the nearest one, or the straight line between its neighbours.
         max_age_s: How far from the row a message may be.

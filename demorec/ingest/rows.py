@@ -16,7 +16,7 @@ from demorec.ingest.mapping import ROWS, BagMapping, CameraSource, Sampling, Sou
 from demorec.ingest.streams import BagStreams, Stream
 from demorec.scene.collected import DEPTH_UNITS
 
-_RATE = 0.05
+RATE = 0.05
 """By which the rate of images that rows follow may differ from fps: as far as `collected_rate` takes it for that of the
 episode. Where fps is the rate rounded, half an image a second is more."""
 _SAME_COUNT = 2
@@ -195,8 +195,8 @@ class Timelines:
         if clock.rows == "camera" and (cameras := self._cameras_at_fps(begin, end)):
             return self._followed(cameras, window, begin, end), f"camera {cameras[0]}"
         # What comes twice as often as rows has something new for each of them, wherever these are.
-        slow = [line.times_ns for line in self.lines.values() if line.is_regular and 2 * line.period_ns * clock.fps > NS]
-        return grid(begin, end, clock.fps, slow), ""
+        slow = [line for line in self.lines.values() if line.is_regular and 2 * line.period_ns * clock.fps > NS]
+        return grid(begin, end, clock.fps, [line.times_ns for line in slow]), ""
 
     def _cameras_at_fps(self, begin: int, end: int) -> list[str]:
         """Cameras that give an image for each row; the one that rows follow first.
@@ -210,7 +210,7 @@ class Timelines:
             times = self.lines[name].times_ns
             times = times[(times >= begin) & (times <= end)]
             seconds = float(times[-1] - times[0]) / NS if len(times) > 1 else 0.0
-            if seconds and abs(len(times) - 1 - fps * seconds) <= max(_RATE * fps, 0.5) * seconds + 1:
+            if seconds and abs(len(times) - 1 - fps * seconds) <= max(RATE * fps, 0.5) * seconds + 1:
                 counts[name] = len(times)
         colour = [name for name in counts if self.lines[name].stream.heads[0].encoding not in DEPTH_UNITS]
         may_lead = colour or list(counts)
