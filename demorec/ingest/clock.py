@@ -212,21 +212,26 @@ def grid(begin_ns: int, end_ns: int, fps: int, streams: Sequence[Int] = ()) -> I
     """(R,) row times, evenly spaced, `fps` a second; the first within a period from `begin_ns` on, none after `end_ns`.
 
     Row k is k/fps s after the first, rounded down: a whole number of nanoseconds is not after that exactly if it is not
-    after the fraction. The first row is as early as shows most messages of `streams`, (M,) times of each, to a reader
-    that takes the last one before the row: none of them sits on an edge, where jitter and rounding decide.
+    after the fraction. The first row is where a reader that takes the last message before each row is shown most of
+    those of `streams`, (M,) times of each, and these as soon as can be: none sits on an edge, where jitter and rounding
+    decide.
     """
     count = max(0, (end_ns - begin_ns) * fps // NS + 1)
     if count > MAX_ROWS:
         raise ValueError(f"{count:,} rows, at most {MAX_ROWS:,} are made")
     inside = [times[(times >= begin_ns) & (times <= end_ns)] for times in streams]
 
-    def num_shown(phase: int) -> int:
-        last = (end_ns - begin_ns - phase) * fps // NS
-        rows = [np.maximum(-((begin_ns + phase - times) * fps // NS), 0) for times in inside]  # the first not before
-        return sum(len(np.unique(row[row <= last])) for row in rows)
+    def fit(phase: int) -> tuple[int, int]:
+        first, num_shown, age = begin_ns + phase, 0, 0
+        for times in inside:
+            rows = np.maximum(-((first - times) * fps // NS), 0)  # the first row that is not before the message
+            is_shown = np.append(rows[1:] != rows[:-1], True) & (rows <= (end_ns - first) * fps // NS)
+            num_shown += int(is_shown.sum())
+            age += int((first + rows * NS // fps - times)[is_shown].sum())
+        return num_shown, -age
 
-    phases = (0, _ROUNDED_NS, *(NS * part // (fps * _PHASES) for part in range(1, _PHASES))) if inside else (0,)
-    begin_ns += max(phases, key=lambda phase: (num_shown(phase), -phase)) if count else 0
+    phases = (0, _ROUNDED_NS, *(NS * part // (fps * _PHASES) for part in range(1, _PHASES)))
+    begin_ns += max(phases, key=fit) if count and inside else 0
     count = max(0, (end_ns - begin_ns) * fps // NS + 1)
     return begin_ns + np.arange(count, dtype=np.int64) * NS // fps
 
@@ -237,7 +242,7 @@ def followed(lead: Int, others: Sequence[Int], *, period_ns: int, end_ns: int) -
     Images that several cameras take at about the same moment come now in this order, now in that. At each image of one
     of them, another one's would be a period old in one row and two newer in the next. So a row whose image of another
     camera was in the row before may wait for the next one, though not until an image would be skipped: up to the part
-    of a period, of `_WAITS`, with which most images are shown, and the shortest of those.
+    of a period, of `_WAITS`, with which fewest images are skipped, and the shortest of those.
 
     Args:
         lead: (R,) increasing.
@@ -248,11 +253,11 @@ def followed(lead: Int, others: Sequence[Int], *, period_ns: int, end_ns: int) -
     if not others:
         return lead
 
-    def num_shown(rows: Int) -> int:
-        return sum(len(np.unique(np.searchsorted(times, rows, side="right"))) for times in others)
+    def num_skipped(rows: Int) -> int:
+        steps = [np.diff(np.searchsorted(times, rows, side="right")) for times in others]
+        return sum(int(np.maximum(step - 1, 0).sum()) for step in steps)
 
-    waited = [_waited(lead, others, round(part * period_ns), end_ns) for part in _WAITS]
-    return max(waited, key=num_shown)
+    return min((_waited(lead, others, round(part * period_ns), end_ns) for part in _WAITS), key=num_skipped)
 
 
 def _waited(lead: Int, others: Sequence[Int], wait_ns: int, end_ns: int) -> Int:
