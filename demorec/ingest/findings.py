@@ -368,7 +368,8 @@ def row_findings(lines: Timelines, episodes: Sequence[EpisodeRows]) -> Iterator[
     """What is odd in the rows that were made of a bag: their rate, and images that are in two of them or in none."""
     fps = lines.mapping.clock.fps
     for rows in episodes:
-        rate = NS / float(np.median(np.diff(rows.times_ns)))
+        steps = np.diff(rows.times_ns)
+        rate = NS / float(steps[steps <= _LOST * np.median(steps)].mean())
         if rows.follows and abs(rate - fps) > RATE * fps:
             text = f"rows follow its messages, {rate:.1f} a second, fps says {fps}"
             yield Finding(kind="fps", stream=rows.follows, text=text)

@@ -75,7 +75,7 @@ def _kinds(lines: Timelines, rows: EpisodeRows) -> set[str]:
     return {finding.kind for finding in (*all_findings(lines), *row_findings(lines, [rows]))}
 
 
-rates = st.one_of(st.integers(5, 200).map(Fraction), st.floats(5, 200).map(lambda rate: Fraction(rate)))
+rates = st.one_of(st.integers(5, 200).map(Fraction), st.floats(5, 200).map(Fraction))
 jitters = st.one_of(st.just(0.0), st.floats(0.0, 1 / 3))
 phases = st.fractions(0, 1, max_denominator=1000)
 seeds = st.integers(0, 2**32 - 1)
@@ -113,9 +113,7 @@ def test_an_even_grid(rate: int, phase: Fraction, jitter: float, seed: int, roun
 
 @settings(max_examples=200, deadline=None)
 @given(st.integers(5, 200), phases, phases, st.floats(0.0, 0.24), seeds, roundings)
-def test_two_cameras(
-    rate: int, phase: Fraction, other: Fraction, jitter: float, seed: int, rounding: str
-) -> None:
+def test_two_cameras(rate: int, phase: Fraction, other: Fraction, jitter: float, seed: int, rounding: str) -> None:
     """Up to a quarter of a period all can be shown: images of a pair are nearer to each other than to those after."""
     cameras = {
         "front": _moments(Fraction(rate), phase, jitter, seed, rounding),
