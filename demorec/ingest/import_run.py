@@ -117,8 +117,10 @@ class _Import:
                 rows = lines.rows(window)
             except NoRowsError as error:
                 if self.mapping.clock.when_old == "error":
-                    kinds = sorted({finding.kind for finding in findings})
-                    told = f" (the bag's report: {', '.join(kinds)})" if kinds else ""
+                    kinds = {finding.kind: finding.kind for finding in findings}
+                    offsets = [finding.text for finding in findings if finding.kind == "clock_offset"]
+                    kinds |= {"clock_offset": f"clock_offset, {offsets[0]}"} if offsets else {}
+                    told = f" (the bag's report: {'; '.join(sorted(kinds.values()))})" if kinds else ""
                     raise BagError(f"The bag gives no whole episode: {error}{told}: {self.bag.path}") from error
                 reports.append(_report(window, begin, None, str(error)))
                 continue
