@@ -194,10 +194,9 @@ class Timelines:
             return line.times_ns[(line.times_ns >= begin) & (line.times_ns <= end)], line.stream.label
         if clock.rows == "camera" and (cameras := self._cameras_at_fps(begin, end)):
             return self._followed(cameras, window, begin, end), f"camera {cameras[0]}"
-        # Of what comes more often than rows some is in none of them, wherever these are.
-        slow = [
-            line for line in self.lines.values() if line.is_regular and line.period_ns * clock.fps > (1 - RATE) * NS
-        ]
+        # Of what comes more often than rows some is in none of them, wherever these are. (The median period of a stream
+        # that jitters is off by a few hundredths.)
+        slow = [line for line in self.lines.values() if line.is_regular and line.period_ns * clock.fps > 0.9 * NS]
         return grid(begin, end, clock.fps, [line.times_ns for line in slow]), ""
 
     def _cameras_at_fps(self, begin: int, end: int) -> list[str]:
