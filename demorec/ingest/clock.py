@@ -250,14 +250,16 @@ def followed(lead: Int, others: Sequence[Int], *, period_ns: int, end_ns: int) -
         period_ns: The usual distance of two.
         end_ns: The last moment of a row.
     """
-    if not others:
-        return lead
-
-    def num_skipped(rows: Int) -> int:
+    best, fewest = lead, -1
+    for part in _WAITS:
+        rows = _waited(lead, others, round(part * period_ns), end_ns)
         steps = [np.diff(np.searchsorted(times, rows, side="right")) for times in others]
-        return sum(int(np.maximum(step - 1, 0).sum()) for step in steps)
-
-    return min((_waited(lead, others, round(part * period_ns), end_ns) for part in _WAITS), key=num_skipped)
+        num_skipped = sum(int(np.maximum(step - 1, 0).sum()) for step in steps)
+        if fewest < 0 or num_skipped < fewest:
+            best, fewest = rows, num_skipped
+        if not fewest:
+            break
+    return best
 
 
 def _waited(lead: Int, others: Sequence[Int], wait_ns: int, end_ns: int) -> Int:

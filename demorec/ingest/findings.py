@@ -367,10 +367,10 @@ def _slow_findings(lines: Iterable[Timeline], fps: int) -> Iterator[Finding]:
 def row_findings(lines: Timelines, episodes: Sequence[EpisodeRows]) -> Iterator[Finding]:
     """What is odd in the rows that were made of a bag: their rate, and images that are in two of them or in none."""
     fps = lines.mapping.clock.fps
-    for rows in episodes:
+    for rows in (rows for rows in episodes if rows.follows and len(rows.times_ns) > 1):
         steps = np.diff(rows.times_ns)
         rate = NS / float(steps[steps <= _LOST * np.median(steps)].mean())
-        if rows.follows and abs(rate - fps) > RATE * fps:
+        if abs(rate - fps) > RATE * fps:
             text = f"rows follow its messages, {rate:.1f} a second, fps says {fps}"
             yield Finding(kind="fps", stream=rows.follows, text=text)
             break
@@ -385,10 +385,12 @@ def _use_findings(name: str, lines: Timelines, episodes: Sequence[EpisodeRows]) 
     for rows in episodes:
         shown = lines.chosen(name, rows.times_ns).index
         steps = np.diff(shown)
-        after = np.minimum(shown[:-1][steps == 0] + 1, len(line.times_ns) - 1)
-        waits = line.times_ns[after] - line.times_ns[after - 1]
-        num_repeated += len(waits)
-        num_free += max(0, int(np.sum(waits <= _LOST * line.period_ns)) - 1)  # an episode may begin at an image's end
+        repeated = shown[1:][steps == 0]
+        num_repeated += len(repeated)
+        # Not those where an image is missing, or the stream is at its end; and an episode may begin between two images.
+        repeated = repeated[repeated < len(line.times_ns) - 1]
+        waits = line.times_ns[repeated + 1] - line.times_ns[repeated]
+        num_free += max(0, int(np.sum(waits <= _LOST * line.period_ns)) - 1)
         num_skipped += int(np.maximum(steps - 1, 0).sum())
         num_images += int(shown[-1] - shown[0]) + 1
     num_rows = sum(len(rows.times_ns) for rows in episodes)
@@ -400,7 +402,7 @@ def _use_findings(name: str, lines: Timelines, episodes: Sequence[EpisodeRows]) 
         if abs(rate - clock.fps) > max(RATE * clock.fps, 0.5):
             advice = f"use fps = {max(1, round(rate))}"
         elif clock.rows == "camera":
-            advice = "they come too unevenly beside those of the camera that rows follow"
+            advice = "they come too unevenly for these rows"
         yield _of(line.stream, "repeats", f"{repeats} and {skips}: {advice}")
     elif max(num_free / num_rows, num_skipped / num_images) > RATE:
         told = repeats if num_free else skips
