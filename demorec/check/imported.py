@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 _TIMES = frozenset(
     ("clock_offset", "clock_jump", "clock_drift", "unstamped", "drops", "gap", "slow", "fps", "jitter", "order")
-) | {"duplicates", "late_start", "early_end", "cut_off", "repeats"}
+) | {"duplicates", "late_start", "early_end", "cut_off", "repeats", "skips"}
 _PICTURES = frozenset(("frozen", "same_pictures", "swapped", "size", "format", "keyframe", "frame_id"))
 _MOST_TOLD = 5
 

@@ -98,7 +98,8 @@ class Import:
             kinds = ", ".join(sorted(set(odd)))
             say(f"{counted(len(odd), 'finding')} in the bags ({kinds}), see above and demorec check.")
         else:
-            say(f"Nothing odd was found{f'; {counted(notes, "note")} above' if notes else ''}.")
+            above = f"No findings; {counted(notes, 'note')} above of images in two rows, or in none, by design."
+            say(above if notes else "Nothing odd was found.")
 
     def _import_dataset(self) -> int:
         if len(self.bags) != 2 or self.out is None:

@@ -405,8 +405,13 @@ def _use_findings(name: str, lines: Timelines, episodes: Sequence[EpisodeRows]) 
             advice = "they come too unevenly for these rows"
         yield _of(line.stream, "repeats", f"{repeats} and {skips}: {advice}")
     elif max(num_free / num_rows, num_skipped / num_images) > RATE:
-        told = repeats if num_free else skips
-        yield _of(line.stream, NOTE, f"{told}, since it comes {rate:.1f} times a second and rows {clock.fps} times")
+        told = f"{repeats if num_free else skips}, since it comes {rate:.1f} times a second and rows {clock.fps} times"
+        # Every second image is a choice. Now the next, now the one after it is none, but for a camera beside a slower one.
+        is_uneven = abs(rate / clock.fps - round(rate / clock.fps)) > RATE
+        if num_skipped and is_uneven and not any(rows.follows for rows in episodes):
+            yield _of(line.stream, "skips", f"{told}: use fps = {max(1, round(rate))}")
+        else:
+            yield _of(line.stream, NOTE, told)
 
 
 def _unit_findings(streams: BagStreams, mapping: BagMapping) -> Iterator[Finding]:

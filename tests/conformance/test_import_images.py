@@ -213,7 +213,8 @@ def test_cameras_of_different_rates(fps: int, slow: int, tmp_path: Path, capsys:
     cameras = {FRONT: ticks(30, 90, jitter_s=0.001), SIDE: ticks(slow, 3 * slow, phase=0.2, jitter_s=0.001)}
     path = WRITERS["rosbags"](bag(cameras), tmp_path)
     told, shown = imported(path, MAPPING.replace("fps = 30", f"fps = {fps}"), tmp_path, capsys)
-    assert "Nothing odd was found; 1 note above." in told
+    assert "No findings; 1 note above" in told
+    assert "Nothing odd" not in told
     times = cameras[FRONT if fps == 30 else SIDE]
     followed = shown["front" if fps == 30 else "side"]
     assert followed == [time for time in times if time >= followed[0]]
@@ -224,6 +225,22 @@ def test_cameras_of_different_rates(fps: int, slow: int, tmp_path: Path, capsys:
     assert float(share) == pytest.approx({30: 50, 15: 50, 25: 100 / 6}[fps], abs=1)
     assert ("in no row" in note) == (fps < 30)
     assert CHECKS.load("import_times").run(tmp_path / "run").level == "pass"
+
+
+@pytest.mark.parametrize(("fps", "kind"), [(20, "skips"), (15, "note"), (25, "skips"), (60, "slow")])
+def test_a_rate_that_no_camera_has(fps: int, kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Every second image can be meant; now the next one and now the one after it cannot."""
+    path = WRITERS["mcap"](bag({FRONT: ticks(30, 90, jitter_s=0.001)}), tmp_path)
+    told, shown = imported(path, ONE_CAMERA.replace("fps = 30", f"fps = {fps}"), tmp_path, capsys)
+    lines = [line for line in told.splitlines() if line.startswith(f"  {kind}: ")]
+    assert len(lines) == 1
+    assert ("use fps = 30" in lines[0]) == (kind != "note")
+    left_out = 90 - len(set(shown["front"]))
+    if fps < 30:
+        (share,) = re.findall(r"([\d.]+) % of its images are in no row", lines[0])
+        assert float(share) == pytest.approx(100 * left_out / 90, abs=1)
+    level = CHECKS.load("import_times").run(tmp_path / "run").level
+    assert level == ("pass" if kind == "note" else "warn")
 
 
 def test_the_suggested_rate_is_that_of_the_slowest_camera(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -71,8 +71,8 @@ def test_each_row_holds_the_right_message(name: str, tmp_path: Path) -> None:
     # A row for each image of the slowest camera, whose others are as fast: at the stamp of one of a set's images.
     stamps = {note.header_ns for source in mapping.cameras.values() for note in bags.of_topic(notes, source.topic)}
     assert stamps >= set(episode.times_ns[1:].tolist())
-    for rows in episode.cameras.values():
-        assert np.all(np.diff(rows.numbers) == 1)
+    for shown in episode.cameras.values():
+        assert np.all(np.diff(shown.numbers) == 1)
     for feature, sources in mapping.features.items():
         rows = episode.features[feature]
         for row, time_ns in enumerate(episode.times_ns.tolist()):
