@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from demorec.ingest.clock import NS, SKEW_S, Int, Numbers, Timeline
 from demorec.ingest.mapping import BagMapping
 from demorec.ingest.mapping_file import ACTION, STATE
-from demorec.ingest.rows import RATE, EpisodeRows, Timelines
+from demorec.ingest.rows import Timelines
 from demorec.ingest.streams import NO_STAMP, BagStreams, Stream
 
 _JITTER = 0.25
@@ -36,7 +36,7 @@ _EPOCH_S = 1e8
 """Between two clocks: three years. No clock is as wrong; one of the two counts from another beginning."""
 _SLOW = 1.15
 """Periods of the rows, from which on a stream is called slower than they are."""
-_LOST = 1.6
+LOST = 1.6
 """Periods, from which on a message is missing between two."""
 NOTE = "note"
 """Kind of what is not odd, but good to know."""
@@ -72,7 +72,7 @@ def _findings(bag: Timelines, lines: Sequence[Timeline]) -> Iterator[Finding]:
     for line in lines:
         found = (*_message_findings(line.stream), *_time_findings(line), *_clock_findings(skews[line]))
         for kind, text in (*found, *_picture_findings(line), *_value_findings(line)):
-            yield _of(line.stream, kind, text)
+            yield of_stream(line.stream, kind, text)
     for problem in bag.streams.problems:
         yield Finding(kind="cut_off", stream="", text=problem)
     yield from _extent_findings([line for line in lines if line.is_regular])
@@ -84,7 +84,8 @@ def _findings(bag: Timelines, lines: Sequence[Timeline]) -> Iterator[Finding]:
     yield from _action_findings(bag.streams, bag.mapping)
 
 
-def _of(stream: Stream, kind: str, text: str) -> Finding:
+def of_stream(stream: Stream, kind: str, text: str) -> Finding:
+    """A finding of a stream."""
     return Finding(kind=kind, stream=stream.label, text=f"{stream.topic}: {text}")
 
 
@@ -114,14 +115,14 @@ def _time_findings(line: Timeline) -> Iterator[tuple[str, str]]:
     steps = np.diff(line.times_ns)
     gaps = np.flatnonzero(steps > _GAP * line.period_ns)
     lost = np.round(steps / line.period_ns).astype(np.int64) - 1
-    small = np.flatnonzero((lost > 0) & (steps <= _GAP * line.period_ns) & (steps > _LOST * line.period_ns))
+    small = np.flatnonzero((lost > 0) & (steps <= _GAP * line.period_ns) & (steps > LOST * line.period_ns))
     if len(gaps):
         longest = int(steps[gaps].max())
         begin = (line.times_ns[gaps[0]] - line.times_ns[0]) / NS
         yield "gap", f"{len(gaps)} gaps, the first at {begin:.2f} s, the longest of {longest / NS:.3f} s"
     if len(small):
         yield "drops", f"{int(lost[small].sum())} of {len(line.times_ns) + int(lost[small].sum())} messages are lost"
-    regular = steps[steps <= _LOST * line.period_ns]
+    regular = steps[steps <= LOST * line.period_ns]
     off = np.percentile(np.abs(regular - line.period_ns), 90) if len(regular) else 0.0
     if off > _JITTER * line.period_ns:
         yield "jitter", f"its steps of {line.period_ns / 1e6:.1f} ms are off by {off / 1e6:.1f} ms (one of ten by more)"
@@ -172,7 +173,7 @@ def _mixed_findings(bag: Timelines, lines: Sequence[Timeline]) -> Iterator[Findi
         return
     text = f'goes by times of recording, {usual:+.3f} s from the headers of the other streams: set clock.stamp = "log"'
     for line in (line for line in lines if not line.is_header):
-        yield _of(line.stream, "clock_offset", text)
+        yield of_stream(line.stream, "clock_offset", text)
     for topic, texts in bag.streams.texts.items():
         if topic != bag.mapping.robot.urdf_topic and not all(each.is_header for each in texts):
             yield Finding(kind="clock_offset", stream=topic, text=f"{topic}: {text}")
@@ -297,9 +298,9 @@ def _extent_findings(regular: Sequence[Timeline]) -> Iterator[Finding]:
     for line in regular:
         late, early = (line.times_ns[0] - begin) / NS, (end - line.times_ns[-1]) / NS
         if late > _STILL_S:
-            yield _of(line.stream, "late_start", f"begins {late:.2f} s late")
+            yield of_stream(line.stream, "late_start", f"begins {late:.2f} s late")
         if early > _STILL_S:
-            yield _of(line.stream, "early_end", f"ends {early:.2f} s early")
+            yield of_stream(line.stream, "early_end", f"ends {early:.2f} s early")
 
 
 def _offset_findings(lines: Sequence[Timeline]) -> Iterator[Finding]:
@@ -320,10 +321,10 @@ def _camera_findings(streams: BagStreams) -> Iterator[Finding]:
         frame = str(streams.infos.get(name, {}).get("header", {}).get("frame_id", ""))
         if frame and stream.frame_ids and stream.frame_ids[0] and frame != stream.frame_ids[0]:
             text = f"its pictures are of {stream.frame_ids[0]!r}, its calibration is of {frame!r}"
-            yield _of(stream, "swapped", text)
+            yield of_stream(stream, "swapped", text)
         elif other := _claimed_by(name, streams):
             text = f"its coordinate frame {stream.frame_ids[0]!r} is named like the topic of {other}"
-            yield _of(stream, "swapped", text)
+            yield of_stream(stream, "swapped", text)
     for (name, stream), (other_name, other_stream) in pairwise(sorted(streams.cameras.items())):
         shared = min(len(stream), len(other_stream))
         if shared >= _FROZEN and np.mean(np.isin(stream.picture_sums, other_stream.picture_sums)) > 0.9:
@@ -358,60 +359,10 @@ def _slow_findings(lines: Iterable[Timeline], fps: int) -> Iterator[Finding]:
     for line in slow:
         rate = NS / line.period_ns
         if not line.stream.heads:
-            yield _of(line.stream, "slow", f"comes {rate:.1f} times a second, rows {fps} times")
+            yield of_stream(line.stream, "slow", f"comes {rate:.1f} times a second, rows {fps} times")
         elif not is_filmed:
             advice = f"use fps = {max(1, round(rate))}"
-            yield _of(line.stream, "slow", f"comes {rate:.1f} times a second, rows {fps} times: {advice}")
-
-
-def row_findings(lines: Timelines, episodes: Sequence[EpisodeRows]) -> Iterator[Finding]:
-    """What is odd in the rows that were made of a bag: their rate, and images that are in two of them or in none."""
-    fps = lines.mapping.clock.fps
-    for rows in (rows for rows in episodes if rows.follows and len(rows.times_ns) > 1):
-        steps = np.diff(rows.times_ns)
-        rate = NS / float(steps[steps <= _LOST * np.median(steps)].mean())
-        if abs(rate - fps) > RATE * fps:
-            text = f"rows follow its messages, {rate:.1f} a second, fps says {fps}"
-            yield Finding(kind="fps", stream=rows.follows, text=text)
-            break
-    for name in lines.mapping.cameras if episodes else ():
-        yield from _use_findings(name, lines, episodes)
-
-
-def _use_findings(name: str, lines: Timelines, episodes: Sequence[EpisodeRows]) -> Iterator[Finding]:
-    """What becomes of a camera's images: a finding where rows could show more of them, else a note."""
-    line, clock = lines.lines[name], lines.mapping.clock
-    num_repeated = num_free = num_skipped = num_images = 0
-    for rows in episodes:
-        shown = lines.chosen(name, rows.times_ns).index
-        steps = np.diff(shown)
-        repeated = shown[1:][steps == 0]
-        num_repeated += len(repeated)
-        # Not those where an image is missing, or the stream is at its end; and an episode may begin between two images.
-        repeated = repeated[repeated < len(line.times_ns) - 1]
-        waits = line.times_ns[repeated + 1] - line.times_ns[repeated]
-        num_free += max(0, int(np.sum(waits <= _LOST * line.period_ns)) - 1)
-        num_skipped += int(np.maximum(steps - 1, 0).sum())
-        num_images += int(shown[-1] - shown[0]) + 1
-    num_rows = sum(len(rows.times_ns) for rows in episodes)
-    rate = NS / max(line.period_ns, 1)
-    repeats = f"{100 * num_repeated / num_rows:.3g} % of the rows show the image before"
-    skips = f"{100 * num_skipped / num_images:.3g} % of its images are in no row"
-    if min(num_free, num_skipped):  # where a row repeats and another skips, other rows would lose nothing
-        advice = 'use rows = "camera"'
-        if abs(rate - clock.fps) > max(RATE * clock.fps, 0.5):
-            advice = f"use fps = {max(1, round(rate))}"
-        elif clock.rows == "camera":
-            advice = "they come too unevenly for these rows"
-        yield _of(line.stream, "repeats", f"{repeats} and {skips}: {advice}")
-    elif max(num_free / num_rows, num_skipped / num_images) > RATE:
-        told = f"{repeats if num_free else skips}, since it comes {rate:.1f} times a second and rows {clock.fps} times"
-        # Every second image is a choice. Now the next, now the one after it is none, but for a camera beside a slower one.
-        is_uneven = abs(rate / clock.fps - round(rate / clock.fps)) > RATE
-        if num_skipped and is_uneven and not any(rows.follows for rows in episodes):
-            yield _of(line.stream, "skips", f"{told}: use fps = {max(1, round(rate))}")
-        else:
-            yield _of(line.stream, NOTE, told)
+            yield of_stream(line.stream, "slow", f"comes {rate:.1f} times a second, rows {fps} times: {advice}")
 
 
 def _unit_findings(streams: BagStreams, mapping: BagMapping) -> Iterator[Finding]:
@@ -421,7 +372,7 @@ def _unit_findings(streams: BagStreams, mapping: BagMapping) -> Iterator[Finding
             continue
         largest = float(np.nanmax(np.abs(stream.values), initial=0.0))
         if largest > _FULL_TURNS:
-            yield _of(stream, "unit", f"angles reach {largest:.4g}, which is hardly rad")
+            yield of_stream(stream, "unit", f"angles reach {largest:.4g}, which is hardly rad")
 
 
 def _action_findings(streams: BagStreams, mapping: BagMapping) -> Iterator[Finding]:
@@ -437,7 +388,7 @@ def _action_findings(streams: BagStreams, mapping: BagMapping) -> Iterator[Findi
     dead = [pair for pair in moving if _spread(state.values[:, pair[0]]) == 0.0]
     if dead:
         name = state.layout.names[dead[0][0]]
-        yield _of(state, "stuck", f"{name!r} never changes while the action of the same name does")
+        yield of_stream(state, "stuck", f"{name!r} never changes while the action of the same name does")
 
 
 def _spread(numbers: NDArray[Any]) -> float:

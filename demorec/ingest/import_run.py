@@ -22,10 +22,11 @@ from demorec.ingest.description import described_camera, described_feature, urdf
 from demorec.ingest.episode_writer import ImportedEpisodeWriter, PlannedEpisode, picture_plan
 from demorec.ingest.episodes import Window, subtask_rows, task_text, windows
 from demorec.ingest.fields import FieldError
-from demorec.ingest.findings import all_findings, row_findings
+from demorec.ingest.findings import all_findings
 from demorec.ingest.import_file import ImportFile, load_import_file, save_import_file
 from demorec.ingest.mapping import BagMapping, read_mapping
 from demorec.ingest.report import BagReport, EpisodeReport, stream_reports
+from demorec.ingest.row_findings import row_findings
 from demorec.ingest.rows import EpisodeRows, NoRowsError, Timelines
 from demorec.ingest.streams import BagDecoder, read_streams
 from demorec.runs.collected import CollectedFolder, differences, open_collected_run
