@@ -6,9 +6,10 @@ from bisect import bisect_right
 from collections.abc import Callable
 from fractions import Fraction
 from math import ceil, floor
+from typing import Any
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from demorec.ingest.episodes import Window
@@ -29,6 +30,8 @@ ROUNDINGS: dict[str, Callable[[Fraction], int]] = {
     "microseconds": lambda time: 1000 * round(time / 1000),
     "microseconds down": lambda time: 1000 * floor(time / 1000),
 }
+PATIENT: dict[str, Any] = {"deadline": None, "suppress_health_check": [HealthCheck.too_slow]}
+"""On a busy machine."""
 SOURCE = Source(topic="/joints", field="position")
 
 
@@ -83,7 +86,7 @@ seeds = st.integers(0, 2**32 - 1)
 roundings = st.sampled_from(sorted(ROUNDINGS))
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200, **PATIENT)
 @given(rates, phases, jitters, seeds, roundings)
 def test_a_camera_of_any_rate(rate: Fraction, phase: Fraction, jitter: float, seed: int, rounding: str) -> None:
     """Which the suggested fps is, rounded."""
@@ -95,7 +98,7 @@ def test_a_camera_of_any_rate(rate: Fraction, phase: Fraction, jitter: float, se
         assert _kinds(lines, rows) == set()
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200, **PATIENT)
 @given(st.integers(5, 200), phases, jitters, seeds, roundings)
 def test_an_even_grid(rate: int, phase: Fraction, jitter: float, seed: int, rounding: str) -> None:
     times = _moments(Fraction(rate), phase, jitter, seed, rounding)
@@ -112,7 +115,7 @@ def test_an_even_grid(rate: int, phase: Fraction, jitter: float, seed: int, roun
         assert sorted(rows.cameras["front"].ages_ns.tolist())[COUNT - 2] <= 3_000
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200, **PATIENT)
 @given(st.integers(5, 200), phases, phases, st.floats(0.0, 0.24), seeds, roundings)
 def test_two_cameras(rate: int, phase: Fraction, other: Fraction, jitter: float, seed: int, rounding: str) -> None:
     """Up to a quarter of a period all can be shown: images of a pair are nearer to each other than to those after."""
@@ -131,7 +134,7 @@ def test_two_cameras(rate: int, phase: Fraction, other: Fraction, jitter: float,
     assert "repeats" not in _kinds(lines, rows)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100, **PATIENT)
 @given(st.integers(5, 200), phases, phases, jitters, seeds)
 def test_two_cameras_that_jitter_wildly(rate: int, phase: Fraction, other: Fraction, jitter: float, seed: int) -> None:
     """Never more are lost than by a reader at the images of the followed camera, and what is lost is found."""
