@@ -98,10 +98,13 @@ def _between_gaps(timelines: list[Timeline], gap_s: float) -> list[Window]:
 def _unknown_words(markers: list[Text], mapping: BagMapping) -> list[str]:
     """What markers say that the mapping gives no meaning, each once, as it is shown; subtasks may share their topic."""
     words = mapping.episodes
-    if words.topic == mapping.subtasks.topic:
-        return []
     known = {True, False, "", words.start, words.stop, words.success, words.failure, *words.discard, *words.ignore}
-    found = dict.fromkeys(repr(marker.value)[:_SHOWN] for marker in markers if marker.value not in known)
+    is_shared = words.topic == mapping.subtasks.topic
+
+    def is_known(value: object) -> bool:
+        return isinstance(value, str | int | float) and ((is_shared and isinstance(value, str)) or value in known)
+
+    found = dict.fromkeys(repr(marker.value)[:_SHOWN] for marker in markers if not is_known(marker.value))
     return [*found][:_MOST_TOLD] + [f"{len(found) - _MOST_TOLD} more"] * (len(found) > _MOST_TOLD)
 
 
@@ -118,15 +121,14 @@ def _between_markers(markers: list[Text], mapping: BagMapping) -> list[Window]:
             success = {words.success: True, words.failure: False}.get(marker.value) if marker.value else None
             found.append(Window(begin_ns=begin, end_ns=marker.time_ns, success=success))
             begin = None
-        elif marker.value in words.discard:
-            if begin is not None:
-                found.append(Window(begin_ns=begin, end_ns=marker.time_ns, discarded=marker.value))
-            elif found:
-                found[-1] = replace(found[-1], discarded=marker.value)
-            begin = None
         elif begin is None and found and marker.value in (words.success, words.failure):
             # The verdict may come after the end.
             found[-1] = replace(found[-1], success=marker.value == words.success)
+        elif begin is not None and marker.value in words.discard:
+            found.append(Window(begin_ns=begin, end_ns=marker.time_ns, discarded=marker.value))
+            begin = None
+        elif found and marker.value in words.discard:
+            found[-1] = replace(found[-1], discarded=marker.value)
     return found
 
 
