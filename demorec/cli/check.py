@@ -90,7 +90,7 @@ class Check:
         options = CheckOptions(pictures=self.pictures, only=self.only, workers=workers, allowed=allowed)
         options.validate()
         reports, replays = [], []
-        with ProgressBar("checking", total=len(subjects), unit="item") as bar:
+        with ProgressBar("checking", total=len(subjects), unit="item", at_once=workers) as bar:
             for report in check_subjects(subjects, options):
                 reports.append(report)
                 bar.advance()
