@@ -112,7 +112,7 @@ class Check:
             say_json(plain + [plain_deep(report) for report in remade])
         else:
             summary = _summary(reports, len(failed), len(replays), len(diverged))
-            say(summary + deep_summary(remade, different))
+            say(summary + deep_summary(remade, different), *_lacking(reports))
         return 1 if failed or diverged or different else 0
 
     def _remade(self, subjects: Sequence[Subject], options: CheckOptions) -> Iterator[DeepReport]:
@@ -176,8 +176,11 @@ def _lines(report: SubjectReport, *, verbose: bool) -> Iterator[str]:
         ("skip", "not measured"),
     )
     blocked = sum(result.is_blocked for result in report.results)
-    numbers = {level: report.count(level) - (blocked if level == "skip" else 0) for level, _ in words}
+    lacking = sum(result.needs_allow for result in report.results)
+    numbers = {level: report.count(level) - (blocked + lacking if level == "skip" else 0) for level, _ in words}
     counts = ", ".join(f"{numbers[level]} {word}" for level, word in words if numbers[level])
+    if lacking:
+        counts += f", {lacking} {'needs' if lacking == 1 else 'need'} --allow"
     counts = counts or f"none of the chosen checks is about a {report.kind}"
     kind = "failed attempt" if report.is_failed_attempt else report.kind
     yield f"{report.level:<4}  {kind} {report.path}: {counts}"
@@ -186,6 +189,16 @@ def _lines(report: SubjectReport, *, verbose: bool) -> Iterator[str]:
             yield f"      {_result(result)}"
     if blocked:
         yield f"      {blocked} {'check needs' if blocked == 1 else 'checks need'} what is damaged."
+
+
+def _lacking(reports: Sequence[SubjectReport]) -> Iterator[str]:
+    """What was skipped, and the flags that it takes."""
+    lacking = sum(result.needs_allow for report in reports for result in report.results)
+    if modules := dict.fromkeys(name for report in reports for name in report.needs_allow):
+        yield (
+            f"{counted(lacking, 'check')} skipped, which need files beside code from outside of demorec: if you trust "
+            f"it, add {' '.join(f'--allow {name}' for name in modules)}."
+        )
 
 
 def _result(result: Result) -> str:
@@ -217,7 +230,8 @@ def _plain(report: SubjectReport) -> dict[str, Any]:
         if result["value"] is not None and abs(result["value"]) == float("inf"):
             result["value"] = None  # JSON has no infinity; the level and the detail tell
     return {"path": str(report.path), "kind": report.kind, "level": report.level, "results": results} | (
-        {"failed_attempt": True} if report.is_failed_attempt else {}
+        ({"failed_attempt": True} if report.is_failed_attempt else {})
+        | ({"needs_allow": list(report.needs_allow)} if report.needs_allow else {})
     )
 
 
