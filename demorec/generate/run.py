@@ -27,6 +27,9 @@ from demorec.processes import available_cores
 from demorec.render.warm import warm_up_renderer
 from demorec.runs.recordings import inspect_recording
 from demorec.runs.run_file import UNFINISHED, RunFile
+from demorec.scene.assets import allow_models
+from demorec.scene.inertials import check_masses
+from demorec.tables import load_robot
 
 MAX_LOSSES = 5
 """How often one attempt may lose its worker before the run stops: chance takes few, too little memory takes all."""
@@ -65,15 +68,17 @@ def generate(
 
     Raises:
         MissingDependencyError: Ray is not installed.
-        ConfigError: The task cannot be loaded, the Ray cluster cannot be reached, or the folder is in use, holds
-            another run or cannot be written to.
+        ConfigError: The task cannot be loaded, a link of the robot does not say what it weighs, the Ray cluster cannot
+            be reached, or the folder is in use, holds another run or cannot be written to.
         GenerationError: The run cannot go on; everything finished is kept.
         KeyboardInterrupt: At the second Ctrl-C.
     """
     from demorec.loop import load_task
 
     progress = progress or RunObserver()
-    load_task(config)  # which raises what the first worker would raise, before anything is written
+    load_task(config)  # these raise what the first worker would raise, before anything is written
+    allow_models(config.modules)
+    check_masses(load_robot(config.robot, config.modules).urdf)
     with ExitStack() as stack:
         if options.executor == "ray":
             from demorec.generate.on_ray import connected

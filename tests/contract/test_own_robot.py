@@ -132,6 +132,25 @@ def test_check_says_what_it_skips_for_lack_of_the_model_and_names_the_flag(
     assert "needs_allow" not in report
 
 
+def test_a_link_without_a_mass_is_refused_before_anything_is_made(
+    folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    text = (folder / "xarm6.urdf").read_text()
+    begin = text.index("<inertial>", text.index('<link name="link6">'))
+    end = text.index("</inertial>", begin) + len("</inertial>")
+    (folder / "xarm6.urdf").write_text(text[:begin] + text[end:])
+    flags = ["--robot", XARM6, "--cameras", "none", "--num-episodes", "1", "--out", tmp_path / "run"]
+    assert exit_code(*flags, program=generate_dataset_main) == 2
+    told = capfd.readouterr()
+    assert told.out == ""
+    assert re.fullmatch(
+        r"generate-dataset: The robot cannot be simulated, since its URDF does not say what these links weigh: 'link6' "
+        r"\(moves and has a shape, but no <inertial>\).*: my_robots:xarm6.urdf\n",
+        told.err,
+    )
+    assert not (tmp_path / "run").exists()
+
+
 def test_only_what_can_be_a_module_is_named_as_one() -> None:
     names = [
         "lab.arms:a.urdf",
