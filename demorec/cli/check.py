@@ -14,7 +14,7 @@ from demorec.cli.check_deep import deep_lines, deep_summary, plain_deep
 from demorec.cli.replay import demonstrations, told
 from demorec.cli.shared.allow import Allow, allowed_modules
 from demorec.cli.shared.output import counted, say, say_json
-from demorec.cli.shared.paths import need_paths, places_read, refuse_inside
+from demorec.cli.shared.paths import need_paths, places_read, refuse_inside, tell_unfinished
 from demorec.cli.shared.progress import ProgressBar
 from demorec.errors import ConfigError, OptionError
 from demorec.safety.replacing import PICTURE, check_replaceable
@@ -113,6 +113,7 @@ class Check:
         else:
             summary = _summary(reports, len(failed), len(replays), len(diverged))
             say(summary + deep_summary(remade, different), *_lacking(reports))
+        tell_unfinished(self.paths)
         return 1 if failed or diverged or different else 0
 
     def _remade(self, subjects: Sequence[Subject], options: CheckOptions) -> Iterator[DeepReport]:
