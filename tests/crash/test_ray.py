@@ -72,10 +72,10 @@ def cluster() -> Iterator[object]:
         assert not alive
 
 
-def processes_of_ray() -> set[psutil.Process]:
-    """Those that descend from this process: nodes, their services, workers."""
+def processes_of_ray(above: int | None = None) -> set[psutil.Process]:
+    """Those that descend from this process, or from the one of this number: nodes, their services, workers."""
     found = set()
-    for process in psutil.Process().children(recursive=True):
+    for process in psutil.Process(above).children(recursive=True):
         with suppress(psutil.Error):
             command = " ".join(process.cmdline())
             if "/ray/" in command or command.startswith("ray::"):
@@ -204,7 +204,7 @@ def test_a_node_that_ends_on_its_own_machine_ends_the_run_with_an_error(tmp_path
         while num_finished(out) < 2:
             assert process.poll() is None
             time.sleep(0.05)
-        family = processes_of_ray()
+        family = processes_of_ray(process.pid)
         agents = [p for p in family if p.cmdline() and p.cmdline()[0].startswith("ray::DashboardAgent")]
         assert agents
         for agent in agents:
