@@ -65,7 +65,8 @@ class Check:
     verbose: bool = False
     """Print the checks that pass, too."""
     allow: Allow = ()
-    """A module or package of your own that may be imported for the tasks, robots and cameras that the files name."""
+    """A module or package of your own that may be imported for the tasks, robots and cameras that the files name, and
+    beside which their models may be read."""
     json: bool = False
     """Print JSON: a list with one object for each recording, run and dataset."""
 
