@@ -11,6 +11,7 @@ import json
 import os
 import struct
 from collections.abc import Iterator
+from concurrent.futures import BrokenExecutor
 from pathlib import Path
 
 
@@ -106,6 +107,10 @@ def resource_error(error: BaseException, path: Path | None = None) -> ResourceEr
     for cause in error_chain(error):
         if isinstance(cause, ResourceError):
             return cause
+        if isinstance(cause, BrokenExecutor):
+            return ResourceError(
+                "A process of this command was killed, perhaps for lack of memory: try again with fewer --workers."
+            )
         number = errno.ENOMEM if isinstance(cause, MemoryError) else getattr(cause, "errno", None)
         if isinstance(cause, ImportError | OSError) and number is None:  # the dynamic linker says why in words alone
             number = next((number for words, number in _LINKER_WORDS.items() if words in str(cause)), None)

@@ -26,7 +26,7 @@ Scope = Literal["recording", "collected", "run", "collected_run", "dataset", "mo
 Group = Literal["file", "time", "physics", "alignment", "calibration", "pictures", "outcome", "run", "dataset"]
 
 _BLOCKED = "it needs what is damaged"
-
+_NEEDS_ALLOW = "not measured without --allow: "
 
 COLOR_TOPICS = ("/camera/{camera}/h264", "/camera/{camera}/video", "/camera/{camera}/image/compressed")
 """Where a camera's coded colour pictures are, whatever the codec; for `Check.reads`."""
@@ -113,7 +113,7 @@ class Check:
         except MissingDependencyError as error:
             return self.skipped(str(error))
         except NotAllowedError as error:  # a model of the user's own, which says nothing about the recording
-            return self.skipped(f"not measured: {error}")
+            return self.skipped(f"{_NEEDS_ALLOW}{error}")
         except Exception as error:
             if (lack := resource_error(error)) is not None:
                 raise lack from error
@@ -187,6 +187,11 @@ class Result:
     def is_blocked(self) -> bool:
         """Whether nothing was measured since what it needs is damaged, which another check tells."""
         return self.level == "skip" and self.detail == _BLOCKED
+
+    @property
+    def needs_allow(self) -> bool:
+        """Whether nothing was measured since the user has not allowed a module that it needs a file of."""
+        return self.level == "skip" and self.detail.startswith(_NEEDS_ALLOW)
 
 
 def check(

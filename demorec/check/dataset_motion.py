@@ -13,7 +13,6 @@ from demorec.check.coverage import twins, worst_gap
 from demorec.check.dataset import Dataset, Rows
 from demorec.check.rows import LinkMatrices, displacement, matrices
 from demorec.check.run import motion_vector
-from demorec.errors import NotAllowedError
 from demorec.geometry import Array
 from demorec.scene.assets import asset_path
 from demorec.scene.episode import EpisodeInfo
@@ -65,10 +64,7 @@ def dataset_forward_kinematics(dataset: Dataset) -> Found:
         if (model := dataset.robot_digests[each.number]) is not None:
             urdf = dataset.robots[model].model
         else:
-            try:
-                urdf = Urdf.load(asset_path(info.robot.urdf), scale=info.scene.robot.scale)
-            except NotAllowedError:  # older datasets do not hold the model of a robot of the user's own
-                return None
+            urdf = Urdf.load(asset_path(info.robot.urdf), scale=info.scene.robot.scale)  # as of older datasets
         joints = dict(zip(info.robot.arm_joints, rows[STATE].astype(np.float64).T, strict=False))
         fk = LinkMatrices(urdf, joints, len(rows[STATE]))[info.robot.tcp_link]
         for name, poses in told.items():

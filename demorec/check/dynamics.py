@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from demorec.check.base import Found, Measurement, NotMeasured, physics_check, worst
 from demorec.check.episode import CheckedEpisode
 from demorec.check.rows import longest_run
-from demorec.errors import SceneError
+from demorec.errors import SceneError, as_reason
 from demorec.geometry import Array
 from demorec.scene.assets import asset_path
-from demorec.scene.urdf import parse_xml
+from demorec.scene.inertials import link_masses
 
 MIN_LOAD = 3.0
 """N m: joints that bear less, root mean square, say nothing about efforts."""
@@ -101,17 +101,9 @@ class _Dynamics:
 def _inertials(urdf: str) -> dict[str, tuple[float, Array]]:
     """Link -> mass, kg, and centre of mass in the link's frame, metres."""
     try:
-        root = parse_xml(asset_path(urdf).read_text())
-        found = {}
-        for link in root.findall("link"):
-            mass, origin = link.find("inertial/mass"), link.find("inertial/origin")
-            if mass is not None:
-                words = "0 0 0" if origin is None else origin.get("xyz", "0 0 0")
-                centre = np.array([float(word) for word in words.split()])
-                found[link.attrib["name"]] = (float(mass.attrib["value"]), centre)
-    except (OSError, ValueError, KeyError) as error:
-        raise SceneError(f"The masses of the model {urdf!r} cannot be read.") from error
-    return found
+        return link_masses(asset_path(urdf).read_text())
+    except (OSError, ValueError) as error:
+        raise SceneError(as_reason(error)) from error
 
 
 @physics_check(

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 _TIMES = frozenset(
     ("clock_offset", "clock_jump", "clock_drift", "unstamped", "drops", "gap", "slow", "fps", "jitter", "order")
-) | {"duplicates", "late_start", "early_end", "cut_off"}
+) | {"duplicates", "late_start", "early_end", "cut_off", "repeats", "skips"}
 _PICTURES = frozenset(("frozen", "same_pictures", "swapped", "size", "format", "keyframe", "frame_id"))
 _MOST_TOLD = 5
 
@@ -27,7 +27,7 @@ import_check = partial(check, scope="collected_run", fail=math.inf, reads=("impo
 
 @import_check(
     group="time",
-    measures="findings about times in the bags that were imported: clocks, losses, gaps, jitter, order",
+    measures="findings about times in the bags that were imported: clocks, losses, gaps, repeats, jitter, order",
 )
 def import_times(folder: Path) -> Found:
     """The streams of the bags were whole, in order and on one clock."""
@@ -57,11 +57,11 @@ def import_numbers(folder: Path) -> Found:
     measures="episodes that an import dropped, since something was missing or too old, and bags that it skipped",
 )
 def import_dropped(folder: Path) -> Found:
-    """Every episode that the bags hold is in the run."""
+    """Every episode that the bags hold is in the run, but those that a marker discards."""
     if (found := _import(folder)) is None:
         return None
-    dropped = [row.reason for bag in found.bags for row in bag.episodes if row.episode_index is None]
-    dropped += [f"{bag.name}: {bag.reason}" for bag in found.skipped]
+    rows = [row for bag in found.bags for row in bag.episodes if row.episode_index is None and not row.discarded]
+    dropped = [row.reason for row in rows] + [f"{bag.name}: {bag.reason}" for bag in found.skipped]
     return Measurement(value=len(dropped), detail="; ".join(dropped[:_MOST_TOLD]))
 
 
@@ -77,7 +77,7 @@ def _found(folder: Path, is_mine: Callable[[str], bool]) -> Found:
     told = [
         f"{bag.name}: {finding.kind}, {finding.stream}: {finding.text}".replace(", : ", ": ")
         for bag in found.bags
-        for finding in bag.findings
+        for finding in bag.odd
         if is_mine(finding.kind)
     ]
     return Measurement(value=len(told), detail="; ".join(told[:_MOST_TOLD]))

@@ -20,7 +20,9 @@ from demorec.recording.opening import is_collected
 from demorec.runs.collected import is_collected_run
 from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings, find
 from demorec.runs.run_file import DATASET
-from demorec.scene.assets import allow_models
+from demorec.safety.user_modules import is_allowed
+from demorec.scene.assets import allow_models, modules_of_models
+from demorec.scene.episode import EpisodeInfo
 from demorec.tables import CHECKS
 
 _OF_THE_FILE: tuple[Group, ...] = ("file", "time")
@@ -80,9 +82,11 @@ class SubjectReport(Subject):
 
     Attributes:
         results: In the order of the table.
+        needs_allow: The user's own modules that must be allowed for the checks that were skipped for lack of them.
     """
 
     results: tuple[Result, ...]
+    needs_allow: tuple[str, ...] = ()
 
     @property
     def level(self) -> Level:
@@ -158,6 +162,7 @@ def check_subjects(subjects: Sequence[Subject], options: CheckOptions) -> Iterat
 def check_subject(subject: Subject, options: CheckOptions) -> SubjectReport:
     """All checks of one recording, run or dataset."""
     allow_models(options.allowed)
+    infos: Sequence[EpisodeInfo] = ()
     checks = options.checks(subject.kind)
     if subject.kind == "recording" and is_collected(subject.path):
         with CollectedRecording(subject.path) as recording:
@@ -168,6 +173,8 @@ def check_subject(subject: Subject, options: CheckOptions) -> SubjectReport:
     elif subject.kind == "recording":
         with CheckedEpisode(subject.path) as episode:
             found = _run(checks, episode, ("opens", "readable"), lambda: episode.columns)
+            if any(result.needs_allow for result in found):
+                infos = [episode.info]
     elif subject.kind == "run" and is_collected_run(subject.path):
         found = [check.run(subject.path) for check in options.checks("collected_run")]
         found += [check.skipped(NOT_APPLICABLE) for check in checks]
@@ -177,8 +184,12 @@ def check_subject(subject: Subject, options: CheckOptions) -> SubjectReport:
         dataset = Dataset(subject.path)
         found = _run(checks, dataset, ("dataset_readable",), lambda: dataset.rows)
         found += _run(options.checks("motion"), Motions(dataset), (), lambda: dataset.rows)
+        if any(result.needs_allow for result in found):
+            infos = [info for info in dataset.infos if info]
+    models = [name for info in infos for name in (info.robot.urdf, *(body.shape.file for body in info.scene.bodies))]
+    modules = tuple(name for name in modules_of_models(models) if not is_allowed(name, options.allowed))
     results = tuple(replace(result, detail=_within(subject.path, result.detail)) for result in found)
-    return SubjectReport(**vars(subject), results=results)
+    return SubjectReport(**vars(subject), results=results, needs_allow=modules)
 
 
 def _within(path: Path, detail: str) -> str:

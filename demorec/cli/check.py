@@ -14,7 +14,7 @@ from demorec.cli.check_deep import deep_lines, deep_summary, plain_deep
 from demorec.cli.replay import demonstrations, told
 from demorec.cli.shared.allow import Allow, allowed_modules
 from demorec.cli.shared.output import counted, say, say_json
-from demorec.cli.shared.paths import need_paths, places_read, refuse_inside
+from demorec.cli.shared.paths import need_paths, places_read, refuse_inside, tell_unfinished
 from demorec.cli.shared.progress import ProgressBar
 from demorec.errors import ConfigError, OptionError
 from demorec.safety.replacing import PICTURE, check_replaceable
@@ -65,7 +65,8 @@ class Check:
     verbose: bool = False
     """Print the checks that pass, too."""
     allow: Allow = ()
-    """A module or package of your own that may be imported for the tasks, robots and cameras that the files name."""
+    """A module or package of your own that may be imported for the tasks, robots and cameras that the files name, and
+    beside which their models may be read."""
     json: bool = False
     """Print JSON: a list with one object for each recording, run and dataset."""
 
@@ -90,7 +91,7 @@ class Check:
         options = CheckOptions(pictures=self.pictures, only=self.only, workers=workers, allowed=allowed)
         options.validate()
         reports, replays = [], []
-        with ProgressBar("checking", total=len(subjects), unit="item") as bar:
+        with ProgressBar("checking", total=len(subjects), unit="item", at_once=workers) as bar:
             for report in check_subjects(subjects, options):
                 reports.append(report)
                 bar.advance()
@@ -112,7 +113,8 @@ class Check:
             say_json(plain + [plain_deep(report) for report in remade])
         else:
             summary = _summary(reports, len(failed), len(replays), len(diverged))
-            say(summary + deep_summary(remade, different))
+            say(summary + deep_summary(remade, different), *_lacking(reports))
+        tell_unfinished(self.paths)
         return 1 if failed or diverged or different else 0
 
     def _remade(self, subjects: Sequence[Subject], options: CheckOptions) -> Iterator[DeepReport]:
@@ -176,8 +178,11 @@ def _lines(report: SubjectReport, *, verbose: bool) -> Iterator[str]:
         ("skip", "not measured"),
     )
     blocked = sum(result.is_blocked for result in report.results)
-    numbers = {level: report.count(level) - (blocked if level == "skip" else 0) for level, _ in words}
+    lacking = sum(result.needs_allow for result in report.results)
+    numbers = {level: report.count(level) - (blocked + lacking if level == "skip" else 0) for level, _ in words}
     counts = ", ".join(f"{numbers[level]} {word}" for level, word in words if numbers[level])
+    if lacking:
+        counts += f", {lacking} {'needs' if lacking == 1 else 'need'} --allow"
     counts = counts or f"none of the chosen checks is about a {report.kind}"
     kind = "failed attempt" if report.is_failed_attempt else report.kind
     yield f"{report.level:<4}  {kind} {report.path}: {counts}"
@@ -186,6 +191,16 @@ def _lines(report: SubjectReport, *, verbose: bool) -> Iterator[str]:
             yield f"      {_result(result)}"
     if blocked:
         yield f"      {blocked} {'check needs' if blocked == 1 else 'checks need'} what is damaged."
+
+
+def _lacking(reports: Sequence[SubjectReport]) -> Iterator[str]:
+    """What was skipped, and the flags that it takes."""
+    lacking = sum(result.needs_allow for report in reports for result in report.results)
+    if modules := dict.fromkeys(name for report in reports for name in report.needs_allow):
+        yield (
+            f"{counted(lacking, 'check')} skipped, which need files beside code from outside of demorec: if you trust "
+            f"it, add {' '.join(f'--allow {name}' for name in modules)}."
+        )
 
 
 def _result(result: Result) -> str:
@@ -217,7 +232,8 @@ def _plain(report: SubjectReport) -> dict[str, Any]:
         if result["value"] is not None and abs(result["value"]) == float("inf"):
             result["value"] = None  # JSON has no infinity; the level and the detail tell
     return {"path": str(report.path), "kind": report.kind, "level": report.level, "results": results} | (
-        {"failed_attempt": True} if report.is_failed_attempt else {}
+        ({"failed_attempt": True} if report.is_failed_attempt else {})
+        | ({"needs_allow": list(report.needs_allow)} if report.needs_allow else {})
     )
 
 

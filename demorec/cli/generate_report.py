@@ -58,10 +58,11 @@ def check_run(result: RunResult, *, deep_every: int = 0, progress: Callable[[int
     sample = [a.file for a in result.run.successes[deep_every - 1 :: deep_every]] if deep_every else []
     total = len(subjects) + len(sample)
     workers = useful_workers(subjects, pictures=False, cores=available_cores())
+    options = CheckOptions(pictures=False, workers=workers, allowed=result.run.config.modules)
     warnings = 0
     failures: list[str] = []
     failed_attempts = 0
-    for done, report in enumerate(check_subjects(subjects, CheckOptions(pictures=False, workers=workers))):
+    for done, report in enumerate(check_subjects(subjects, options)):
         progress(done + 1, total)
         if report.is_failed_attempt and not report.is_bad():
             failed_attempts += report.level == "fail"
@@ -142,7 +143,8 @@ def print_result(result: RunResult, export: ExportRecord | None, checked: Closin
 def next_commands(result: RunResult, export: ExportRecord | None) -> list[str]:
     """What to type next, quoted for the shell."""
     folder = str(result.folder)
-    commands = [[_program("demorec"), "view", folder], [_program("demorec"), "check", folder]]
+    allow = [word for module in result.run.config.modules for word in ("--allow", module)]
+    commands = [[_program("demorec"), name, folder, *allow] for name in ("view", "check")]
     # LeRobot's policies take pictures, or an environment state that this dataset does not have.
     if export is not None and result.run.config.cameras and find_spec("torch") and find_spec("lerobot"):
         commands.append(

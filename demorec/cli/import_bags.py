@@ -118,10 +118,15 @@ class Import:
         episodes = [episode for report in result.reports for episode in report.episodes]
         made = [episode for episode in episodes if episode.episode_index is not None]
         dropped = f", {len(episodes) - len(made)} dropped" if len(made) < len(episodes) else ""
-        findings = sum(len(report.findings) for report in result.reports)
+        odd = [finding.kind for report in result.reports for finding in report.odd]
+        notes = sum(len(report.findings) for report in result.reports) - len(odd)
         say(f"{counted(len(made), 'episode')}, {sum(row.num_frames for row in made)} frames{dropped}: {out}")
-        odd = f"{counted(findings, 'finding')} in the bags, see above and demorec check."
-        say(odd if findings else "Nothing odd was found.")
+        if odd:
+            kinds = ", ".join(sorted(set(odd)))
+            say(f"{counted(len(odd), 'finding')} in the bags ({kinds}), see above and demorec check.")
+        else:
+            above = f"No findings; {counted(notes, 'note')} above of images in two rows, or in none, by design."
+            say(above if notes else "Nothing odd was found.")
         if not result.skipped:
             return 0
         say(f"Skipped {len(result.skipped)} of {counted(len(result.reports) + len(result.skipped), 'bag')}:")

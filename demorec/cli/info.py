@@ -60,7 +60,11 @@ def _describe(path: Path) -> tuple[dict[str, Any], list[str]]:
     """Plain data for --json, and the lines for people."""
     found = expect(path, "recording", "run", "dataset", "recordings", "evaluation")
     describe = {"recording": _recording, "run": _run, "dataset": _dataset}.get(found.kind)
-    return _folder(found) if describe is None else describe(path)
+    plain, lines = _folder(found) if describe is None else describe(path)
+    if found.unfinished:
+        plain["unfinished"] = [str(file) for file in found.unfinished]
+        lines += ["", f"Left out: {found.left}."]
+    return plain, lines
 
 
 def _recording(path: Path) -> tuple[dict[str, Any], list[str]]:

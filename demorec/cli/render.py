@@ -97,7 +97,7 @@ class Render:
         workers = min(self.workers or available_cores(), len(jobs))
         reports: list[RerenderReport] = []
         try:
-            with ProgressBar("rendering", total=len(jobs)) as bar:
+            with ProgressBar("rendering", total=len(jobs), at_once=workers) as bar:
                 for report in _rendered(jobs, options, self.overwrite, workers):
                     bar.advance()
                     reports.append(report)

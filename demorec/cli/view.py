@@ -12,7 +12,7 @@ from tyro.conf import Positional
 
 from demorec.cli.shared.allow import Allow, allowed_modules
 from demorec.cli.shared.output import say, tell
-from demorec.cli.shared.paths import places_read, refuse_inside
+from demorec.cli.shared.paths import places_read, refuse_inside, tell_unfinished
 from demorec.errors import ConfigError, check_option
 from demorec.runs.find import expect
 from demorec.safety.replacing import PICTURE, RERUN_FILE, check_replaceable
@@ -77,6 +77,7 @@ class View:
         from demorec.playback.sources import find_episodes, select
 
         sources = select(find_episodes(self.paths, include_failures=self.include_failures), self.episodes)
+        tell_unfinished(self.paths)
         if self.compare:
             if len(sources) != 2:
                 raise ConfigError(f"--compare takes two episodes, found {len(sources)}: name two recordings.")

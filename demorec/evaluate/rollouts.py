@@ -15,6 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from importlib.metadata import PackageNotFoundError, version
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -193,11 +194,13 @@ def evaluate(
         EpisodePlan(config=settings.config, episode_index=index) for index in range(num_episodes) if index not in done
     ]
     with LocalExecutor(MAKE_ROLLOUT, out, workers=workers, recycle_after=1000) as executor:
-        for report in executor.carry_out(due):
+        for report in chain.from_iterable(executor.carry_out(functools.partial(next, iter(due), None))):
             if isinstance(report, Raised):
                 raise DemorecError(f"Episode {report.plan.episode_index}: {report.kind}: {report.message}")
             if isinstance(report, Lost):
-                raise DemorecError(f"Episode {report.plan.episode_index} was lost: {report.reason}.")
+                raise DemorecError(
+                    f"Episode {report.plan.episode_index} was lost: {report.reason}; the same command goes on."
+                )
             evaluation = _with(evaluation, [*evaluation.rollouts, report.attempt])
             _save(evaluation, out)
             progress(evaluation)

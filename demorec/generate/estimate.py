@@ -7,6 +7,8 @@ import shutil
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import chain
 from pathlib import Path
 
 from demorec.config import EpisodePlan, GenerateConfig
@@ -101,9 +103,9 @@ def estimate(config: GenerateConfig, options: RunOptions, *, maker: str = MAKE_E
 def _make(maker: str, folder: Path, config: GenerateConfig, count: int, *, workers: int) -> list[Made]:
     """The first episodes, in order of their ends."""
     made: list[Made] = []
-    plans = [EpisodePlan(config=config, episode_index=index) for index in range(count)]
+    plans = (EpisodePlan(config=config, episode_index=index) for index in range(count))
     with LocalExecutor(maker, folder, workers=workers, recycle_after=count) as executor:
-        for report in executor.carry_out(plans):
+        for report in chain.from_iterable(executor.carry_out(partial(next, plans, None))):
             if isinstance(report, Raised):
                 raise report.error(f"The pilot episode cannot be made: {report.message}")
             if isinstance(report, Lost):

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import errno
 import importlib
+import time
 import traceback
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,7 +27,10 @@ MAKE_EPISODE = "demorec.generate.worker:make_episode"
 _THREAD_SETTINGS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 SINGLE_THREADED = dict.fromkeys(_THREAD_SETTINGS, "1")
 """Environment of a worker: a worker is one core, so that N workers take N cores and not N times N threads."""
-_POLL_S = 1.0
+CAPACITY_WAIT_S = 300.0
+"""How long a run waits without room for any worker: a cloud takes 1 to 5 min to boot a machine for a lost one."""
+POLL_S = 0.2
+"""How often the caller of `Executor.carry_out` may look around, at Ctrl-C for example."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,13 +107,45 @@ class Executor(Protocol):
     def __exit__(self, *exc: object) -> None:
         self.close()
 
-    def carry_out(self, plans: Iterable[EpisodePlan]) -> Iterator[Report]:
-        """Begin plans in their order, as many at a time as there is room for; gives reports in that of their ends."""
-        waiting = deque(plans)
-        while waiting or self.pending:
-            while waiting and self.has_room:
-                self.submit(waiting.popleft())
-            yield from self.wait(_POLL_S)
+    def carry_out(
+        self, take: Callable[[], EpisodePlan | None], *, says: Callable[[str], None] = lambda message: None
+    ) -> Iterator[list[Report]]:
+        """Carry out plans until none is due and none is pending, as many at a time as there is room for.
+
+        Args:
+            take: Gives the next plan, or None when none is due now; asked again after each list of reports.
+            says: Told when there is no room for any worker, which is waited for.
+
+        Yields:
+            What has ended; an empty list when nothing has for `POLL_S`.
+
+        Raises:
+            GenerationError: There was no room for `CAPACITY_WAIT_S`.
+        """
+        lost_at: float | None = None
+        plan = take()
+        while plan is not None or self.pending:
+            while plan is not None and self.has_room:
+                self.submit(plan)
+                plan = take()
+            if self.pending:
+                reports = self.wait(POLL_S)
+            else:
+                reports = []
+                time.sleep(POLL_S)
+            if reports or (self.workers and (self.pending or self.has_room)):
+                lost_at = None
+            elif lost_at is None:
+                lost_at = time.monotonic()
+                says(f"There is no room for any worker now: waiting for it, at most {CAPACITY_WAIT_S:.0f} s.")
+            elif time.monotonic() - lost_at > CAPACITY_WAIT_S:
+                raise GenerationError(
+                    f"There has been no room for any worker for {CAPACITY_WAIT_S:.0f} s: see whether the nodes of the "
+                    "cluster are up, then run the same command again."
+                )
+            yield reports
+            if plan is None:
+                plan = take()
 
 
 def attempt_episode(maker: str, plan: EpisodePlan, folder: Path) -> Made | Raised:

@@ -8,6 +8,7 @@ the bound and the words are those of the local executor.
 from __future__ import annotations
 
 import logging
+import math
 import socket
 import time
 from collections.abc import Iterator
@@ -59,7 +60,9 @@ class RayExecutor(Executor):
         cpus, gpus = options.cpus_per_worker, options.gpus_per_worker
         self._needs = {"CPU": cpus, "GPU": gpus}
         self._pending: dict[Any, EpisodePlan] = {}
-        self._counted_at = -1e9
+        self._node = ray.get_runtime_context().get_node_id()
+        self._is_cut_off = False
+        self._counted_at = -math.inf
         self._size = 0
         self._task = ray.remote(
             num_cpus=cpus,
@@ -78,11 +81,21 @@ class RayExecutor(Executor):
 
     @property
     def workers(self) -> int:
-        """Attempts that the cluster has room for now, or as many as were asked for."""
+        """Attempts that the cluster has room for now, or as many as were asked for.
+
+        Raises:
+            GenerationError: The node that we are connected to has ended: whatever comes back, we cannot reach it.
+        """
         if time.monotonic() - self._counted_at > _RECOUNT_S:
             self._counted_at = time.monotonic()
             have = ray.cluster_resources()
             self._size = min(int(have.get(name, 0) / need) for name, need in self._needs.items() if need > 0)
+            self._is_cut_off |= any(node["NodeID"] == self._node and not node["Alive"] for node in ray.nodes())
+        if self._is_cut_off:
+            raise GenerationError(
+                "The Ray node that this command is connected to has ended (perhaps for lack of memory): start it again "
+                "if it was not ours (ray start), then run the same command again."
+            )
         return self._size if self._asked is None else min(self._asked, self._size)
 
     @property
@@ -117,7 +130,10 @@ class RayExecutor(Executor):
                 raise GenerationError(f"A Ray worker cannot work: {_last_line(error)}") from error
             except ray.exceptions.RuntimeEnvSetupError as error:
                 raise GenerationError(f"A Ray worker cannot be set up: {_last_line(error)}") from error
+            except ray.exceptions.LocalRayletDiedError:  # told when the other reports have been taken in
+                self._pending[reference], self._is_cut_off = plan, True
             except ray.exceptions.RayError as error:
+                self._counted_at = -math.inf  # it may have been a whole node
                 reports.append(Lost(plan=plan, reason=f"its Ray worker was lost ({type(error).__name__})"))
         return reports
 

@@ -9,13 +9,13 @@ from __future__ import annotations
 import errno
 import time
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
 from demorec.config import EpisodePlan, GenerateConfig
 from demorec.errors import ConfigError, GenerationError
-from demorec.generate.executor import MAKE_EPISODE, Executor, Lost, Made, Raised
+from demorec.generate.executor import MAKE_EPISODE, POLL_S, Executor, Lost, Made, Raised, Report
 from demorec.generate.folder import RunFolder, open_run
 from demorec.generate.interrupts import catch_interrupts
 from demorec.generate.local import LocalExecutor
@@ -27,12 +27,14 @@ from demorec.processes import available_cores
 from demorec.render.warm import warm_up_renderer
 from demorec.runs.recordings import inspect_recording
 from demorec.runs.run_file import UNFINISHED, RunFile
+from demorec.scene.assets import allow_models
+from demorec.scene.inertials import check_masses
+from demorec.tables import load_robot
 
 MAX_LOSSES = 5
 """How often one attempt may lose its worker before the run stops: chance takes few, too little memory takes all."""
 GRACE_S = 3.0
 """How long current episodes may go on after the first Ctrl-C."""
-_POLL_S = 0.2
 _MORE_MEMORY = "try fewer --workers or a machine with more memory"
 _SOUND_STORAGE = "see whether the storage of the output folder is sound, then run the same command again"
 _REFUSED = {
@@ -66,15 +68,17 @@ def generate(
 
     Raises:
         MissingDependencyError: Ray is not installed.
-        ConfigError: The task cannot be loaded, the Ray cluster cannot be reached, or the folder is in use, holds
-            another run or cannot be written to.
+        ConfigError: The task cannot be loaded, a link of the robot does not say what it weighs, the Ray cluster cannot
+            be reached, or the folder is in use, holds another run or cannot be written to.
         GenerationError: The run cannot go on; everything finished is kept.
         KeyboardInterrupt: At the second Ctrl-C.
     """
     from demorec.loop import load_task
 
     progress = progress or RunObserver()
-    load_task(config)  # which raises what the first worker would raise, before anything is written
+    load_task(config)  # these raise what the first worker would raise, before anything is written
+    allow_models(config.modules)
+    check_masses(load_robot(config.robot, config.modules).urdf)
     with ExitStack() as stack:
         if options.executor == "ray":
             from demorec.generate.on_ray import connected
@@ -98,7 +102,12 @@ def generate(
             folder.end_session("stopped")
             raise
         folder.end_session("interrupted" if interrupted else "ended")
-        return folder.result(interrupted=interrupted)
+        result = folder.result(interrupted=interrupted)
+        if not interrupted and not result.run.is_complete:  # whatever the executor was: no run ends well with less
+            raise GenerationError(
+                f"The run has ended before it had all that was asked for: run the same command again. {folder.kept}"
+            )
+        return result
 
 
 def make_executor(options: RunOptions, folder: Path, run: RunFile, maker: str) -> Executor:
@@ -125,12 +134,12 @@ class _Driver:
     def work(self) -> bool:
         """Until nothing is due any more; returns whether the user has interrupted it."""
         with catch_interrupts() as interrupts:
-            while not interrupts.count:
-                while self._executor.has_room and (plan := self._schedule.take()) is not None:
-                    self._executor.submit(plan)
-                if not self._executor.pending:
-                    return False
-                self._handle_next()
+            for reports in self._reports():
+                self._handle(reports)
+                if interrupts.count:
+                    break
+            else:
+                return False
             self._progress.says(
                 f"Interrupted: the current episodes may end within {GRACE_S:.0f} s (Ctrl-C again ends at once)."
             )
@@ -139,15 +148,21 @@ class _Driver:
             self._drain(GRACE_S)
             return True
 
+    def _reports(self) -> Iterator[list[Report]]:
+        try:
+            yield from self._executor.carry_out(self._schedule.take, says=self._progress.says)
+        except GenerationError as error:  # the executor knows nothing of the run
+            raise GenerationError(f"{error} {self._folder.kept}") from error
+
     def _drain(self, seconds: float) -> None:
         deadline = time.monotonic() + seconds
         while self._executor.pending and time.monotonic() < deadline:
-            for report in self._executor.wait(_POLL_S):
+            for report in self._executor.wait(POLL_S):
                 if isinstance(report, Made):
                     self._made(report)
 
-    def _handle_next(self) -> None:
-        for report in self._executor.wait(_POLL_S):
+    def _handle(self, reports: list[Report]) -> None:
+        for report in reports:
             if isinstance(report, Made):
                 self._made(report)
             elif isinstance(report, Lost):

@@ -75,6 +75,7 @@ class Vector:
         prefix: In front of each name.
         first: The first numbers.
         rate_hz: Of the messages that hold it; 0 for fewer than two.
+        has_stamp: Whether the headers of its messages have a time.
         age_s: How old a message may have to be for a row to have one, where that is more than usual; 0 elsewhere.
     """
 
@@ -89,6 +90,7 @@ class Vector:
     prefix: str = ""
     first: str = ""
     rate_hz: float = 0.0
+    has_stamp: bool = True
     age_s: float = 0.0
 
     @property

@@ -6,19 +6,29 @@ and what is older than the mapping allows is no row.
 
 from __future__ import annotations
 
+from bisect import bisect_right
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.ingest.mapping import BagMapping, Sampling
+from demorec.ingest.mapping import Sampling
 from demorec.ingest.streams import Stream
 
 NS = 1_000_000_000
 MISSING = 2**62
 """Age of what is not there."""
 MAX_ROWS = 10_000_000
+SKEW_S = 0.1
+"""Between the times of headers and of recording: a camera's exposure and transport take less."""
+_PHASES = 64
+"""Moments of a period at which a grid may begin: a stream that jitters by a third of it leaves 21 of them free."""
+_ROUNDED_NS = 2_000
+"""By which the distance of two stamps is off at most that were rounded to microseconds, in whatever direction."""
+_WAITS = (0.0, 0.25, 0.5, 0.75, 1.0)
+"""Of a period, for which a row may wait for an image."""
 Int = NDArray[np.int64]
 Numbers = NDArray[np.floating[Any]]
 
@@ -61,10 +71,10 @@ class Timeline:
         return len(known) - len(np.unique(known))
 
 
-def timeline(stream: Stream, mapping: BagMapping) -> Timeline:
-    """The timeline of a stream, by header stamps if the mapping wants them and most messages have one."""
+def timeline(stream: Stream, *, by_header: bool) -> Timeline:
+    """The timeline of a stream, by header stamps if they are wanted and most messages have one."""
     stamped = stream.header_ns > 0
-    is_header = mapping.clock.stamp == "header" and bool(len(stamped)) and bool(np.mean(stamped) > 0.5)
+    is_header = by_header and bool(len(stamped)) and bool(np.mean(stamped) > 0.5)
     times = stream.header_ns if is_header else stream.log_ns
     if (not is_header or stamped.all()) and bool(np.all(times[1:] > times[:-1])):
         order: Int = np.arange(len(times))
@@ -198,9 +208,72 @@ def _slerp(first: Numbers, second: Numbers, fraction: NDArray[np.float64]) -> Nu
     return np.asarray(mixed / np.maximum(np.linalg.norm(mixed, axis=1, keepdims=True), 1e-300) * length)
 
 
-def grid(begin_ns: int, end_ns: int, fps: int) -> Int:
-    """Row times from `begin_ns` on, `fps` a second, none after `end_ns`; no rounding error adds up."""
+def grid(begin_ns: int, end_ns: int, fps: int, streams: Sequence[Int] = ()) -> Int:
+    """(R,) row times, evenly spaced, `fps` a second; the first within a period from `begin_ns` on, none after `end_ns`.
+
+    Row k is k/fps s after the first, rounded down: a whole number of nanoseconds is not after that exactly if it is not
+    after the fraction. The first row is where a reader that takes the last message before each row is shown most of
+    those of `streams`, (M,) times of each, and these as soon as can be: none sits on an edge, where jitter and rounding
+    decide.
+    """
     count = max(0, (end_ns - begin_ns) * fps // NS + 1)
     if count > MAX_ROWS:
         raise ValueError(f"{count:,} rows, at most {MAX_ROWS:,} are made")
+    inside = [times[(times >= begin_ns) & (times <= end_ns)] for times in streams]
+
+    def fit(phase: int) -> tuple[int, int]:
+        first, num_shown, age = begin_ns + phase, 0, 0
+        for times in inside:
+            rows = np.maximum(-((first - times) * fps // NS), 0)  # the first row that is not before the message
+            is_shown = np.append(rows[1:] != rows[:-1], True) & (rows <= (end_ns - first) * fps // NS)
+            num_shown += int(is_shown.sum())
+            age += int((first + rows * NS // fps - times)[is_shown].sum())
+        return num_shown, -age
+
+    phases = (0, _ROUNDED_NS, *(NS * part // (fps * _PHASES) for part in range(1, _PHASES)))
+    begin_ns += max(phases, key=fit) if count and inside else 0
+    count = max(0, (end_ns - begin_ns) * fps // NS + 1)
     return begin_ns + np.arange(count, dtype=np.int64) * NS // fps
+
+
+def followed(lead: Int, others: Sequence[Int], *, period_ns: int, end_ns: int) -> Int:
+    """(R,) row times, one for each time of `lead`: at it, or a little later where an image of `others` would be lost.
+
+    Images that several cameras take at about the same moment come now in this order, now in that. At each image of one
+    of them, another one's would be a period old in one row and two newer in the next. So a row whose image of another
+    camera was in the row before may wait for the next one, though not until an image would be skipped: up to the part
+    of a period, of `_WAITS`, with which fewest images are skipped, and the shortest of those.
+
+    Args:
+        lead: (R,) increasing.
+        others: (M,) of each other camera of that rate, increasing.
+        period_ns: The usual distance of two.
+        end_ns: The last moment of a row.
+    """
+    best, fewest = lead, -1
+    for part in _WAITS:
+        rows = _waited(lead, others, round(part * period_ns), end_ns)
+        steps = [np.diff(np.searchsorted(times, rows, side="right")) for times in others]
+        num_skipped = sum(int(np.maximum(step - 1, 0).sum()) for step in steps)
+        if fewest < 0 or num_skipped < fewest:
+            best, fewest = rows, num_skipped
+        if not fewest:
+            break
+    return best
+
+
+def _waited(lead: Int, others: Sequence[Int], wait_ns: int, end_ns: int) -> Int:
+    """(R,) the rows of `followed` that wait for `wait_ns` at most."""
+    if not wait_ns or not len(lead):
+        return lead
+    images = [times.tolist() for times in others]
+    shown = [bisect_right(times, int(lead[0])) - 1 for times in images]
+    rows = []
+    for time, following in zip(lead.tolist(), [*lead[1:].tolist(), end_ns + 1], strict=True):
+        ends = [times[last + 2] - 1 for times, last in zip(images, shown, strict=True) if last + 2 < len(times)]
+        until = min(time + wait_ns, following - 1, end_ns, *ends)
+        nexts = [times[last + 1] for times, last in zip(images, shown, strict=True) if last + 1 < len(times)]
+        row = max([time, *(image for image in nexts if image <= until)])
+        shown = [bisect_right(times, row) - 1 for times in images]
+        rows.append(row)
+    return np.array(rows, dtype=np.int64)

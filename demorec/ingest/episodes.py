@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,6 +14,9 @@ from demorec.ingest.mapping import BagMapping, Episodes
 from demorec.ingest.streams import BagStreams, Text
 from demorec.ingest.words import task_in_name
 
+_SHOWN, _MOST_TOLD = 40, 5
+"""Characters of a marker, and markers, in an error."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Window:
@@ -22,15 +25,17 @@ class Window:
     Attributes:
         begin_ns, end_ns: Its first and last moment, by the mapping's clock.
         success: How it ended; None where the bag does not say.
+        discarded: The marker that says that it is no episode; "" for those that are.
     """
 
     begin_ns: int
     end_ns: int
     success: bool | None = None
+    discarded: str = ""
 
 
 def windows(bag: Bag, streams: BagStreams, timelines: list[Timeline], mapping: BagMapping) -> list[Window]:
-    """The episodes of a bag, in order; BagError when there are none."""
+    """The episodes of a bag, in order; BagError when there are none, or where a marker has no meaning."""
     begin = min(int(line.times_ns[0]) for line in timelines if len(line.times_ns))
     end = max(int(line.times_ns[-1]) for line in timelines if len(line.times_ns))
     episodes = mapping.episodes
@@ -50,7 +55,14 @@ def windows(bag: Bag, streams: BagStreams, timelines: list[Timeline], mapping: B
     if episodes.cut == "gap":
         return _between_gaps(timelines, episodes.gap_s)
     is_service = episodes.cut == "service"
-    found = _between_markers(_calls(bag, streams, episodes) if is_service else streams.texts[episodes.topic], mapping)
+    markers = _calls(bag, streams, episodes) if is_service else streams.texts[episodes.topic]
+    if unknown := _unknown_words(markers, mapping):
+        raise BagError(
+            f"{'Calls' if is_service else 'Markers'} of {episodes.topic} say {', '.join(unknown)}, which the mapping "
+            f"does not know: put it into episodes.discard (the episode is left out) or episodes.ignore, or set start, "
+            f"stop, success or failure: {bag.path}"
+        )
+    found = _between_markers(markers, mapping)
     if found:
         return found
     if episodes.start_topic:
@@ -83,6 +95,19 @@ def _between_gaps(timelines: list[Timeline], gap_s: float) -> list[Window]:
     return [Window(begin_ns=int(times[a]), end_ns=int(times[b])) for a, b in zip(begins, ends, strict=True)]
 
 
+def _unknown_words(markers: list[Text], mapping: BagMapping) -> list[str]:
+    """What markers say that the mapping gives no meaning, each once, as it is shown; subtasks may share their topic."""
+    words = mapping.episodes
+    known = {True, False, "", words.start, words.stop, words.success, words.failure, *words.discard, *words.ignore}
+    is_shared = words.topic == mapping.subtasks.topic
+
+    def is_known(value: object) -> bool:
+        return isinstance(value, str | int | float) and ((is_shared and isinstance(value, str)) or value in known)
+
+    found = dict.fromkeys(repr(marker.value)[:_SHOWN] for marker in markers if not is_known(marker.value))
+    return [*found][:_MOST_TOLD] + [f"{len(found) - _MOST_TOLD} more"] * (len(found) > _MOST_TOLD)
+
+
 def _between_markers(markers: list[Text], mapping: BagMapping) -> list[Window]:
     words = mapping.episodes
     found: list[Window] = []
@@ -98,8 +123,12 @@ def _between_markers(markers: list[Text], mapping: BagMapping) -> list[Window]:
             begin = None
         elif begin is None and found and marker.value in (words.success, words.failure):
             # The verdict may come after the end.
-            last = found[-1]
-            found[-1] = Window(begin_ns=last.begin_ns, end_ns=last.end_ns, success=marker.value == words.success)
+            found[-1] = replace(found[-1], success=marker.value == words.success)
+        elif begin is not None and marker.value in words.discard:
+            found.append(Window(begin_ns=begin, end_ns=marker.time_ns, discarded=marker.value))
+            begin = None
+        elif found and marker.value in words.discard:
+            found[-1] = replace(found[-1], discarded=marker.value)
     return found
 
 
@@ -131,7 +160,8 @@ def subtask_rows(bag: Bag, streams: BagStreams, window: Window, times_ns: Int, m
     """
     words = mapping.episodes
     is_marker = words.cut == "marker" and words.topic == mapping.subtasks.topic
-    markers = {words.start, words.stop, words.success, words.failure} if is_marker else set()
+    ends = {words.start, words.stop, words.success, words.failure, *words.discard, *words.ignore}
+    markers = ends if is_marker else set()
     found: dict[int, str] = {}
     for text in sorted(streams.texts.get(mapping.subtasks.topic, ()), key=lambda text: text.time_ns):
         if not window.begin_ns <= text.time_ns <= times_ns[-1]:

@@ -6,7 +6,7 @@ Nothing is repaired: a finding tells what the rows hold.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.ingest.clock import NS, Int, Numbers, Timeline
-from demorec.ingest.mapping import BagMapping, Clock
+from demorec.ingest.clock import NS, SKEW_S, Int, Numbers, Timeline
+from demorec.ingest.mapping import BagMapping
 from demorec.ingest.mapping_file import ACTION, STATE
 from demorec.ingest.rows import Timelines
 from demorec.ingest.streams import NO_STAMP, BagStreams, Stream
@@ -24,8 +24,6 @@ _JITTER = 0.25
 """Of a period: what nine of ten steps of a sensor stay within."""
 _GAP = 5.0
 """Periods without a message that are told as a gap; shorter ones are lost messages."""
-_SKEW_S = 0.1
-"""Between the times of headers and of recording: a camera's exposure and transport take less."""
 _STEP_S = 0.05
 """By which a clock must jump, or drift in a bag, to be told."""
 _STILL_S = 0.5
@@ -34,6 +32,14 @@ _FROZEN = 5
 """Pictures in a row with the same bytes: no camera without noise."""
 _SPIKE = 25.0
 """Times the usual step of an element."""
+_EPOCH_S = 1e8
+"""Between two clocks: three years. No clock is as wrong; one of the two counts from another beginning."""
+_SLOW = 1.15
+"""Periods of the rows, from which on a stream is called slower than they are."""
+LOST = 1.6
+"""Periods, from which on a message is missing between two."""
+NOTE = "note"
+"""Kind of what is not odd, but good to know."""
 _FULL_TURNS = 4 * np.pi
 """Beyond which no joint angle is in rad."""
 
@@ -62,22 +68,25 @@ def all_findings(lines: Timelines) -> tuple[Finding, ...]:
 
 
 def _findings(bag: Timelines, lines: Sequence[Timeline]) -> Iterator[Finding]:
+    skews = _comparable_skews(lines)
     for line in lines:
-        found = (*_message_findings(line.stream), *_time_findings(line), *_clock_findings(line.skews_ns))
+        found = (*_message_findings(line.stream), *_time_findings(line), *_clock_findings(skews[line]))
         for kind, text in (*found, *_picture_findings(line), *_value_findings(line)):
-            yield _of(line.stream, kind, text)
+            yield of_stream(line.stream, kind, text)
     for problem in bag.streams.problems:
         yield Finding(kind="cut_off", stream="", text=problem)
     yield from _joint_findings([line for line in lines if line.is_regular])
     yield from _extent_findings([line for line in lines if line.is_regular])
     yield from _offset_findings(lines)
+    yield from _mixed_findings(bag, lines)
     yield from _camera_findings(bag.streams)
-    yield from _rate_findings(lines, bag.mapping.clock)
+    yield from _slow_findings(lines, bag.mapping.clock.fps)
     yield from _unit_findings(bag.streams, bag.mapping)
     yield from _action_findings(bag.streams, bag.mapping)
 
 
-def _of(stream: Stream, kind: str, text: str) -> Finding:
+def of_stream(stream: Stream, kind: str, text: str) -> Finding:
+    """A finding of a stream."""
     return Finding(kind=kind, stream=stream.label, text=f"{stream.topic}: {text}")
 
 
@@ -107,25 +116,25 @@ def _time_findings(line: Timeline) -> Iterator[tuple[str, str]]:
     steps = np.diff(line.times_ns)
     gaps = np.flatnonzero(steps > _GAP * line.period_ns)
     lost = np.round(steps / line.period_ns).astype(np.int64) - 1
-    small = np.flatnonzero((lost > 0) & (steps <= _GAP * line.period_ns) & (steps > 1.6 * line.period_ns))
+    small = np.flatnonzero((lost > 0) & (steps <= _GAP * line.period_ns) & (steps > LOST * line.period_ns))
     if len(gaps):
         longest = int(steps[gaps].max())
         begin = (line.times_ns[gaps[0]] - line.times_ns[0]) / NS
         yield "gap", f"{len(gaps)} gaps, the first at {begin:.2f} s, the longest of {longest / NS:.3f} s"
     if len(small):
         yield "drops", f"{int(lost[small].sum())} of {len(line.times_ns) + int(lost[small].sum())} messages are lost"
-    regular = steps[steps <= 1.6 * line.period_ns]
+    regular = steps[steps <= LOST * line.period_ns]
     off = np.percentile(np.abs(regular - line.period_ns), 90) if len(regular) else 0.0
     if off > _JITTER * line.period_ns:
         yield "jitter", f"its steps of {line.period_ns / 1e6:.1f} ms are off by {off / 1e6:.1f} ms (one of ten by more)"
 
 
-def _clock_findings(skew: Int) -> Iterator[tuple[str, str]]:
+def _clock_findings(skew: Numbers) -> Iterator[tuple[str, str]]:
     """Of the difference between the times of recording and of headers."""
     if len(skew) < 8:
         return
     median = float(np.median(skew)) / NS
-    if abs(median) > _SKEW_S:
+    if abs(median) > SKEW_S:
         yield "clock_offset", f"its headers are {median:+.3f} s behind the times of recording"
     width = max(3, min(20, len(skew) // 4))
     smooth = np.array([np.median(part) for part in np.array_split(skew, max(2, len(skew) // width))]) / NS
@@ -137,6 +146,38 @@ def _clock_findings(skew: Int) -> Iterator[tuple[str, str]]:
         yield "clock_jump", f"its clock jumps by {-step:+.3f} s"
     elif abs(total) > _STEP_S and abs(total) > 0.7 * np.abs(np.diff(smooth)).sum():
         yield "clock_drift", f"its clock drifts by {-total:+.3f} s in the bag"
+
+
+def _comparable_skews(lines: Sequence[Timeline]) -> dict[Timeline, Numbers]:
+    """(K,) of each stream: time of recording minus that of the header, nanoseconds.
+
+    Where all headers count from another beginning than times of recording (simulated time), that difference says
+    nothing of a single stream: then it is the one to the difference of the stream that has most messages.
+    """
+    skews: dict[Timeline, Numbers] = {line: line.skews_ns.astype(np.float64) for line in lines}
+    known = [line for line in lines if len(line.skews_ns)]
+    if not known or any(abs(np.median(line.skews_ns)) < _EPOCH_S * NS for line in known):
+        return skews
+    usual = max(known, key=lambda line: len(line.skews_ns))
+    stamps = usual.stream.header_ns[usual.stream.header_ns > 0]
+    order = np.argsort(stamps, kind="stable")
+    for line in known:
+        own = line.stream.header_ns[line.stream.header_ns > 0]
+        skews[line] = line.skews_ns - np.interp(own, stamps[order], usual.skews_ns[order])
+    return skews
+
+
+def _mixed_findings(bag: Timelines, lines: Sequence[Timeline]) -> Iterator[Finding]:
+    """What goes by the time of recording where other streams go by headers, and these are of another clock."""
+    skews = [float(np.median(line.skews_ns)) / NS for line in lines if line.is_header]
+    if not skews or abs(usual := float(np.median(skews))) <= SKEW_S:
+        return
+    text = f'goes by times of recording, {usual:+.3f} s from the headers of the other streams: set clock.stamp = "log"'
+    for line in (line for line in lines if not line.is_header):
+        yield of_stream(line.stream, "clock_offset", text)
+    for topic, texts in bag.streams.texts.items():
+        if topic != bag.mapping.robot.urdf_topic and not all(each.is_header for each in texts):
+            yield Finding(kind="clock_offset", stream=topic, text=f"{topic}: {text}")
 
 
 def _value_findings(line: Timeline) -> Iterator[tuple[str, str]]:
@@ -259,7 +300,8 @@ def _joint_findings(regular: Sequence[Timeline]) -> Iterator[Finding]:
         early = max(int(other.times_ns[-1]) for other in others) - int(line.times_ns[-1])
         if joints and early > _GAP * line.period_ns:
             told = f"{joints[0]!r}" + (f" and {len(joints) - 1} more joints" if len(joints) > 1 else "")
-            yield _of(line.stream, "early_end", f"{told} stop {early / NS:.2f} s before other joints of the topic")
+            text = f"{told} stop {early / NS:.2f} s before other joints of the topic"
+            yield of_stream(line.stream, "early_end", text)
 
 
 def _extent_findings(regular: Sequence[Timeline]) -> Iterator[Finding]:
@@ -270,9 +312,9 @@ def _extent_findings(regular: Sequence[Timeline]) -> Iterator[Finding]:
     for line in regular:
         late, early = (line.times_ns[0] - begin) / NS, (end - line.times_ns[-1]) / NS
         if late > _STILL_S:
-            yield _of(line.stream, "late_start", f"begins {late:.2f} s late")
+            yield of_stream(line.stream, "late_start", f"begins {late:.2f} s late")
         if early > _STILL_S:
-            yield _of(line.stream, "early_end", f"ends {early:.2f} s early")
+            yield of_stream(line.stream, "early_end", f"ends {early:.2f} s early")
 
 
 def _offset_findings(lines: Sequence[Timeline]) -> Iterator[Finding]:
@@ -282,7 +324,7 @@ def _offset_findings(lines: Sequence[Timeline]) -> Iterator[Finding]:
         return
     usual = float(np.median(list(skews.values())))
     for label, skew in skews.items():
-        if abs(skew - usual) > _SKEW_S:
+        if abs(skew - usual) > SKEW_S:
             text = f"its clock is off by {usual - skew:+.3f} s against that of the other streams"
             yield Finding(kind="clock_offset", stream=label, text=text)
 
@@ -293,10 +335,10 @@ def _camera_findings(streams: BagStreams) -> Iterator[Finding]:
         frame = str(streams.infos.get(name, {}).get("header", {}).get("frame_id", ""))
         if frame and stream.frame_ids and stream.frame_ids[0] and frame != stream.frame_ids[0]:
             text = f"its pictures are of {stream.frame_ids[0]!r}, its calibration is of {frame!r}"
-            yield _of(stream, "swapped", text)
+            yield of_stream(stream, "swapped", text)
         elif other := _claimed_by(name, streams):
             text = f"its coordinate frame {stream.frame_ids[0]!r} is named like the topic of {other}"
-            yield _of(stream, "swapped", text)
+            yield of_stream(stream, "swapped", text)
     for (name, stream), (other_name, other_stream) in pairwise(sorted(streams.cameras.items())):
         shared = min(len(stream), len(other_stream))
         if shared >= _FROZEN and np.mean(np.isin(stream.picture_sums, other_stream.picture_sums)) > 0.9:
@@ -323,17 +365,18 @@ def _claimed_by(name: str, streams: BagStreams) -> str:
 _COMMON = {"camera", "cam", "color", "image", "raw", "rect", "compressed", "optical", "frame", "link", "rgb", "depth"}
 
 
-def _rate_findings(lines: Sequence[Timeline], clock: Clock) -> Iterator[Finding]:
-    period = NS / clock.fps
-    for line in lines:
-        if line.is_regular and line.period_ns > 1.15 * period:
-            text = f"comes {NS / line.period_ns:.1f} times a second, rows {clock.fps} times"
-            yield _of(line.stream, "slow", text)
-    for line in lines:
-        if line.stream.topic == clock.rows != "grid" and abs(line.period_ns - period) > 0.05 * period:
-            text = f"rows follow {clock.rows} at {NS / line.period_ns:.1f} a second, fps says {clock.fps}"
-            yield Finding(kind="fps", stream=line.stream.label, text=text)
-            break
+def _slow_findings(lines: Iterable[Timeline], fps: int) -> Iterator[Finding]:
+    """Streams that are slower than the rows; cameras only where none has an image for each row."""
+    regular = [line for line in lines if line.is_regular]
+    slow = [line for line in regular if line.period_ns * fps > _SLOW * NS]
+    is_filmed = any(line.stream.heads and line not in slow for line in regular)
+    for line in slow:
+        rate = NS / line.period_ns
+        if not line.stream.heads:
+            yield of_stream(line.stream, "slow", f"comes {rate:.1f} times a second, rows {fps} times")
+        elif not is_filmed:
+            advice = f"use fps = {max(1, round(rate))}"
+            yield of_stream(line.stream, "slow", f"comes {rate:.1f} times a second, rows {fps} times: {advice}")
 
 
 def _unit_findings(streams: BagStreams, mapping: BagMapping) -> Iterator[Finding]:
@@ -343,7 +386,7 @@ def _unit_findings(streams: BagStreams, mapping: BagMapping) -> Iterator[Finding
             continue
         largest = float(np.nanmax(np.abs(stream.values), initial=0.0))
         if largest > _FULL_TURNS:
-            yield _of(stream, "unit", f"angles reach {largest:.4g}, which is hardly rad")
+            yield of_stream(stream, "unit", f"angles reach {largest:.4g}, which is hardly rad")
 
 
 def _action_findings(streams: BagStreams, mapping: BagMapping) -> Iterator[Finding]:
@@ -359,7 +402,7 @@ def _action_findings(streams: BagStreams, mapping: BagMapping) -> Iterator[Findi
     dead = [pair for pair in moving if _spread(state.values[:, pair[0]]) == 0.0]
     if dead:
         name = state.layout.names[dead[0][0]]
-        yield _of(state, "stuck", f"{name!r} never changes while the action of the same name does")
+        yield of_stream(state, "stuck", f"{name!r} never changes while the action of the same name does")
 
 
 def _spread(numbers: NDArray[Any]) -> float:

@@ -30,6 +30,7 @@ from demorec.ingest.import_file import ImportFile, load_import_file
 from demorec.ingest.mapping import BagMapping, read_mapping
 from demorec.ingest.pipeline import processes
 from demorec.ingest.report import BagReport, EpisodeReport, stream_reports
+from demorec.ingest.row_findings import row_findings
 from demorec.ingest.rows import EpisodeRows, NoRowsError, Timelines
 from demorec.ingest.streams import BagDecoder, read_streams
 from demorec.recording.collected.frame_check import MAX_STAMP_NS, MAX_SUBTASK
@@ -137,12 +138,17 @@ class _Import:
         episodes: list[PlannedEpisode] = []
         reports: list[EpisodeReport] = []
         for window in found:
+            if window.discarded:
+                reports.append(_report(window, begin, None, f"its marker says {window.discarded!r}"))
+                continue
             try:
                 rows = lines.rows(window)
             except NoRowsError as error:
                 if self.mapping.clock.when_old == "error":
-                    kinds = sorted({finding.kind for finding in findings})
-                    told = f" (the bag's report: {', '.join(kinds)})" if kinds else ""
+                    kinds = {finding.kind: finding.kind for finding in findings}
+                    offsets = [finding.text for finding in findings if finding.kind == "clock_offset"]
+                    kinds |= {"clock_offset": f"clock_offset, {offsets[0]}"} if offsets else {}
+                    told = f" (the bag's report: {'; '.join(sorted(kinds.values()))})" if kinds else ""
                     raise BagError(f"The bag gives no whole episode: {error}{told}: {self.bag.path}") from error
                 reports.append(_report(window, begin, None, str(error)))
                 continue
@@ -155,7 +161,7 @@ class _Import:
             files=tuple(self.files.items()),
             num_bytes=self.bag.num_bytes,
             streams=tuple(stream_reports(lines, [episode.rows for episode in episodes])),
-            findings=findings,
+            findings=(*findings, *row_findings(lines, [episode.rows for episode in episodes])),
             episodes=tuple(reports),
         )
         return PlannedBag(report=report, episodes=tuple(episodes))
@@ -277,10 +283,11 @@ def _first_pictures(episodes: Iterable[PlannedEpisode]) -> dict[tuple[str, int],
 
 def _report(window: Window, zero_ns: int, episode: PlannedEpisode | None, reason: str = "") -> EpisodeReport:
     """Of a window of a bag that begins at `zero_ns`, and the episode that comes of it, or why none does."""
-    begin_ns, end_ns, count, trimmed_ns = window.begin_ns, window.end_ns, 0, (0, 0)
+    begin_ns, end_ns, count, trimmed_ns, follows = window.begin_ns, window.end_ns, 0, (0, 0), ""
     if episode is not None:
         times = episode.rows.times_ns
         begin_ns, end_ns, count, trimmed_ns = int(times[0]), int(times[-1]), len(times), episode.rows.trimmed_ns
+        follows = episode.rows.follows
     return EpisodeReport(
         episode_index=None if episode is None else episode.info.episode_index,
         begin_s=(begin_ns - zero_ns) / NS,
@@ -290,4 +297,6 @@ def _report(window: Window, zero_ns: int, episode: PlannedEpisode | None, reason
         trimmed_s=(trimmed_ns[0] / NS, trimmed_ns[1] / NS),
         pictures={} if episode is None else {name: plan.told for name, plan in episode.plans.items()},
         reason=reason,
+        discarded=window.discarded,
+        follows=follows,
     )

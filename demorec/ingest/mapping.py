@@ -24,6 +24,9 @@ from demorec.ingest.mapping_file import (
 )
 
 Sampling = Literal["latest", "nearest", "linear"]
+Stamp = Literal["header", "log"]
+ROWS = ("camera", "grid")
+"""Values of `Clock.rows` that are no topic."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,6 +38,7 @@ class Source(Part):
         field: Path of the numbers in a message: "position", "pose.orientation", "transforms[child_frame_id=hand]".
         joints: Elements by name, in this order, where the message names them.
         names_field: Where it names them (auto: "name" or "joint_names" beside the field).
+        stamp: As `Clock.stamp`, for this source.
         sample: As `Clock.sample`, for this source.
         max_age_s: As `Clock.max_age_s`, for this source.
     """
@@ -43,6 +47,7 @@ class Source(Part):
     field: str = ""
     joints: tuple[str, ...] = ()
     names_field: str = ""
+    stamp: Stamp | None = None
     sample: Sampling | None = None
     max_age_s: float | None = None
 
@@ -55,12 +60,14 @@ class CameraSource:
         topic: Of its pictures: sensor_msgs Image or CompressedImage, foxglove RawImage, CompressedImage or
             CompressedVideo.
         info_topic: Of its calibration (CameraInfo, CameraCalibration).
+        stamp: As `Clock.stamp`, for this camera.
         sample: As `Clock.sample`; pictures are never mixed.
         max_age_s: As `Clock.max_age_s`, for this camera.
     """
 
     topic: str
     info_topic: str = ""
+    stamp: Stamp | None = None
     sample: Literal["latest", "nearest"] | None = None
     max_age_s: float | None = None
 
@@ -116,7 +123,8 @@ class Clock:
 
     Attributes:
         fps: Rows a second; that of the dataset.
-        rows: "grid": evenly spaced; or a topic: a row for each of its messages.
+        rows: "camera": a row for each image of the slowest camera of those that give `fps` images a second (where none
+            does, a grid); "grid": evenly spaced; or a topic: a row for each of its messages.
         stamp: Whether a message's time is that of its header, or when it was recorded.
         sample: The last message before the row, the nearest one, or the straight line between its neighbours.
         max_age_s: How far from the row a message may be.
@@ -125,8 +133,8 @@ class Clock:
     """
 
     fps: int
-    rows: str = "grid"
-    stamp: Literal["header", "log"] = "header"
+    rows: str = "camera"
+    stamp: Stamp = "header"
     sample: Sampling = "latest"
     max_age_s: float = 0.2
     when_old: Literal["error", "drop_episode"] = "error"
@@ -145,6 +153,8 @@ class Episodes:
             and a call of the other ending it.
         start, stop: Texts of markers that begin and end an episode (text only; a boolean does both).
         success, failure: Texts of markers that say how it ended.
+        discard: Texts of markers that leave out the episode under way, or else the one before.
+        ignore: Texts of markers that mean nothing here; any other text is an error.
         gap_s: A pause of all streams longer than that ends an episode.
         times_s: [begin, end] of each episode, seconds from the bag's first message.
     """
@@ -158,6 +168,8 @@ class Episodes:
     stop: str = "stop"
     success: str = "success"
     failure: str = "failure"
+    discard: tuple[str, ...] = ("discard",)
+    ignore: tuple[str, ...] = ()
     gap_s: float = 5.0
     times_s: tuple[tuple[float, float], ...] = ()
 
@@ -194,7 +206,7 @@ class BagMapping(AnyMapping):
             self.task.topic,
             self.subtasks.topic,
             self.robot.urdf_topic,
-            "" if self.clock.rows == "grid" else self.clock.rows,
+            "" if self.clock.rows in ROWS else self.clock.rows,
         }
         if self.episodes.cut == "marker":
             named.add(self.episodes.topic)

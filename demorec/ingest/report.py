@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from demorec.ingest.clock import NS
-from demorec.ingest.findings import Finding
+from demorec.ingest.findings import NOTE, Finding
 from demorec.ingest.rows import EpisodeRows, Timelines
 
 
@@ -61,6 +61,8 @@ class EpisodeReport:
         trimmed_s: What of its window no row covers, at the beginning and the end.
         pictures: Camera -> what became of its pictures, in words.
         reason: Why it was dropped; "" for others.
+        discarded: The marker that left it out, so that nothing is missing; "" for others.
+        follows: Of whose messages each has a row; "" for rows of a grid.
     """
 
     episode_index: int | None
@@ -71,6 +73,8 @@ class EpisodeReport:
     trimmed_s: tuple[float, float]
     pictures: dict[str, str]
     reason: str = ""
+    discarded: str = ""
+    follows: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,6 +94,11 @@ class BagReport:
     streams: tuple[StreamReport, ...]
     findings: tuple[Finding, ...]
     episodes: tuple[EpisodeReport, ...]
+
+    @property
+    def odd(self) -> tuple[Finding, ...]:
+        """Findings that are no notes."""
+        return tuple(finding for finding in self.findings if finding.kind != NOTE)
 
 
 def stream_reports(lines: Timelines, episodes: Sequence[EpisodeRows]) -> Iterator[StreamReport]:
@@ -167,6 +176,7 @@ def _episode_lines(episode: EpisodeReport) -> Iterator[str]:
         yield f"  no episode from {place}: {episode.reason}"
         return
     verdict = {True: ", success", False: ", failure", None: ""}[episode.success]
-    yield f"  episode {episode.episode_index}: {place}, {episode.num_frames} frames{verdict}"
+    rows = f", one for each message of {episode.follows}" if episode.follows else ""
+    yield f"  episode {episode.episode_index}: {place}, {episode.num_frames} frames{rows}{verdict}"
     for camera, told in episode.pictures.items():
         yield f"    camera {camera}: {told}"

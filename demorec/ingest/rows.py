@@ -10,11 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.ingest.channel import BagError
-from demorec.ingest.clock import MISSING, NS, Chosen, Int, Timeline, choose, grid, sampled, timeline
+from demorec.ingest.clock import MISSING, NS, Chosen, Int, Timeline, choose, followed, grid, sampled, timeline
 from demorec.ingest.episodes import Window
-from demorec.ingest.mapping import BagMapping, CameraSource, Sampling, Source
+from demorec.ingest.mapping import ROWS, BagMapping, CameraSource, Sampling, Source
 from demorec.ingest.streams import BagStreams, Stream
+from demorec.scene.collected import DEPTH_UNITS
 
+RATE = 0.05
+"""By which the rate of images that rows follow may differ from fps: as far as `collected_rate` takes it for that of the
+episode. Where fps is the rate rounded, half an image a second is more."""
+_SAME_COUNT = 2
+"""Images that cameras of one rate differ by: one more or less at each end of an episode."""
 Key = tuple[str, int] | str
 """A stream: (feature, number of its source), or the name of a camera."""
 
@@ -61,6 +67,7 @@ class EpisodeRows:
         features: Name -> feature.
         cameras: Name -> camera.
         trimmed_ns: How much of the window's beginning and end no row covers.
+        follows: Of whose messages each has a row ("camera front"); "" for a grid.
     """
 
     window: Window
@@ -68,6 +75,7 @@ class EpisodeRows:
     features: Mapping[str, FeatureRows]
     cameras: Mapping[str, CameraRows]
     trimmed_ns: tuple[int, int]
+    follows: str
 
 
 class NoRowsError(BagError):
@@ -85,26 +93,27 @@ class Timelines:
     def __init__(self, streams: BagStreams, mapping: BagMapping) -> None:
         self.streams, self.mapping = streams, mapping
         pairs: tuple[tuple[Key, Stream], ...] = (*streams.sources.items(), *streams.cameras.items())
-        self.lines = {key: _from_keyframe(timeline(stream, mapping)) for key, stream in pairs}
+        self.lines = {
+            key: _from_keyframe(timeline(stream, by_header=(self._owner(key).stamp or mapping.clock.stamp) == "header"))
+            for key, stream in pairs
+        }
+
+    def _owner(self, key: Key) -> Source | CameraSource:
+        return self.mapping.cameras[key] if isinstance(key, str) else self.mapping.features[key[0]][key[1]]
 
     def rule(self, key: Key) -> tuple[Sampling, int]:
         """How a stream is sampled, and how old what it gives may be, nanoseconds."""
-        clock = self.mapping.clock
-        owner: Source | CameraSource
-        sample: Sampling
-        if isinstance(key, str):
-            owner = self.mapping.cameras[key]
-            sample = owner.sample or ("latest" if clock.sample == "linear" else clock.sample)  # pictures are not mixed
-        else:
-            owner = self.mapping.features[key[0]][key[1]]
-            sample = owner.sample or clock.sample
+        clock, owner = self.mapping.clock, self._owner(key)
+        sample: Sampling = owner.sample or clock.sample
+        if isinstance(key, str) and sample == "linear":
+            sample = "latest"  # images are not mixed
         age = clock.max_age_s if owner.max_age_s is None else owner.max_age_s
         return sample, MISSING - 1 if age >= 1e9 else round(age * NS)
 
     def rows(self, window: Window) -> EpisodeRows:
         """The rows of an episode; NoRowsError where a stream has nothing fit for them."""
         begin, end = self._extent(window)
-        times = self._times(begin, end)
+        times, follows = self._times(window, begin, end)
         if len(times) < 2:
             raise NoRowsError(f"only {len(times)} rows have all streams")
         chosen = {key: self.chosen(key, times) for key in self.lines}
@@ -135,6 +144,7 @@ class Timelines:
             features={name: _first_rows(features[name], count) for name in self.mapping.features},
             cameras=cameras,
             trimmed_ns=(int(times[0]) - window.begin_ns, max(0, window.end_ns - end)),
+            follows=follows,
         )
 
     def chosen(self, key: Key, times: Int) -> Chosen:
@@ -174,14 +184,51 @@ class Timelines:
             age = min(age, line.period_ns if sample == "latest" else line.period_ns // 2)
         return int(line.times_ns[last]) + (0 if sample == "linear" else age)
 
-    def _times(self, begin: int, end: int) -> Int:
+    def _times(self, window: Window, begin: int, end: int) -> tuple[Int, str]:
+        """(R,) of the rows, and what they follow."""
         clock = self.mapping.clock
-        if clock.rows == "grid":
-            return grid(begin, end, clock.fps)
-        times = next((line.times_ns for line in self.lines.values() if line.stream.topic == clock.rows), None)
-        if times is None:
-            raise BagError(f"clock.rows is {clock.rows!r}, of which the mapping takes no feature or camera")
-        return times[(times >= begin) & (times <= end)]
+        if clock.rows not in ROWS:
+            line = next((line for line in self.lines.values() if line.stream.topic == clock.rows), None)
+            if line is None:
+                raise BagError(f"clock.rows is {clock.rows!r}, of which the mapping takes no feature or camera")
+            return line.times_ns[(line.times_ns >= begin) & (line.times_ns <= end)], line.stream.label
+        if clock.rows == "camera" and (cameras := self._cameras_at_fps(begin, end)):
+            return self._followed(cameras, window, begin, end), f"camera {cameras[0]}"
+        # Of what comes more often than rows some is in none of them, wherever these are. (The median period of a stream
+        # that jitters is off by a few hundredths.)
+        slow = [line for line in self.lines.values() if line.is_regular and line.period_ns * clock.fps > 0.9 * NS]
+        return grid(begin, end, clock.fps, [line.times_ns for line in slow]), ""
+
+    def _cameras_at_fps(self, begin: int, end: int) -> list[str]:
+        """Cameras that give an image for each row; the one that rows follow first.
+
+        That is the one with the fewest images: of those that have about as few, the first of the mapping, so that it is
+        the same in all episodes. A camera of distances is followed only where there is no other.
+        """
+        fps = self.mapping.clock.fps
+        counts: dict[str, int] = {}
+        for name in self.mapping.cameras:
+            times = self.lines[name].times_ns
+            times = times[(times >= begin) & (times <= end)]
+            seconds = float(times[-1] - times[0]) / NS if len(times) > 1 else 0.0
+            if seconds and abs(len(times) - 1 - fps * seconds) <= max(RATE * fps, 0.5) * seconds + 1:
+                counts[name] = len(times)
+        colour = [name for name in counts if self.lines[name].stream.heads[0].encoding not in DEPTH_UNITS]
+        may_lead = colour or list(counts)
+        fewest = min((counts[name] for name in may_lead), default=0)
+        lead = next((name for name in may_lead if counts[name] <= fewest + _SAME_COUNT), "")
+        return [lead, *(name for name in counts if name != lead)] if lead else []
+
+    def _followed(self, cameras: list[str], window: Window, begin: int, end: int) -> Int:
+        """A row for each image of the first of some cameras, so that those of the others are shown as well."""
+        line = self.lines[cameras[0]]
+        # The image that was there shortly before another stream began is shown as soon as that has something.
+        first = max(window.begin_ns, begin - line.period_ns // 2)
+        lead = line.times_ns[(line.times_ns >= first) & (line.times_ns <= end)]
+        lead = np.unique(np.maximum(lead, begin))
+        are_latest = all(self.rule(name)[0] == "latest" for name in cameras)
+        others = [self.lines[name].times_ns for name in cameras[1:]] if are_latest else []
+        return followed(lead, others, period_ns=line.period_ns, end_ns=end)
 
     def _label(self, key: Key) -> str:
         stream = self.lines[key].stream

@@ -91,10 +91,12 @@ class Text:
     Attributes:
         time_ns: Of its message, as the mapping's clock takes it.
         value: The text, number or boolean.
+        is_header: Whether the time is that of a header.
     """
 
     time_ns: int
     value: Any
+    is_header: bool = False
 
 
 @dataclass(kw_only=True, eq=False)
@@ -334,7 +336,8 @@ class _Reading:
             self._refused[topic] = f"a text has {len(value):,} characters, at most {limit:,} are read"
             return
         stamp = stamp_of(values) if self._mapping.clock.stamp == "header" else None
-        self._texts[topic].append(Text(time_ns=message.log_ns if stamp is None else stamp, value=value))
+        time_ns = message.log_ns if stamp is None else stamp
+        self._texts[topic].append(Text(time_ns=time_ns, value=value, is_header=stamp is not None))
 
     def check(self, bag: Bag) -> None:
         """Raise BagError for all that the mapping names and the bag lacks."""
@@ -355,11 +358,22 @@ class _Reading:
             if stream.reader is not None and (others := list(stream.reader.others)):
                 problems.append(_unnamed_joints(stream, others))
         problems += self._double_names()
+        problems += self._lacking_stamps()
         for camera in self._cameras.values():
             if camera.heads and not camera.heads.are_keyframes.any():
                 problems.append(f"{camera.topic} has no keyframe with its parameter sets, so it cannot be decoded")
         if problems:
             raise BagError(f"The mapping does not fit the bag: {'; '.join(problems)}: {bag.path}")
+
+    def _lacking_stamps(self) -> list[str]:
+        features, cameras = self._mapping.features, self._mapping.cameras
+        chosen = [(features[name][index].stamp, stream) for (name, index), stream in self._sources.items()]
+        chosen += [(cameras[name].stamp, stream) for name, stream in self._cameras.items()]
+        return [
+            f'{stream.label} has stamp = "header", but the headers of {stream.topic} have no time: write "log"'
+            for stamp, stream in chosen
+            if stamp == "header" and stream.header_ns and max(stream.header_ns) <= 0
+        ]
 
     def _double_names(self) -> list[str]:
         problems = []

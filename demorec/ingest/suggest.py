@@ -21,14 +21,14 @@ from demorec.ingest.bag import Bag, open_bag
 from demorec.ingest.candidates import Vector, transforms_of, vectors_of
 from demorec.ingest.channel import BagError, BagMessage
 from demorec.ingest.choice import Choice, choose_features
-from demorec.ingest.clock import NS
+from demorec.ingest.clock import NS, SKEW_S
 from demorec.ingest.decoding import UnknownEncodingError
 from demorec.ingest.fields import FieldError, follow, stamp_of
 from demorec.ingest.mapping import Clock
-from demorec.ingest.picture_messages import VIDEO_FORMATS, PictureHead, picture_head
+from demorec.ingest.picture_messages import PictureHead, picture_head
 from demorec.ingest.ros_types import Values
 from demorec.ingest.streams import BagDecoder
-from demorec.ingest.words import SHOWN, first_numbers, quoted, unique_name
+from demorec.ingest.words import SHOWN, first_numbers, quoted, task_in_name, unique_name
 from demorec.scene.collected import DEPTH_UNITS
 
 _KEPT = 64
@@ -40,6 +40,7 @@ _MAX_OFFERED = 24
 _TASK = re.compile(r"(?<!sub)(?<!sub[_/-])task|instruction|prompt")
 _STOP_WORDS = {"camera", "cam", "color", "image", "raw", "rect", "compressed", "rgb", "cameras", "images", "video"}
 _DEPTH_WORDS = {"depth", "aligned", "to", "compresseddepth", "registered"}
+_LOG = 'stamp = "log"  # its headers have no time'
 _CAMERA_WORD = re.compile(r"[^a-z0-9]+")
 
 
@@ -55,6 +56,8 @@ class _Topic:
         vectors: Numbers in them that a feature may be made of.
         publishers: Names of joints in a message -> when such messages were recorded, nanoseconds; () where none are.
         has_stamp: Whether these have headers with a time.
+        stamps_ns: Of the headers of those that were looked into.
+        skew_ns: By which the first was recorded after the time of its header.
         problem: Why none can be read; "".
     """
 
@@ -66,6 +69,8 @@ class _Topic:
     vectors: list[Vector] = field(default_factory=list)
     publishers: dict[tuple[str, ...], array[int]] = field(default_factory=dict)
     has_stamp: bool = True
+    stamps_ns: array[int] = field(default_factory=lambda: array("q"))
+    skew_ns: int = 0
     problem: str = ""
 
     @property
@@ -73,6 +78,14 @@ class _Topic:
         """Of its messages, on average."""
         seconds = (self.last_ns - self.first_ns) / NS
         return (self.count - 1) / seconds if self.count > 1 and seconds > 0 else 0.0
+
+    def rate_by(self, stamp: str) -> float:
+        """Its usual rate by the times that rows follow; simulated time is slower, or faster, than that of recording."""
+        if stamp == "log" or not self.has_stamp or len(self.stamps_ns) < 3:
+            return self.rate_hz
+        steps = np.diff(np.unique(self.stamps_ns))
+        usual = steps[np.abs(steps - np.median(steps)) <= 0.5 * np.median(steps)]  # without pauses
+        return NS / float(usual.mean()) if len(usual) else self.rate_hz
 
 
 def suggested_mapping(path: Path, tell: Callable[[str], None]) -> list[str]:
@@ -92,7 +105,12 @@ def suggested_mapping(path: Path, tell: Callable[[str], None]) -> list[str]:
     if not topics:
         raise BagError(f"The bag holds no messages: {path}")
     cameras = _cameras(topics)
-    choice = choose_features([vector for name, topic in sorted(topics.items()) for vector in _vectors(name, topic)])
+    vectors = [
+        replace(vector, has_stamp=topic.has_stamp)
+        for name, topic in sorted(topics.items())
+        for vector in _vectors(name, topic)
+    ]
+    choice = choose_features(vectors)
     lines = [f"# A mapping for {path.name}, suggested from what is in it; docs/import.md explains every key.", "#"]
     if choice.warning:
         tell(choice.warning)
@@ -108,6 +126,7 @@ def suggested_mapping(path: Path, tell: Callable[[str], None]) -> list[str]:
     lines += [*_services(topics), *_subtasks(topics), *_features(choice)]
     for camera, topic in cameras.items():
         lines += ["", f"[cameras.{camera}]", f"topic = {quoted(topic)}", *_info_topic(topic, topics)]
+        lines += [] if topics[topic].has_stamp else [_LOG]
     return lines
 
 
@@ -133,7 +152,11 @@ def _look_into(topic: _Topic, message: BagMessage, decoder: BagDecoder) -> None:
         return
     except (ValueError, RecursionError, OverflowError, TypeError):
         return
-    topic.has_stamp = topic.has_stamp and bool(stamp_of(values))
+    stamp = stamp_of(values)
+    topic.has_stamp = topic.has_stamp and bool(stamp)
+    if stamp and 0 < stamp < 2**63:
+        topic.skew_ns = topic.skew_ns or message.log_ns - stamp
+        topic.stamps_ns.append(stamp)
     if len(topic.values) < 2 or (len(topic.values) < _KEPT and _head(values) is None):
         topic.values.append(values)
         if not topic.vectors and _head(values) is None:
@@ -250,7 +273,10 @@ def _info_topic(topic: str, topics: Mapping[str, _Topic]) -> list[str]:
 def _task(topics: Mapping[str, _Topic], bag: Bag) -> list[str]:
     if told := _task_topics(topics):
         return [f"topic = {quoted(told[0])}"]
-    return [f"text = {quoted(bag.name.replace('_', ' '))}  # what the robot was asked to do", "# file_name = true"]
+    text = f"# text = {quoted('what the robot was asked to do')}  # the same for all bags"
+    if name := task_in_name(bag.name):
+        return [f"file_name = true  # the name of each bag is its task, here {quoted(name)}; or write:", text]
+    return ["# No topic and no name of a file says what the robot was asked to do. Write it here:", text]
 
 
 def _task_topics(topics: Mapping[str, _Topic]) -> list[str]:
@@ -269,18 +295,26 @@ def _is_text(topic: _Topic) -> bool:
 
 
 def _clock(topics: Mapping[str, _Topic], cameras: Mapping[str, str], vectors: Sequence[Vector]) -> list[str]:
-    rates = {name: topics[topic].rate_hz for name, topic in cameras.items() if topics[topic].rate_hz}
-    rate = min(rates.values(), default=min([30.0, *(vector.rate_hz for vector in vectors if vector.rate_hz)]))
+    mapped = {*cameras.values(), *(vector.topic for vector in vectors)}
+    skews = [topics[name].skew_ns for name in mapped if topics[name].has_stamp]
+    # One clock for all where that of the headers is far from that of recording, which some topics have alone.
+    is_mixed = 0 < len(skews) < len(mapped) and abs(float(np.median(skews))) > SKEW_S * NS
+    stamp = "log" if is_mixed or not skews else "header"
+    rates = {topic: topics[topic].rate_by(stamp) for topic in cameras.values() if topics[topic].rate_hz}
+    colour = {topic: rate for topic, rate in rates.items() if not _is_depth(topics[topic])} or rates
+    slowest = min(colour, key=lambda topic: colour[topic], default="")
+    rate = colour.get(slowest, min([30.0, *(vector.rate_hz for vector in vectors if vector.rate_hz)]))
     lines = [f"fps = {max(1, round(rate))}"]
-    slowest = min(rates, key=lambda name: rates[name], default="")
     if slowest:
-        head = _head(topics[cameras[slowest]].values[0])
-        chosen = f"rows = {quoted(cameras[slowest])}  # a row for each of its pictures"
-        lines.append(chosen if head is not None and head.format in VIDEO_FORMATS else f"# {chosen}")
-    mapped = [*cameras.values(), *(vector.topic for vector in vectors if vector.role)]
-    if any(not topics[name].has_stamp for name in mapped):
-        lines.append('stamp = "log"  # not all headers have a time')
+        lines += [f'rows = "camera"  # a row for each image of the slowest, {quoted(slowest)}; or "grid", or a topic']
+    if is_mixed:
+        lines += ['stamp = "log"  # not all headers have a time, and those that do are of another clock']
     return [*lines, 'when_old = "error"  # or "drop_episode"']
+
+
+def _is_depth(topic: _Topic) -> bool:
+    head = _head(topic.values[0]) if topic.values else None
+    return head is not None and head.encoding in DEPTH_UNITS
 
 
 def _services(topics: Mapping[str, _Topic]) -> Iterator[str]:
@@ -342,3 +376,5 @@ def _source(feature: str, vector: Vector, *, prefix: str) -> Iterator[str]:
         yield f"prefix = {quoted(prefix + vector.prefix)}"
     if vector.age_s:
         yield f"max_age_s = {vector.age_s:.1f}  # its messages are that far apart"
+    if not vector.has_stamp:
+        yield _LOG

@@ -6,15 +6,17 @@ words. Nothing is opened that could block: a FIFO, a socket or a device is told 
 
 from __future__ import annotations
 
+import shlex
 import stat
 from collections.abc import Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 from demorec.errors import ConfigError, resource_error
 from demorec.lerobot.paths import INFO_PATH
-from demorec.runs.run_file import EPISODES, FAILED, RUN_NAME
+from demorec.runs.run_file import EPISODES, FAILED, RUN_NAME, UNFINISHED
 from demorec.safety.files import HDF5_MAGIC, MCAP_MAGIC, RERUN_MAGICS, irregular_kind, open_regular
 from demorec.safety.replacing import shown
 
@@ -78,6 +80,8 @@ class Found:
         recordings: Finished recordings, in order: of a run or an evaluation those in episodes/, of any other folder
             those in itself and in episodes/; of a recording itself.
         failed: Recordings of failed attempts, in failed/.
+        unfinished: What is still being recorded, or was when a process was killed, and has not been made again since:
+            in the folder itself, in episodes/ and in folders of unfinished/.
     """
 
     path: Path
@@ -85,6 +89,18 @@ class Found:
     reason: str = ""
     recordings: tuple[Path, ...] = ()
     failed: tuple[Path, ...] = ()
+    unfinished: tuple[Path, ...] = ()
+
+    @property
+    def left(self) -> str:
+        """What is unfinished, and what to do about it, as a sentence without its end; "" for nothing."""
+        if not self.unfinished:
+            return ""
+        first, count = shlex.quote(str(self.unfinished[0])), len(self.unfinished)
+        what, it = ("a recording is", "it") if count == 1 else (f"{count} recordings are", "the first")
+        return (
+            f"{what} unfinished (being made, or left by a crash): demorec recover {first} keeps what is whole in {it}"
+        )
 
 
 def find(path: Path) -> Found:
@@ -103,7 +119,11 @@ def find(path: Path) -> Found:
     except FileNotFoundError:
         if path.is_symlink():
             return Found(path=path, kind="nothing", reason="This is a link to something that is not there")
-        return Found(path=path, kind="nothing", reason="There is no such file or folder")
+        part = path.with_name(f"{path.name}.part")
+        left = Found(path=path, kind="unfinished", unfinished=(part,) if _is_there(part) else ()).left
+        return Found(
+            path=path, kind="nothing", reason="; ".join(filter(None, ("There is no such file or folder", left)))
+        )
     except OSError as error:
         if (lack := resource_error(error, path)) is not None:
             raise lack from error
@@ -132,7 +152,8 @@ def expect_recordings(found: Found, files: Sequence[Path]) -> None:
     if files:
         return
     only = " but failed attempts, in failed/" if found.failed else ""
-    raise ConfigError(f"There is no finished recording in {_WORDS[found.kind][0]}{only}: {found.path}")
+    left = f"; {found.left}" if found.left else ""
+    raise ConfigError(f"There is no finished recording in {_WORDS[found.kind][0]}{only}{left}: {found.path}")
 
 
 def _file(path: Path) -> Found:
@@ -154,9 +175,19 @@ def _folder(path: Path) -> Found:
         return Found(path=path, kind=kind)
     here = _recordings_in(path) if kind is None else ()
     recordings, failed = (*here, *_recordings_in(path / EPISODES)), _recordings_in(path / FAILED)
+    made = {file.stem for file in (*recordings, *failed)}
+    places = [path, path / EPISODES]
+    with suppress(OSError):
+        places += _entries(path / UNFINISHED)
+    parts: list[Path] = []
+    for place in places:
+        with suppress(OSError):  # what cannot be seen of these is no reason to refuse the rest
+            parts += [file for file in _entries(place) if file.name.endswith(".mcap.part")]
+    unfinished = tuple(p for p in parts if not {p.name.removesuffix(".mcap.part"), p.name.partition(".")[0]} & made)
+    found = Found(path=path, kind=kind or "recordings", recordings=recordings, failed=failed, unfinished=unfinished)
     if kind is None and not recordings and not failed:
-        return Found(path=path, kind="nothing", reason=_nothing_in(path, entries))
-    return Found(path=path, kind=kind or "recordings", recordings=recordings, failed=failed)
+        return replace(found, kind="nothing", reason=_nothing_in(found, entries))
+    return found
 
 
 def _is_there(path: Path) -> bool:
@@ -169,18 +200,23 @@ def _is_there(path: Path) -> bool:
 
 
 def _recordings_in(folder: Path) -> tuple[Path, ...]:
+    return tuple(path for path in _entries(folder) if path.suffix == ".mcap")
+
+
+def _entries(folder: Path) -> tuple[Path, ...]:
+    """What is in a folder, in order; nothing where there is none."""
     try:
-        return tuple(sorted(path for path in folder.iterdir() if path.suffix == ".mcap"))
+        return tuple(sorted(folder.iterdir()))
     except (FileNotFoundError, NotADirectoryError):
         return ()
 
 
-def _nothing_in(path: Path, entries: Sequence[str]) -> str:
+def _nothing_in(found: Found, entries: Sequence[str]) -> str:
     """Why a folder is taken for nothing, with what may have been meant."""
     reason = f"The folder holds no recording (*.mcap), run ({RUN_NAME}) or dataset ({INFO_PATH})"
-    parts = sorted(name for name in entries if name.endswith(".mcap.part"))
-    if parts:
-        return f"{reason}; it has unfinished recordings, of which demorec recover {parts[0]} reads one"
+    if found.left:
+        return f"{reason}; {found.left}"
+    path = found.path
     below = sorted(name for name in entries if _is_there(path / name / RUN_NAME) or _is_there(path / name / EPISODES))
     if below:
         return f"{reason}; it holds runs, name one ({shown(below)})"

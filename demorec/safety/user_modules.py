@@ -19,7 +19,7 @@ from demorec.errors import ConfigError
 def split_name(name: str) -> tuple[str, str] | None:
     """("package.module", "Thing") of "package.module:Thing"; None unless the name is exactly of that form."""
     module, _, attribute = name.partition(":")
-    if attribute.isidentifier() and _is_module_name(module):
+    if attribute.isidentifier() and is_module_name(module):
         return module, attribute
     return None
 
@@ -38,7 +38,7 @@ def is_allowed(module: str, allowed: Iterable[str]) -> bool:
 def check_allowed(names: Sequence[str]) -> None:
     """Raise ConfigError unless every name can be that of a module or package."""
     for name in names:
-        if not _is_module_name(name):
+        if not is_module_name(name):
             parts = split_name(name)
             advice = f" Did you mean {parts[0]!r}?" if parts else ""
             raise ConfigError(f"--allow names a module or package, for example my_tasks, found {name!r}.{advice}")
@@ -108,5 +108,6 @@ def import_root(module: str) -> Path:
     return file.parents[module.count(".") + (file.stem == "__init__")]
 
 
-def _is_module_name(name: str) -> bool:
+def is_module_name(name: str) -> bool:
+    """Whether a module or package can be called so."""
     return all(part.isidentifier() for part in name.split("."))

@@ -14,7 +14,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from demorec.errors import ConfigError, MissingDependencyError, NotAllowedError, SceneError
-from demorec.safety.user_modules import import_root, is_allowed, module_file
+from demorec.safety.user_modules import import_root, is_allowed, is_module_name, module_file
 
 OWN_PREFIX = "demorec:"
 
@@ -45,7 +45,7 @@ def asset_path(name: str) -> Path:
         ConfigError: That module cannot be found.
     """
     module, _, relative = name.rpartition(":")
-    if module and f"{module}:" != OWN_PREFIX:
+    if modules_of_models([name]):
         if not is_allowed(module, _modules_with_models):
             raise NotAllowedError(
                 f"The model {name!r} lies beside a module from outside of demorec: if you trust that module, add "
@@ -64,6 +64,12 @@ def asset_path(name: str) -> Path:
             "your own module."
         )
     return path
+
+
+def modules_of_models(names: Iterable[str]) -> tuple[str, ...]:
+    """The modules of the user's own beside which these models lie, each once."""
+    modules = (name.rpartition(":")[0] for name in names)
+    return tuple(dict.fromkeys(m for m in modules if f"{m}:" != OWN_PREFIX and is_module_name(m)))
 
 
 def model_name(file: str | Path, module: str) -> str:

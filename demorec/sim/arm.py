@@ -44,7 +44,7 @@ class Arm:
                 f"{num_fingers}."
             )
         base, what = placement.world_from_base, f"robot {spec.name!r}"
-        self.body = load_urdf(client, spec.urdf, base, scale=placement.scale, is_fixed=True, what=what)
+        self.body = load_urdf(client, spec.urdf, base, scale=placement.scale, is_fixed=True, what=what, is_robot=True)
         info = [client.getJointInfo(self.body, i) for i in range(client.getNumJoints(self.body))]
         self.links = {spec.base_link: -1} | {row[12].decode(): row[0] for row in info}
         by_name = {row[1].decode(): row[0] for row in info}

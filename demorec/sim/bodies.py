@@ -8,6 +8,7 @@ from typing import Any
 from demorec.errors import SceneError
 from demorec.scene.assets import asset_path
 from demorec.scene.scene import Body
+from demorec.sim.client import silence
 from demorec.sim.urdf_file import load_urdf
 
 
@@ -35,7 +36,8 @@ def add_body(client: Any, body: Body) -> int:
         collision = -1
         if body.collides:  # a mesh becomes its convex hull
             geometry = shape_arguments(client, shape.kind, size, file, length_name="height")
-            collision = client.createCollisionShape(**geometry, **{f"collision{k}": v for k, v in place.items()})
+            with silence():  # a mesh may be warned of
+                collision = client.createCollisionShape(**geometry, **{f"collision{k}": v for k, v in place.items()})
         geometry = shape_arguments(client, shape.kind, size, file)
         placed = {f"visual{k}": v for k, v in place.items()}
         visual = client.createVisualShape(**geometry, **placed, rgbaColor=body.rgba)

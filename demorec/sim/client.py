@@ -1,7 +1,7 @@
 """A PyBullet client without PyBullet's chatter, freed whoever forgets to.
 
-PyBullet prints its build time while it is imported and "argv[0]=" when it connects, from C and onto the same
-streams as our tables and JSON.
+PyBullet prints its build time while it is imported, "argv[0]=" when it connects and warnings about models, from C and
+onto the same streams as our tables and JSON.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any
 
 
 @contextmanager
-def _silence() -> Iterator[None]:
+def silence() -> Iterator[None]:
     """Send this process's stdout and stderr to nowhere, C's buffers included."""
     libc = ctypes.CDLL(None)
     for stream in (sys.stdout, sys.stderr):
@@ -78,7 +78,7 @@ class BulletClient:
 
 def connect() -> BulletClient:
     """A new client without a window."""
-    with _silence():
+    with silence():
         import pybullet
 
         return BulletClient(pybullet.DIRECT)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import socket
 from collections.abc import Callable
@@ -9,6 +10,7 @@ from pathlib import Path
 
 import h5py
 import pytest
+from support.commands import exit_code
 from support.recording import write_episode
 
 from demorec.cli import main
@@ -182,3 +184,49 @@ def test_what_is_not_taken_is_named_with_what_is(tmp_path: Path) -> None:
         "Expected a recording (.mcap), a run or a folder of recordings, found a LeRobot dataset; name the run that it "
         f"was made from: {tmp_path}"
     )
+
+
+@pytest.fixture
+def after_a_kill(tmp_path: Path) -> Path:
+    """A folder with a whole recording, one that a crash left, and one that was left and has been made again since."""
+    folder = tmp_path / "after a kill"
+    a_recording("episodes/episode_000000.mcap")(folder)
+    for name in ("episodes/episode_000001", "unfinished/node-1-0/episode_000000.attempt_0"):
+        write(f"{name}.mcap.part", b"\x89MCAP0\r\n")(folder)
+    return folder
+
+
+@pytest.mark.parametrize("command", ["info", "check", "view"])
+def test_what_a_kill_left_is_named_with_what_to_do(
+    after_a_kill: Path, capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    flags = {"view": ["--save", str(after_a_kill.parent / "x.rrd")]}.get(command, [])
+    exit_code(command, after_a_kill, *flags)
+    told = capsys.readouterr()
+    assert (
+        "Left out: a recording is unfinished (being made, or left by a crash): demorec recover "
+        f"'{after_a_kill}/episodes/episode_000001.mcap.part' keeps what is whole in it."
+    ) in told.out + told.err
+
+
+def test_info_has_it_in_json_too(after_a_kill: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert exit_code("info", after_a_kill, "--json") == 0
+    assert json.loads(capsys.readouterr().out)["unfinished"] == [f"{after_a_kill}/episodes/episode_000001.mcap.part"]
+
+
+@pytest.mark.parametrize("command", ["info", "check", "view"])
+@pytest.mark.parametrize("asked", ["", "episodes/episode_000001.mcap"])
+def test_where_nothing_else_is_it_is_named_too(
+    after_a_kill: Path, capsys: pytest.CaptureFixture[str], command: str, asked: str
+) -> None:
+    (after_a_kill / "episodes/episode_000000.mcap").unlink()
+    assert exit_code(command, after_a_kill / asked) == 2
+    told = capsys.readouterr().err
+    assert f"demorec recover '{after_a_kill}/episodes/episode_000001.mcap.part' keeps what is whole in" in told
+    assert ("a recording is unfinished" if asked else "2 recordings are unfinished") in told
+
+
+def test_a_folder_of_parts_that_may_not_be_seen_hides_nothing_else(after_a_kill: Path) -> None:
+    (after_a_kill / "unfinished" / "loop").symlink_to("loop")
+    assert len(find(after_a_kill).recordings) == 1
+    assert len(find(after_a_kill).unfinished) == 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 import sys
@@ -23,6 +24,7 @@ from demorec.recording import Recording
 from demorec.replay import ReplayOptions, open_file, replay_all
 from demorec.runs.run_file import load_run_file
 from demorec.safety.own_versions import changed_sources, own_versions, source_digest
+from demorec.scene.assets import asset_path, modules_of_models
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "own_robot"
@@ -105,6 +107,64 @@ def test_the_robot_does_a_task_and_replays(folder: Path, tmp_path: Path) -> None
     assert report.is_identical
 
 
+def test_check_says_what_it_skips_for_lack_of_the_model_and_names_the_flag(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recording = simulate(tmp_path / "e.mcap", robot=XARM6)
+    monkeypatch.setattr("demorec.scene.assets._modules_with_models", set())
+    forget("my_robots")
+
+    assert exit_code("check", recording) == 0
+    told = capsys.readouterr().out
+    assert exit_code("check", recording, "--json") == 0
+    (report,) = json.loads(capsys.readouterr().out)
+    assert "my_robots" not in sys.modules  # nothing of it has run
+    skipped = {result["check"] for result in report["results"] if "--allow" in result["detail"]}
+    assert "effort_bears_the_arm" in skipped
+    assert f", {len(skipped)} need --allow" in told
+    assert told.endswith("if you trust it, add --allow my_robots.\n")
+    assert f"\n{len(skipped)} checks skipped" in told
+    assert report["needs_allow"] == ["my_robots"]
+
+    assert exit_code("check", recording, "--allow", "my_robots", "--json") == 0
+    (report,) = json.loads(capsys.readouterr().out)
+    assert skipped <= {result["check"] for result in report["results"] if result["level"] == "pass"}
+    assert "needs_allow" not in report
+
+
+def test_a_link_without_a_mass_is_refused_before_anything_is_made(
+    folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    text = (folder / "xarm6.urdf").read_text()
+    begin = text.index("<inertial>", text.index('<link name="link6">'))
+    end = text.index("</inertial>", begin) + len("</inertial>")
+    (folder / "xarm6.urdf").write_text(text[:begin] + text[end:])
+    flags = ["--robot", XARM6, "--cameras", "none", "--num-episodes", "1", "--out", tmp_path / "run"]
+    assert exit_code(*flags, program=generate_dataset_main) == 2
+    told = capfd.readouterr()
+    assert told.out == ""
+    assert re.fullmatch(
+        r"generate-dataset: The robot cannot be simulated, since its URDF does not say what these links weigh: 'link6' "
+        r"\(moves and has a shape, but no <inertial>\).*: my_robots:xarm6.urdf\n",
+        told.err,
+    )
+    assert not (tmp_path / "run").exists()
+
+
+def test_only_what_can_be_a_module_is_named_as_one() -> None:
+    names = [
+        "lab.arms:a.urdf",
+        "x; rm -rf ~:a.urdf",
+        "\x1b[2J:a.urdf",
+        "demorec:a.urdf",
+        "xarm/a.urdf",
+        "lab.arms:b.obj",
+    ]
+    assert modules_of_models(names) == ("lab.arms",)
+    with pytest.raises(SceneError, match="was not found"):
+        asset_path(names[1])
+
+
 def test_a_run_is_not_gone_on_with_when_its_task_was_edited(folder: Path, tmp_path: Path) -> None:
     source = "from demorec.tasks.pick_place import PickPlace\n\n\nclass Mine(PickPlace):\n    speed = 1.0\n"
     (folder / "my_tasks.py").write_text(source)
@@ -174,7 +234,7 @@ def test_the_source_counts_with_what_it_imports_from_beside_it(folder: Path) -> 
 
 @pytest.mark.parametrize("has_init", [True, False])
 def test_modules_in_packages_name_models_of_their_package(has_init: bool, folder: Path) -> None:
-    from demorec.scene.assets import allow_models, asset_path, model_name
+    from demorec.scene.assets import allow_models, model_name
 
     package = folder / "my_lab"
     (package / "arms").mkdir(parents=True)
@@ -209,7 +269,7 @@ def test_models_are_found_wherever_they_may_lie(where: str, folder: Path) -> Non
 
 
 def test_a_model_from_elsewhere_cannot_be_recorded(folder: Path, tmp_path: Path) -> None:
-    from demorec.scene.assets import allow_models, asset_path, model_name
+    from demorec.scene.assets import allow_models, model_name
 
     shutil.copy(folder / "xarm6.urdf", tmp_path / "xarm6.urdf")
     with pytest.raises(ConfigError, match="put it beside the module, found "):

@@ -1,4 +1,4 @@
-"""Commands that work in several processes, killed with SIGKILL in the middle: no descendant lives on."""
+"""Commands that work in several processes, killed with SIGKILL in the middle: no descendant lives on, no false end."""
 
 from __future__ import annotations
 
@@ -28,19 +28,35 @@ def command(run: Path, out: Path, name: str) -> list[str]:
     return [sys.executable, "-c", "from demorec.cli import main; main()", *map(str, arguments)]
 
 
-@pytest.mark.parametrize("name", ["export", "check", "render"])
-def test_a_killed_command_leaves_no_orphans(run: Path, tmp_path: Path, name: str) -> None:
-    """Killed as soon as two workers are there: they are starting, working or waiting for work."""
+def busy(run: Path, out: Path, name: str) -> subprocess.Popen[str]:
+    """The command as soon as two of its workers are there."""
     process = subprocess.Popen(
-        command(run, tmp_path, name), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env={**os.environ}
+        command(run, out, name), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, env={**os.environ}
     )
     deadline = time.monotonic() + 120
     while len(workers_of(process)) < 2:
         assert process.poll() is None, "it ended before it could be killed"
         assert time.monotonic() < deadline
         time.sleep(0.01)
+    return process
+
+
+@pytest.mark.parametrize("name", ["export", "check", "render"])
+def test_a_killed_command_leaves_no_orphans(run: Path, tmp_path: Path, name: str) -> None:
+    """Killed as soon as two workers are there: they are starting, working or waiting for work."""
+    process = busy(run, tmp_path, name)
     descendants = psutil.Process(process.pid).children(recursive=True)
     process.kill()
     process.wait()
     _, alive = psutil.wait_procs(descendants, timeout=60)
     assert not alive
+
+
+@pytest.mark.parametrize("name", ["export", "check", "render"])
+def test_a_command_whose_worker_is_killed_does_not_end_well(run: Path, tmp_path: Path, name: str) -> None:
+    process = busy(run, tmp_path, name)
+    workers_of(process)[0].kill()
+    _, errors = process.communicate(timeout=240)
+    assert process.returncode == 1
+    assert "for lack of memory" in errors
+    assert "please report" not in errors

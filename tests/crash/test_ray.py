@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import subprocess
 import sys
 import threading
 import time
@@ -13,7 +14,7 @@ from typing import Any
 
 import psutil
 import pytest
-from support.generate import Remembers, expected_attempts, inspect, run_fake
+from support.generate import Remembers, expected_attempts, inspect, num_finished, run_fake
 
 from demorec.config import GenerateConfig
 from demorec.errors import ConfigError, GenerationError
@@ -21,6 +22,7 @@ from demorec.generate import on_ray
 from demorec.generate.observer import RunObserver, RunResult
 from demorec.generate.options import RunOptions
 from demorec.generate.run import generate
+from demorec.runs.run_file import load_run_file
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 NUM_EPISODES = 60
@@ -70,10 +72,10 @@ def cluster() -> Iterator[object]:
         assert not alive
 
 
-def processes_of_ray() -> set[psutil.Process]:
-    """Those that descend from this process: nodes, their services, workers."""
+def processes_of_ray(above: int | None = None) -> set[psutil.Process]:
+    """Those that descend from this process, or from the one of this number: nodes, their services, workers."""
     found = set()
-    for process in psutil.Process().children(recursive=True):
+    for process in psutil.Process(above).children(recursive=True):
         with suppress(psutil.Error):
             command = " ".join(process.cmdline())
             if "/ray/" in command or command.startswith("ray::"):
@@ -188,6 +190,34 @@ def test_the_real_job_is_the_same_in_every_way(tmp_path: Path, cluster: object) 
     assert {one.run.digest, two.run.digest, ray.run.digest} == {one.run.digest}
     for other in (two, ray):
         assert [a.sha256 for a in other.run.attempts] == [a.sha256 for a in one.run.attempts]
+
+
+def test_a_node_that_ends_on_its_own_machine_ends_the_run_with_an_error(tmp_path: Path) -> None:
+    """A node ends with its agent (of the dashboard), which is among the first that a lack of memory takes."""
+    number = 40
+    one = generate(REAL, RunOptions(out=tmp_path / "one", num_episodes=number, workers=2))
+    out, entry = tmp_path / "ray", "from demorec.cli import generate_dataset_main as main; main()"
+    arguments = ["--out", str(out), "--num-episodes", str(number), "--seed", "5", "--no-export", "--no-check"]
+    arguments += ["--cameras", "wrist", "--width", "32", "--height", "32", "--workers", "2"]
+    command = [sys.executable, "-c", entry, *arguments]
+    with subprocess.Popen([*command, "--executor", "ray"], stderr=subprocess.PIPE, text=True) as process:
+        while num_finished(out) < 2:
+            assert process.poll() is None
+            time.sleep(0.05)
+        family = processes_of_ray(process.pid)
+        agents = [p for p in family if p.cmdline() and p.cmdline()[0].startswith("ray::DashboardAgent")]
+        assert agents
+        for agent in agents:
+            agent.kill()
+        _, errors = process.communicate()
+    assert process.returncode == 1, errors
+    assert "The Ray node that this command is connected to has ended" in errors
+    assert f"{num_finished(out)} of {number} episodes are complete and kept" in errors
+    assert 2 <= num_finished(out) < number
+    _, alive = psutil.wait_procs(family, timeout=60)
+    assert not alive
+    subprocess.run(command, check=True)
+    assert load_run_file(out).digest == one.run.digest
 
 
 def test_a_run_begun_on_ray_goes_on_without_it(tmp_path: Path, cluster: object, reference: str) -> None:

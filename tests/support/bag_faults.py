@@ -96,6 +96,12 @@ def _swapped_cameras(notes: Notes) -> Notes:
     return [replace(note, topic=other.get(note.topic, note.topic)) for note in notes]
 
 
+def _halved(notes: Notes) -> Notes:
+    for topic in (FRONT, SIDE):
+        notes = changed(notes, topic, lambda k, note: note if k % 2 else None)
+    return notes
+
+
 def _same_pictures(notes: Notes) -> Notes:
     fronts = [note for note in notes if note.topic == FRONT]
     return changed(notes, SIDE, lambda k, note: with_body(note, data=fronts[min(k, len(fronts) - 1)].body["data"]))
@@ -177,7 +183,7 @@ FAULTS: dict[str, Fault] = {
     "one camera twice": Fault(kind="same_pictures", hurt=_same_pictures),
     "a frozen camera": Fault(kind="frozen", hurt=_frozen),
     "a camera that changes its size": Fault(kind="size", hurt=_each(FRONT, _resized), is_refused=True),
-    "a camera of half the rate": Fault(kind="slow", hurt=_each(SIDE, lambda k, n: n if k % 2 else None)),
+    "cameras of half the rate": Fault(kind="slow", hurt=_halved),
     "frames of another camera in between": Fault(
         kind="frame_id", hurt=_each(FRONT, lambda k, n: replace(n, frame_id="cam_side") if k == 30 else n)
     ),

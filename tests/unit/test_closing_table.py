@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 import shutil
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -32,6 +33,14 @@ def test_a_shell_reads_them_as_they_are_meant(monkeypatch: pytest.MonkeyPatch, f
     assert view == ["demorec", "view", folder]
     assert check == ["demorec", "check", folder]
     assert train[:3] == ["lerobot-train", "--dataset.repo_id=me/cubes", f"--dataset.root={folder}/dataset"]
+
+
+def test_modules_of_the_users_own_are_allowed_in_them() -> None:
+    config = GenerateConfig(task="mytask:Mine", robot="lab.arms:A1", cameras=("front", "lab.arms:CORNER"))
+    result = result_of(Path("/data"))
+    result = replace(result, run=replace(result.run, config=config))
+    for line in next_commands(result, None):
+        assert shlex.split(line)[2:] == ["/data", "--allow", "mytask", "--allow", "lab.arms"]
 
 
 def test_a_program_that_is_not_on_the_path_is_given_by_its_own(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -47,9 +47,31 @@ def test_a_line_says_how_far_it_is_and_how_long_it_will_take(capsys: pytest.Capt
 
 
 def test_what_was_done_before_does_not_count_for_the_time_that_is_left(capsys: pytest.CaptureFixture[str]) -> None:
-    assert lines_of(capsys, total=104, done=100, seconds_each=10.0)[0] == (
-        "generating: 101 of 104 episodes (97 %), 10 s passed, about 30 s left"
-    )
+    assert lines_of(capsys, total=120, done=100, seconds_each=10.0)[:2] == [
+        "generating: 101 of 120 episodes (84 %), 10 s passed",
+        "generating: 107 of 120 episodes (89 %), 70 s passed, about 2.2 min left",
+    ]
+
+
+@pytest.mark.parametrize("is_terminal", [True, False])
+@pytest.mark.parametrize("workers", [1, 8])
+def test_the_start_does_not_count_for_the_time_that_is_left(
+    capsys: pytest.CaptureFixture[str], workers: int, is_terminal: bool
+) -> None:
+    """Workers that all start for two minutes, and then end an episode each minute, a second after one another."""
+    total, clock = 100_000, Clock()
+    with ProgressBar("generating", total=total, at_once=workers, is_terminal=is_terminal, clock=clock) as bar:
+        clock.now += 120
+        for _ in range(7):
+            clock.now += 60 - workers
+            for _ in range(workers):
+                clock.now += 1
+                bar.advance()
+    left = re.findall(r"about ([\d.]+) days left", capsys.readouterr().err)
+    expected = total / workers * 60 / 86400
+    assert left
+    assert all(expected / 2 < float(days) < expected * 1.1 for days in left)
+    assert float(left[-1]) > expected * 0.8
 
 
 @pytest.mark.parametrize(
@@ -78,8 +100,13 @@ def test_a_total_may_be_known_only_later(capsys: pytest.CaptureFixture[str]) -> 
     clock = Clock()
     with ProgressBar("exporting", is_terminal=False, clock=clock) as bar:
         clock.now += 20
-        bar.set(1, 3)
-    assert capsys.readouterr().err == "exporting: 1 of 3 episodes (33 %), 20 s passed, about 40 s left\n"
+        bar.set(1, 4)
+        clock.now += 10
+        bar.set(2, 4)
+    assert capsys.readouterr().err.splitlines() == [
+        "exporting: 1 of 4 episodes (25 %), 20 s passed",
+        "exporting: 2 of 4 episodes (50 %), 30 s passed, about 20 s left",
+    ]
 
 
 def test_a_terminal_gets_a_bar_and_no_lines(capsys: pytest.CaptureFixture[str]) -> None:

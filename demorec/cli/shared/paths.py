@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+from demorec.cli.shared.output import tell
 from demorec.errors import ConfigError
 from demorec.lerobot.kind import DATASET as DATASET_KIND
 from demorec.runs.find import EPISODE_FOLDERS, EVALUATION_NAME, find
@@ -20,6 +21,11 @@ def need_paths(paths: Sequence[Path], command: str) -> None:
         raise ConfigError(
             f"No path is given: name a recording, a run or a dataset, e.g. demorec {command} recordings/demo."
         )
+
+
+def tell_unfinished(paths: Iterable[Path]) -> None:
+    """Name what is unfinished in what the user has named, which the command leaves out."""
+    tell(*(f"Left out: {left}." for path in paths if (left := find(path).left)))
 
 
 def places_read(paths: Sequence[Path]) -> list[Path]:

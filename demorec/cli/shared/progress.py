@@ -22,19 +22,23 @@ _SHARE = 0.05
 """Share of the whole after which the next line is due."""
 _LONGEST_S = 300.0
 """Longest time without a line while something ends: in a run of days, a share takes hours."""
+_BAR = "{l_bar}{bar}| {n_fmt}/{total_fmt} [{elapsed}{postfix}]"
+"""Without tqdm's own time that is left, which counts the start as work."""
 
 
 class ProgressBar(AbstractContextManager["ProgressBar"]):
     """Counts what is done of one job; a context manager.
 
     On a terminal a bar. Elsewhere a line after ten seconds and then for every 5 % of the whole, but neither more often
-    than every ten seconds nor, while anything ends, less often than every five minutes.
+    than every ten seconds nor, while anything ends, less often than every five minutes. The time that is left is
+    counted from the first end on, when all that has to start has started, and told after one more round.
 
     Args:
         title: What is being done, as in "exporting".
         total: How many things there are; 0 when it is not known yet.
         done: How many of them were done before.
         unit: What one of them is called.
+        at_once: How many of them are worked on at the same time.
         is_terminal: Whether a person watches (default: whether standard error is a terminal).
         clock: Seconds, monotonic.
     """
@@ -46,11 +50,14 @@ class ProgressBar(AbstractContextManager["ProgressBar"]):
         total: int = 0,
         done: int = 0,
         unit: str = "episode",
+        at_once: int = 1,
         is_terminal: bool | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._title, self._unit, self._clock = title, unit, clock
-        self._first, self.done, self.total = done, done, total
+        self.done, self.total = done, total
+        self._at_once = at_once
+        self._first_end: tuple[float, int] | None = None  # when, and how many were done then
         self._note = ""
         self._started = self._told_at = clock()
         self._told_done: int | None = None
@@ -73,10 +80,14 @@ class ProgressBar(AbstractContextManager["ProgressBar"]):
 
     def set(self, done: int, total: int | None = None) -> None:
         """So many are done, of `total` if that is known only now."""
+        if self._first_end is None and done > self.done:
+            self._first_end = self._clock(), done
         self.done = done
         self.total = self.total if total is None else total
         if self._bar is not None:
             self._bar.total = self.total
+            self._bar.bar_format = _BAR if self.total else None
+            self._bar.set_postfix_str(self._last_words(), refresh=False)
             self._bar.update(done - self._bar.n)
         elif self._is_due():
             self._told_at, self._told_done = self._clock(), done
@@ -86,7 +97,7 @@ class ProgressBar(AbstractContextManager["ProgressBar"]):
         """Something to be shown with the count from now on: "2 failed attempts"."""
         self._note = text
         if self._bar is not None:
-            self._bar.set_postfix_str(text)
+            self._bar.set_postfix_str(self._last_words())
 
     def _is_due(self) -> bool:
         waited = self._clock() - self._told_at
@@ -97,16 +108,21 @@ class ProgressBar(AbstractContextManager["ProgressBar"]):
         return self.done - self._told_done >= _SHARE * self.total
 
     def _line(self) -> str:
-        passed = self._clock() - self._started
         parts = [f"{self._title}: {self.done}"]
         if self.total:
             parts = [f"{self._title}: {self.done} of {self.total} {self._unit}s ({100 * self.done // self.total} %)"]
-        parts.append(f"{duration(passed)} passed")
-        if self.total and self.done > self._first:
-            parts.append(f"about {duration(passed * (self.total - self.done) / (self.done - self._first))} left")
-        if self._note:
-            parts.append(self._note)
-        return ", ".join(parts)
+        parts.append(f"{duration(self._clock() - self._started)} passed")
+        return ", ".join([*parts, *filter(None, [self._last_words()])])
+
+    def _last_words(self) -> str:
+        """How much time is left, if that can be told, and the note."""
+        words = [self._note] if self._note else []
+        if self._first_end is not None and self.total:
+            began, done_then = self._first_end
+            if (since := self.done - done_then) >= self._at_once:
+                left = (self._clock() - began) * (self.total - self.done) / since
+                words.insert(0, f"about {duration(left)} left")
+        return ", ".join(words)
 
 
 class RunProgress(RunObserver, AbstractContextManager["RunProgress"]):
@@ -139,7 +155,7 @@ class RunProgress(RunObserver, AbstractContextManager["RunProgress"]):
 
     def started(self, run: RunFile, workers: int) -> None:
         """The work begins."""
-        self._show("generating", run.num_episodes, done=len(run.successes))
+        self._show("generating", run.num_episodes, done=len(run.successes), at_once=workers)
 
     def ended(self, attempt: Attempt) -> None:
         """An attempt has come to its end."""
@@ -156,12 +172,12 @@ class RunProgress(RunObserver, AbstractContextManager["RunProgress"]):
         """Something that a person should know."""
         tell(message)
 
-    def _show(self, title: str, total: int, *, done: int = 0, unit: str = "episode") -> ProgressBar:
+    def _show(self, title: str, total: int, *, done: int = 0, unit: str = "episode", at_once: int = 1) -> ProgressBar:
         if self._bar is None or title != self._title:
             if self._bar is not None:
                 self._bar.close()
             self._title = title
-            self._bar = ProgressBar(title, total=total, done=done, unit=unit)
+            self._bar = ProgressBar(title, total=total, done=done, unit=unit, at_once=at_once)
         return self._bar
 
 

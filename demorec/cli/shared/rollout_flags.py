@@ -79,7 +79,8 @@ class RolloutFlags:
             episode_length=self.episode_length,
             allowed=allowed_modules(self.allow),
         )
-        with ProgressBar(title, total=self.num_episodes, unit="rollout") as bar:
+        workers = self.workers or available_cores()
+        with ProgressBar(title, total=self.num_episodes, unit="rollout", at_once=workers) as bar:
 
             def progress(evaluation: Evaluation) -> None:
                 bar.note(str(evaluation.rate))
@@ -89,7 +90,7 @@ class RolloutFlags:
                 replace(settings, takeover=takeover),
                 out,
                 num_episodes=self.num_episodes,
-                workers=self.workers or available_cores(),
+                workers=workers,
                 overwrite=self.overwrite,
                 progress=progress,
             )

@@ -1,0 +1,244 @@
+"""Bags whose headers and times of recording are of two clocks, or that lack headers in part; fps by the rows' clock."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support import bag_mappings, bags
+
+from demorec.cli import main
+from demorec.recording import CollectedRecording
+
+STATE, ACTION, FRONT = "/joint_states", "/joint_command", "/front/rgb"
+GRIPPER = "/gripper/state"
+WALL_NS = bags.EPOCH_NS + 5 * bags.NS
+SLOWDOWN = 30 / 23
+"""Seconds of recording to one of a simulation that cannot keep up."""
+MAPPING = """
+[robot]
+name = "arm"
+[task]
+text = "stack the cups"
+[clock]
+fps = 30
+[[features."observation.state"]]
+topic = "/joint_states"
+field = "position"
+[[features.action]]
+topic = "/joint_command"
+field = "position"
+[cameras.front]
+topic = "/front/rgb"
+"""
+
+
+def isaac(seconds: float = 3.0) -> bags.Notes:
+    """As of Isaac Sim's ROS 2 bridge: headers of simulated time, from its start on, recorded at the host's pace."""
+
+    def simulated(moments: list[int]) -> list[int]:
+        return [moment - bags.EPOCH_NS + 500_000_000 for moment in moments]
+
+    steps = [round(k * bags.NS / 60) + bags.EPOCH_NS for k in range(round(60 * seconds))]
+    notes = bags.joints(STATE, ("a", "b"), steps) + bags.joints(ACTION, ("a", "b"), steps, shift=0.1)
+    notes += bags.jpeg_pictures(FRONT, steps[::2], 0, "front")
+    stamps = simulated([note.header_ns for note in notes])
+    return bags.in_order(
+        [
+            replace(note, header_ns=stamp, log_ns=WALL_NS + round(stamp * SLOWDOWN) + note.log_ns - note.header_ns)
+            for note, stamp in zip(notes, stamps, strict=True)
+        ]
+    )
+
+
+def real(seconds: float = 2.0, *, skew_s: float = 0.0) -> bags.Notes:
+    """A robot with a camera, and a gripper without headers; those of the others are `skew_s` behind the recorder."""
+    notes = bags.joints(STATE, ("a", "b"), bags.times(100, seconds, seed=1))
+    notes += bags.joints(ACTION, ("a", "b"), bags.times(100, seconds, seed=2), shift=0.1)
+    notes += bags.jpeg_pictures(FRONT, bags.times(30, seconds, seed=3), 0, "front")
+    notes = [replace(note, header_ns=note.header_ns - round(skew_s * bags.NS)) for note in notes]
+    notes += [
+        bags.Note(
+            topic=GRIPPER, type="std_msgs/msg/Float64MultiArray", log_ns=moment, header_ns=0,
+            body={"data": bags.motion(moment, 1)},
+        )
+        for moment in bags.times(100, seconds, seed=4)
+    ]  # fmt: skip
+    return bags.in_order(notes)
+
+
+def run(*words: str | Path) -> int:
+    """The exit code of a command."""
+    with pytest.raises(SystemExit) as ended:
+        main([str(word) for word in words])
+    return int(ended.value.code or 0)
+
+
+@pytest.fixture
+def imports(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[[bags.Notes, str], tuple[int, str, str]]:
+    """Exit code, output and error of an import of messages by a mapping; "suggested" for the suggested one."""
+
+    def do(notes: bags.Notes, mapping: str) -> tuple[int, str, str]:
+        bag = bags.write_rosbag2(notes, tmp_path / "stack_cups_01")
+        file = bag_mappings.write_mapping(mapping, tmp_path / "robot.toml")
+        if mapping == "suggested":
+            assert run("import", "--suggest", bag) == 0
+            bag_mappings.write_mapping(capsys.readouterr().out, file)
+        code = run("import", bag, "--mapping", file, "--out", tmp_path / "run")
+        return code, *capsys.readouterr()
+
+    return do
+
+
+Imports = Callable[[bags.Notes, str], tuple[int, str, str]]
+
+
+@pytest.mark.parametrize("mapping", ["suggested", MAPPING])
+def test_simulated_time(mapping: str, imports: Imports, tmp_path: Path) -> None:
+    """By the recorder's clock the camera has 23 images a second, by that of the headers, which rows follow, 30."""
+    notes = isaac()
+    code, told, _ = imports(notes, mapping)
+    assert code == 0
+    assert tomllib.loads((tmp_path / "robot.toml").read_text())["clock"]["fps"] == 30
+    assert "Nothing odd was found." in told
+    with CollectedRecording(tmp_path / "run/episodes/episode_000000.mcap") as recording:
+        assert recording.info.fps == 30
+        times = recording.columns().time_ns.tolist()
+        assert times == [note.header_ns for note in bags.of_topic(notes, FRONT)]
+
+
+def test_a_drift_against_other_simulated_times_is_found(imports: Imports) -> None:
+    drifting = bags.changed(
+        isaac(), FRONT, lambda k, note: replace(note, header_ns=note.header_ns + round(0.0015 * k * bags.NS))
+    )
+    _, told, _ = imports(drifting, MAPPING)
+    (line,) = [line for line in told.splitlines() if line.startswith("  clock_drift: ")]
+    assert FRONT in line
+
+
+def _with_gripper(**keys: str) -> str:
+    lines = "".join(f'{key} = "{value}"\n' for key, value in keys.items())
+    return MAPPING + f'[[features."observation.state"]]\ntopic = "{GRIPPER}"\nfield = "data"\nprefix = "g"\n{lines}'
+
+
+def test_only_the_source_without_headers_goes_by_times_of_recording(imports: Imports, tmp_path: Path) -> None:
+    notes = real()
+    code, told, _ = imports(notes, _with_gripper(stamp="log"))
+    assert code == 0
+    assert "Nothing odd was found." in told
+    with CollectedRecording(tmp_path / "run/episodes/episode_000000.mcap") as recording:
+        columns = recording.columns()
+    states, grippers = bags.of_topic(notes, STATE), [note for note in notes if note.topic == GRIPPER]
+    for time_ns, values in zip(columns.time_ns.tolist(), columns.features["observation.state"], strict=True):
+        state = max((note for note in states if note.header_ns <= time_ns), key=lambda note: note.header_ns)
+        gripper = max((note for note in grippers if note.log_ns <= time_ns), key=lambda note: note.log_ns)
+        assert values.tolist() == [*state.body["position"].tolist(), *gripper.body["data"].tolist()]
+
+
+def test_a_camera_by_times_of_recording(imports: Imports, tmp_path: Path) -> None:
+    notes = real()
+    assert imports(notes, MAPPING + 'stamp = "log"\n')[0] == 0
+    with CollectedRecording(tmp_path / "run/episodes/episode_000000.mcap") as recording:
+        times = recording.columns().picture_stamps["front"].tolist()
+    assert set(times) <= {note.log_ns for note in notes if note.topic == FRONT}
+
+
+def test_the_suggestion_sets_it_for_that_source_alone(imports: Imports, tmp_path: Path) -> None:
+    notes = [replace(note, topic=note.topic.replace("/gripper/state", "/gripper/joint_states")) for note in real()]
+    code, told, _ = imports(notes, "suggested")
+    assert code == 0
+    assert "Nothing odd was found." in told
+    mapping = tomllib.loads((tmp_path / "robot.toml").read_text())
+    assert "stamp" not in mapping["clock"]
+    sources = [source for rows in mapping["features"].values() for source in rows if "topic" in source]
+    stamps = {source["topic"]: source.get("stamp") for source in (*sources, *mapping["cameras"].values())}
+    assert stamps == {"/gripper/joint_states": "log", STATE: None, ACTION: None, FRONT: None}
+
+
+def test_headers_far_from_times_of_recording_are_found_where_both_are_used(imports: Imports) -> None:
+    _, told, _ = imports(real(skew_s=0.3), _with_gripper(stamp="log"))
+    lines = [line for line in told.splitlines() if line.startswith("  clock_offset: ") and GRIPPER in line]
+    assert len(lines) == 1
+    assert "+0.31" in lines[0] or "+0.30" in lines[0]
+    assert 'clock.stamp = "log"' in lines[0]
+    assert "clock_offset" in told.splitlines()[-1]
+
+
+def test_simulated_headers_beside_none_are_suggested_by_one_clock(imports: Imports, tmp_path: Path) -> None:
+    gripper = [
+        replace(note, log_ns=WALL_NS + round((note.log_ns - bags.EPOCH_NS + 500_000_000) * SLOWDOWN))
+        for note in real(3.0)
+        if note.topic == GRIPPER
+    ]
+    notes = bags.in_order(isaac() + [replace(note, topic="/gripper/joint_states") for note in gripper])
+    code, told, _ = imports(notes, "suggested")
+    assert code == 0
+    clock = tomllib.loads((tmp_path / "robot.toml").read_text())["clock"]
+    assert (clock["stamp"], clock["fps"]) == ("log", 23)  # the rows' clock is that of the recorder
+    assert "Nothing odd was found." in told
+
+
+def test_simulated_headers_beside_none_are_refused(imports: Imports) -> None:
+    gripper = [
+        replace(note, log_ns=note.log_ns - bags.EPOCH_NS + WALL_NS) for note in real(3.0) if note.topic == GRIPPER
+    ]
+    code, told, error = imports(bags.in_order(isaac() + gripper), _with_gripper())
+    assert (code, told) == (1, "")
+    assert "clock_offset" in error
+    assert 'clock.stamp = "log"' in error
+    assert error.count("\n") == 1
+
+
+def test_header_times_that_are_not_there_cannot_be_chosen(imports: Imports) -> None:
+    code, _, error = imports(real(), _with_gripper(stamp="header"))
+    assert code == 1
+    assert f'observation.state has stamp = "header", but the headers of {GRIPPER} have no time: write "log"' in error
+
+
+@pytest.mark.parametrize("rate", [5, 12, 30, 59.94, 90])
+def test_the_suggested_rate(rate: float, imports: Imports, tmp_path: Path) -> None:
+    """Though the camera pauses for two seconds, as between two tries."""
+    moments = [bags.EPOCH_NS + 1000 * round(k * 1e6 / rate + (2e6 if k > rate else 0)) for k in range(round(3 * rate))]
+    notes = bags.joints(STATE, ("a", "b"), range(moments[0] - 10_000_000, moments[-1], 10_000_000))
+    notes += bags.joints(ACTION, ("a", "b"), range(moments[0] - 10_000_000, moments[-1], 10_000_000))
+    notes += bags.jpeg_pictures(FRONT, moments, 0, "front")
+    imports(bags.in_order(notes), "suggested")
+    assert tomllib.loads((tmp_path / "robot.toml").read_text())["clock"]["fps"] == round(rate)
+
+
+@pytest.mark.parametrize(("name", "task"), [("stack_the_cups_003", "stack the cups"), ("0042", None)])
+def test_the_suggested_task_is_that_of_each_bag(
+    name: str, task: str | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Never the first one's for all; where a name says nothing, it has to be written."""
+    paths = []
+    for number in range(2):
+        notes = bags.in_order(bags.so101(0.6 + 0.1 * number))
+        path = bags.write_mcap(notes, tmp_path / (f"{name}.mcap" if not number else "push_the_block_1.mcap"))
+        paths.append(path)
+    assert run("import", "--suggest", paths[0]) == 0
+    text = capsys.readouterr().out
+    assert tomllib.loads(text)["task"] == ({"file_name": True} if task else {})
+    mapping = bag_mappings.write_mapping(text, tmp_path / "robot.toml")
+    code = run("import", *paths, "--mapping", mapping, "--out", tmp_path / "run")
+    if task is None:
+        assert code == 2
+        assert "[task] needs one of text, topic and file_name" in capsys.readouterr().err
+        return
+    for index, instruction in enumerate((task, "push the block")):
+        with CollectedRecording(tmp_path / f"run/episodes/episode_{index:06d}.mcap") as recording:
+            assert recording.info.instruction == instruction
+
+
+def test_simulated_time_that_jumps_is_found(imports: Imports) -> None:
+    """Against the headers of the other streams."""
+    jumping = bags.changed(
+        isaac(), ACTION, lambda k, note: replace(note, header_ns=note.header_ns + (k > 90) * 120_000_000)
+    )
+    _, told, _ = imports(jumping, MAPPING)
+    assert any(line.startswith("  clock_jump: ") and ACTION in line for line in told.splitlines())
+    assert np.all([FRONT not in line for line in told.splitlines() if line.startswith("  clock_")])

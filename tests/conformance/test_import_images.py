@@ -1,0 +1,268 @@
+"""Images of other recorders' bags, by `rosbags` and `mcap`: none is lost, nothing is found in clean ones, faults are.
+
+Stamps are made here from exact ticks, rounded as drivers do; which image a row holds is read from the recording.
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support import bag_mappings, bags
+
+from demorec.cli import main
+from demorec.recording import CollectedRecording
+from demorec.tables import CHECKS
+
+FRONT, SIDE = "/front/image_raw/compressed", "/side/image_raw/compressed"
+STATE, ACTION = "/follower/joint_states", "/leader/joint_states"
+NAMES = ("a", "b")
+MAPPING = """
+[robot]
+name = "arm"
+[task]
+text = "stack the cups"
+[clock]
+fps = 30
+[[features."observation.state"]]
+topic = "/follower/joint_states"
+field = "position"
+[[features.action]]
+topic = "/leader/joint_states"
+field = "position"
+[cameras.front]
+topic = "/front/image_raw/compressed"
+[cameras.side]
+topic = "/side/image_raw/compressed"
+"""
+ONE_CAMERA = MAPPING.partition("[cameras.side]")[0]
+Write = Callable[[bags.Notes, Path], Path]
+WRITERS: dict[str, Write] = {
+    "rosbags": lambda notes, folder: bags.write_rosbag2(notes, folder / "stack_cups"),
+    "mcap": lambda notes, folder: bags.write_mcap(notes, folder / "stack_cups.mcap"),
+}
+
+
+def ticks(
+    rate: float, count: int, *, phase: float = 0.0, jitter_s: float = 0.0, unit: int = 1, mode: str = "nearest"
+) -> list[int]:
+    """Stamps of a sensor, in whole `unit` ns, rounded as `mode` says; `phase` in periods."""
+    off = np.random.default_rng(count).uniform(-jitter_s, jitter_s, count) * bags.NS
+    exact = [((phase + k) * bags.NS / rate + off[k]) / unit for k in range(count)]
+    rounded = {"nearest": np.rint, "down": np.floor, "up": np.ceil}[mode](exact)
+    return [bags.EPOCH_NS + bags.NS + unit * int(value) for value in rounded]
+
+
+def bag(cameras: Mapping[str, Sequence[int]], *, shift_s: float = 0.0, joints_rate: float = 100.0) -> bags.Notes:
+    """Cameras, and two joint topics from 50 ms before them to after them, whose headers are off by `shift_s`."""
+    first, last = min(min(times) for times in cameras.values()), max(max(times) for times in cameras.values())
+    count = round((last - first) / bags.NS * joints_rate) + 15
+    moments = [first - 50_000_000 + round(k * bags.NS / joints_rate) for k in range(count)]
+    notes = bags.joints(STATE, NAMES, moments) + bags.joints(ACTION, NAMES, moments, shift=0.1)
+    notes = [replace(note, header_ns=note.header_ns + round(shift_s * bags.NS)) for note in notes]
+    for number, (topic, times) in enumerate(cameras.items()):
+        notes += bags.jpeg_pictures(topic, times, number, topic.split("/")[1])
+    return bags.in_order(notes)
+
+
+def run(*words: str | Path) -> int:
+    """The exit code of a command."""
+    with pytest.raises(SystemExit) as ended:
+        main([str(word) for word in words])
+    return int(ended.value.code or 0)
+
+
+def imported(
+    path: Path, mapping: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> tuple[str, dict[str, list[int]]]:
+    """What an import says, and the stamp of the image that each row of its only episode shows of each camera."""
+    file = bag_mappings.write_mapping(mapping, tmp_path / "robot.toml")
+    assert run("import", path, "--mapping", file, "--out", tmp_path / "run") == 0
+    told = capsys.readouterr().out
+    with CollectedRecording(tmp_path / "run/episodes/episode_000000.mcap") as recording:
+        columns = recording.columns()
+        shown = {name: columns.picture_stamps[name][columns.pictures[name]].tolist() for name in columns.pictures}
+    return told, shown
+
+
+def suggested(path: Path, capsys: pytest.CaptureFixture[str]) -> str:
+    """The suggestion for a bag."""
+    assert run("import", "--suggest", path) == 0
+    return capsys.readouterr().out
+
+
+CLEAN: dict[str, Mapping[str, Sequence[int]]] = {
+    "stamps to the nearest nanosecond": {FRONT: ticks(30, 60)},
+    "stamps rounded down": {FRONT: ticks(30, 60, mode="down")},
+    "stamps rounded up": {FRONT: ticks(30, 60, mode="up")},
+    "microseconds": {FRONT: ticks(30, 60, unit=1000)},
+    "milliseconds": {FRONT: ticks(30, 60, unit=1_000_000)},
+    "a millisecond of jitter": {FRONT: ticks(30, 90, jitter_s=0.001)},
+    "two cameras of one phase": {
+        FRONT: ticks(30, 90, jitter_s=0.001),
+        SIDE: ticks(30, 89, jitter_s=0.001),
+    },
+    "two cameras half a period apart": {
+        FRONT: ticks(30, 90, jitter_s=0.003),
+        SIDE: ticks(30, 91, phase=0.5, jitter_s=0.003),
+    },
+}
+
+
+@pytest.mark.parametrize("rows", ["default", "suggested", "grid"])
+@pytest.mark.parametrize("name", sorted(CLEAN))
+def test_no_image_is_lost(name: str, rows: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    cameras = CLEAN[name]
+    path = WRITERS["rosbags" if "of" in name else "mcap"](bag(cameras), tmp_path)
+    mapping = MAPPING if SIDE in cameras else ONE_CAMERA
+    if rows == "suggested":
+        mapping = suggested(path, capsys)
+        assert tomllib.loads(mapping)["clock"]["fps"] == 30
+    elif rows == "grid":
+        mapping = mapping.replace("fps = 30", 'fps = 30\nrows = "grid"')
+    told, shown = imported(path, mapping, tmp_path, capsys)
+    assert "Nothing odd was found." in told
+    # Before the second camera's first image nothing can be shown, and nothing after the last of the first one.
+    begin, end = max(times[0] for times in cameras.values()), min(times[-1] for times in cameras.values())
+    for times, stamps in zip(cameras.values(), shown.values(), strict=True):
+        assert {time for time in times if begin <= time <= end} <= set(stamps)
+
+
+def test_cameras_of_slightly_different_clocks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """One has an image more each ten seconds, and its images come before those of the other, then after them."""
+    slow, fast = ticks(30, 360, jitter_s=0.001), ticks(30.1, 360, phase=0.3, jitter_s=0.001)
+    assert slow[0] < fast[0]
+    assert slow[-1] > fast[-1]
+    told, shown = imported(WRITERS["mcap"](bag({FRONT: fast, SIDE: slow}), tmp_path), MAPPING, tmp_path, capsys)
+    assert "Nothing odd was found." in told
+    assert "one for each message of camera front" in told  # the first one of those that have equally many
+    assert shown["front"] == fast
+    assert len(set(slow) - set(shown["side"])) <= 2
+
+
+def test_joints_whose_headers_are_off(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A camera's exposure and transport: the joints' times are 40 ms before or after."""
+    for number, shift in enumerate((-0.04, 0.04)):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        times = ticks(30, 60)
+        path = WRITERS["mcap"](bag({FRONT: times}, shift_s=shift), folder)
+        told, shown = imported(path, ONE_CAMERA, folder, capsys)
+        assert "Nothing odd was found." in told
+        joints = [note.header_ns for note in bags.of_topic(bag({FRONT: times}, shift_s=shift), STATE)]
+        assert shown["front"] == [time for time in times if time >= joints[0]]
+
+
+OFF_NS = np.random.default_rng(3).integers(-12_000_000, 12_000_000, 90).tolist()
+FAULTS: dict[str, tuple[str, str, Callable[[int, bags.Note], bags.Note | None]]] = {
+    "images dropped": ("drops", FRONT, lambda k, note: None if k % 9 == 5 else note),
+    "a few images dropped": ("drops", FRONT, lambda k, note: None if k in (20, 50) else note),
+    "joints dropped": ("drops", STATE, lambda k, note: None if k % 9 == 5 else note),
+    "jitter": (
+        "jitter", FRONT, lambda k, note: replace(note, header_ns=note.header_ns + OFF_NS[k]),
+    ),
+    "drift": (
+        "clock_drift", FRONT, lambda k, note: replace(note, header_ns=note.header_ns + round(k * 0.0015 * bags.NS)),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", sorted(FAULTS))
+def test_what_is_wrong_is_found(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    kind, topic, change = FAULTS[name]
+    notes = bags.changed(bag({FRONT: ticks(30, 90), SIDE: ticks(30, 90, phase=0.4)}), topic, change)
+    told, shown = imported(WRITERS["mcap"](notes, tmp_path), MAPPING, tmp_path, capsys)
+    assert f"  {kind}: " in told
+    assert "Nothing odd" not in told
+    assert f"({kind}" in told.splitlines()[-1] or f", {kind}" in told.splitlines()[-1]
+    assert CHECKS.load("import_times").run(tmp_path / "run").level == "warn"
+    if name == "images dropped":  # of the whole camera none is lost, and rows stay a thirtieth of a second apart
+        times = [note.header_ns for note in bags.of_topic(notes, SIDE)]
+        assert set(times[1:-1]) <= set(shown["side"])
+
+
+def test_rows_on_the_edge_of_a_camera_are_a_finding(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Joints and images of one phase: at the joints' stamps an image is now there, now not yet."""
+    cameras = {FRONT: ticks(30, 90, jitter_s=0.001)}
+    notes = bag(cameras, joints_rate=30.0)
+    mapping = ONE_CAMERA.replace("fps = 30", f'fps = 30\nrows = "{STATE}"')
+    half = bags.NS // 60
+    notes = bags.changed(notes, STATE, lambda k, note: replace(note, header_ns=note.header_ns - half))
+    state = [note.header_ns for note in bags.of_topic(notes, STATE)]
+    assert all(min(abs(time - moment) for moment in state) < 2_100_000 for time in cameras[FRONT])
+    told, shown = imported(WRITERS["mcap"](notes, tmp_path), mapping, tmp_path, capsys)
+    repeated = sum(a == b for a, b in zip(shown["front"], shown["front"][1:], strict=False))
+    assert repeated > 5
+    share = f"{100 * repeated / len(shown['front']):.3g} %"
+    (line,) = [line for line in told.splitlines() if line.startswith("  repeats: ")]
+    assert f"{share} of the rows show the image before" in line
+    assert 'use rows = "camera"' in line
+    assert told.splitlines()[-1].startswith("1 finding in the bags (repeats)")
+    result = CHECKS.load("import_times").run(tmp_path / "run")
+    assert (result.level, share in result.detail) == ("warn", True)
+
+
+@pytest.mark.parametrize(("fps", "slow"), [(30, 15), (15, 15), (25, 25)])
+def test_cameras_of_different_rates(fps: int, slow: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """What repeats, or is in no row, by design is a note: rows go by the camera that has fps images a second."""
+    cameras = {FRONT: ticks(30, 90, jitter_s=0.001), SIDE: ticks(slow, 3 * slow, phase=0.2, jitter_s=0.001)}
+    path = WRITERS["rosbags"](bag(cameras), tmp_path)
+    told, shown = imported(path, MAPPING.replace("fps = 30", f"fps = {fps}"), tmp_path, capsys)
+    assert "No findings; 1 note above" in told
+    assert "Nothing odd" not in told
+    times = cameras[FRONT if fps == 30 else SIDE]
+    followed = shown["front" if fps == 30 else "side"]
+    assert followed == [time for time in times if time >= followed[0]]
+    assert len(followed) >= len(times) - 1
+    assert set(cameras[SIDE][1:-1]) <= set(shown["side"])
+    (note,) = [line for line in told.splitlines() if line.startswith("  note: ")]
+    (share,) = re.findall(r"([\d.]+) % of (?:the rows show the image before|its images are in no row)", note)
+    assert float(share) == pytest.approx({30: 50, 15: 50, 25: 100 / 6}[fps], abs=1)
+    assert ("in no row" in note) == (fps < 30)
+    assert CHECKS.load("import_times").run(tmp_path / "run").level == "pass"
+
+
+@pytest.mark.parametrize(("fps", "kind"), [(20, "skips"), (15, "note"), (25, "skips"), (60, "slow")])
+def test_a_rate_that_no_camera_has(fps: int, kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Every second image can be meant; now the next one and now the one after it cannot."""
+    path = WRITERS["mcap"](bag({FRONT: ticks(30, 90, jitter_s=0.001)}), tmp_path)
+    told, shown = imported(path, ONE_CAMERA.replace("fps = 30", f"fps = {fps}"), tmp_path, capsys)
+    lines = [line for line in told.splitlines() if line.startswith(f"  {kind}: ")]
+    assert len(lines) == 1
+    assert ("use fps = 30" in lines[0]) == (kind != "note")
+    left_out = 90 - len(set(shown["front"]))
+    if fps < 30:
+        (share,) = re.findall(r"([\d.]+) % of its images are in no row", lines[0])
+        assert float(share) == pytest.approx(100 * left_out / 90, abs=1)
+    level = CHECKS.load("import_times").run(tmp_path / "run").level
+    assert level == ("pass" if kind == "note" else "warn")
+
+
+def test_the_suggested_rate_is_that_of_the_slowest_camera(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    cameras = {FRONT: ticks(30, 60), SIDE: ticks(15, 30)}
+    clock = tomllib.loads(suggested(WRITERS["mcap"](bag(cameras), tmp_path), capsys))["clock"]
+    assert (clock["fps"], clock["rows"]) == (15, "camera")
+
+
+def test_a_depth_camera_decides_only_where_there_is_no_other(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    depth = [
+        bags.Note(
+            topic="/depth/image_raw", type="sensor_msgs/msg/Image", log_ns=time + 1_000_000, header_ns=time,
+            body={"encoding": "16UC1", "width": 8, "height": 6, "step": 16, "data": np.full(96, 7, np.uint8)},
+            frame_id="depth",
+        )
+        for time in ticks(30, 85)
+    ]  # fmt: skip
+    times = ticks(30, 90)
+    path = WRITERS["mcap"](bags.in_order(bag({FRONT: times}) + depth), tmp_path)
+    mapping = ONE_CAMERA + '[cameras.depth]\ntopic = "/depth/image_raw"\n'
+    told, shown = imported(path, mapping, tmp_path, capsys)
+    assert "one for each message of camera front" in told
+    assert shown["front"] == [time for time in times if time <= shown["front"][-1]]

@@ -1,0 +1,118 @@
+"""Markers that cut a bag: what an operator discards is no episode, and what the mapping does not know is an error."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support import bag_mappings, bags
+
+from demorec.cli import main
+from demorec.recording import CollectedRecording
+from demorec.tables import CHECKS
+
+TOPIC = "/episode"
+TAKES = [(0.2, "start"), (0.9, "stop"), (1.1, "start"), (1.8, "stop"), (2.0, "start"), (2.7, "success")]
+"""Three episodes."""
+
+
+def _import(tmp_path: Path, marks: list[tuple[float, str]], *, keys: str = "", more: str = "") -> int:
+    notes = bags.so101(3.0)
+    for seconds, word in marks:
+        time_ns = bags.EPOCH_NS + round(seconds * bags.NS)
+        notes.append(
+            bags.Note(topic=TOPIC, type="std_msgs/msg/String", log_ns=time_ns, header_ns=0, body={"data": word})
+        )
+    bag = bags.write_rosbag2(bags.in_order(notes), tmp_path / "bag")
+    text = f'{bag_mappings.SO101}[episodes]\ncut = "marker"\ntopic = "{TOPIC}"\n{keys}\n{more}'
+    mapping = bag_mappings.write_mapping(text, tmp_path / "robot.toml")
+    with pytest.raises(SystemExit) as ended:
+        main(["import", str(bag), "--mapping", str(mapping), "--out", str(tmp_path / "run")])
+    return int(ended.value.code or 0)
+
+
+def _begins(run: Path) -> list[float]:
+    """When each episode begins, seconds, to a twentieth."""
+    found = []
+    for path in sorted((run / "episodes").glob("*.mcap")):
+        with CollectedRecording(path) as recording:
+            found.append(round((int(recording.columns().time_ns[0]) - bags.EPOCH_NS) / bags.NS * 20) / 20)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("marks", "kept", "left_out"),
+    [
+        (TAKES, [0.2, 1.1, 2.0], []),
+        ([*TAKES, (1.9, "discard")], [0.2, 2.0], ["1.09 to 1.79"]),  # after its end
+        ([*TAKES, (1.5, "discard")], [0.2, 2.0], ["1.09 to 1.49"]),  # while it goes on; the stop ends nothing then
+        ([*TAKES, (2.8, "discard"), (0.5, "discard")], [1.1], ["0.19 to 0.49", "1.99 to 2.69"]),
+        ([*TAKES, (0.1, "discard"), (0.95, "")], [0.2, 1.1, 2.0], []),  # of no episode; and nothing at all
+    ],
+)
+def test_what_is_discarded_is_no_episode(
+    marks: list[tuple[float, str]],
+    kept: list[float],
+    left_out: list[str],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert _import(tmp_path, marks) == 0
+    told = capsys.readouterr().out
+    assert _begins(tmp_path / "run") == kept
+    lines = [line.strip() for line in told.splitlines() if "no episode" in line]
+    assert lines == [f"no episode from {place} s: its marker says 'discard'" for place in left_out]
+    dropped = f", {len(left_out)} dropped" if left_out else ""
+    assert f"{len(kept)} episode{'s' * (len(kept) > 1)}, " in told
+    assert f" frames{dropped}: " in told
+    assert told.endswith("Nothing odd was found.\n")
+    assert CHECKS.load("import_dropped").run(tmp_path / "run").level == "pass"  # nothing is missing
+
+
+def test_an_unknown_marker_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert _import(tmp_path, [*TAKES, (1.9, "abort"), (1.95, "abort"), (2.75, "redo\x1b[2J")]) == 1
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.count("\n") == 1
+    assert "Markers of /episode say 'abort', 'redo\\x1b[2J', which the mapping does not know" in err
+    assert "episodes.discard" in err
+    assert "episodes.ignore" in err
+    assert not list((tmp_path / "run").glob("episodes/*"))
+
+
+@pytest.mark.parametrize(
+    ("keys", "kept"),
+    [
+        ('discard = ["abort", "discard"]', [0.2, 2.0]),
+        ('ignore = ["abort"]', [0.2, 1.1, 2.0]),
+        ('failure = "abort"\ndiscard = ["abort"]', [0.2, 1.1, 2.0]),  # a verdict, not a discard
+    ],
+)
+def test_what_the_refusal_says_helps(keys: str, kept: list[float], tmp_path: Path) -> None:
+    assert _import(tmp_path, [*TAKES, (1.9, "abort")], keys=keys) == 0
+    assert _begins(tmp_path / "run") == kept
+
+
+def test_markers_that_are_no_texts_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    notes = bags.so101(1.0)
+    for moment in bags.times(10, 1.0):
+        body = {"data": np.zeros(3)}
+        kind = "std_msgs/msg/Float64MultiArray"
+        notes.append(bags.Note(topic=TOPIC, type=kind, log_ns=moment, header_ns=0, body=body))
+    bag = bags.write_mcap(bags.in_order(notes), tmp_path / "bag.mcap")
+    text = f'{bag_mappings.SO101}[episodes]\ncut = "marker"\ntopic = "{TOPIC}"\n'
+    mapping = bag_mappings.write_mapping(text, tmp_path / "robot.toml")
+    with pytest.raises(SystemExit) as ended:
+        main(["import", str(bag), "--mapping", str(mapping), "--out", str(tmp_path / "run")])
+    assert ended.value.code == 1
+    assert "Markers of /episode say array([0., 0., 0.])" in capsys.readouterr().err
+
+
+def test_subtasks_share_the_topic(tmp_path: Path) -> None:
+    """All other texts of it are subtasks then, but not those that discard or are ignored."""
+    marks = [*TAKES, (0.3, "reach"), (0.6, "grasp"), (0.7, "beep"), (1.5, "discard")]
+    assert _import(tmp_path, marks, keys='ignore = ["beep"]', more=f'[subtasks]\ntopic = "{TOPIC}"\n') == 0
+    assert _begins(tmp_path / "run") == [0.2, 2.0]
+    with CollectedRecording(tmp_path / "run/episodes/episode_000000.mcap") as recording:
+        assert [text for _, text in recording.subtasks] == ["reach", "grasp"]

@@ -1,0 +1,158 @@
+"""Which images rows hold: none is lost that a reader could show which takes the last one before each row."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Callable
+from fractions import Fraction
+from math import ceil, floor
+from typing import Any
+
+import numpy as np
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from demorec.ingest.episodes import Window
+from demorec.ingest.fields import layout_of
+from demorec.ingest.findings import all_findings
+from demorec.ingest.mapping import BagMapping, CameraSource, Clock, Robot, Source, TaskText
+from demorec.ingest.picture_messages import PictureHead, PictureHeads
+from demorec.ingest.row_findings import row_findings
+from demorec.ingest.rows import EpisodeRows, Timelines
+from demorec.ingest.streams import BagStreams, Stream
+
+NS = 1_000_000_000
+COUNT = 60
+ROUNDINGS: dict[str, Callable[[Fraction], int]] = {
+    "down": floor,
+    "up": ceil,
+    "nearest": lambda time: floor(time + Fraction(1, 2)),
+    "microseconds": lambda time: 1000 * round(time / 1000),
+    "microseconds down": lambda time: 1000 * floor(time / 1000),
+}
+PATIENT: dict[str, Any] = {"deadline": None, "suppress_health_check": [HealthCheck.too_slow]}
+"""On a busy machine."""
+SOURCE = Source(topic="/joints", field="position")
+
+
+def _moments(rate: Fraction, phase: Fraction, jitter: float, seed: int, rounding: str) -> list[int]:
+    """A camera's stamps: exact ticks, each off by `jitter` of a period at most, rounded."""
+    off = np.random.default_rng(seed).uniform(-jitter, jitter, COUNT).tolist()
+    return [ROUNDINGS[rounding]((100 + phase + k + Fraction(off[k])) * NS / rate) for k in range(COUNT)]
+
+
+def _stream(label: str, times: list[int], *, is_camera: bool) -> Stream:
+    heads = PictureHeads()
+    for _ in times if is_camera else ():
+        heads.append(PictureHead("jpeg", "", 64, 48, True))
+    stamps = np.array(times)
+    return Stream(
+        label=label, topic=f"/{label}", type="", log_ns=stamps + 1_000_000, header_ns=stamps,
+        numbers=np.arange(len(times)) if is_camera else np.arange(0),
+        values=None if is_camera else np.linspace(0, 1, len(times))[:, None],
+        layout=None if is_camera else layout_of(SOURCE, {"name": ["a"], "position": np.zeros(1)}),
+        heads=heads, checksums=np.arange(len(times), dtype=np.uint32),
+        picture_sums=np.arange(len(times) if is_camera else 0, dtype=np.uint32),
+        frame_ids=(), num_malformed=0, first_problem="",
+    )  # fmt: skip
+
+
+def _rows(cameras: dict[str, list[int]], clock: Clock) -> tuple[Timelines, EpisodeRows]:
+    """Of a bag with these cameras and joints at a kilohertz, from before the first image to after the last."""
+    first, last = min(min(times) for times in cameras.values()), max(max(times) for times in cameras.values())
+    joints = list(range(first - 2_000_000, last + 2 * NS // clock.fps, 1_000_000))
+    mapping = BagMapping(
+        robot=Robot(name="r"), task=TaskText(text="t"), clock=clock,
+        features={"observation.state": (SOURCE,), "action": (SOURCE,)},
+        cameras={name: CameraSource(topic=f"/{name}") for name in cameras},
+    )  # fmt: skip
+    streams = BagStreams(
+        sources={(name, 0): _stream("joints", joints, is_camera=False) for name in ("observation.state", "action")},
+        cameras={name: _stream(name, times, is_camera=True) for name, times in cameras.items()},
+        infos={}, texts={}, calls={}, problems=[],
+    )  # fmt: skip
+    lines = Timelines(streams, mapping)
+    return lines, lines.rows(Window(begin_ns=joints[0], end_ns=joints[-1]))
+
+
+def _kinds(lines: Timelines, rows: EpisodeRows) -> set[str]:
+    return {finding.kind for finding in (*all_findings(lines), *row_findings(lines, [rows]))}
+
+
+rates = st.one_of(st.integers(5, 200).map(Fraction), st.floats(5, 200).map(Fraction))
+jitters = st.one_of(st.just(0.0), st.floats(0.0, 1 / 3))
+phases = st.fractions(0, 1, max_denominator=1000)
+seeds = st.integers(0, 2**32 - 1)
+roundings = st.sampled_from(sorted(ROUNDINGS))
+
+
+@settings(max_examples=200, **PATIENT)
+@given(rates, phases, jitters, seeds, roundings)
+def test_a_camera_of_any_rate(rate: Fraction, phase: Fraction, jitter: float, seed: int, rounding: str) -> None:
+    """Which the suggested fps is, rounded."""
+    times = _moments(rate, phase, jitter, seed, rounding)
+    lines, rows = _rows({"front": times}, Clock(fps=round(rate), max_age_s=1.0))
+    assert rows.cameras["front"].numbers.tolist() == list(range(COUNT))
+    assert rows.times_ns.tolist() == times
+    if jitter < 0.1 and abs(rate / round(rate) - 1) < 0.03:
+        assert _kinds(lines, rows) == set()
+
+
+@settings(max_examples=200, **PATIENT)
+@given(st.integers(5, 200), phases, jitters, seeds, roundings)
+def test_an_even_grid(rate: int, phase: Fraction, jitter: float, seed: int, rounding: str) -> None:
+    times = _moments(Fraction(rate), phase, jitter, seed, rounding)
+    lines, rows = _rows({"front": times}, Clock(fps=rate, rows="grid", max_age_s=1.0))
+    steps = np.diff(rows.times_ns)
+    assert set(steps.tolist()) <= {NS // rate, -(-NS // rate)}
+    expected = [bisect_right(times, time) - 1 for time in rows.times_ns.tolist()]
+    numbers = rows.cameras["front"].numbers.tolist()
+    assert numbers == expected
+    assert set(numbers) == set(range(COUNT))
+    assert "repeats" not in _kinds(lines, rows)
+    # No later than need be: where nothing jitters, images are as good as new, but for a row after the last one.
+    if not jitter:
+        assert sorted(rows.cameras["front"].ages_ns.tolist())[COUNT - 2] <= 3_000
+
+
+@settings(max_examples=200, **PATIENT)
+@given(st.integers(5, 200), phases, phases, st.floats(0.0, 0.24), seeds, roundings)
+def test_two_cameras(rate: int, phase: Fraction, other: Fraction, jitter: float, seed: int, rounding: str) -> None:
+    """Up to a quarter of a period all can be shown: images of a pair are nearer to each other than to those after."""
+    cameras = {
+        "front": _moments(Fraction(rate), phase, jitter, seed, rounding),
+        "side": _moments(Fraction(rate), other, jitter, seed + 1, rounding),
+    }
+    lines, rows = _rows(cameras, Clock(fps=rate, max_age_s=1.0))
+    for name, times in cameras.items():
+        numbers = rows.cameras[name].numbers
+        assert numbers.tolist() == [bisect_right(times, time) - 1 for time in rows.times_ns.tolist()]
+        # Not lost: all between the first and the last; of these only what one camera had before the other began.
+        assert set(numbers.tolist()) == set(range(numbers[0], numbers[-1] + 1))
+        assert numbers[0] <= 1
+        assert numbers[-1] >= COUNT - 2
+    assert "repeats" not in _kinds(lines, rows)
+
+
+@settings(max_examples=100, **PATIENT)
+@given(st.integers(5, 200), phases, phases, jitters, seeds)
+def test_two_cameras_that_jitter_wildly(rate: int, phase: Fraction, other: Fraction, jitter: float, seed: int) -> None:
+    """Never more are lost than by a reader at the images of the followed camera, and what is lost is found."""
+    cameras = {
+        "front": _moments(Fraction(rate), phase, jitter, seed, "nearest"),
+        "side": _moments(Fraction(rate), other, jitter, seed + 1, "nearest"),
+    }
+    lines, rows = _rows(cameras, Clock(fps=rate, max_age_s=1.0))
+    assert rows.follows
+    lead = rows.follows.removeprefix("camera ")
+    (second,) = {"front", "side"} - {lead}
+    assert np.all(np.diff(rows.cameras[lead].numbers) == 1)
+    shown = set(rows.cameras[second].numbers.tolist())
+    plain = {bisect_right(cameras[second], time) - 1 for time in cameras[lead]} - {-1}
+    assert len(shown) >= len(plain) - 1
+    skipped = max(shown) - min(shown) + 1 - len(shown)
+    repeated = int(np.sum(np.diff(rows.cameras[second].numbers) == 0))
+    if skipped and repeated > 1 and np.diff(cameras[second]).max() < 1.5 * NS / rate:  # no image seems to be missing
+        assert "repeats" in _kinds(lines, rows)
+    if not skipped:
+        assert "repeats" not in _kinds(lines, rows)

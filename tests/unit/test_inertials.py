@@ -1,0 +1,125 @@
+"""What the links of a robot weigh: said by its URDF, never made up by the simulator."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from demorec.errors import ConfigError
+from demorec.geometry import Pose
+from demorec.scene.assets import asset_path
+from demorec.scene.inertials import check_masses, link_masses
+from demorec.sim.client import connect
+from demorec.sim.urdf_file import load_urdf, urdf_file
+
+BOX = '<collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision>'
+
+
+def inertial(mass: str = "2", moments: tuple[str, str, str] = ("0.01", "0.01", "0.01"), xy: str = "0") -> str:
+    xx, yy, zz = moments
+    return (
+        f'<inertial><origin xyz="0.5 0 0"/><mass value="{mass}"/>'
+        f'<inertia ixx="{xx}" iyy="{yy}" izz="{zz}" ixy="{xy}" ixz="0" iyz="0"/></inertial>'
+    )
+
+
+def arm(*, arm: str = BOX + inertial(), tool: str = "", base: str = "", ground: str = "") -> str:
+    """A root with something fixed to it, an arm that turns on it, and a tool that is fixed to the arm."""
+    return f"""<robot name="r">
+      <link name="base">{base}</link><link name="ground">{ground}</link><link name="arm">{arm}</link>
+      <link name="tool">{tool}</link>
+      <joint name="g" type="fixed"><parent link="base"/><child link="ground"/></joint>
+      <joint name="turn" type="revolute"><parent link="ground"/><child link="arm"/><axis xyz="0 1 0"/>
+        <limit lower="-3" upper="3" effort="100" velocity="10"/></joint>
+      <joint name="t" type="fixed"><parent link="arm"/><child link="tool"/><origin xyz="1 0 0"/></joint>
+    </robot>"""
+
+
+@pytest.mark.parametrize(
+    "model",
+    ["franka_panda/panda.urdf", "kuka_iiwa/model.urdf", "xarm/xarm6_with_gripper.urdf", "demorec:iiwa.urdf"],
+)
+def test_masses_are_those_that_the_simulator_reads(model: str) -> None:
+    check_masses(model)
+    found = link_masses(asset_path(model).read_text())
+    client = connect()
+    with urdf_file(model) as path:
+        body = client.loadURDF(path, useFixedBase=True)
+    joints = range(client.getNumJoints(body))
+    masses = {client.getJointInfo(body, i)[12].decode(): client.getDynamicsInfo(body, i)[0] for i in joints}
+    client.disconnect()
+    assert {name for name, mass in masses.items() if mass} == found.keys() & masses.keys()
+    assert len(found) >= 7
+    for name in found.keys() & masses.keys():
+        assert found[name][0] == pytest.approx(masses[name])
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        arm(),
+        arm(base=BOX, ground=BOX),  # of what stands on the ground the mass does not matter
+        arm(base=BOX + inertial(mass="0"), ground=BOX + inertial(mass="0")),  # as in kuka_iiwa/model.urdf
+        arm(tool=inertial(mass="0")),  # as in franka_panda/panda.urdf
+        arm(tool=inertial(mass="0", moments=("0", "0", "0"))),
+        arm(arm="", tool=BOX + inertial()),  # one body of two links
+    ],
+)
+def test_frames_and_what_stands_on_the_ground_need_no_mass(text: str) -> None:
+    assert {name: mass for name, (mass, _) in link_masses(text).items()} in ({"arm": 2.0}, {"tool": 2.0})
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        (arm(arm=BOX), r"'arm' \(moves and has a shape, but no <inertial>\)"),
+        (arm(arm=""), r"'arm' \(moves, but weighs nothing\)"),
+        (arm(arm=inertial(mass="0")), r"'arm' \(moves, but weighs nothing\)"),
+        (arm(tool=BOX), r"'tool' \(moves and has a shape, but no <inertial>\)"),
+        (arm(arm=inertial(mass="-1")), r"'arm' \(a mass of -1 kg\)"),
+        (arm(base=inertial(mass="-1")), r"'base' \(a mass of -1 kg\)"),
+        (arm(arm=inertial(mass="nan")), r"'arm' \(a mass or an inertia that is no number\)"),
+        (arm(arm=inertial(mass="inf")), "no number"),
+        (arm(arm=inertial(mass="2 kg")), "no number"),
+        (arm(arm=inertial(mass="20000")), r"'arm' \(a mass of 20000 kg\)"),
+        (arm(arm="<inertial/>"), "without mass or inertia"),
+        (arm(arm='<inertial><mass value="1"/></inertial>'), "without mass or inertia"),
+        (arm(arm=inertial(moments=("0", "0", "0"))), "smallest principal value is 0 kg"),
+        (arm(arm=inertial(moments=("0.01", "-0.01", "0.01"))), "smallest principal value is -0.01 kg"),
+        (arm(arm=inertial(xy="0.02")), "smallest principal value is -0.01 kg"),
+        (arm(arm=inertial(moments=("0.01", "nan", "0.01"))), "no number"),
+        (
+            arm(arm=inertial(moments=("5000", "5000", "5000"))),
+            r"principal inertias of 5e\+03 to 5e\+03 kg m\^2 for 2 kg",
+        ),
+        (arm(arm=BOX, tool=BOX), "'arm' .*, 'tool' "),
+    ],
+)
+def test_a_link_that_no_body_can_be_is_named(tmp_path: Path, text: str, sentence: str) -> None:
+    with pytest.raises(ValueError, match=r"does not say what these links weigh: .*" + sentence):
+        link_masses(text)
+
+
+def test_a_frame_weighs_nothing_and_the_engine_is_not_heard(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """By statics: the motor holds the arm of 2 kg, half a metre out, and not the frame a metre out."""
+    file = tmp_path / "arm.urdf"
+    monkeypatch.setattr("demorec.scene.inertials.asset_path", lambda name: file)
+    monkeypatch.setattr("demorec.sim.urdf_file.asset_path", lambda name: file)
+    file.write_text(arm())
+    client = connect()
+    client.setGravity(0, 0, -9.81)
+    body = load_urdf(client, "arm.urdf", Pose(), scale=1.0, is_fixed=True, what="robot", is_robot=True)
+    client.setJointMotorControl2(body, 1, client.POSITION_CONTROL, targetPosition=0, force=100)
+    for _ in range(200):
+        client.stepSimulation()
+    assert [client.getDynamicsInfo(body, link)[0] for link in range(-1, 3)] == [0, 0, 2, 0]
+    assert abs(client.getJointState(body, 1)[3]) == pytest.approx(2 * 9.81 * 0.5, rel=1e-3)
+    file.write_text(arm(arm=BOX))
+    with pytest.raises(ConfigError, match="The robot cannot be simulated, since its URDF does not say"):
+        load_urdf(client, "arm.urdf", Pose(), scale=1.0, is_fixed=True, what="robot", is_robot=True)
+    load_urdf(client, "arm.urdf", Pose(), scale=1.0, is_fixed=True, what="body")
+    client.disconnect()
+    assert capfd.readouterr() == ("", "")
