@@ -10,7 +10,7 @@ BIN := .venv/bin
 # Containers often set this; every process would then compile LeRobot's and PyTorch's modules again, for 10 s each.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-slow setup lint precompiled constraints clean
+.PHONY: demo test test-slow setup lint constraints clean
 
 demo: .venv/.stamp
 	@$(BIN)/generate-dataset --config demo.toml --out $(DEMO)
@@ -46,12 +46,8 @@ setup: .venv/.stamp
 	"$$uv" pip install -q -p .venv -c constraints.txt -e . --group dev
 	@$(BIN)/python -c 'import pybullet, sys; sys.exit(not pybullet.isNumpyEnabled())' >/dev/null 2>&1 || \
 	  { echo "make: PyBullet was built without NumPy: run 'make clean', then make again with an up-to-date uv."; exit 1; }
+	@$(BIN)/python -c "from demorec.render.warm import warm_up_renderer; warm_up_renderer('raster')"
 	@touch .venv/.stamp
-
-# The code of compiled functions that comes with the package, after a change of their sources or of Numba's version.
-# Numba's order of work follows Python's hashes: with a fixed seed equal sources give equal files.
-precompiled: .venv/.stamp
-	PYTHONHASHSEED=0 $(BIN)/python tools/precompile.py
 
 # The versions that are installed now become the pinned ones (names and versions only).
 constraints:

@@ -22,7 +22,7 @@ from demorec.errors import DemorecError, MissingDependencyError, NotAllowedError
 from demorec.geometry import Array
 
 Level = Literal["pass", "warn", "fail", "skip"]
-Scope = Literal["recording", "collected", "run", "collected_run", "dataset"]
+Scope = Literal["recording", "collected", "run", "collected_run", "dataset", "motion"]
 Group = Literal["file", "time", "physics", "alignment", "calibration", "pictures", "outcome", "run", "dataset"]
 
 _BLOCKED = "it needs what is damaged"
@@ -74,7 +74,8 @@ class Check:
     Attributes:
         name: Its row in `demorec.tables.CHECKS`.
         group: What it is about.
-        scope: What it looks at: a recording of a simulated or of a collected episode, a run (its folder) or a dataset.
+        scope: What it looks at: a recording of a simulated or of a collected episode, a run (its folder), a dataset, or
+            the motions of any of them whose robot is not one of our simulation (`demorec.check.motion`).
         measures: What the value is, in words.
         unit: Of the value and the limits; "" for counts and ratios.
         warn, fail: The value passes up to `warn`, is a warning up to `fail`, and a failure above.

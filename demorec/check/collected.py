@@ -18,13 +18,11 @@ from demorec.check.base import Found, Measurement, NotMeasured, check, collected
 from demorec.check.file import complete
 from demorec.recording import CollectedRecording
 from demorec.recording.collected.streams import SUBTASK
-from demorec.recording.collected.transforms import JointPositions
 from demorec.recording.container import Container
 from demorec.recording.video import decode
 from demorec.runs.collected import load_collected_run
 from demorec.runs.run_file import EPISODES, sha256_of
 from demorec.scene.collected import COLLECTED_VERSION, NO_PICTURE
-from demorec.scene.urdf import Urdf
 
 NOT_APPLICABLE = "not applicable: the episode was collected, and this needs the scene of a simulated one"
 _NANOSECONDS = 1_000_000_000
@@ -164,31 +162,6 @@ def collected_missing_pictures(recording: CollectedRecording) -> Iterator[Found]
             first = int(without[0]) if len(without) else None
             told = f"camera {camera}: {len(without)} of {len(numbers)} frames"
             yield Measurement(value=len(without) / len(numbers), frame=first, detail=told)
-
-
-@collected_check(
-    group="physics",
-    measures="how far joints are beyond their limits, rad or m",
-    warn=0.01,
-    fail=0.2,
-    reads=("/{feature}", "/robot_description"),
-)
-def collected_joint_limits(recording: CollectedRecording) -> Iterator[Found]:
-    """Observed joints are within the limits of the URDF."""
-    info = recording.info
-    if not info.urdf:
-        yield NotMeasured(why="the robot's URDF is not known")
-        return
-    positions = JointPositions(info.features)
-    limits = {joint.name: (joint.lower, joint.upper) for joint in Urdf.parse(info.urdf).joints}
-    if not positions.joints or not recording.columns().num_frames:
-        yield NotMeasured(why="no element of the observations is said to be a joint's position")
-        return
-    values = positions.of(recording.columns().features)
-    for joint, column in zip(positions.joints, values.T, strict=False):
-        lower, upper = limits[joint]
-        if (beyond := worst_frame(np.maximum(column - upper, lower - column), joint)) is not None:
-            yield replace(beyond, value=max(beyond.value, 0.0))
 
 
 @collected_check(

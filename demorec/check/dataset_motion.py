@@ -1,4 +1,4 @@
-"""Is what a LeRobot dataset shows possible and different: twins, coverage, limits, kinematics, the actions' lag."""
+"""Is what a LeRobot dataset shows possible and different: twins, coverage, kinematics, the actions' lag."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from demorec.check.run import motion_vector
 from demorec.geometry import Array
 from demorec.scene.assets import asset_path
 from demorec.scene.episode import EpisodeInfo
-from demorec.scene.features import ACTION, EE_POSE, STATE, VELOCITY
+from demorec.scene.features import ACTION, EE_POSE, STATE
 from demorec.scene.urdf import Urdf
 
 
@@ -41,51 +41,6 @@ def dataset_duplicates(dataset: Dataset) -> Measurement | None:
 def dataset_coverage(dataset: Dataset) -> Found:
     """Start places, yaws, sizes and goals are spread over their ranges (judged from 50 episodes on)."""
     return worst_gap(dataset.infos)
-
-
-@dataset_check(
-    measures="state against joint limits and the gripper's range",
-    unit="rad, m",
-    warn=0.005,
-    fail=0.05,
-    reads=("observation.state",),
-)
-def dataset_joint_limits(dataset: Dataset) -> Iterator[Found]:
-    """States are rad and metres within the robot's limits."""
-    for each in dataset.described():
-        robot = each.info.robot
-        state = each.rows[STATE].astype(np.float64)[:, : len(robot.arm_joints) + 1]
-        low = np.array([*robot.position_lower, 0.0])
-        high = np.array([*robot.position_upper, robot.gripper.max_width])
-        beyond = np.maximum(np.maximum(low - state, state - high), 0.0)
-        yield worst_frame(beyond.max(axis=1), f"episode {each.number}")
-
-
-@dataset_check(
-    measures="ratio of state differences to velocities, off 1",
-    warn=0.1,
-    fail=0.16,
-    reads=(
-        "observation.state",
-        "observation.velocity",
-    ),
-)
-def dataset_velocity(dataset: Dataset) -> Measurement | None:
-    """States change by velocity over time: catches a wrong fps and other joints' velocities. All episodes together."""
-    if VELOCITY not in dataset.info.features:
-        return None
-    product = square = 0.0
-    for rows in dataset.rows:
-        velocity = rows[VELOCITY].astype(np.float64)[:, :-1]
-        state = rows[STATE].astype(np.float64)[:, : velocity.shape[1]]
-        mean = (velocity[1:] + velocity[:-1]) / 2
-        product += float((np.diff(state, axis=0) * dataset.info.fps * mean).sum())
-        square += float((mean * mean).sum())
-    if square == 0.0:
-        return None
-    # At few frames a second the mean of two velocities says less about the way between them.
-    value = abs(product / square - 1.0) * min(1.0, dataset.info.fps / 20)
-    return Measurement(value=value, detail=f"ratio {product / square:.3f}")
 
 
 @dataset_check(

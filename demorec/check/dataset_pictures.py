@@ -9,11 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from demorec.check.base import Found, Measurement, dataset_check
+from demorec.check.base import Found, Measurement, NotMeasured, dataset_check
 from demorec.check.dataset import Dataset
 from demorec.check.dataset_statistics import episode_column, numbers_of, read_statistics
 from demorec.check.drawn import judge_lag, judge_unlike
+from demorec.check.rows import longest_run
 from demorec.geometry import Array
+from demorec.scene.features import STATE
 
 
 @dataset_check(
@@ -37,6 +39,46 @@ def dataset_pictures(dataset: Dataset) -> Measurement | None:
         return None
     named = "; ".join(f"{key}, episode {number}, frame {frame}" for key, number, frame in wrong[:3])
     return Measurement(value=len(wrong), frame=wrong[0][2] if wrong else None, detail=named or f"{count} pictures")
+
+
+@dataset_check(
+    measures="longest time for which a camera gives one and the same image while the robot moves",
+    unit="s",
+    warn=0.25,
+    fail=1.0,
+    needs_pictures=True,
+    reads=("observation.images.{camera}", "observation.state"),
+)
+def dataset_frozen(dataset: Dataset) -> Iterator[Found]:
+    """A camera that sees the robot move shows it: catches a stream that hangs.
+
+    A camera that shows the same in more than a fifth of the other moving frames does not see the robot, and tells
+    nothing.
+    """
+    if STATE not in dataset.info.features:
+        return
+    for key in dataset.colour_keys:
+        repeats = [
+            (pictures.cells[1:] == pictures.cells[:-1]).all(axis=(1, 2, 3)) for pictures in dataset.pictures(key)
+        ]
+        steps = [np.linalg.norm(np.diff(rows[STATE].astype(np.float64), axis=0), axis=1) for rows in dataset.rows]
+        if not repeats or not len(everything := np.concatenate(steps)):
+            continue
+        limit = 0.3 * float(np.sqrt((everything**2).mean()))
+        moving = [step > limit for step in steps]
+        found, hidden, others = [], 0, 0
+        for number, (same, moves) in enumerate(zip(repeats, moving, strict=True)):
+            # Where nothing moves, the same image again says nothing, and ends no run.
+            length, start = longest_run(same | ~moves)
+            run = np.zeros(len(same), dtype=np.bool_)
+            run[start : start + length] = True
+            seconds = int((same & moves & run).sum()) / dataset.info.fps
+            found.append(Measurement(value=seconds, frame=start + 1, detail=f"{key}, episode {number}"))
+            hidden, others = hidden + int((same & moves & ~run).sum()), others + int((moves & ~run).sum())
+        if hidden > 0.2 * others:
+            yield NotMeasured(why=f"{key} hardly sees the robot move")
+        else:
+            yield from found
 
 
 @dataset_check(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
@@ -50,10 +50,15 @@ def dataset_statistics(dataset: Dataset) -> Iterator[Found]:
         episodes = [_flat(rows[name]) for rows in dataset.rows]
         true = statistics_of(np.concatenate(episodes))
         weights = [len(values) for values in episodes]
-        own = {q: [np.quantile(values, share, axis=0) for values in episodes] for q, share in QUANTILES.items()}
-        averaged = {q: np.average(values, axis=0, weights=weights) for q, values in own.items()}
-        between = {} if dataset.sidecar else {q: (np.min(v, axis=0), np.max(v, axis=0)) for q, v in own.items()}
-        yield _off(stats.get(name), true, averaged, between, detail=name)
+        own = [_quantile_ranges(values) for values in episodes]
+        # (2, D) of each quantile: lowest and highest that it may be.
+        averaged = {q: np.average([ranges[q] for ranges in own], axis=0, weights=weights) for q in QUANTILES}
+        between = {
+            q: np.stack([np.min([r[q][0] for r in own], axis=0), np.max([r[q][1] for r in own], axis=0)])
+            for q in QUANTILES
+        }
+        ranges = (_quantile_ranges(np.concatenate(episodes)), averaged)
+        yield _off(stats.get(name), true, ranges, {} if dataset.sidecar else between, detail=name)
 
 
 @dataset_check(
@@ -69,7 +74,8 @@ def dataset_episode_statistics(dataset: Dataset) -> Iterator[Found]:
     for number, (row, rows) in enumerate(zip(told, dataset.rows, strict=False)):
         for name in names:
             said = {quantity: row[f"stats/{name}/{quantity}"] for quantity in NAMES}
-            yield _off(said, statistics_of(_flat(rows[name])), detail=f"episode {number}, {name}")
+            values = _flat(rows[name])
+            yield _off(said, statistics_of(values), (_quantile_ranges(values),), detail=f"episode {number}, {name}")
 
 
 def episode_column(dataset: Dataset, name: str) -> list[Any]:
@@ -109,6 +115,18 @@ def statistics_of(values: Array) -> dict[str, Array]:
     }
 
 
+def _quantile_ranges(values: Array) -> dict[str, Array]:
+    """Quantile -> (2, D) lowest and highest value that it has by any definition: those of the neighbouring ranks.
+
+    LeRobot reads them off a histogram, others interpolate; where samples are far apart, the difference is large.
+    """
+    ordered, last = np.sort(values, axis=0), len(values) - 1
+    ranks = {name: share * last for name, share in QUANTILES.items()}
+    return {
+        name: ordered[[max(math.ceil(rank) - 1, 0), min(math.floor(rank) + 1, last)]] for name, rank in ranks.items()
+    }
+
+
 def _numeric(dataset: Dataset) -> list[str]:
     """Columns of numbers, less those that number the rows: LeRobot's delete, split and merge number rows anew and leave
     their statistics as they were, and nobody normalises by them.
@@ -124,13 +142,13 @@ def _flat(rows: Any) -> Array:
 def _off(
     said: Mapping[str, Any] | None,
     true: Mapping[str, Array],
-    others: Mapping[str, Array] = MappingProxyType({}),
-    between: Mapping[str, tuple[Array, Array]] = MappingProxyType({}),
+    ranges: Sequence[Mapping[str, Array]],
+    between: Mapping[str, Array] = MappingProxyType({}),
     *,
     detail: str,
 ) -> Found:
-    """How far the worst quantity of a feature is off, by the nearer of two values where there are two; by no more than
-    `_MERGED` where it lies between two others.
+    """How far the worst quantity of a feature is off; a quantile from the nearest of its ranges (2, D), and by no more
+    than `_MERGED` where it lies `between` two others.
     """
     if said is None:
         return Measurement(value=math.inf, detail=f"{detail} has no statistics")
@@ -141,11 +159,11 @@ def _off(
         off, merged = math.inf, ""
         if told.shape == value.shape:
             distance = np.abs(told - value)
-            if quantity in others:
-                distance = np.minimum(distance, np.abs(told - others[quantity]))
+            for low, high in (known[quantity] for known in ranges if quantity in known):
+                distance = np.minimum(distance, np.maximum(np.maximum(low - told, told - high), 0.0))
             distance = distance if quantity == "count" else distance / scale
-            low, high = between.get(quantity, (np.inf, -np.inf))
-            is_between = (low <= told) & (told <= high) & (distance > _MERGED)
+            lowest, highest = between.get(quantity, (np.inf, -np.inf))
+            is_between = (lowest <= told) & (told <= highest) & (distance > _MERGED)
             off = float(np.where(is_between, _MERGED, distance).max())
             merged = ", between the episodes' own, as LeRobot's merge leaves it" if off == _MERGED else ""
         found.append(Measurement(value=off, detail=f"{quantity} of {detail}{merged}"))

@@ -11,6 +11,7 @@ from demorec.check.base import Check, Group, Level, Result, Scope
 from demorec.check.collected import NOT_APPLICABLE
 from demorec.check.dataset import Dataset
 from demorec.check.episode import CheckedEpisode
+from demorec.check.motion import Motions
 from demorec.check.run import CheckedRun
 from demorec.errors import check_option, resource_error
 from demorec.processes import SPAWN
@@ -167,6 +168,7 @@ def check_subject(subject: Subject, options: CheckOptions) -> SubjectReport:
         with CollectedRecording(subject.path) as recording:
             gates = ("collected_opens", "collected_readable")
             found = _run(options.checks("collected"), recording, gates, recording.columns)
+            found += _run(options.checks("motion"), Motions(recording), (), recording.columns)
         found += [check.skipped(NOT_APPLICABLE) for check in checks]
     elif subject.kind == "recording":
         with CheckedEpisode(subject.path) as episode:
@@ -181,6 +183,7 @@ def check_subject(subject: Subject, options: CheckOptions) -> SubjectReport:
     else:
         dataset = Dataset(subject.path)
         found = _run(checks, dataset, ("dataset_readable",), lambda: dataset.rows)
+        found += _run(options.checks("motion"), Motions(dataset), (), lambda: dataset.rows)
         if any(result.needs_allow for result in found):
             infos = [info for info in dataset.infos if info]
     models = [name for info in infos for name in (info.robot.urdf, *(body.shape.file for body in info.scene.bodies))]
@@ -221,7 +224,7 @@ def _run(checks: Sequence[Check], subject: object, gates: tuple[str, ...], read:
         if check.name == "opens" and result.level == "fail":
             results += [other.blocked() for other in checks if other is not check]
             break
-    if unreadable and all(result.level in ("pass", "skip") for result in results):
+    if gates and unreadable and all(result.level in ("pass", "skip") for result in results):
         # No chosen check looks at what is broken; it must not pass for that.
         gate = CHECKS.load(gates[-1])
         results.append(gate.run(subject))

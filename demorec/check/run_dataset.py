@@ -15,16 +15,14 @@ from demorec.check.base import Measurement, run_check
 from demorec.check.dataset import Dataset, Rows, read_rows
 from demorec.check.run import CheckedRun
 from demorec.errors import ConfigError, DemorecError, RecordingError, in_words, resource_error
-from demorec.export.columns import frame_stride
+from demorec.export.episode import exported
 from demorec.lerobot.files import read_json
 from demorec.lerobot.options import ExportOptions
 from demorec.lerobot.paths import SIDECAR_DIR, is_dataset
-from demorec.lerobot.prepare import prepare_episode
+from demorec.lerobot.prepare import prepare_episode, reasons_to_transcode
 from demorec.lerobot.reader import PacketReader
 from demorec.lerobot.sidecar import EPISODE_SCHEMA, EXPORT_PATH
-from demorec.lerobot.transcode import reason_to_transcode
 from demorec.recording import Recording
-from demorec.scene.features import IMAGE_PREFIX
 
 _OF_THE_PLACE = ("episode_index", "source", "content_digest")
 """What the sidecar keeps that is not of the recording."""
@@ -132,14 +130,10 @@ def episode_differences(
     """
     try:
         with Recording(recording_file) as recording:
-            prepared = prepare_episode(recording, options, code_depth=False)
-            stride = frame_stride(recording.info.fps, options.fps)
-            # Coded anew, pictures have the bytes of the version and machine that coded them.
-            transcoded = {
-                IMAGE_PREFIX + name
-                for name in recording.cameras
-                if reason_to_transcode(recording.video_settings(name), stride)
-            }
+            exporting = exported(recording, options)
+            prepared = prepare_episode(exporting, options, code_depth=False)
+            # Encoded anew, images have the bytes of the version and machine that encoded them.
+            transcoded = {camera.feature for camera, reason in reasons_to_transcode(exporting).items() if reason}
     except RecordingError as error:
         yield str(error), ()
         return

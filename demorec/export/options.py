@@ -32,13 +32,14 @@ class CommonOptions:
     """Add observation.environment_state: poses and sizes that no sensor of a real robot gives."""
     features: tuple[str, ...] = ()
     """Names of the features to have, the others are left out; all by default. observation.state, action and what the
-    format itself needs (times, indices) stay whatever is named. Fewer features make training faster."""
+    format itself needs (times, indices) stay whatever is named. Fewer features make training faster. Only when named:
+    observation.effort, observation.contact_force, observation.wrench and command, of simulated episodes."""
     depth: bool = False
     """Add depth pictures of recordings that have depth: LeRobot's 12-bit videos, or float32 metres in HDF5."""
     fps: int | None = None
     """Frames per second of the dataset; divides that of the recordings, the frames between are left out."""
     hold_pictures: float = 0.0
-    """Of collected episodes: seconds for which a frame without a picture of a camera shows the camera's last one, as a
+    """Of external episodes: seconds for which a frame without a picture of a camera shows the camera's last one, as a
     policy would see it; 0: such a frame is an error."""
     overwrite: bool = False
     """Replace the dataset that is there already; anything else than a dataset, or with anything else in it, is not."""
@@ -68,8 +69,8 @@ class ExportReport:
         skipped_unwanted: Recordings that `episodes` and `corrected_only` left out.
         transcoded: Cameras whose pictures had to be coded anew, with the reason.
         left_out: Features that the dataset appended to does not have.
-        depth_left_out: Depth cameras of collected episodes that were not asked for.
-        silent: Recordings of collected episodes whose language was asked for, but of which nobody said a subtask.
+        depth_left_out: Depth cameras of external episodes that were not asked for.
+        silent: Recordings of external episodes whose language was asked for, but whose source states no subtask.
         verified_frames: Frames that were compared through LeRobot; 0 when not asked for, or without LeRobot.
         not_verified: Why LeRobot did not verify what was asked for, as a sentence, or "".
         digest: Of the content, as `dataset_digest`.

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from demorec.errors import ConfigError
-from demorec.export.collected import wanted_cameras, wanted_depth
+from demorec.export.episode import ExportEpisode, exported
 from demorec.export.options import CommonOptions, parse_episodes
-from demorec.plain import digest
-from demorec.recording import AnyRecording, CollectedRecording, open_recording
+from demorec.recording import AnyRecording, open_recording
 from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings
 from demorec.scene.collected import CollectedOutcome
 from demorec.scene.episode import POLICY_PHASE, Outcome, interventions
-from demorec.scene.features import ENVIRONMENT_STATE, IMAGE_PREFIX, observation_names
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,21 +58,18 @@ def is_wanted(recording: AnyRecording, options: CommonOptions) -> bool:
     """
     if not parse_episodes(options.episodes)(recording.info.episode_index):
         return False
-    if not options.corrected_only or isinstance(recording, CollectedRecording):
+    if not options.corrected_only:
         return True
-    phases = recording.columns().phase
+    phases = recording.phases()
     return POLICY_PHASE not in phases or bool(interventions(phases).any())
 
 
 def goes_in(source: ExportSource, recording: AnyRecording, options: CommonOptions) -> bool:
     """Whether a recording of a wanted episode goes into the dataset, and is no failed attempt to be left out.
 
-    A collected episode of which nobody said whether it succeeded is no failure.
+    An external episode of which nobody said whether it succeeded is no failure.
     """
-    success = recording.outcome is not None and recording.outcome.success
-    if isinstance(recording, CollectedRecording):
-        success = recording.outcome is None or recording.outcome.success is not False
-    return source.is_chosen and (success or options.include_failures)
+    return source.is_chosen and (not recording.has_failed or options.include_failures)
 
 
 def places_of(sources: Iterable[ExportSource]) -> list[Path]:
@@ -99,8 +94,8 @@ class Profile:
 
     Attributes:
         traits: That.
-        depth_left_out: Depth cameras of collected episodes that were not asked for.
-        is_silent: Whether it is a collected episode of which nobody said a subtask.
+        depth_left_out: Depth cameras that were not asked for.
+        is_silent: Whether it is an external episode whose source states no subtask.
     """
 
     traits: tuple[tuple[str, str], ...] = ()
@@ -108,27 +103,9 @@ class Profile:
     is_silent: bool = field(default=False, compare=False)
 
     @classmethod
-    def of(cls, recording: AnyRecording, options: CommonOptions) -> Profile:
-        """That of a recording, as far as it matters for these options."""
-        if isinstance(recording, CollectedRecording):
-            unwanted = () if options.depth else recording.depth_cameras
-            common = _collected_traits(recording, options)
-            return cls(traits=common, depth_left_out=unwanted, is_silent=not recording.subtasks)
-        info = recording.info
-        # A scaled arm (the tutorial's) has the same joints and limits; its lengths stay with each episode's sidecar.
-        robot = info.robot.scaled(0.0)
-        traits = [
-            ("kind of episode", "simulated"),
-            ("fps", str(info.fps)),
-            ("robot", f"{info.robot.name} ({digest(robot)})"),
-        ]
-        cameras = [name for name in recording.cameras if options.takes(IMAGE_PREFIX + name)]
-        traits += _camera_traits(recording, cameras)
-        if options.privileged and options.takes(ENVIRONMENT_STATE):
-            names = observation_names(info.robot, info.scene, privileged=True)[ENVIRONMENT_STATE]
-            traits.append(("objects and goals", " ".join(dict.fromkeys(name.partition(".")[0] for name in names))))
-            traits.append(("components of the environment state", f"{len(names)} ({digest(list(names))})"))
-        return cls(traits=tuple(traits))
+    def of(cls, episode: ExportEpisode) -> Profile:
+        """That of an episode."""
+        return cls(traits=tuple(episode.traits()), depth_left_out=episode.depth_left_out, is_silent=episode.is_silent)
 
     def differences(self, other: Profile) -> tuple[str, ...]:
         """How `other` differs, in words."""
@@ -138,30 +115,6 @@ class Profile:
             for what in mine
             if what in theirs and theirs[what] != mine[what]
         )
-
-
-def _camera_traits(recording: AnyRecording, cameras: Sequence[str]) -> Iterator[tuple[str, str]]:
-    yield "cameras", " ".join(cameras) or "none"
-    for camera in cameras:
-        settings = recording.video_settings(camera)
-        yield f"size of camera {camera}", f"{settings.width}x{settings.height}"
-        yield f"codec of camera {camera}", settings.codec
-
-
-def _collected_traits(recording: CollectedRecording, options: CommonOptions) -> tuple[tuple[str, str], ...]:
-    info = recording.info
-    wanted = [feature for feature in info.features if options.takes(feature.name)]
-    features = [(f"feature {feature.name}", ", ".join(feature.names)) for feature in wanted]
-    cameras = [*wanted_cameras(recording, options), *wanted_depth(recording, options)]
-    names = ("features", " ".join(feature.name for feature in wanted))
-    return (
-        ("kind of episode", "collected"),
-        ("fps", str(info.fps)),
-        ("robot", info.robot),
-        names,
-        *features,
-        *_camera_traits(recording, cameras),
-    )
 
 
 class Intake:
@@ -175,7 +128,7 @@ class Intake:
         skipped_failures: Failed attempts that were left out so far.
         skipped_unknown: Recordings that were left out since they end before their outcome.
         depth_left_out: Depth cameras that were not asked for.
-        silent: Names of recordings of collected episodes of which nobody said a subtask.
+        silent: Names of recordings of external episodes whose source states no subtask.
         num_taken: Recordings that go in.
     """
 
@@ -237,7 +190,7 @@ def _refuse_differences(
     for source in sources:
         with open_recording(source.path) as recording:
             if is_wanted(recording, options) and goes_in(source, recording, options):
-                for difference in profile.differences(Profile.of(recording, options)):
+                for difference in profile.differences(Profile.of(exported(recording, options))):
                     files_by_difference.setdefault(difference, []).append(source.path.name)
     if files_by_difference:
         told = "; ".join(f"{difference} ({_some(files)})" for difference, files in files_by_difference.items())

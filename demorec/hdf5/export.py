@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from demorec.errors import ExportError
+from demorec.export.episode import exported
 from demorec.export.options import ExportReport, ProgressCallback
 from demorec.export.sources import (
     ExportSource,
@@ -67,8 +68,9 @@ def _write(
         with open_recording(source.path) as recording:
             if is_wanted(recording, options):
                 if goes_in(source, recording, options):
-                    intake.take(source.path, Profile.of(recording, options))
-                    writer.add(recording)
+                    episode = exported(recording, options)
+                    intake.take(source.path, Profile.of(episode))
+                    writer.add(episode)
                 else:
                     intake.leave_out(recording.outcome)
         if progress is not None:

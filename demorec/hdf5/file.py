@@ -21,11 +21,14 @@ ENV_ARGUMENTS = frozenset({"robot", "fps", "physics_hz", "cameras", "action", "p
 """What `env_args` says of every environment of ours, by which our files are known."""
 PICTURE_ARGUMENTS = frozenset({"width", "height"})
 """What it says of environments with cameras beside."""
-COLLECTED_ENVIRONMENT = "demorec/collected"
-"""What stands for an environment in files of collected episodes, which have none."""
-COLLECTED_ARGUMENTS = frozenset({"robot", "fps", "cameras", "observations"})
+EXTERNAL_ENVIRONMENT = "demorec/collected"
+"""What stands for an environment in files of external episodes, which have none."""
+EXTERNAL_ARGUMENTS = frozenset({"robot", "fps", "cameras", "observations"})
 """What `env_args` says beside it."""
-_OBSERVATIONS = r"robot0_(joint_pos|joint_vel|gripper_qpos|gripper_qvel|eef_pos|eef_quat)|object|[^/]+_(image|depth)"
+_OBSERVATIONS = (
+    r"robot0_(joint_pos|joint_vel|gripper_qpos|gripper_qvel|eef_pos|eef_quat)|object|effort|contact_force|wrench|command"
+    r"|[^/]+_(image|depth)"
+)
 _PARTS = r"data|mask|mask/(train|valid)|data/demo_\d+(/(actions|states|rewards|dones|obs))?|data/demo_\d+/obs/({names})"
 _ATTRIBUTES = (
     ("data", frozenset({"env_args", "total", "task", "fps"})),
@@ -53,8 +56,8 @@ def _is_our_dataset(path: Path) -> bool:
                 return False
             described = json.loads(data.attrs["env_args"])
             given = set(described["env_kwargs"])
-            if described["env_name"] == COLLECTED_ENVIRONMENT:
-                return given == COLLECTED_ARGUMENTS
+            if described["env_name"] == EXTERNAL_ENVIRONMENT:
+                return given == EXTERNAL_ARGUMENTS
             return str(described["env_name"]).startswith("demorec/") and given - PICTURE_ARGUMENTS == ENV_ARGUMENTS
     except (OSError, RuntimeError, KeyError, ValueError, TypeError, RecursionError):
         return False
@@ -84,9 +87,9 @@ def _strangers(path: Path) -> list[str]:
 
 
 def _observation_pattern(file: h5py.File) -> str:
-    """The observations that the export has written: of collected episodes the file itself names them."""
+    """The observations that the export has written: of external episodes the file itself names them."""
     described = json.loads(file["data"].attrs["env_args"])
-    if described["env_name"] != COLLECTED_ENVIRONMENT:
+    if described["env_name"] != EXTERNAL_ENVIRONMENT:
         return _OBSERVATIONS
     return "|".join(re.escape(str(name)) for name in described["env_kwargs"]["observations"])
 

@@ -7,44 +7,28 @@ observations are those of robosuite's environments, which robomimic's example co
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
 from fractions import Fraction
-from itertools import islice
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.export.columns import DONE, REWARD, SUCCESS, check_feature_names, feature_columns, frame_stride
-from demorec.hdf5.collected import collected_attributes, write_collected
-from demorec.hdf5.file import ENV_ARGUMENTS, PICTURE_ARGUMENTS, NewFile
+from demorec.errors import ConfigError
+from demorec.export.episode import DONE, ExportEpisode, Simulated
+from demorec.hdf5.file import ENV_ARGUMENTS, EXTERNAL_ARGUMENTS, EXTERNAL_ENVIRONMENT, PICTURE_ARGUMENTS, NewFile
 from demorec.hdf5.options import Hdf5Options
 from demorec.hdf5.streams import GYM, add_pictures, add_vectors
-from demorec.recording import AnyRecording, CollectedRecording, Recording, channels
 from demorec.scene.episode import EpisodeColumns, EpisodeInfo
-from demorec.scene.features import (
-    ACTION,
-    DEPTH_SUFFIX,
-    EE_POSE,
-    ENVIRONMENT_STATE,
-    IMAGE_PREFIX,
-    STATE,
-    VELOCITY,
-    action_names,
-    observation_names,
-)
+from demorec.scene.features import ACTION, EE_POSE, ENVIRONMENT_STATE, IMAGE_PREFIX, STATE, VELOCITY
 from demorec.tables import environment_name
 
-_OBSERVATIONS = {
-    "robot0_joint_pos": (STATE, slice(None, -1)),
-    "robot0_gripper_qpos": (STATE, slice(-1, None)),
-    "robot0_joint_vel": (VELOCITY, slice(None, -1)),
-    "robot0_gripper_qvel": (VELOCITY, slice(-1, None)),
-    "robot0_eef_pos": (EE_POSE, slice(0, 3)),
-    "robot0_eef_quat": (EE_POSE, slice(3, 7)),
-    "object": (ENVIRONMENT_STATE, slice(None)),
+_ROBOSUITE = {
+    STATE: {"robot0_joint_pos": slice(None, -1), "robot0_gripper_qpos": slice(-1, None)},
+    VELOCITY: {"robot0_joint_vel": slice(None, -1), "robot0_gripper_qvel": slice(-1, None)},
+    EE_POSE: {"robot0_eef_pos": slice(0, 3), "robot0_eef_quat": slice(3, 7)},
+    ENVIRONMENT_STATE: {"object": slice(None)},
 }
-"""robomimic's observations: which components of which feature."""
+"""Of simulated arms: feature -> robosuite's observations, and which elements each of them has."""
 
 
 class RobomimicWriter:
@@ -62,43 +46,49 @@ class RobomimicWriter:
         self._file = file
         self._data = file.root.create_group("data")
 
-    def add(self, recording: AnyRecording) -> None:
-        """Append an episode: numbers at once, pictures one by one."""
+    def add(self, episode: ExportEpisode) -> None:
+        """Append an episode: numbers at once, images one by one.
+
+        Raises:
+            ConfigError: It has no actions, two of its streams would get one name, or images are missing.
+            ExportError: It has no frames, a number that is not finite, or frames without an image.
+            RecordingError: It is damaged.
+        """
         demo = self._data.create_group(f"demo_{self.num_episodes}")
-        if isinstance(recording, CollectedRecording):
-            num_frames = write_collected(demo, recording, self.options)
-            described = collected_attributes(recording, self.options)
-        else:
-            num_frames = self._write_simulated(demo, recording)
-            described = self._attributes(recording)
+        self._write(demo, episode)
         if self.num_episodes == 0:
-            self._data.attrs.update(described)
+            self._data.attrs.update(_attributes(episode))
         self.num_episodes += 1
-        self.num_frames += num_frames
+        self.num_frames += len(episode.rows)
         self._file.flush()
 
-    def _write_simulated(self, demo: h5py.Group, recording: Recording) -> int:
-        """Fill in the group of an episode; how many frames it has."""
-        info, options = recording.info, self.options
-        names = observation_names(info.robot, info.scene, privileged=options.privileged)
-        self._check_feature_names(recording, names)
-        columns = feature_columns(recording, options, dtype=np.float64)
-        demo.attrs["num_samples"] = len(columns.rows)
+    def _write(self, demo: h5py.Group, episode: ExportEpisode) -> None:
+        """Fill in the group of an episode."""
+        observations, images = _observation_names(episode), _image_names(episode)
+        info, outcome, count = episode.recording.info, episode.recording.outcome, len(episode.rows)
+        demo.attrs["num_samples"] = count
         demo.attrs["instruction"] = info.instruction
         demo.attrs["episode_index"], demo.attrs["attempt"] = info.episode_index, info.attempt
-        demo.attrs["success"] = recording.outcome is not None and recording.outcome.success
-        if channels.description_topic() in recording.topics:
-            demo.attrs["model_file"] = recording.description()
-        add_vectors(demo, "actions", columns.features[ACTION], action_names(info.robot, options.action))
-        add_vectors(demo, "states", *_states(columns.recorded, columns.rows, info))
-        demo["rewards"] = columns.features[REWARD]
-        demo["dones"] = columns.features[DONE].astype(np.int64)
-        observations = demo.create_group("obs")
-        for name, (feature, components) in _OBSERVATIONS.items():
-            if feature in names and options.takes(feature):
-                add_vectors(observations, name, columns.features[feature][:, components], names[feature][components])
-        self._add_pictures(observations, recording, len(columns.rows))
-        return len(columns.rows)
+        if episode.origin:
+            demo.attrs["origin"] = episode.origin
+        if urdf := episode.urdf:
+            demo.attrs["model_file"] = urdf
+        dones = episode.scalar_columns[DONE].astype(np.int64)
+        success = False if episode.recording.has_failed else None if outcome is None else outcome.success
+        if success is not None:
+            demo.attrs["success"] = success
+            demo["rewards"] = (dones * success).astype(np.float32)
+        demo["dones"] = dones
+        add_vectors(demo, "actions", episode.vectors[ACTION], episode.names[ACTION])
+        if (simulated := episode.simulated) is not None:
+            add_vectors(demo, "states", *_states(simulated.columns, episode.rows, simulated.recording.info))
+        group = demo.create_group("obs")
+        for name, (feature, elements) in observations.items():
+            add_vectors(group, name, episode.vectors[feature][:, elements], episode.names[feature][elements])
+        for name, camera in zip(images, episode.cameras, strict=True):
+            settings = episode.recording.video_settings(camera.name)
+            shape = (count, settings.height, settings.width, 1 if camera.is_depth else 3)
+            add_pictures(group, name, shape, episode.images(camera), self.options.compression)
 
     def finish(self) -> None:
         """Write what is known of all episodes together: their number of samples, and who is for validation."""
@@ -110,41 +100,69 @@ class RobomimicWriter:
         for name, chosen in (("train", train), ("valid", valid)):
             self._file.root[f"mask/{name}"] = np.array([f"demo_{number}" for number in chosen], dtype="S")
 
-    def _check_feature_names(self, recording: Recording, names: Iterable[str]) -> None:
-        pictures = [IMAGE_PREFIX + camera for camera in recording.cameras]
-        depth = [name + DEPTH_SUFFIX for name in pictures] if self.options.depth else []
-        check_feature_names(self.options, [*names, *pictures, *depth, ACTION, REWARD, DONE, SUCCESS])
 
-    def _add_pictures(self, observations: h5py.Group, recording: Recording, count: int) -> None:
-        options, level = self.options, self.options.compression
-        stride = frame_stride(recording.info.fps, options.fps)
-        for camera in recording.cameras:
-            settings = recording.video_settings(camera)
-            size = settings.height, settings.width
-            if options.takes(IMAGE_PREFIX + camera):
-                pictures = islice(recording.images(camera), 0, None, stride)
-                add_pictures(observations, f"{camera}_image", (count, *size, 3), pictures, level)
-            if options.depth and options.takes(IMAGE_PREFIX + camera + DEPTH_SUFFIX):
-                distances = islice(recording.depth(camera), 0, None, stride)
-                add_pictures(observations, f"{camera}_depth", (count, *size, 1), distances, level)
+def _observation_names(episode: ExportEpisode) -> dict[str, tuple[str, slice]]:
+    """Observation -> which elements of which feature: robosuite's names, or "force" for "observation.force".
 
-    def _attributes(self, recording: Recording) -> dict[str, str | int]:
-        """The attributes of `data` that robomimic makes an environment from, and what else holds for all episodes."""
-        info, options = recording.info, self.options
-        fps = info.fps // frame_stride(info.fps, options.fps)
-        cameras = [camera for camera in info.scene.cameras if options.takes(IMAGE_PREFIX + camera.name)]
-        arguments = {
-            "robot": info.scene.robot.name,
-            "fps": fps,
-            "physics_hz": info.physics_hz,
-            "cameras": [camera.name for camera in cameras],
-            **({"width": cameras[0].width, "height": cameras[0].height} if cameras else {}),
-            "action": options.action,
-            "privileged": options.privileged,
-        }
-        assert arguments.keys() - PICTURE_ARGUMENTS == ENV_ARGUMENTS
-        described = {"env_name": environment_name(info.task), "type": GYM, "env_kwargs": arguments}
-        return {"env_args": json.dumps(described), "task": info.task, "fps": fps}
+    Raises:
+        ConfigError: There are no actions, or two streams would get one name.
+    """
+    wanted = [name for name in episode.names if episode.options.takes(name)]
+    if ACTION not in wanted:
+        raise ConfigError(f"robomimic's layout needs actions, and the episode has none: {episode.recording.path}")
+    known = {} if episode.simulated is None else _ROBOSUITE
+    found = [
+        (name, (feature, elements))
+        for feature in wanted
+        if feature != ACTION
+        for name, elements in known.get(feature, {feature.removeprefix("observation."): slice(None)}).items()
+    ]
+    given = [*(name for name, _ in found), *_image_names(episode)]
+    if twice := sorted({name for name in given if given.count(name) > 1}):
+        raise ConfigError(
+            f"Two streams of the episode would be called {', '.join(twice)} in the file, leave one of them out "
+            f"(--features): {episode.recording.path}"
+        )
+    return dict(found)
+
+
+def _image_names(episode: ExportEpisode) -> list[str]:
+    """Of each camera: "front_image", or of a depth camera what the dataset calls it."""
+    return [
+        camera.feature.removeprefix(IMAGE_PREFIX) + ("" if camera.is_depth else "_image") for camera in episode.cameras
+    ]
+
+
+def _attributes(episode: ExportEpisode) -> dict[str, str | int]:
+    """The attributes of `data`: what robomimic makes an environment from, and what else holds for all episodes.
+
+    Of an external episode there is no environment but its name.
+    """
+    arguments = {
+        "robot": episode.recording.info.robot_name,
+        "fps": episode.fps,
+        "cameras": [camera.name for camera in episode.cameras if not camera.is_depth],
+    }
+    if (simulated := episode.simulated) is None:
+        arguments["observations"] = [*_observation_names(episode), *_image_names(episode)]
+        assert arguments.keys() == EXTERNAL_ARGUMENTS
+        described = {"env_name": EXTERNAL_ENVIRONMENT, "type": GYM, "env_kwargs": arguments}
+        return {"env_args": json.dumps(described), "fps": episode.fps}
+    return {**_environment(simulated, episode, arguments), "fps": episode.fps}
+
+
+def _environment(simulated: Simulated, episode: ExportEpisode, arguments: dict[str, object]) -> dict[str, str | int]:
+    info, options = simulated.recording.info, episode.options
+    cameras = [camera for camera in info.scene.cameras if options.takes(IMAGE_PREFIX + camera.name)]
+    arguments |= {
+        "physics_hz": info.physics_hz,
+        **({"width": cameras[0].width, "height": cameras[0].height} if cameras else {}),
+        "action": options.action,
+        "privileged": options.privileged,
+    }
+    assert arguments.keys() - PICTURE_ARGUMENTS == ENV_ARGUMENTS
+    described = {"env_name": environment_name(info.task), "type": GYM, "env_kwargs": arguments}
+    return {"env_args": json.dumps(described), "task": info.task}
 
 
 def _states(

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import pyarrow as pa
 
-from demorec.recording import AnyRecording, CollectedRecording, Recording
-from demorec.scene.episode import Outcome
+from demorec.recording import AnyRecording
 
 ATTEMPT_SCHEMA = pa.schema(
     [
@@ -27,11 +26,15 @@ ATTEMPT_SCHEMA = pa.schema(
 )
 
 
+CUT_OFF = "cut off by a crash"
+"""Reason of a failure that nobody was there to state."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class AttemptRecord:
     """One attempt, as far as success rates need it; positions in the world frame, metres, at the start.
 
-    `success` is None where nobody said: of a collected episode.
+    `success` is None where nobody said.
     """
 
     source: str
@@ -49,51 +52,24 @@ class AttemptRecord:
     @classmethod
     def of(cls, recording: AnyRecording) -> AttemptRecord:
         """From the recording's metadata alone."""
-        if isinstance(recording, CollectedRecording):
-            return cls._of_collected(recording)
-        info, outcome = recording.info, outcome_of(recording)
-        name, object_position, goal_position = "", (None, None), (None, None)
-        if info.scene.goals:
-            goal = info.scene.goals[0]
-            name = goal.object
-            x, y, _ = info.scene.body(goal.object).world_from_body.position.tolist()
-            object_position = (x, y)
-            x, y, _ = info.scene.world_from_goal(goal).position.tolist()
-            goal_position = (x, y)
+        info, outcome, scene = recording.info, recording.outcome, recording.info.scene
+        name = ""
+        place: list[float | None] = [None] * 4
+        if scene is not None and scene.goals:
+            name = scene.goals[0].object
+            poses = (scene.body(name).world_from_body, scene.world_from_goal(scene.goals[0]))
+            place = [value for pose in poses for value in pose.position[:2].tolist()]
+        object_x, object_y, goal_x, goal_y = place
         return cls(
             source=recording.path.name,
             run_episode_index=info.episode_index,
             attempt=info.attempt,
-            success=outcome.success,
-            failure_phase=outcome.failure_phase,
-            failure_reason=outcome.failure_reason,
+            success=False if recording.has_failed else None if outcome is None else outcome.success,
+            failure_phase="" if outcome is None else outcome.failure_phase,
+            failure_reason=CUT_OFF if outcome is None else outcome.failure_reason,
             object=name,
-            object_x=object_position[0],
-            object_y=object_position[1],
-            goal_x=goal_position[0],
-            goal_y=goal_position[1],
+            object_x=object_x,
+            object_y=object_y,
+            goal_x=goal_x,
+            goal_y=goal_y,
         )
-
-    @classmethod
-    def _of_collected(cls, recording: CollectedRecording) -> AttemptRecord:
-        outcome = recording.outcome
-        return cls(
-            source=recording.path.name,
-            run_episode_index=recording.info.episode_index,
-            attempt=0,
-            success=None if outcome is None else outcome.success,
-            failure_phase="",
-            failure_reason="cut off by a crash" if outcome is None else outcome.reason,
-            object="",
-            object_x=None,
-            object_y=None,
-            goal_x=None,
-            goal_y=None,
-        )
-
-
-def outcome_of(recording: Recording) -> Outcome:
-    """That of the recording; one that a crash cut off counts as failed."""
-    return recording.outcome or Outcome(
-        success=False, checks=(), failure_reason="interrupted", num_frames=recording.num_frames
-    )

@@ -28,7 +28,17 @@ from demorec.lerobot.reader import read_tasks
 from demorec.lerobot.robots import ROBOTS_DIR
 from demorec.lerobot.thumbnails import THUMBNAILS_PATH, write_thumbnails
 from demorec.lerobot.writer import write_text
-from demorec.scene.features import ACTION, EE_POSE, ENVIRONMENT_STATE, IMAGE_PREFIX, STATE, VELOCITY, ActionKind
+from demorec.scene.features import (
+    ACTION,
+    COMMAND,
+    EE_POSE,
+    ENVIRONMENT_STATE,
+    IMAGE_PREFIX,
+    SENSED,
+    STATE,
+    VELOCITY,
+    ActionKind,
+)
 
 SECOND_CARD_PATH = f"{SIDECAR_DIR}/README.md"
 """Where the card goes if the dataset has a README.md that demorec did not write."""
@@ -42,13 +52,13 @@ class CardFacts:
         options: Of the export.
         configs: Config digest -> configuration of the runs.
         is_transcoded: Whether any pictures were coded anew.
-        is_collected: Whether the episodes were collected, not simulated.
+        is_simulated: Whether demorec simulated the episodes.
     """
 
     options: ExportOptions
     configs: Mapping[str, Any]
     is_transcoded: bool
-    is_collected: bool
+    is_simulated: bool
 
 
 _MARK = "<!-- written by demorec, which renews it at every export unless it was edited ({digest}) -->\n"
@@ -61,6 +71,7 @@ _MEANING = {
     EE_POSE: "tool centre point in the base frame: position (m), quaternion xyzw with x >= 0",
     ENVIRONMENT_STATE: "privileged: TCP, objects and goals, symmetric and relative quantities first, raw poses last "
     "(m, rad; base frame)",
+    COMMAND: "what the motors were sent: joint targets (rad), gripper opening (m)",
     "next.reward": "1 at the last frame of a success, else 0",
     "next.done": "true at the last frame",
     "next.success": "true at the last frame of a success",
@@ -79,7 +90,7 @@ _ACTION_MEANING: Mapping[ActionKind, str] = {
     "ee_delta": "change of the tool centre point's pose since the frame before, the first since the observed one: "
     "translation (m) and rotation vector (rad) in base axes, applied from the left; gripper opening (m), absolute",
 }
-_COLLECTED_ROWS = (
+_EXTERNAL_ROWS = (
     "Row t holds what was recorded at frame t, as it came. LeRobot's timestamps are multiples of the nominal "
     "period; the frames' own stamps, and how old each sample was, are in the recordings."
 )
@@ -89,7 +100,7 @@ _SIMULATED_ROWS = (
     "action is derived from the clean target. Frame times are multiples of the simulation's frame period, not of a "
     "wall clock."
 )
-_BESIDE_COLLECTED = (
+_BESIDE_EXTERNAL = (
     f"`{SIDECAR_DIR}/episodes/` says where each episode comes from, how it ended and what its cameras were."
 )
 _BESIDE_SIMULATED = (
@@ -131,14 +142,14 @@ def _card(root: Path, info: DatasetInfo, about: CardFacts, has_sheet: bool) -> I
         "some pictures were coded anew" if about.is_transcoded else "every video packet is the one that was recorded"
     )
     yield from ("---", f"license: {options.license}", "task_categories:", "- robotics")
-    yield from ("tags:", "- LeRobot", "- demorec", *([] if about.is_collected else ["- simulation"]))
+    yield from ("tags:", "- LeRobot", "- demorec", *(["- simulation"] if about.is_simulated else []))
     yield from ("configs:", "- config_name: default", "  data_files: data/*/*.parquet", "---", "")
     yield from (f"# {options.repo_id}", "")
     plural = "" if info.total_episodes == 1 else "s"
     whose = (
-        f"demonstration{plural} of {info.robot_type}, collected"
-        if about.is_collected
-        else f"scripted demonstration{plural} by a simulated {info.robot_type} arm in PyBullet"
+        f"scripted demonstration{plural} by a simulated {info.robot_type} arm in PyBullet"
+        if about.is_simulated
+        else f"demonstration{plural} of {info.robot_type}"
     )
     yield (
         f"{info.total_episodes} {whose}, "
@@ -157,12 +168,12 @@ def _card(root: Path, info: DatasetInfo, about: CardFacts, has_sheet: bool) -> I
     for key, item in info.features.items():
         yield f"| `{key}` | {item.dtype} | {list(item.shape)} | {_meaning(key, item, about)} |"
     yield from ("", "Names of all components are in `meta/info.json`.", "", "## Contract", "")
-    yield from (_COLLECTED_ROWS if about.is_collected else _SIMULATED_ROWS, "")
+    yield from (_SIMULATED_ROWS if about.is_simulated else _EXTERNAL_ROWS, "")
     yield from _success_section(_read_attempts(root))
-    yield from ("## What stands beside", "", _BESIDE_COLLECTED if about.is_collected else _BESIDE_SIMULATED)
+    yield from ("## What stands beside", "", _BESIDE_SIMULATED if about.is_simulated else _BESIDE_EXTERNAL)
     yield from _robot_section(root)
     yield ""
-    if not about.is_collected:
+    if about.is_simulated:
         yield from _origin_section(root, about)
 
 
@@ -179,8 +190,13 @@ def _robot_section(root: Path) -> Iterable[str]:
 
 
 def _meaning(key: str, item: Feature, about: CardFacts) -> str:
-    if about.is_collected and not key.startswith(IMAGE_PREFIX) and key not in AUTOMATIC_FEATURES and key != "next.done":
-        return "as it was collected"
+    if (
+        not about.is_simulated
+        and not key.startswith(IMAGE_PREFIX)
+        and key not in AUTOMATIC_FEATURES
+        and key != "next.done"
+    ):
+        return "as it was recorded"
     if key == ACTION:
         return _ACTION_MEANING[about.options.action]
     if key == STATE and about.options.state == "joint_ee":
@@ -189,6 +205,8 @@ def _meaning(key: str, item: Feature, about: CardFacts) -> str:
         return "distance along the optical axis, 12-bit logarithmic codes of 0.01 to 10 m; 0.01 m: nothing was hit"
     if key.startswith(IMAGE_PREFIX):
         return f"camera {key.removeprefix(IMAGE_PREFIX)}, RGB"
+    if key in SENSED:
+        return SENSED[key].meaning
     return _MEANING.get(key, "filled in by LeRobot's rules")
 
 

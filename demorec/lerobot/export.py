@@ -94,7 +94,7 @@ class _Export:
         self._digests: list[str] = []
         self._recordings: list[Path] = []
         self._intake = Intake(found, options)
-        self._is_collected = False
+        self._is_simulated = True
 
     def run(self, progress: ProgressCallback | None) -> ExportReport:
         aside = self._folder.with_name(CODED)  # is removed with everything beside the new folder
@@ -107,7 +107,7 @@ class _Export:
                 break
         self._intake.check()
         info = self._dataset_info(begun[-1])
-        self._is_collected = begun[-1].is_collected
+        self._is_simulated = begun[-1].is_simulated
         start = self._existing.writer if self._existing else WriterStart()
         sidecar_start = self._existing.sidecar if self._existing else SidecarStart()
         limits: dict[str, Any] = {"limit_mb": info.data_files_size_in_mb, "chunks_size": info.chunks_size}
@@ -132,7 +132,7 @@ class _Export:
             options=self._options,
             configs=configs,
             is_transcoded=bool(self._transcoded),
-            is_collected=self._is_collected,
+            is_simulated=self._is_simulated,
         )
         write_card(self._folder, finished, facts)
         return ExportReport(
@@ -227,13 +227,13 @@ class _Export:
             and len(self._intake.silent) == self._intake.num_taken
         ):
             raise ConfigError(
-                "Language is asked for, but the episodes were collected and nobody said a subtask in any of them (in "
-                "the mapping of an import, [subtasks] names the topic of it): leave --language out."
+                "Language is asked for, but the episodes are external and no source of them states a subtask (in the "
+                "mapping of an import, [subtasks] names the topic of it): leave --language out."
             )
 
     def _about_this_export(self) -> dict[str, Any]:
         options = self._options
-        held = {"hold_pictures": options.hold_pictures} if self._is_collected else {}
+        held = {} if self._is_simulated else {"hold_pictures": options.hold_pictures}
         return {
             **held,
             "demorec": version("demorec"),

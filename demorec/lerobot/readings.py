@@ -8,15 +8,15 @@ from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from demorec.export.columns import frame_stride
+from demorec.export.episode import exported
 from demorec.export.options import ProgressCallback
 from demorec.export.sources import ExportSource, Profile, goes_in, is_wanted
 from demorec.lerobot.attempts import AttemptRecord
 from demorec.lerobot.layout import Feature
 from demorec.lerobot.options import ExportOptions
-from demorec.lerobot.prepare import PreparedEpisode, dataset_features, prepare_episode, transcoded_cameras
+from demorec.lerobot.prepare import PreparedEpisode, dataset_features, prepare_episode, reasons_to_transcode
 from demorec.processes import SPAWN, available_cores
-from demorec.recording import CollectedRecording, open_recording
+from demorec.recording import open_recording
 from demorec.scene.collected import CollectedOutcome
 from demorec.scene.episode import Outcome
 
@@ -39,7 +39,7 @@ class Reading:
         profile: What must agree with all the others.
         features, fps, robot: Of a dataset made from it.
         transcoded: Cameras whose images had to be encoded anew, with the reason.
-        is_collected: Whether the episode was recorded elsewhere, not simulated.
+        is_simulated: Whether demorec simulated the episode.
     """
 
     path: Path
@@ -51,7 +51,7 @@ class Reading:
     fps: int = 0
     robot: str = ""
     transcoded: tuple[str, ...] = ()
-    is_collected: bool = False
+    is_simulated: bool = False
 
 
 def read(source: ExportSource, options: ExportOptions) -> Reading | None:
@@ -62,23 +62,24 @@ def read(source: ExportSource, options: ExportOptions) -> Reading | None:
         ExportError: It has no frames, or its fps is no multiple of the wanted one.
     """
     with open_recording(source.path) as recording:
-        info = recording.info
         if not is_wanted(recording, options):
             return None
         attempt = AttemptRecord.of(recording)
         if not goes_in(source, recording, options):
             return Reading(path=source.path, attempt=attempt, outcome=recording.outcome)
+        episode = exported(recording, options)
+        reasons = reasons_to_transcode(episode)
         return Reading(
             path=source.path,
             attempt=attempt,
             outcome=recording.outcome,
-            profile=Profile.of(recording, options),
-            features=dataset_features(recording, options),
-            fps=info.fps // frame_stride(info.fps, options.fps),
-            robot=info.robot if isinstance(info.robot, str) else info.robot.name,
-            transcoded=transcoded_cameras(recording, options),
-            is_collected=isinstance(recording, CollectedRecording),
-            prepared=prepare_episode(recording, options),
+            profile=Profile.of(episode),
+            features=dataset_features(episode, options),
+            fps=episode.fps,
+            robot=recording.info.robot_name,
+            transcoded=tuple(f"{camera.name}, {reason}" for camera, reason in reasons.items() if reason),
+            is_simulated=episode.simulated is not None,
+            prepared=prepare_episode(episode, options),
         )
 
 

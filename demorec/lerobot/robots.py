@@ -15,15 +15,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from demorec.errors import DemorecError, ExportError, in_words
+from demorec.export.episode import ExportEpisode
 from demorec.lerobot.files import MAX_JSON_BYTES
 from demorec.lerobot.paths import SIDECAR_DIR
 from demorec.lerobot.writer import write_text
 from demorec.plain import digest, from_json, to_json
-from demorec.recording import CollectedRecording, Recording
 from demorec.safety.files import read_text_limited
 from demorec.scene.assets import asset_path
-from demorec.scene.collected import CollectedFeature
-from demorec.scene.features import STATE, StateKind
 from demorec.scene.robot import RobotSpec
 from demorec.scene.urdf import MAX_BYTES, Urdf, parse_xml
 from demorec.scene.urdf_shapes import read_links
@@ -78,47 +76,35 @@ class DatasetRobot:
         return Urdf.parse(self.urdf)
 
 
-def robot_of(recording: Recording, state: StateKind) -> DatasetRobot:
-    """The arm of a simulated episode, as its recording describes it, and which of its joints observation.state moves.
+def robot_of(episode: ExportEpisode) -> DatasetRobot | None:
+    """The robot of an episode, and which of its joints the features move; None where its URDF is not known.
 
     Raises:
         RecordingError: The recording is damaged.
     """
-    return _simulated(recording.info.robot, recording.description(), state)
-
-
-@functools.lru_cache(maxsize=8)  # nearly always the same in all recordings of a run
-def _simulated(spec: RobotSpec, urdf: str, state: StateKind) -> DatasetRobot:
-    pose = ("m",) * 3 + ("",) * 4 if state == "joint_ee" else ()
-    return DatasetRobot(
-        record=RobotRecord(
-            name=spec.name,
-            urdf_sha256=_sha256(urdf),
-            joints={STATE: (*spec.arm_joints, "", *("" for _ in pose))},
-            units={STATE: (*("rad" for _ in spec.arm_joints), "m", *pose)},
-            spec=spec,
-            meshes=_mesh_names(spec.urdf),
-        ),
-        urdf=urdf,
+    simulated, urdf = episode.simulated, episode.urdf
+    spec = None if simulated is None else simulated.recording.info.robot
+    if not urdf:
+        return None
+    return _robot(
+        episode.recording.info.robot_name, urdf, tuple(episode.joints.items()), tuple(episode.units.items()), spec
     )
 
 
-def robot_of_collected(recording: CollectedRecording) -> DatasetRobot | None:
-    """That of a collected episode; None where its URDF is not known."""
-    info = recording.info
-    return _collected(info.robot, info.urdf, info.features) if info.urdf else None
+_ByFeature = tuple[tuple[str, tuple[str, ...]], ...]
 
 
-@functools.lru_cache(maxsize=8)
-def _collected(name: str, text: str, features: tuple[CollectedFeature, ...]) -> DatasetRobot:
-    urdf = portable_urdf(text)
-    moving = [feature for feature in features if any(feature.joints)]
+@functools.lru_cache(maxsize=8)  # nearly always the same in all recordings of a run
+def _robot(name: str, text: str, joints: _ByFeature, units: _ByFeature, spec: RobotSpec | None) -> DatasetRobot:
+    urdf = portable_urdf(text) if spec is None else text
     return DatasetRobot(
         record=RobotRecord(
             name=name,
             urdf_sha256=_sha256(urdf),
-            joints={feature.name: feature.joints for feature in moving},
-            units={feature.name: feature.units for feature in moving if feature.units},
+            joints=dict(joints),
+            units=dict(units),
+            spec=spec,
+            meshes={} if spec is None else _mesh_names(spec.urdf),
         ),
         urdf=urdf,
     )

@@ -23,17 +23,16 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from demorec.export.episode import ExportEpisode, Simulated
 from demorec.geometry import Array
-from demorec.lerobot.attempts import ATTEMPT_SCHEMA, AttemptRecord, outcome_of
+from demorec.lerobot.attempts import ATTEMPT_SCHEMA, AttemptRecord
 from demorec.lerobot.layout import SIDECAR_ATTEMPTS_PATH, SIDECAR_CAMERAS_PATH, SIDECAR_EPISODES_PATH, FilePosition
 from demorec.lerobot.parquet import RollingParquet, vector_array
 from demorec.lerobot.paths import SIDECAR_DIR
-from demorec.lerobot.robots import DatasetRobot, robot_of, robot_of_collected, write_robot
+from demorec.lerobot.robots import DatasetRobot, robot_of, write_robot
 from demorec.lerobot.writer import WrittenEpisode, write_text
 from demorec.plain import to_json, to_plain
-from demorec.recording import CollectedRecording, Recording
 from demorec.scene.episode import EpisodeColumns
-from demorec.scene.features import StateKind
 from demorec.scene.scene import Scene
 
 CONFIGS_PATH = f"{SIDECAR_DIR}/configs.json"
@@ -117,57 +116,52 @@ class EpisodeRecord:
     robot: DatasetRobot | None
 
     @classmethod
-    def of_collected(cls, row: Mapping[str, Any], recording: CollectedRecording) -> EpisodeRecord:
-        """Of a collected episode, of which there is no config and no pose."""
+    def of(cls, episode: ExportEpisode) -> EpisodeRecord:
+        """Of an episode; frame numbers are those of the dataset."""
+        recording, rows, attempt = episode.recording, episode.rows, AttemptRecord.of(episode.recording)
+        row = {
+            "source": attempt.source,
+            "run_episode_index": attempt.run_episode_index,
+            "attempt": attempt.attempt,
+            "origin": episode.origin,
+            "frame_stride": recording.info.fps // episode.fps if len(rows) > 1 else 1,
+            "success": attempt.success,
+            "failure_reason": attempt.failure_reason,
+            "cameras": episode.described_cameras(),
+        }
+        moving: dict[str, Array] = {}
+        if (simulated := episode.simulated) is not None:
+            row |= _simulated_row(simulated, rows)
+            cameras = simulated.recording.info.scene.cameras
+            poses = simulated.columns.world_from_camera
+            moving = {camera.name: poses[camera.name][rows] for camera in cameras if camera.mount != "world"}
         return cls(
             row=row,
-            attempt=AttemptRecord.of(recording),
-            moving_cameras={},
-            config_digest="",
-            config={},
-            robot=robot_of_collected(recording),
+            attempt=attempt,
+            moving_cameras=moving,
+            config_digest="" if simulated is None else simulated.recording.info.config_digest,
+            config={} if simulated is None else simulated.recording.info.config,
+            robot=robot_of(episode),
         )
 
-    @classmethod
-    def of(
-        cls, recording: Recording, columns: EpisodeColumns, rows: NDArray[np.intp], state: StateKind
-    ) -> EpisodeRecord:
-        """Of a recording of which the frames `rows` are exported; frame numbers are those of the dataset."""
-        info, outcome = recording.info, outcome_of(recording)
-        row = {
-            "source": recording.path.name,
-            "run_episode_index": info.episode_index,
-            "attempt": info.attempt,
-            "root_seed": info.root_seed,
-            "task": info.task,
-            "origin": info.origin,
-            "config_digest": info.config_digest,
-            "frame_stride": int(rows[1] - rows[0]) if len(rows) > 1 else 1,
-            "success": outcome.success,
-            "failure_phase": outcome.failure_phase,
-            "failure_reason": outcome.failure_reason,
-            "num_retries": outcome.num_retries,
-            "final_state_digest": outcome.final_state_digest,
-            "checks": [to_plain(check) for check in outcome.checks],
-            "behaviour": sorted(info.behaviour.items()),
-            "phases": _phases(columns, rows),
-            "deliberate_miss_frames": np.flatnonzero(columns.is_deliberate_miss[rows]).tolist(),
-            **_things(info.scene, columns),
-            "episode_info": to_json(info),
-        }
-        moving = {
-            camera.name: columns.world_from_camera[camera.name][rows]
-            for camera in info.scene.cameras
-            if camera.mount != "world"
-        }
-        return cls(
-            row=row,
-            attempt=AttemptRecord.of(recording),
-            moving_cameras=moving,
-            config_digest=info.config_digest,
-            config=info.config,
-            robot=robot_of(recording, state),
-        )
+
+def _simulated_row(simulated: Simulated, rows: NDArray[np.intp]) -> dict[str, Any]:
+    """What is known of a simulated episode; it failed where its recording ends without an outcome."""
+    info, columns, outcome = simulated.recording.info, simulated.columns, simulated.recording.outcome
+    return {
+        "root_seed": info.root_seed,
+        "task": info.task,
+        "config_digest": info.config_digest,
+        "failure_phase": "" if outcome is None else outcome.failure_phase,
+        "num_retries": 0 if outcome is None else outcome.num_retries,
+        "final_state_digest": "" if outcome is None else outcome.final_state_digest,
+        "checks": [] if outcome is None else [to_plain(check) for check in outcome.checks],
+        "behaviour": sorted(info.behaviour.items()),
+        "phases": _phases(columns, rows),
+        "deliberate_miss_frames": np.flatnonzero(columns.is_deliberate_miss[rows]).tolist(),
+        **_things(info.scene, columns),
+        "episode_info": to_json(info),
+    }
 
 
 def _phases(columns: EpisodeColumns, rows: NDArray[np.intp]) -> list[dict[str, Any]]:
@@ -180,7 +174,7 @@ def _phases(columns: EpisodeColumns, rows: NDArray[np.intp]) -> list[dict[str, A
 
 
 def _things(scene: Scene, columns: EpisodeColumns) -> dict[str, list[dict[str, Any]]]:
-    """Where the objects, goals and cameras are, at the start and at the end."""
+    """Where the objects and goals are, at the start and at the end."""
     return {
         "objects": [
             {
@@ -197,18 +191,6 @@ def _things(scene: Scene, columns: EpisodeColumns) -> dict[str, list[dict[str, A
                 "world_from_goal_start": scene.world_from_goal(goal).vector().tolist(),
             }
             for goal in scene.goals
-        ],
-        "cameras": [
-            {
-                "name": camera.name,
-                "width": camera.width,
-                "height": camera.height,
-                "intrinsics": camera.intrinsics.reshape(-1).tolist(),
-                "mount": camera.mount,
-                "mount_from_camera": camera.mount_from_camera.vector().tolist(),
-                "world_from_camera_start": columns.world_from_camera[camera.name][0].tolist(),
-            }
-            for camera in scene.cameras
         ],
     }
 

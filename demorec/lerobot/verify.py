@@ -24,17 +24,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.errors import DemorecError, ExportError, in_words, resource_error
-from demorec.export.collected import shown_pictures
-from demorec.export.columns import frame_stride
-from demorec.lerobot.collected import reasons_to_transcode
+from demorec.export.episode import ExportCamera, ExportEpisode, exported
 from demorec.lerobot.depth import code_values, quantised
 from demorec.lerobot.language import EVENTS, PERSISTENT, EpisodeLanguage
 from demorec.lerobot.options import ExportOptions
 from demorec.lerobot.prepare import prepare_episode
 from demorec.lerobot.transcode import reason_to_transcode
 from demorec.processes import SPAWN
-from demorec.recording import AnyRecording, CollectedRecording, open_recording
-from demorec.scene.features import DEPTH_SUFFIX, IMAGE_PREFIX
+from demorec.recording import AnyRecording, open_recording
 
 LEROBOT = "lerobot[dataset]>=0.6.1,<0.7"
 """What pip has to install for a verification; a test compares it with pyproject.toml."""
@@ -153,11 +150,11 @@ def _compare_episode(
     dataset: Any, sample: VerifiedEpisode, recording: AnyRecording, options: ExportOptions, number: int
 ) -> int:
     first = int(dataset.meta.episodes[sample.episode_index]["dataset_from_index"])
-    stride = 1 if isinstance(recording, CollectedRecording) else frame_stride(recording.info.fps, options.fps)
-    length = len(range(0, recording.num_frames, stride))
+    episode = exported(recording, options)
+    length = len(episode.rows)
     # The last frame, where offsets add up, and one more that differs from episode to episode.
     moments = sorted({(number * 37) % length, length - 1})
-    expected = prepare_episode(recording, options, code_depth=False, about=moments).data
+    expected = prepare_episode(episode, options, code_depth=False, about=moments).data
     for moment in moments:
         try:
             item = dataset[first + moment]
@@ -174,9 +171,11 @@ def _compare_episode(
             wrong.append("task")
         if float(item["timestamp"]) != float(np.float32(moment / dataset.meta.fps)):
             wrong.append("timestamp")
-        depth = recording.depth_cameras if isinstance(recording, CollectedRecording) else ()
-        for camera in (*recording.cameras, *depth):
-            wrong += _wrong_pictures(item, recording, camera, moment, options)
+        wrong += [
+            camera.feature
+            for camera in episode.cameras
+            if camera.feature in item and _is_wrong_image(item[camera.feature], episode, camera, moment)
+        ]
         if wrong:
             raise ExportError(
                 f"The new dataset was dropped: read through LeRobot, {', '.join(wrong)} of frame {moment} of episode "
@@ -195,18 +194,14 @@ def _wrong_language(item: Any, expected: EpisodeLanguage, moment: int) -> list[s
     return [name for name, told in rows.items() if name in item and item[name] != [row.to_json() for row in told]]
 
 
-def _is_wrong_collected(
-    tensor: Any, recording: CollectedRecording, camera: str, moment: int, options: ExportOptions
-) -> bool:
-    """Whether a picture differs from the one that the frame shows."""
-    shown = shown_pictures(recording, recording.columns(), camera, options)
-    if camera in recording.depth_cameras:
-        recorded = next(islice(recording.depth(camera), int(shown[moment]), None))
-        return _is_wrong_depth(tensor, recorded)
-    expected = recording.picture(camera, int(shown[moment]))
-    limit = _TRANSCODED_TOLERANCE if reasons_to_transcode(recording, options)[camera] else 0.0
+def _is_wrong_image(tensor: Any, episode: ExportEpisode, camera: ExportCamera, moment: int) -> bool:
+    """Whether an image differs from the one that the frame shows; of depth, as far as its codes tell."""
+    number, recording = int(episode.numbers(camera)[moment]), episode.recording
+    if camera.is_depth:
+        return _is_wrong_depth(tensor, next(islice(recording.depth(camera.name), number, None)))
+    limit = _TRANSCODED_TOLERANCE if reason_to_transcode(episode, camera) else 0.0
     found = tensor.numpy().transpose(1, 2, 0).astype(np.float64)
-    return bool(np.abs(found - expected).mean() > limit)
+    return bool(np.abs(found - recording.picture(camera.name, number)).mean() > limit)
 
 
 def _is_wrong_depth(tensor: Any, recorded: NDArray[np.float32]) -> bool:
@@ -214,22 +209,3 @@ def _is_wrong_depth(tensor: Any, recorded: NDArray[np.float32]) -> bool:
     found = tensor.numpy()
     found = found.reshape(found.shape[-2:]) / 1000
     return bool(np.abs(found - code_values()[quantised(recorded)]).max() > _DEPTH_TOLERANCE)
-
-
-def _wrong_pictures(item: Any, recording: AnyRecording, camera: str, moment: int, options: ExportOptions) -> list[str]:
-    wrong: list[str] = []
-    key = IMAGE_PREFIX + camera
-    if isinstance(recording, CollectedRecording):
-        return [key] if key in item and _is_wrong_collected(item[key], recording, camera, moment, options) else []
-    stride = frame_stride(recording.info.fps, options.fps)
-    if key in item:
-        settings = recording.video_settings(camera)
-        found = item[key].numpy().transpose(1, 2, 0).astype(np.float64)
-        limit = _TRANSCODED_TOLERANCE if reason_to_transcode(settings, stride) else 0.0
-        if np.abs(found - recording.image(camera, moment * stride)).mean() > limit:
-            wrong.append(key)
-    if key + DEPTH_SUFFIX in item:
-        recorded = next(islice(recording.depth(camera), moment * stride, None))
-        if _is_wrong_depth(item[key + DEPTH_SUFFIX], recorded):
-            wrong.append(key + DEPTH_SUFFIX)
-    return wrong

@@ -14,6 +14,7 @@ from demorec.errors import RecordingError
 from demorec.plain import to_json, to_plain
 from demorec.recording import messages, metadata
 from demorec.recording.channels import camera_topic
+from demorec.recording.chunks import Block
 from demorec.recording.container import Container, damage_as_recording_error
 from demorec.recording.pixels import PixelCounter, PixelStatistics
 from demorec.recording.video import Rgb, VideoPacket, VideoSettings, decode
@@ -88,6 +89,15 @@ class EpisodeFile[O: (Outcome, CollectedOutcome), C](Closing):
         return result
 
     @property
+    @abstractmethod
+    def has_failed(self) -> bool:
+        """Whether its attempt failed."""
+
+    @abstractmethod
+    def phases(self) -> Sequence[str]:
+        """Phase of each frame; empty where nobody stated any."""
+
+    @property
     def topics(self) -> dict[str, tuple[str, int]]:
         """topic -> (type, number of messages), sorted by topic."""
         container = self._container
@@ -111,9 +121,17 @@ class EpisodeFile[O: (Outcome, CollectedOutcome), C](Closing):
     def packets(self, camera: str) -> Iterator[VideoPacket]:
         """The coded pictures of a camera, in order."""
 
+    @abstractmethod
+    def coded_pictures(self, cameras: Sequence[str]) -> dict[str, Block]:
+        """camera -> all its coded pictures, in memory together."""
+
     def images(self, camera: str) -> Iterator[Rgb]:
         """The decoded pictures of a camera, (H, W, 3) uint8 RGB, in order."""
         return decode(self.video_settings(camera), self.packets(camera))
+
+    def picture(self, camera: str, number: int) -> Rgb:
+        """One decoded picture of a camera, (H, W, 3) uint8 RGB, by its own number."""
+        return next(self._images(camera, [number]))
 
     def _images(self, camera: str, numbers: Sequence[int]) -> Iterator[Rgb]:
         """Some decoded pictures, read in one pass, each decoded from the keyframe before it on."""

@@ -81,6 +81,15 @@ class RecordingReader(EpisodeFile[Outcome, metadata.CameraStreams]):
         """Whether segmentation pictures of a camera were recorded."""
         return self._camera(camera).segmentation
 
+    @property
+    def has_failed(self) -> bool:
+        """Whether it did not succeed, or a crash cut it off."""
+        return self.outcome is None or not self.outcome.success
+
+    def phases(self) -> Sequence[str]:
+        """Phase of each frame."""
+        return self.columns().phase
+
     def _frame_times(self) -> NDArray[np.int64]:
         """(T,) `frame_time_ns` of every frame."""
         fps = self.info.fps

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -126,7 +126,12 @@ class CollectedInfo:
         cameras: None to many.
         origin: How the episode came here.
         versions: package -> version, of what wrote it.
+        scene: Nothing is known of it.
+        attempt: The only one.
     """
+
+    scene: ClassVar[None] = None
+    attempt: ClassVar[int] = 0
 
     format_version: int = COLLECTED_VERSION
     episode_index: int
@@ -138,6 +143,11 @@ class CollectedInfo:
     cameras: tuple[CollectedCamera, ...] = ()
     origin: Origin = field(default_factory=Origin)
     versions: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def robot_name(self) -> str:
+        """What the robot is called."""
+        return self.robot
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -187,6 +197,16 @@ class CollectedOutcome:
     num_frames: int
     drops: Mapping[str, int] = field(default_factory=dict)
     reason: str = ""
+
+    @property
+    def failure_phase(self) -> str:
+        """Nobody states any."""
+        return ""
+
+    @property
+    def failure_reason(self) -> str:
+        """Why it is no success, in words, "" when nobody said."""
+        return self.reason
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

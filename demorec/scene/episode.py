@@ -180,6 +180,11 @@ class EpisodeInfo:
     versions: Mapping[str, str] = field(default_factory=dict)
     origin: str = ""
 
+    @property
+    def robot_name(self) -> str:
+        """What the robot is called."""
+        return self.robot.name
+
 
 @dataclass(frozen=True, kw_only=True)
 class SuccessCheck:

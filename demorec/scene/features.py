@@ -11,7 +11,7 @@ Frames: everything is expressed in the robot's base frame (the world's, where th
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -31,6 +31,8 @@ VELOCITY = "observation.velocity"
 EE_POSE = "observation.ee_pose"
 ENVIRONMENT_STATE = "observation.environment_state"
 ACTION = "action"
+COMMAND = "command"
+"""What the motors were sent: the action in joint space plus exploration noise."""
 IMAGE_PREFIX, DEPTH_SUFFIX = "observation.images.", "_depth"
 """A camera's pictures are called IMAGE_PREFIX + its name, its distances have the suffix, too."""
 
@@ -65,6 +67,9 @@ class ObservationRows:
     gripper_width: Array  # (T,)
     base_from_tcp: Array  # (T, 7)
     object_poses: Mapping[str, Array]  # name -> (T, 7), world_from_object
+    joint_effort: Array | None = None  # (T, n_joints)
+    contact_force: Array | None = None  # (T,)
+    wrench: Array | None = None  # (T, 6)
 
     @classmethod
     def of_columns(cls, columns: EpisodeColumns, rows: NDArray[np.intp] | slice = slice(None)) -> ObservationRows:
@@ -75,6 +80,9 @@ class ObservationRows:
             gripper_width=columns.gripper_width[rows],
             base_from_tcp=columns.base_from_tcp[rows],
             object_poses={name: poses[rows] for name, poses in columns.object_poses.items()},
+            joint_effort=columns.joint_effort[rows],
+            contact_force=columns.contact_force[rows],
+            wrench=None if columns.wrench is None else columns.wrench[rows],
         )
 
     @classmethod
@@ -86,7 +94,45 @@ class ObservationRows:
             gripper_width=np.array([observation.gripper_width]),
             base_from_tcp=observation.base_from_tcp.vector()[np.newaxis],
             object_poses={name: pose.vector()[np.newaxis] for name, pose in observation.object_poses.items()},
+            joint_effort=observation.joint_effort[np.newaxis],
+            contact_force=np.array([observation.contact_force]),
+            wrench=None if observation.wrench is None else observation.wrench[np.newaxis],
         )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SensedFeature:
+    """A sensed quantity that datasets have only when they are asked for it by name.
+
+    Attributes:
+        meaning: In words, with units and coordinate frame.
+        names: Of its elements.
+        values: (T, D) or (T,) of T observations; None where it was not sensed.
+    """
+
+    meaning: str
+    names: Callable[[RobotSpec], tuple[str, ...]]
+    values: Callable[[ObservationRows, RobotSpec], Array | None]
+
+
+SENSED: Mapping[str, SensedFeature] = {
+    "observation.effort": SensedFeature(
+        meaning="motor torques of the arm's joints (N m)",
+        names=lambda robot: tuple(f"{joint}.effort" for joint in robot.arm_joints),
+        values=lambda rows, robot: None if rows.joint_effort is None else rows.joint_effort[:, : len(robot.arm_joints)],
+    ),
+    "observation.contact_force": SensedFeature(
+        meaning="sum of the normal forces on the fingers (N)",
+        names=lambda robot: ("gripper.force",),
+        values=lambda rows, robot: rows.contact_force,
+    ),
+    "observation.wrench": SensedFeature(
+        meaning="force (N) and torque (N m) with which the arm holds the hand, along the axes of the hand's link",
+        names=lambda robot: tuple(f"hand.{kind}.{axis}" for kind in ("force", "torque") for axis in _POSITION),
+        values=lambda rows, robot: rows.wrench,
+    ),
+}
+"""Feature -> what it is. A row here makes a sensed quantity exportable (`--features`)."""
 
 
 def state_names(robot: RobotSpec, kind: StateKind) -> tuple[str, ...]:
@@ -96,7 +142,12 @@ def state_names(robot: RobotSpec, kind: StateKind) -> tuple[str, ...]:
 
 
 def observation_names(
-    robot: RobotSpec, scene: Scene, *, privileged: bool = False, state: StateKind = "joint"
+    robot: RobotSpec,
+    scene: Scene,
+    *,
+    privileged: bool = False,
+    state: StateKind = "joint",
+    sensed: Collection[str] = (),
 ) -> dict[str, tuple[str, ...]]:
     """Feature name -> name of every component, in the order of `observation_vectors`."""
     names = {
@@ -106,7 +157,7 @@ def observation_names(
     }
     if privileged:
         names[ENVIRONMENT_STATE] = tuple(_environment_names(robot, scene))
-    return names
+    return names | {name: feature.names(robot) for name, feature in SENSED.items() if name in sensed}
 
 
 def observation_vectors(
@@ -116,6 +167,7 @@ def observation_vectors(
     *,
     privileged: bool = False,
     state: StateKind = "joint",
+    sensed: Collection[str] = (),
     dtype: VectorType = np.float32,
 ) -> dict[str, Vectors]:
     """Feature name -> (T, D) numbers of that type.
@@ -126,6 +178,7 @@ def observation_vectors(
     - `observation.ee_pose`: base_from_tcp, xyz (m) and quaternion xyzw. Of the two signs of the quaternion the one
       with x >= 0: it does not jump for a hand that points down within 180 degrees of yaw.
     - `observation.environment_state` (only if `privileged`): see `_environment_columns`.
+    - those of `SENSED` that `sensed` names, as far as they were sensed.
     """
     arm = len(robot.arm_joints)
     tcp = _continuous(rows.base_from_tcp)
@@ -136,6 +189,9 @@ def observation_vectors(
     }
     if privileged:
         features[ENVIRONMENT_STATE] = _environment_columns(rows, robot, scene)
+    for name, feature in SENSED.items():
+        if name in sensed and (values := feature.values(rows, robot)) is not None:
+            features[name] = [values]
     return {name: _joined(columns, dtype) for name, columns in features.items()}
 
 
@@ -325,6 +381,11 @@ def action_vectors(
     shifts[1:] += share * (poses[:-1, :3] - executed[:-1, :3])
     turns[1:] += share * _rotation_vectors(executed[:-1, 3:], poses[:-1, 3:])
     return _joined([shifts, turns, gripper], dtype)
+
+
+def command_vectors(columns: EpisodeColumns, rows: NDArray[np.intp] | slice = slice(None)) -> Vectors:
+    """(T, D) float64, what the motors were sent: joint targets (rad), gripper opening (m)."""
+    return _joined([columns.command_joint_target[rows], columns.command_gripper[rows]], np.float64)
 
 
 def _noise_share(time_ns: NDArray[np.int64]) -> float:

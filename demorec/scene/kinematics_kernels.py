@@ -9,19 +9,11 @@ damped least squares with a projected null-space pull (Siciliano et al., Robotic
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
+import numba
 import numpy as np
 
-from demorec.precompiled import Bundle
-
-BUNDLE = Bundle("kinematics", [Path(__file__)])
-
-
-def _njit(function: Callable[..., Any]) -> Any:
-    return BUNDLE.njit(function, error_model="numpy")
+_njit = numba.njit(cache=True, error_model="numpy")
 
 
 @_njit

@@ -79,6 +79,7 @@ class UrdfJoint:
         parent_from_joint: Pose of the joint frame (= child link frame at position 0).
         axis: Unit vector in the joint frame.
         lower, upper: Position limits, rad or m; infinite where the URDF has none.
+        max_speed: rad/s or m/s; infinite where the URDF has none.
     """
 
     name: str
@@ -89,6 +90,7 @@ class UrdfJoint:
     axis: tuple[float, float, float]
     lower: float
     upper: float
+    max_speed: float = math.inf
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -203,6 +205,7 @@ def _joint(element: ET.Element, scale: float) -> UrdfJoint:
         axis=(1.0, 0.0, 0.0) if length == 0.0 else tuple(float(v) for v in axis / length),  # type: ignore[arg-type]
         lower=unit * float(cast(ET.Element, limit).get("lower", 0)) if bounded else -math.inf,
         upper=unit * float(cast(ET.Element, limit).get("upper", 0)) if bounded else math.inf,
+        max_speed=math.inf if limit is None else unit * float(limit.get("velocity") or math.inf),
     )
 
 

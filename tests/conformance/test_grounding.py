@@ -14,6 +14,7 @@ from support.export import export, files_of, make_run
 from support.language import NOUNS, language_of, meant, phrases
 
 from demorec.errors import ConfigError
+from demorec.export.episode import exported
 from demorec.geometry import rotation_from_quat
 from demorec.language.masks import outline_area, run_lengths
 from demorec.lerobot import ExportOptions, dataset_digest
@@ -162,7 +163,9 @@ def test_a_picture_alone_is_asked_the_same(run: Path, dataset: Path) -> None:
     step, last = 30, len(frames) - 1
     with Recording(path) as recording:
         options = ExportOptions(language=())
-        told = prepare_episode(recording, options, code_depth=False, about=[2 * step, last]).data.language
+        told = prepare_episode(
+            exported(recording, options), options, code_depth=False, about=[2 * step, last]
+        ).data.language
     there = {row: events for row, (_, events) in enumerate(frames) if events}
     assert len(there) > 3
     assert {row: [entry.to_json() for entry in entries] for row, entries in told.events.items()} == {

@@ -169,7 +169,7 @@ def test_all_kinds_are_as_much_as_is_known(tmp_path: Path) -> None:
     assert imported(texts("/subtask", SAID), SUBTASKS, tmp_path) == 0
     export(tmp_path / "run", tmp_path / "all", language=())
     assert {entry["style"] for row in rows_of(tmp_path / "all") for entry in row["language_persistent"]} == {"subtask"}
-    with pytest.raises(ConfigError, match="nothing is known but the subtasks"):
+    with pytest.raises(ConfigError, match="only the subtasks are known"):
         export(tmp_path / "run", tmp_path / "plans", language=("subtask", "plan"))
 
 
@@ -198,7 +198,7 @@ def test_where_nobody_says_anything_none_is_invented(tmp_path: Path, capsys: pyt
     capsys.readouterr()
     assert exit_code(*words, "--no-verify") == 2
     err = capsys.readouterr().err
-    assert "nobody said a subtask in any of them" in err
+    assert "no source of them states a subtask" in err
     assert err.count("\n") == 1
     assert not (tmp_path / "dataset").exists()
 

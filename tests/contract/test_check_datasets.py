@@ -168,7 +168,7 @@ def test_swapped_joints(dataset: Path, tmp_path: Path) -> None:
 def test_degrees(dataset: Path, tmp_path: Path) -> None:
     spoilt = copy(dataset, tmp_path / "ds")
     edit_column(spoilt, "observation.state", np.degrees)
-    assert level_of(spoilt, "dataset_joint_limits", "dataset") == "fail"
+    assert level_of(spoilt, "joint_limits", "dataset") == "fail"
 
 
 def test_quaternions_scalar_first(dataset: Path, tmp_path: Path) -> None:
@@ -180,7 +180,7 @@ def test_quaternions_scalar_first(dataset: Path, tmp_path: Path) -> None:
 def test_wrong_fps(dataset: Path, tmp_path: Path) -> None:
     spoilt = copy(dataset, tmp_path / "ds")
     edit_json(spoilt / "meta/info.json", lambda data: data.update(fps=20))
-    assert level_of(spoilt, "dataset_velocity", "dataset") == "fail"
+    assert level_of(spoilt, "state_matches_velocity", "dataset") == "fail"
     assert level_of(spoilt, "dataset_counts", "dataset") == "fail"
 
 

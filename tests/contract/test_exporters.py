@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import shutil
 from contextlib import suppress
 from pathlib import Path
 
+import h5py
+import numpy as np
 import pytest
-from support.export import export, files_of, make_run
+from support.export import data_table, export, files_of, make_run
 from support.recording import make_episode
 
 from demorec.cli.shared.flags import _field_texts
 from demorec.config import VideoConfig
 from demorec.errors import ConfigError, DemorecError, RecordingError
 from demorec.export.options import CommonOptions
-from demorec.recording import EpisodeWriter
+from demorec.recording import EpisodeWriter, Recording
 from demorec.recording.recover import recover
+from demorec.scene.features import SENSED
 from demorec.tables import EXPORTERS
 
 pytestmark = pytest.mark.parametrize("exporter", EXPORTERS.names())
@@ -55,6 +59,31 @@ def test_the_wanted_episodes_go_in_and_nothing_else_changes(exporter: str, run: 
 def test_failed_attempts_go_in_when_asked_for(exporter: str, run: Path, tmp_path: Path) -> None:
     report = export(run, tmp_path / "d", exporter, include_failures=True)
     assert (report.num_episodes, report.num_frames, report.skipped_failures) == (4, 27, 0)
+
+
+@pytest.mark.parametrize("name", [*SENSED, "command"])
+def test_what_was_sensed_goes_in_when_it_is_named(exporter: str, name: str, run: Path, tmp_path: Path) -> None:
+    export(run, tmp_path / "d", exporter, features=(name,), episodes="0")
+    with Recording(run / "episodes" / "episode_000000.mcap") as recording:
+        columns = recording.columns()
+    expected = {
+        "observation.effort": columns.joint_effort[:, :7],
+        "observation.contact_force": columns.contact_force[:, np.newaxis],
+        "observation.wrench": columns.wrench,
+        "command": np.column_stack([columns.command_joint_target, columns.command_gripper]),
+    }[name]
+    assert expected is not None
+    assert np.ptp(expected) > 0
+    if exporter == "lerobot":
+        found = np.array(data_table(tmp_path / "d").column(name).to_pylist(), dtype=np.float32)
+        assert np.array_equal(found.reshape(len(found), -1), expected.astype(np.float32))
+        assert "filled in" not in (tmp_path / "d" / "README.md").read_text().split(f"`{name}`")[1].splitlines()[0]
+    else:
+        with h5py.File(tmp_path / "d") as file:
+            stored = file["data/demo_0/obs"][name.removeprefix("observation.")]
+            assert np.array_equal(stored[()], expected)
+            assert len(json.loads(stored.attrs["names"])) == expected.shape[1]
+        export(run, tmp_path / "d", exporter, overwrite=True)  # a file with it is still known as ours
 
 
 def test_a_recovered_recording_is_no_failed_attempt(exporter: str, run: Path, tmp_path: Path) -> None:
@@ -113,7 +142,7 @@ def test_what_is_no_dataset_is_never_replaced(exporter: str, run: Path, tmp_path
         ({"fps": 0}, ConfigError, "at least 1"),
         ({"features": ("observation.stat",)}, ConfigError, "Did you mean 'observation.state'"),
         ({"features": ("observation.environment_state",)}, ConfigError, "only --privileged adds it"),
-        ({"depth": True}, ConfigError, "needs recordings with depth pictures"),
+        ({"depth": True}, ConfigError, "needs recordings with depth images"),
     ],
 )
 def test_a_refused_export_leaves_nothing(

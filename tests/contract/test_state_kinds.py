@@ -75,7 +75,7 @@ def test_such_a_dataset_passes_every_check(dataset: Path, small: Path) -> None:
     for path in (dataset, small):
         report = checked(path, "dataset", pictures=False)
         assert [r for r in report.results if r.level in ("warn", "fail")] == []
-    for check in ("dataset_action_lag", "dataset_forward_kinematics", "dataset_description", "dataset_joint_limits"):
+    for check in ("dataset_action_lag", "dataset_forward_kinematics", "dataset_description", "joint_limits"):
         assert level_of(small, check, "dataset") == "pass"
 
 

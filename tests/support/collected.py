@@ -84,6 +84,7 @@ def make_collected(
     times = START_NS + np.cumsum(random.integers(20_000_000, 45_000_000, num_frames))
     pictures: dict[str, list[tuple[int, NDArray[np.uint8]]]] = {camera.name: [] for camera in cameras}
     frames = []
+    phases = random.uniform(-np.pi, np.pi, (2, 3))  # of joints that swing, no faster than motors are
     for index, time_ns in enumerate(times.tolist()):
         held = {}
         for camera in cameras:
@@ -97,9 +98,9 @@ def make_collected(
                 time_ns=time_ns,
                 samples={
                     STATE.name: Sample(
-                        stamp_ns=time_ns - 1_000_000, vector=random.uniform(-1, 1, 3).astype(np.float32)
+                        stamp_ns=time_ns - 1_000_000, vector=np.sin(0.05 * index + phases[0]).astype(np.float32)
                     ),
-                    ACTION.name: Sample(stamp_ns=time_ns, vector=random.uniform(-1, 1, 3)),
+                    ACTION.name: Sample(stamp_ns=time_ns, vector=np.sin(0.05 * index + phases[1])),
                     FORCE.name: Sample(stamp_ns=time_ns - 12_345_678, vector=random.normal(size=3)),
                 },
                 pictures=held,

@@ -69,6 +69,11 @@ def state(value: Callable[[int, Any], Any]) -> Callable[[Episode], Episode]:
     return each(change)
 
 
+def held(frame: CollectedFrame, name: str) -> Sample:
+    """The sample at one value."""
+    return replace(frame.samples[name], vector=np.ones_like(frame.samples[name].vector))
+
+
 def older(name: str, by: int) -> Callable[[Episode], Episode]:
     def change(index: int, frame: CollectedFrame) -> CollectedFrame:
         one = frame.samples[name]
@@ -94,11 +99,17 @@ FAULTS: dict[str, tuple[Callable[[Episode], Episode], str, str]] = {
         "warn",
     ),
     "a joint beyond its limit": (
-        state(lambda i, v: [3.0, *v[1:]] if i == 7 else v),
-        "collected_joint_limits",
+        state(lambda i, v: [v[0] + 3.0, *v[1:]]),
+        "joint_limits",
         "fail",
     ),
-    "a stuck sensor": (state(lambda i, v: [0.1, 0.2, 0.3]), "collected_stuck", "warn"),
+    "a stuck sensor": (
+        each(lambda i, f: replace(f, samples={**f.samples, "observation.force": held(f, "observation.force")})),
+        "collected_stuck",
+        "warn",
+    ),
+    "a dead encoder": (state(lambda i, v: [0.1, *v[1:]]), "elements_alive", "fail"),
+    "a joint too fast": (state(lambda i, v: [v[0] + 0.9 * (i % 2), *v[1:]]), "joint_speed", "fail"),
     "drops": (lambda e: replace(e, outcome=replace(e.outcome, drops={"frames": 3})), "collected_drops", "warn"),
     "a covered camera": (
         lambda e: replace(e, pictures={**e.pictures, "side": [(s, p * 0) for s, p in e.pictures["side"]]}),
@@ -121,7 +132,9 @@ def levels(path: Path) -> dict[str, str]:
 def test_a_good_episode_passes(tmp_path: Path) -> None:
     found = levels(write_collected(tmp_path / "a.mcap", steady()))
     assert {level for check, level in found.items() if check.startswith("collected_")} == {"pass"}
-    assert {level for check, level in found.items() if not check.startswith("collected_")} == {"skip"}
+    assert (found["joint_limits"], found["joint_speed"]) == ("pass", "pass")
+    assert "fail" not in found.values()
+    assert "warn" not in found.values()
     assert found["penetration"] == "skip"
 
 

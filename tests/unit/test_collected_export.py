@@ -46,7 +46,7 @@ def test_numbers_are_those_of_the_recordings(tmp_path: Path) -> None:
     assert info["features"]["observation.state"]["names"] == ["shoulder.pos", "elbow.pos", "gripper.pos"]
     assert "next.success" not in info["features"]
     card = (tmp_path / "d" / "README.md").read_text()
-    assert "2 demonstrations of two_joints, collected" in card
+    assert "2 demonstrations of two_joints, 53 frames" in card
     assert "scripted" not in card
 
 
@@ -78,12 +78,12 @@ def test_a_missing_picture_is_an_error_unless_the_last_may_be_held(tmp_path: Pat
     gap = [replace(frame, pictures={}) if index in (7, 8) else frame for index, frame in enumerate(episode.frames)]
     run = run_of(tmp_path / "run", replace(episode, frames=gap))
     age = episode.frames[8].time_ns - episode.pictures["top"][6][0]
-    with pytest.raises(ExportError, match="Frame 7 has no picture of the camera top, as 2 of 30 frames"):
+    with pytest.raises(ExportError, match="Frame 7 has no image of the camera top, as 2 of 30 frames"):
         export(run, tmp_path / "d")
     with pytest.raises(ExportError, match="Frame 8"):
         export(run, tmp_path / "d", hold_pictures=(age - 10**6) / 1e9)
     report = export(run, tmp_path / "d", hold_pictures=(age + 10**6) / 1e9)
-    assert report.transcoded == ("top, frames show pictures again, or leave some out",)
+    assert report.transcoded == ("top, frames show images again, or leave some out",)
     with av.open(str(next((tmp_path / "d" / "videos").rglob("*.mp4")))) as file:
         shown = [float(frame.to_ndarray(format="rgb24")[30, 30, 1]) for frame in file.decode(video=0)]
     assert np.abs(np.array(shown) - [5 * (6 if index in (7, 8) else index) for index in range(30)]).max() < 12
@@ -120,7 +120,7 @@ def test_a_failure_that_stays_out_blocks_nothing(tmp_path: Path, exporter: str) 
     run = run_of(tmp_path / "run", complete(num_frames=5), without, blind, slow)
     report = export(run, tmp_path / "d", exporter)
     assert (report.num_episodes, report.num_frames, report.skipped_failures) == (1, 5, 3)
-    for options, error in (({}, "no picture of the camera top"), ({"episodes": "0,2"}, "cameras is none")):
+    for options, error in (({}, "no image of the camera top"), ({"episodes": "0,2"}, "cameras is none")):
         with pytest.raises((ExportError, ConfigError), match=error):
             export(run, tmp_path / "e", exporter, include_failures=True, **options)
     other = run_of(tmp_path / "other", make_collected(cameras=(), num_frames=5))
@@ -135,7 +135,7 @@ def test_a_failure_that_stays_out_blocks_nothing(tmp_path: Path, exporter: str) 
         ({"action": "ee"}, "exported as they came"),
         ({"privileged": True}, "privileged is asked for"),
         ({"depth": True}, "depth is asked for"),
-        ({"fps": 10}, "was collected at 30"),
+        ({"fps": 10}, "was recorded at 30"),
         ({"features": ("observation.forse",)}, "Unknown feature 'observation.forse'.*observation.force"),
     ],
 )
@@ -147,7 +147,7 @@ def test_options_that_a_collected_episode_cannot_serve(tmp_path: Path, options: 
 def test_episodes_of_other_kinds_do_not_mix(tmp_path: Path) -> None:
     run = run_of(tmp_path / "run", complete(num_frames=5))
     write_episode(tmp_path / "run" / "episodes" / "episode_000001.mcap", num_frames=5)
-    with pytest.raises(ConfigError, match="kind of episode is simulated instead of collected"):
+    with pytest.raises(ConfigError, match="kind of episode is simulated instead of external"):
         export(run, tmp_path / "d")
 
 

@@ -113,7 +113,7 @@ def test_packets_that_came_coded_stay_byte_for_byte(tmp_path: Path, codec: Liter
         writer.finish(episode.outcome)
     with CollectedRecording(tmp_path / "a.mcap") as recording:
         assert [packet.data for packet in recording.packets("top")] == packets
-        assert bytes(recording.coded_pictures("top").joined()) == b"".join(packets)
+        assert bytes(recording.coded_pictures(["top"])["top"].joined()) == b"".join(packets)
         assert [packet.frame_index for packet in recording.packets("top") if packet.is_keyframe] == [0, 10, 20]
         pictures = list(recording.images("top"))
         assert recording.video_settings("top").codec == codec

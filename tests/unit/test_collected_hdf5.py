@@ -93,7 +93,7 @@ def test_an_episode_without_actions_is_refused(tmp_path: Path) -> None:
 
 def test_a_missing_picture_is_an_error(tmp_path: Path) -> None:
     path = write_collected(tmp_path / "a.mcap", make_collected(num_frames=5))  # the wrist has none at first
-    with pytest.raises(ExportError, match="Frame 0 has no picture of the camera wrist"):
+    with pytest.raises(ExportError, match="Frame 0 has no image of the camera wrist"):
         export(path, tmp_path / "d.hdf5", "hdf5")
     assert not (tmp_path / "d.hdf5").exists()
 

@@ -13,7 +13,7 @@ from support.export import export
 from support.recording import make_episode
 
 from demorec.errors import ConfigError
-from demorec.export import columns
+from demorec.export import episode
 from demorec.recording import EpisodeWriter
 from demorec.training.stretches import INTERVENTION, Stretches
 
@@ -36,7 +36,7 @@ def test_only_frames_of_the_expert_are_shown_each_about_as_often() -> None:
 
 
 def test_the_column_has_the_name_that_the_export_gives_it() -> None:
-    assert INTERVENTION == columns.INTERVENTION
+    assert INTERVENTION == episode.INTERVENTION
 
 
 def write(path: Path, episode_index: int, phases: Sequence[str]) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -112,6 +112,15 @@ class CollectedRecording(EpisodeFile[CollectedOutcome, VideoSettings]):
         """All of them, as `/frames` has them."""
         return tuple(camera.name for camera in self.info.cameras)
 
+    @property
+    def has_failed(self) -> bool:
+        """Whether somebody said so."""
+        return self.outcome is not None and self.outcome.success is False
+
+    def phases(self) -> Sequence[str]:
+        """Nobody states any."""
+        return ()
+
     def video_settings(self, camera: str) -> VideoSettings:
         """How the pictures of a camera were coded."""
         return self._camera(camera)
@@ -203,12 +212,15 @@ class CollectedRecording(EpisodeFile[CollectedOutcome, VideoSettings]):
         for values in self.distances(camera):
             yield values.astype(np.float32) / unit
 
-    def coded_pictures(self, camera: str) -> Block:
-        """All coded pictures of a camera, in memory together."""
-        topic = self._picture_topic(camera)
-        block = self._container.blocks((topic,))[topic]
+    def coded_pictures(self, cameras: Sequence[str]) -> dict[str, Block]:
+        """camera -> all its coded pictures, in memory together."""
+        topics = {camera: self._picture_topic(camera) for camera in cameras}
+        blocks = self._container.blocks(tuple(topics.values()))
         with damage_as_recording_error(self.path):
-            return messages.coded_pictures(block, self.video_settings(camera).codec)
+            return {
+                camera: messages.coded_pictures(blocks[topic], self.video_settings(camera).codec)
+                for camera, topic in topics.items()
+            }
 
     def image(self, camera: str, frame: int) -> Rgb | None:
         """The decoded picture that a frame holds, (H, W, 3) uint8 RGB; None where it has none of this camera.
@@ -218,10 +230,6 @@ class CollectedRecording(EpisodeFile[CollectedOutcome, VideoSettings]):
         """
         number = int(self.columns().pictures[camera][range(self.num_frames)[frame]])
         return None if number == NO_PICTURE else self.picture(camera, number)
-
-    def picture(self, camera: str, number: int) -> Rgb:
-        """One decoded picture of a camera, (H, W, 3) uint8 RGB, by its own number."""
-        return next(self._images(camera, [number]))
 
     def digest(self) -> str:
         """SHA-256 (hex) of the content: metadata, numbers, stamps, coded pictures; not of what versions wrote it."""

@@ -12,7 +12,7 @@ from demorec.render import RenderSetup
 from demorec.render.raster.batch import Batch, make_batch
 from demorec.render.raster.cache import folder_lock
 from demorec.render.raster.canvas import Canvas
-from demorec.render.raster.kernels.jit import BUNDLE, compiled_folder
+from demorec.render.raster.kernels.jit import compiled_folder
 from demorec.render.raster.shapes import Instance, ModelStore, make_instances
 from demorec.render.raster.stage import Stage
 from demorec.render.raster.view import CameraView
@@ -138,8 +138,7 @@ def warm_up() -> None:
     with folder_lock(folder):
         if done.exists():
             return
-        duration = "about five seconds" if BUNDLE.fits else "about half a minute"
-        log.warning("Compiling the renderer for this machine: %s, once (kept in %s).", duration, folder)
+        log.warning("Compiling the renderer for this machine: about half a minute, once (kept in %s).", folder)
         from demorec.render.raster.rehearsal import rehearse
 
         rehearse()

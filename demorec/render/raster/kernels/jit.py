@@ -12,10 +12,7 @@ import llvmlite.binding
 import numba
 import numpy as np
 
-from demorec.precompiled import Bundle
 from demorec.render.raster.cache import cache_folder
-
-BUNDLE = Bundle("raster", Path(__file__).parent.glob("*.py"))
 
 # Only flags that change no finite result: pictures are equal whatever vector width a CPU has. `contract`, `arcp` and
 # `reassoc` are left out on purpose.
@@ -46,7 +43,7 @@ def _compile(function: Callable[..., Any], **options: Any) -> Any:
     before = numba.config.CACHE_DIR
     numba.config.CACHE_DIR = str(compiled_folder())
     try:
-        return BUNDLE.njit(function, fastmath=_FLAGS, error_model="numpy", **options)
+        return numba.njit(cache=True, fastmath=_FLAGS, error_model="numpy", **options)(function)
     finally:
         numba.config.CACHE_DIR = before
 

@@ -1,0 +1,158 @@
+"""Laws of motion on datasets that say nothing of their robot but the names of its joints: one fault at a time."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from support.check import checked, copy, edit_column, edit_json, simulate_run
+
+from demorec.lerobot.export import export_lerobot
+from demorec.lerobot.options import ExportOptions
+from demorec.recording import Recording
+
+STATE, ACTION, VELOCITY, FRONT = "observation.state", "action", "observation.velocity", "observation.images.front"
+Rows = NDArray[Any]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return simulate_run(tmp_path_factory.mktemp("motion") / "run", 3, seed=3, cameras=("front",))
+
+
+@pytest.fixture(scope="module")
+def strange(run: Path) -> Path:
+    """What LeRobot has of an export, without our sidecar."""
+    dataset = run.parent / "ds"
+    export_lerobot([run], dataset, ExportOptions(verify=False))
+    shutil.rmtree(dataset / "demorec")
+    return dataset
+
+
+def offset(rows: Rows) -> Rows:
+    return np.asarray(rows + 0.4 * (np.arange(rows.shape[1]) == 3))
+
+
+def exchanged(rows: Rows) -> Rows:
+    return rows[:, [1, 0, *range(2, rows.shape[1])]]
+
+
+def late(rows: Rows) -> Rows:
+    return np.concatenate([np.repeat(rows[:1], 3, axis=0), rows[:-3]])
+
+
+def slower(data: dict[str, Any]) -> None:
+    data["fps"] = 15
+
+
+FAULTS: dict[str, tuple[str, Callable[[Rows], Rows], str]] = {
+    "a zero that is off": (STATE, offset, "state_reaches_action"),
+    "joints exchanged": (STATE, exchanged, "actions_in_order"),
+    "actions exchanged": (ACTION, exchanged, "actions_in_order"),
+    "late actions": (ACTION, late, "state_follows_action"),
+    "degrees": (STATE, np.degrees, "joint_limits"),
+    "a dead encoder": (STATE, lambda rows: rows * (np.arange(rows.shape[1]) != 2), "elements_alive"),
+    "velocities of another joint": (VELOCITY, exchanged, "state_matches_velocity"),
+    "velocities in degrees": (VELOCITY, np.degrees, "state_matches_velocity"),
+}
+
+
+def level(path: Path, check: str, *, pictures: bool = False) -> str:
+    found = {
+        result.check: result.level for result in checked(path, "dataset", pictures=pictures, only=(check,)).results
+    }
+    return found[check]
+
+
+def test_a_good_one_has_nothing_that_is_odd(strange: Path) -> None:
+    report = checked(strange, "dataset", pictures=True)
+    assert [result for result in report.results if result.level in ("warn", "fail")] == []
+    passed = {result.check for result in report.results if result.level == "pass"}
+    assert {check for _, _, check in FAULTS.values()} | {"joint_speed", "dataset_frozen"} <= passed
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_is_found_by_the_law_that_it_breaks(strange: Path, fault: str, tmp_path: Path) -> None:
+    feature, change, check = FAULTS[fault]
+    spoilt = copy(strange, tmp_path / "ds")
+    edit_column(spoilt, feature, change)
+    assert level(spoilt, check) in ("warn", "fail")
+
+
+def test_a_wrong_rate_is_found(strange: Path, tmp_path: Path) -> None:
+    spoilt = copy(strange, tmp_path / "ds")
+    edit_json(spoilt / "meta/info.json", slower)
+    assert level(spoilt, "state_matches_velocity") == "fail"
+    edit_json(spoilt / "meta/info.json", lambda data: data.update(fps=90))
+    assert level(spoilt, "joint_speed") in ("warn", "fail")
+
+
+def test_a_state_that_is_its_own_action_is_found(strange: Path, tmp_path: Path) -> None:
+    """As when the action was read from the robot instead of being what it was sent."""
+    import pyarrow.parquet as pq
+
+    spoilt = copy(strange, tmp_path / "ds")
+    for file in (spoilt / "data").rglob("*.parquet"):
+        table = pq.read_table(file)
+        place = table.schema.get_field_index(ACTION)
+        pq.write_table(table.set_column(place, table.schema.field(ACTION), table.column(STATE)), file)
+    assert level(spoilt, "state_follows_action") == "warn"
+
+
+def make_by_lerobot(run: Path, root: Path, *, frozen: range = range(0)) -> Path:
+    """A dataset that LeRobot itself wrote from the numbers and images of our recordings."""
+    from lerobot.datasets import LeRobotDataset
+
+    joints = [f"panda_joint{n}" for n in range(1, 8)]
+    vector = {"dtype": "float32", "shape": (7,)}
+    features = {
+        STATE: {**vector, "names": [f"{joint}.pos" for joint in joints]},
+        VELOCITY: {**vector, "names": [f"{joint}.vel" for joint in joints]},
+        ACTION: {**vector, "names": [f"{joint}.pos" for joint in joints]},
+        FRONT: {"dtype": "video", "shape": (96, 96, 3), "names": ["height", "width", "channels"]},
+    }
+    dataset = LeRobotDataset.create("local/strange", 30, features, root=root)
+    for path in sorted((run / "episodes").glob("*.mcap")):
+        with Recording(path) as recording:
+            columns, images = recording.columns(), list(recording.images("front"))
+        for t in range(columns.num_frames):
+            shown = images[frozen.start if t in frozen else t]
+            dataset.add_frame(
+                {
+                    STATE: columns.joint_position[t, :7].astype(np.float32),
+                    VELOCITY: columns.joint_velocity[t, :7].astype(np.float32),
+                    ACTION: columns.action_joint_target[t].astype(np.float32),
+                    FRONT: shown[:96, :96],
+                    "task": "pick it up",
+                }
+            )
+        dataset.save_episode()
+    dataset.finalize()
+    return root
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_faults_in_a_dataset_that_lerobot_wrote(run: Path, tmp_path: Path) -> None:
+    """An offset, a lag, exchanged joints, a wrong rate and a frozen camera, without any file of ours beside it."""
+    clean = make_by_lerobot(run, tmp_path / "clean")
+    odd = [result for result in checked(clean, "dataset").results if result.level in ("warn", "fail")]
+    assert all(result.check == "dataset_statistics" and "LeRobot's merge" in result.detail for result in odd), odd
+    for number, (feature, change, check) in enumerate(
+        ((STATE, offset, "state_reaches_action"),
+         (ACTION, late, "state_follows_action"),
+         (STATE, exchanged, "actions_in_order"))
+    ):  # fmt: skip
+        spoilt = copy(clean, tmp_path / f"spoilt_{number}")
+        edit_column(spoilt, feature, change)
+        assert level(spoilt, check) == "fail"
+    spoilt = copy(clean, tmp_path / "rate")
+    edit_json(spoilt / "meta/info.json", slower)
+    assert level(spoilt, "state_matches_velocity") == "fail"
+    frozen = make_by_lerobot(run, tmp_path / "frozen", frozen=range(20, 80))
+    assert level(frozen, "dataset_frozen", pictures=True) == "fail"
