@@ -28,8 +28,9 @@ from demorec.render.painter import Painter
 from demorec.render.warm import WarmRenderer
 from demorec.scene import features
 from demorec.scene.episode import POLICY_PHASE, Action, CameraImages, EpisodeInfo, Frame, Observation, SuccessCheck
-from demorec.scene.features import STATE_KINDS, ActionKind, ObservationRows, StateKind
+from demorec.scene.features import STATE_KINDS, ActionKind, StateKind
 from demorec.scene.scene import Scene
+from demorec.scene.sensed import ObservationRows
 from demorec.scene.variation import Preset
 from demorec.sim.world import World
 from demorec.tables import CAMERAS, TASKS, environment_name

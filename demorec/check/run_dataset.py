@@ -15,7 +15,7 @@ from demorec.check.base import Measurement, run_check
 from demorec.check.dataset import Dataset, Rows, read_rows
 from demorec.check.run import CheckedRun
 from demorec.errors import ConfigError, DemorecError, RecordingError, in_words, resource_error
-from demorec.export.episode import exported
+from demorec.export.exported import exported
 from demorec.lerobot.files import read_json
 from demorec.lerobot.options import ExportOptions
 from demorec.lerobot.paths import SIDECAR_DIR, is_dataset

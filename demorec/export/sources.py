@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from demorec.errors import ConfigError
-from demorec.export.episode import ExportEpisode, exported
+from demorec.export.episode import ExportEpisode
+from demorec.export.exported import exported
 from demorec.export.options import CommonOptions, parse_episodes
 from demorec.recording import AnyRecording, open_recording
 from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings

@@ -95,9 +95,8 @@ def generate(
         executor = stack.enter_context(make_executor(options, folder.path, folder.run, maker))
         folder.begin_session(executor=options.executor, workers=executor.workers)
         progress.started(folder.run, executor.workers)
-        driver = _Driver(folder, schedule, executor, progress)
         try:
-            interrupted = driver.work()
+            interrupted = _Driver(folder, schedule, executor, progress).work()
         except BaseException:
             folder.end_session("stopped")
             raise

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from demorec.errors import ExportError
-from demorec.export.episode import exported
+from demorec.export.exported import exported
 from demorec.export.options import ExportReport, ProgressCallback
 from demorec.export.sources import (
     ExportSource,

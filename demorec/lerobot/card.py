@@ -34,11 +34,11 @@ from demorec.scene.features import (
     EE_POSE,
     ENVIRONMENT_STATE,
     IMAGE_PREFIX,
-    SENSED,
     STATE,
     VELOCITY,
     ActionKind,
 )
+from demorec.scene.sensed import SENSED
 
 SECOND_CARD_PATH = f"{SIDECAR_DIR}/README.md"
 """Where the card goes if the dataset has a README.md that demorec did not write."""

@@ -8,7 +8,7 @@ from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from demorec.export.episode import exported
+from demorec.export.exported import exported
 from demorec.export.options import ProgressCallback
 from demorec.export.sources import ExportSource, Profile, goes_in, is_wanted
 from demorec.lerobot.attempts import AttemptRecord

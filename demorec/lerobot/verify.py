@@ -24,7 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.errors import DemorecError, ExportError, in_words, resource_error
-from demorec.export.episode import ExportCamera, ExportEpisode, exported
+from demorec.export.episode import ExportCamera, ExportEpisode
+from demorec.export.exported import exported
 from demorec.lerobot.depth import code_values, quantised
 from demorec.lerobot.language import EVENTS, PERSISTENT, EpisodeLanguage
 from demorec.lerobot.options import ExportOptions

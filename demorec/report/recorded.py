@@ -16,15 +16,8 @@ from demorec.report.filmstrip import filmstrip
 from demorec.report.histogram import Histogram
 from demorec.runs.run_file import FAILED
 from demorec.scene.episode import EpisodeColumns, EpisodeInfo
-from demorec.scene.features import (
-    ACTION,
-    STATE,
-    ObservationRows,
-    action_names,
-    action_vectors,
-    observation_names,
-    observation_vectors,
-)
+from demorec.scene.features import ACTION, STATE, action_names, action_vectors, observation_names, observation_vectors
+from demorec.scene.sensed import ObservationRows
 
 
 def read_recording(path: Path, root: Path, *, camera: str, strip_bytes: int) -> tuple[ReportedEpisode, Components]:

@@ -14,7 +14,7 @@ from support.export import export, files_of, make_run
 from support.language import NOUNS, language_of, meant, phrases
 
 from demorec.errors import ConfigError
-from demorec.export.episode import exported
+from demorec.export.exported import exported
 from demorec.geometry import rotation_from_quat
 from demorec.language.masks import outline_area, run_lengths
 from demorec.lerobot import ExportOptions, dataset_digest

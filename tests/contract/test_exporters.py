@@ -20,7 +20,7 @@ from demorec.errors import ConfigError, DemorecError, RecordingError
 from demorec.export.options import CommonOptions
 from demorec.recording import EpisodeWriter, Recording
 from demorec.recording.recover import recover
-from demorec.scene.features import SENSED
+from demorec.scene.sensed import SENSED
 from demorec.tables import EXPORTERS
 
 pytestmark = pytest.mark.parametrize("exporter", EXPORTERS.names())

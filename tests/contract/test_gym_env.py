@@ -25,6 +25,7 @@ from demorec.loop.actions import ACTION_KINDS
 from demorec.recording import Recording
 from demorec.scene import features
 from demorec.scene.episode import EpisodeColumns, EpisodeInfo
+from demorec.scene.sensed import ObservationRows
 from demorec.tables import TASKS
 
 FRAMES = 45
@@ -59,7 +60,7 @@ def test_a_recordings_commands_give_its_observations_to_the_bit(task: str, tmp_p
     """The numbers of the exported features of a file on disk, against those that a policy would see."""
     with Recording(simulate(tmp_path / "e.mcap", episode_index=3, task=task)) as recording:
         info, columns = recording.info, recording.columns()
-    rows = features.ObservationRows.of_columns(columns)
+    rows = ObservationRows.of_columns(columns)
     expected = features.observation_vectors(rows, info.robot, info.scene, privileged=True)
     # The first task to its end, the others until they have touched something.
     count = columns.num_frames if task == "pick_place" else min(columns.num_frames, 2 * FRAMES)

@@ -19,7 +19,6 @@ from demorec.scene.features import (
     ENVIRONMENT_STATE,
     STATE,
     VELOCITY,
-    ObservationRows,
     action_names,
     action_vectors,
     joint_target_from_increment,
@@ -28,6 +27,7 @@ from demorec.scene.features import (
     pose_from_delta,
 )
 from demorec.scene.scene import Body, Goal, RobotPlacement, Scene, Shape
+from demorec.scene.sensed import ObservationRows
 
 
 def random_pose(rng: np.random.Generator) -> Pose:

@@ -21,8 +21,9 @@ from demorec.geometry import Array
 from demorec.plain import from_json, from_plain, to_json, to_plain
 from demorec.recording.streams import FrameValues, frame_streams
 from demorec.scene.episode import Action, EpisodeInfo
-from demorec.scene.features import VELOCITY, ObservationRows, observation_vectors
+from demorec.scene.features import VELOCITY, observation_vectors
 from demorec.scene.robot import ParallelGripper, RobotSpec
+from demorec.scene.sensed import ObservationRows
 from demorec.sim.world import World
 from demorec.tables import ROBOTS
 
