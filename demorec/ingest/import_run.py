@@ -209,7 +209,7 @@ class _Import:
             for plan in episode.plans.values():
                 taken.setdefault(plan.topic, []).append(plan.numbers)
         wanted = {topic: np.bincount(np.concatenate(numbers)) > 0 for topic, numbers in taken.items()}
-        decoder, counts = BagDecoder(), dict.fromkeys(wanted, 0)
+        decoder, counts = BagDecoder(self.bag.num_bytes), dict.fromkeys(wanted, 0)
         for message in self.bag.messages([], wanted.keys()):
             topic = message.channel.topic
             number, counts[topic] = counts[topic], counts[topic] + 1

@@ -15,7 +15,7 @@ from PIL import Image
 from demorec.config import MAX_PIXELS
 from demorec.errors import in_words
 from demorec.ingest.compressed_depth import compressed_depth_head, decode_compressed_depth
-from demorec.ingest.fields import FieldError, picture_bytes
+from demorec.ingest.fields import FieldError, picture_bytes, whole
 from demorec.ingest.raw_pictures import RAW_ENCODINGS, check_raw, raw_picture
 from demorec.ingest.ros_types import Values
 from demorec.recording.video import is_keyframe
@@ -86,7 +86,8 @@ def picture_head(values: Values) -> PictureHead:
     if "data" not in values:
         raise FieldError("it holds no picture")
     if "encoding" in values and "width" in values and "height" in values:
-        head = _checked(PictureHead("raw", str(values["encoding"]), int(values["width"]), int(values["height"]), True))
+        size = whole(values, "width"), whole(values, "height")
+        head = _checked(PictureHead("raw", str(values["encoding"]), *size, True))
         check_raw(values)
         return head
     if "format" not in values:
@@ -170,7 +171,9 @@ def _video_size(codec: str, data: bytes) -> tuple[int, int]:
     key = (codec, data[:end])
     size = _sizes.get(key)
     if size is None:
-        (picture,) = decode_video(codec, [data])
+        picture = next(decode_video(codec, [data]), None)
+        if picture is None:
+            raise FieldError(f"its {codec} keyframe gives no picture")
         if len(_sizes) > 1000:
             _sizes.clear()
         size = _sizes[key] = (picture.shape[1], picture.shape[0])

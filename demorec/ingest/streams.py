@@ -33,13 +33,15 @@ from demorec.ingest.fields import (
 )
 from demorec.ingest.mapping import BagMapping, Source
 from demorec.ingest.picture_messages import PictureHeads, picture_head
-from demorec.ingest.ros_types import Values
+from demorec.ingest.ros_types import Budgets, Values
 from demorec.ingest.service_calls import CallReader, ServiceCall
 from demorec.registry import nearest_match
 
 NO_STAMP = -(2**63)
 _MAX_TEXT = 10_000
 _MAX_URDF = 4 << 20
+_INFO_FIELDS = ("header", "frame_id", "width", "height", "k", "K", "d", "D")
+"""Of a camera's calibration that are asked for."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -203,10 +205,18 @@ class _Growing:
 
 
 class BagDecoder:
-    """Decoders of a bag's channels, made when they are first needed."""
+    """Decoders of a bag's channels, made when they are first needed.
 
-    def __init__(self) -> None:
-        self._decoders: dict[BagChannel, Decoder] = {}
+    Args:
+        num_bytes: Of the bag's files, by which grows what may be read of it.
+
+    Attributes:
+        budgets: What may still be made of it.
+    """
+
+    def __init__(self, num_bytes: int = 0) -> None:
+        self.budgets = Budgets(num_bytes)
+        self._decoders: dict[BagChannel, Decoder | UnknownEncodingError] = {}
 
     def values(self, message: BagMessage) -> Values:
         """Of a message.
@@ -217,7 +227,13 @@ class BagDecoder:
         """
         decoder = self._decoders.get(message.channel)
         if decoder is None:
-            decoder = self._decoders[message.channel] = decoder_of(message.channel)
+            try:
+                decoder = decoder_of(message.channel, self.budgets)
+            except UnknownEncodingError as error:
+                decoder = error
+            self._decoders[message.channel] = decoder
+        if isinstance(decoder, UnknownEncodingError):
+            raise UnknownEncodingError(str(decoder))
         return decoder(message.data)
 
 
@@ -227,7 +243,7 @@ def read_streams(bag: Bag, mapping: BagMapping) -> BagStreams:
     Raises:
         BagError: The mapping does not fit the bag; one message tells all problems.
     """
-    reading = _Reading(mapping)
+    reading = _Reading(mapping, bag.num_bytes)
     problems: list[str] = []
     for message in bag.messages(problems):
         reading.add(message)
@@ -236,9 +252,9 @@ def read_streams(bag: Bag, mapping: BagMapping) -> BagStreams:
 
 
 class _Reading:
-    def __init__(self, mapping: BagMapping) -> None:
+    def __init__(self, mapping: BagMapping, num_bytes: int) -> None:
         self._mapping = mapping
-        self._decoder = BagDecoder()
+        self._decoder = BagDecoder(num_bytes)
         self._sources = {
             (name, index): _Growing(label=name, topic=source.topic, source=source)
             for name, sources in mapping.features.items()
@@ -298,13 +314,19 @@ class _Reading:
             except FieldError as error:
                 self._refused[topic] = str(error)
         if topic in self._info_topics:
-            self._infos.setdefault(self._info_topics[topic], values)
+            kept = {key: value for key, value in values.items() if key in _INFO_FIELDS}
+            self._infos.setdefault(self._info_topics[topic], kept)
 
     def _add_text(self, topic: str, message: BagMessage, values: Values) -> None:
         try:
             value = follow(values, parse_path(self._fields[topic]))
         except ValueError as error:
             self._refused[topic] = str(error)
+            return
+        if isinstance(value, np.generic):
+            value = value.item()
+        if not isinstance(value, str | bool | int | float):
+            self._refused[topic] = f"the field {self._fields[topic]!r} is no text, number or boolean"
             return
         limit = _MAX_URDF if topic == self._mapping.robot.urdf_topic else _MAX_TEXT
         if isinstance(value, str) and len(value) > limit:

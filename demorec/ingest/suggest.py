@@ -109,7 +109,7 @@ def suggested_mapping(path: Path) -> list[str]:
 
 def _topics(bag: Bag, problems: list[str]) -> dict[str, _Topic]:
     topics: dict[str, _Topic] = {}
-    decoder = BagDecoder()
+    decoder = BagDecoder(bag.num_bytes)
     for message in bag.messages(problems):
         topic = topics.setdefault(message.channel.topic, _Topic(type=message.channel.type, first_ns=message.log_ns))
         topic.count += 1

@@ -72,6 +72,52 @@ class Limits:
             )
 
 
+class Unpacked:
+    """What has been unpacked of a file, or of the files of one bag, and the limits that it stays within.
+
+    Args:
+        limits: Of all of it.
+    """
+
+    def __init__(self, limits: Limits) -> None:
+        self.limits = limits
+        self._num_bytes = self._num_records = 0
+
+    def add(self, num_bytes: int, num_records: int = 0) -> None:
+        """Count what comes; LimitError when all together is more than allowed."""
+        self._num_bytes += num_bytes
+        self._num_records += num_records
+        self.limits.check_total(self._num_bytes)
+        self.limits.check_records(self._num_records)
+
+
+class Budget:
+    """So much of something that is made of a file, taken bit by bit: what is built is counted, whatever it is told by.
+
+    Args:
+        total: The most that all calls of `take` may take together.
+        each: The most after each `begin`.
+        what: It is, in the plural ("values").
+    """
+
+    def __init__(self, total: int, each: int, what: str) -> None:
+        self._total, self._each, self._what = total, each, what
+        self.used = 0
+        self.begin()
+
+    def begin(self) -> None:
+        """Begin with the next message, or whatever `each` is of."""
+        self._most = min(self._total, self.used + self._each)
+
+    def take(self, count: int = 1) -> None:
+        """Count so many; LimitError when they are too many."""
+        if self.used + count > self._most:
+            raise LimitError(
+                f"it holds more {self._what} than are read, {self._each:,} in one and {self._total:,} in all"
+            )
+        self.used += count
+
+
 def _check(size: int, allowed: int) -> None:
     if size > allowed:
         raise LimitError(
