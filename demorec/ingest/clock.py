@@ -18,7 +18,6 @@ from demorec.ingest.streams import Stream
 NS = 1_000_000_000
 MISSING = 2**62
 """Age of what is not there."""
-MAX_ROWS = 10_000_000
 Int = NDArray[np.int64]
 Numbers = NDArray[np.floating[Any]]
 
@@ -201,6 +200,4 @@ def _slerp(first: Numbers, second: Numbers, fraction: NDArray[np.float64]) -> Nu
 def grid(begin_ns: int, end_ns: int, fps: int) -> Int:
     """Row times from `begin_ns` on, `fps` a second, none after `end_ns`; no rounding error adds up."""
     count = max(0, (end_ns - begin_ns) * fps // NS + 1)
-    if count > MAX_ROWS:
-        raise ValueError(f"{count:,} rows, at most {MAX_ROWS:,} are made")
     return begin_ns + np.arange(count, dtype=np.int64) * NS // fps

@@ -84,4 +84,4 @@ def described_camera(name: str, plan: PicturePlan, lines: Timelines) -> Collecte
 def _first(values: Mapping[str, Any], *keys: str) -> list[float]:
     """The numbers of the first of these fields that is there."""
     found = next((values[key] for key in keys if key in values), None)
-    return [float(number) for number in found.reshape(-1)] if isinstance(found, np.ndarray) else []
+    return [float(number) for number in found.reshape(-1)] if isinstance(found, np.ndarray) and found.size <= 64 else []

@@ -28,6 +28,7 @@ from demorec.ingest.mapping import BagMapping, read_mapping
 from demorec.ingest.report import BagReport, EpisodeReport, stream_reports
 from demorec.ingest.rows import EpisodeRows, NoRowsError, Timelines
 from demorec.ingest.streams import BagDecoder, read_streams
+from demorec.recording.limits import LimitError, Limits
 from demorec.runs.collected import CollectedFolder, differences, open_collected_run
 from demorec.scene.collected import CollectedInfo, Origin, SourceFile
 from demorec.scene.urdf import Urdf
@@ -123,6 +124,7 @@ class _Import:
             episodes.append(episode)
             reports.append(_report(window, begin, episode))
         self._check_alike(episodes)
+        self._check_pictures(episodes)
         self._write([episode for episode in episodes if not self.folder.has(episode.info)])
         return BagReport(
             name=self.bag.path.name,
@@ -155,6 +157,15 @@ class _Import:
         )
         subtasks = subtask_rows(self.bag, lines.streams, rows.window, rows.times_ns, self.mapping)
         return PlannedEpisode(info=info, rows=rows, plans=plans, subtasks=subtasks)
+
+    def _check_pictures(self, episodes: Sequence[PlannedEpisode]) -> None:
+        """BagError when the pictures unpack to more than a bag of its size holds: a PNG file of zeros is small."""
+        limits = Limits.of_file(self.bag.num_bytes)
+        plans = [plan for episode in episodes for plan in episode.plans.values()]
+        try:
+            limits.check_total(sum(len(plan.numbers) * plan.num_bytes for plan in plans))
+        except LimitError as error:
+            raise BagError(f"The pictures of the bag cannot be used, since {error}: {self.bag.path}") from error
 
     def _check_alike(self, episodes: Sequence[PlannedEpisode]) -> None:
         """ConfigError unless the episodes are of the kind that the run holds, and of one kind."""

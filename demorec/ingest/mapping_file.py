@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 import tomllib
 import typing
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any, Literal
 
-from demorec.errors import ConfigError
+from demorec.errors import ConfigError, in_words
 from demorec.plain import digest, from_plain
 from demorec.registry import nearest_match
 from demorec.safety.files import read_text_limited
@@ -23,7 +25,14 @@ ACTION = "action"
 MAX_FPS = 1000
 MAX_ELEMENTS = 4096
 """Of a part: more is a picture or a point cloud, not a vector."""
+MAX_SECONDS = 1e9
+"""Of any time in a mapping: beyond it nanoseconds are no numbers of 64 bits."""
 _MAX_FILE_BYTES = 1 << 20
+_MAX_TABLES = 1000
+_MAX_TEXT = 10_000
+_MAX_TOLD = 8
+_DEEP_KEY = re.compile(r"""(?:[\w-]+|"[^"\n]*"|'[^'\n]*')(?:[ \t]*\.[ \t]*(?:[\w-]+|"[^"\n]*"|'[^'\n]*')){16}""")
+"""What no mapping has: each part of a key makes a table, and takes as long as all before it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,23 +135,49 @@ def recorded_unit(unit: str) -> str:
     return "deg" if unit == "degree" else unit
 
 
+def listed(problems: Iterable[str]) -> str:
+    """The first problems as one sentence's part, and how many more there are."""
+    told = list(problems)
+    more = [f"and {len(told) - _MAX_TOLD} more"] if len(told) > _MAX_TOLD else []
+    return "; ".join(told[:_MAX_TOLD] + more)
+
+
 def read_mapping_file[M: AnyMapping](path: Path, kind: type[M]) -> M:
-    """A mapping from its TOML file; ConfigError tells all that is wrong with it at once."""
+    """A mapping from its TOML file; ConfigError tells what is wrong with it at once."""
     try:
-        data = tomllib.loads(read_text_limited(path, _MAX_FILE_BYTES))
+        text = read_text_limited(path, _MAX_FILE_BYTES)
+        if _DEEP_KEY.search(text):
+            raise ValueError("a key has more than 16 parts")
+        data = tomllib.loads(text)
     except OSError as error:
         raise ConfigError(f"The mapping cannot be read ({error.strerror}): {path}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise ConfigError(f"The mapping is no valid TOML ({error}): {path}") from error
-    if unknown := list(_unknown_keys(data, kind, "")):
-        raise ConfigError(f"The mapping cannot be used: {'; '.join(unknown)}: {path}")
+    except (ValueError, RecursionError) as error:
+        raise ConfigError(f"The mapping is no valid TOML ({in_words(error)}): {path}") from error
+    problems = [problem] if (problem := _excess(data)) else list(islice(_unknown_keys(data, kind, ""), _MAX_TOLD))
+    if problems:
+        raise ConfigError(f"The mapping cannot be used: {'; '.join(problems)}: {path}")
     try:
         mapping = from_plain(data, kind)
     except ValueError as error:
         raise ConfigError(f"The mapping cannot be used: {error}: {path}") from error
     if problems := list(mapping.problems()):
-        raise ConfigError(f"The mapping cannot be used: {'; '.join(problems)}: {path}")
+        raise ConfigError(f"The mapping cannot be used: {listed(problems)}: {path}")
     return mapping
+
+
+def _excess(data: Any) -> str:
+    """What a mapping has too much of; "" for nothing."""
+    tables, waiting = 0, [data]
+    while waiting:
+        value = waiting.pop()
+        if isinstance(value, dict):
+            tables += 1
+            waiting += [*value, *value.values()]
+        elif isinstance(value, list):
+            waiting += value
+        elif isinstance(value, str) and len(value) > _MAX_TEXT:
+            return f"a text has {len(value):,} characters, at most {_MAX_TEXT:,} are read"
+    return f"it has {tables:,} tables, at most {_MAX_TABLES:,} are read" if tables > _MAX_TABLES else ""
 
 
 def _unknown_keys(value: Any, kind: Any, place: str) -> Iterator[str]:

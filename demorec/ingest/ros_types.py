@@ -49,11 +49,14 @@ class Budgets:
             to, takes 2,200 of them as .msg, and one of 300 fields 130,000 to 790,000 as .idl.
         values: Fields and elements, 100 to 300 bytes each in memory. A message of joints has 30, a list of 100,000
             points 400,000. Small files have a floor, which is read in some seconds.
+        numbers: Bytes of what streams keep of the messages.
     """
 
     def __init__(self, num_bytes: int = 0) -> None:
         self.steps = Budget(1_200_000, 800_000, "parts of definitions")
-        self.values = Budget(max(5_000_000, 4 * num_bytes), 500_000, "values")
+        self.values = Budget(max(5_000_000, 12 * num_bytes), 500_000, "values")
+        numbers = max(64 << 20, 100 * num_bytes)
+        self.numbers = Budget(numbers, numbers, "bytes of numbers")
 
 
 def ros_decoder(

@@ -18,6 +18,11 @@ from demorec.ingest.streams import BagStreams, Stream
 Key = tuple[str, int] | str
 """A stream: (feature, number of its source), or the name of a camera."""
 
+_ROW_BYTES_PER_BYTE = 32
+"""Bytes of rows for each of the bag: a long bag may be brought to a faster clock than any of its streams has."""
+_ROWS_OF_EPISODE = 50
+"""That count for an episode in addition to its own: millions of empty ones would take hours."""
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FeatureRows:
@@ -86,6 +91,10 @@ class Timelines:
         self.streams, self.mapping = streams, mapping
         pairs: tuple[tuple[Key, Stream], ...] = (*streams.sources.items(), *streams.cameras.items())
         self.lines = {key: _from_keyframe(timeline(stream, mapping)) for key, stream in pairs}
+        self._bytes_of_row = sum(_bytes_of_row(line) for line in self.lines.values())
+        self._free_bytes = self._most_bytes = (1 << 25) + _ROW_BYTES_PER_BYTE * streams.num_bytes
+        if empty := [key for key, line in self.lines.items() if not len(line.times_ns)]:
+            raise BagError(f"No message of {self._label(empty[0])} has a time at which it could be used")
 
     def rule(self, key: Key) -> tuple[Sampling, int]:
         """How a stream is sampled, and how old what it gives may be, nanoseconds."""
@@ -103,6 +112,7 @@ class Timelines:
 
     def rows(self, window: Window) -> EpisodeRows:
         """The rows of an episode; NoRowsError where a stream has nothing fit for them."""
+        self._reserve(_ROWS_OF_EPISODE)
         begin, end = self._extent(window)
         times = self._times(begin, end)
         if len(times) < 2:
@@ -177,11 +187,23 @@ class Timelines:
     def _times(self, begin: int, end: int) -> Int:
         clock = self.mapping.clock
         if clock.rows == "grid":
+            self._reserve(max(0, (end - begin) * clock.fps // NS + 1))
             return grid(begin, end, clock.fps)
         times = next((line.times_ns for line in self.lines.values() if line.stream.topic == clock.rows), None)
         if times is None:
             raise BagError(f"clock.rows is {clock.rows!r}, of which the mapping takes no feature or camera")
-        return times[(times >= begin) & (times <= end)]
+        chosen = times[(times >= begin) & (times <= end)]
+        self._reserve(len(chosen))
+        return chosen
+
+    def _reserve(self, count: int) -> None:
+        """Raise BagError for more rows, in all episodes, than a bag of this size gives; before memory is taken."""
+        self._free_bytes -= count * self._bytes_of_row
+        if self._free_bytes < 0:
+            raise BagError(
+                f"The mapping makes more rows and episodes of the bag, {self._most_bytes / 1e6:,.0f} MB of them, than "
+                "one of its size is read for: lower clock.fps, or import a part of it (episodes.times_s)"
+            )
 
     def _label(self, key: Key) -> str:
         stream = self.lines[key].stream
@@ -255,6 +277,11 @@ def _from_keyframe(line: Timeline) -> Timeline:
     keyframes = np.flatnonzero(line.stream.heads.are_keyframes[line.order])
     first = int(keyframes[0]) if len(keyframes) else len(line.order)
     return replace(line, times_ns=line.times_ns[first:], order=line.order[first:]) if first else line
+
+
+def _bytes_of_row(line: Timeline) -> int:
+    """What a row takes of a stream while an episode is made: its numbers, which message, and how old that is."""
+    return 32 + (0 if line.stream.layout is None else 8 * len(line.stream.layout.names))
 
 
 def _first_rows(feature: FeatureRows, count: int) -> FeatureRows:

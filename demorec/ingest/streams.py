@@ -32,15 +32,24 @@ from demorec.ingest.fields import (
     stamp_of,
 )
 from demorec.ingest.mapping import BagMapping, Source
+from demorec.ingest.mapping_file import listed
 from demorec.ingest.picture_messages import PictureHeads, picture_head
 from demorec.ingest.ros_types import Budgets, Values
 from demorec.ingest.service_calls import CallReader, ServiceCall
+from demorec.recording.limits import LimitError
 from demorec.registry import nearest_match
 
 NO_STAMP = -(2**63)
+_BYTES_OF_MESSAGE = 40
+"""That a stream keeps of each, beside its numbers."""
+_BYTES_OF_VALUE = 200
+_VALUES_OF_ADDING = 5
+"""As long as reading so many takes to give a message to a stream, of which a topic may have many."""
+_MAX_NUMBERS = 16_384
+"""Of all features together, in a row."""
 _MAX_TEXT = 10_000
 _MAX_URDF = 4 << 20
-_INFO_FIELDS = ("header", "frame_id", "width", "height", "k", "K", "d", "D")
+_INFO_FIELDS = ("width", "height", "k", "K", "d", "D")
 """Of a camera's calibration that are asked for."""
 
 
@@ -107,6 +116,7 @@ class BagStreams:
         texts: Topic -> its texts.
         calls: Topic of a service's events -> its calls.
         problems: Why parts of the bag could not be read.
+        num_bytes: Of the bag's files.
     """
 
     sources: dict[tuple[str, int], Stream]
@@ -115,6 +125,7 @@ class BagStreams:
     texts: dict[str, list[Text]]
     calls: dict[str, list[ServiceCall]]
     problems: list[str]
+    num_bytes: int
 
 
 @dataclass(kw_only=True, eq=False)
@@ -123,6 +134,7 @@ class _Growing:
 
     label: str
     topic: str
+    budgets: Budgets
     source: Source | None = None
     type: str = ""
     layout: SourceLayout | None = None
@@ -144,6 +156,8 @@ class _Growing:
         """Take one message."""
         self.type = self.type or message.channel.type
         try:
+            self.budgets.values.take(_VALUES_OF_ADDING)
+            self.budgets.numbers.take(_BYTES_OF_MESSAGE)
             if self.source is not None:
                 if self.reader is None:
                     self.layout = layout_of(self.source, values)
@@ -156,8 +170,8 @@ class _Growing:
         except OtherPublisherError as error:
             self.first_refusal = self.first_refusal or str(error)
             return
-        except ValueError as error:
-            self.malformed(str(error))
+        except (ValueError, RecursionError, OverflowError, TypeError) as error:
+            self.malformed(in_words(error))
             return
         stamp = stamp_of(values)
         self.log_ns.append(message.log_ns)
@@ -178,6 +192,7 @@ class _Growing:
         elif self.dtype != vector.dtype:  # float64 holds both
             self.vectors = bytearray(np.frombuffer(self.vectors, self.dtype).astype(np.float64).data)
             self.dtype = np.dtype(np.float64)
+        self.budgets.numbers.take(self.dtype.itemsize * len(vector))
         self.vectors += vector.astype(self.dtype, copy=False).data
 
     def finished(self) -> Stream:
@@ -236,6 +251,15 @@ class BagDecoder:
             raise UnknownEncodingError(str(decoder))
         return decoder(message.data)
 
+    def may_keep(self, message: BagMessage) -> bool:
+        """Whether the values that a message has just given are few enough to be kept beside those kept before."""
+        used = self.budgets.values.used - self.budgets.values.begun
+        try:
+            self.budgets.numbers.take(len(message.data) + _BYTES_OF_VALUE * used)
+        except LimitError:
+            return False
+        return True
+
 
 def read_streams(bag: Bag, mapping: BagMapping) -> BagStreams:
     """Read a bag from its front to its end.
@@ -253,16 +277,18 @@ def read_streams(bag: Bag, mapping: BagMapping) -> BagStreams:
 
 class _Reading:
     def __init__(self, mapping: BagMapping, num_bytes: int) -> None:
-        self._mapping = mapping
+        self._mapping, self._num_bytes = mapping, num_bytes
         self._decoder = BagDecoder(num_bytes)
+        budgets = self._decoder.budgets
         self._sources = {
-            (name, index): _Growing(label=name, topic=source.topic, source=source)
+            (name, index): _Growing(label=name, topic=source.topic, budgets=budgets, source=source)
             for name, sources in mapping.features.items()
             for index, source in enumerate(sources)
             if source.topic
         }
         self._cameras = {
-            name: _Growing(label=f"camera {name}", topic=camera.topic) for name, camera in mapping.cameras.items()
+            name: _Growing(label=f"camera {name}", topic=camera.topic, budgets=budgets)
+            for name, camera in mapping.cameras.items()
         }
         self._streams: dict[str, list[_Growing]] = {}
         for stream in (*self._sources.values(), *self._cameras.values()):
@@ -306,6 +332,9 @@ class _Reading:
         checksum = zlib.crc32(message.data)
         for stream in streams:
             stream.add(number, message, values, checksum)
+        if (topic in self._texts or topic in self._calls) and not self._decoder.may_keep(message):
+            self._refused[topic] = "it holds too much to be kept in memory"
+            return
         if topic in self._texts:
             self._add_text(topic, message, values)
         if topic in self._calls:
@@ -314,7 +343,7 @@ class _Reading:
             except FieldError as error:
                 self._refused[topic] = str(error)
         if topic in self._info_topics:
-            kept = {key: value for key, value in values.items() if key in _INFO_FIELDS}
+            kept = {key: values[key] for key in _INFO_FIELDS if key in values} | {"frame_id": frame_id_of(values)}
             self._infos.setdefault(self._info_topics[topic], kept)
 
     def _add_text(self, topic: str, message: BagMessage, values: Values) -> None:
@@ -351,12 +380,15 @@ class _Reading:
             if stream.topic in self._counts and stream.topic not in self._refused and not stream.log_ns:
                 reason = stream.first_problem or stream.first_refusal
                 problems.append(f"{stream.label} cannot be taken from {stream.topic} ({stream.type}): {reason}")
+        count = sum(len(stream.layout.names) for stream in self._sources.values() if stream.layout)
+        if count > _MAX_NUMBERS:
+            problems.append(f"its features have {count:,} numbers, at most {_MAX_NUMBERS:,} are read")
         problems += self._double_names()
         for camera in self._cameras.values():
             if camera.heads and not camera.heads.are_keyframes.any():
                 problems.append(f"{camera.topic} has no keyframe with its parameter sets, so it cannot be decoded")
         if problems:
-            raise BagError(f"The mapping does not fit the bag: {'; '.join(problems)}: {bag.path}")
+            raise BagError(f"The mapping does not fit the bag: {listed(problems)}: {bag.path}")
 
     def _double_names(self) -> list[str]:
         problems = []
@@ -382,4 +414,5 @@ class _Reading:
             texts=self._texts,
             calls={topic: reader.calls() for topic, reader in self._calls.items()},
             problems=problems,
+            num_bytes=self._num_bytes,
         )

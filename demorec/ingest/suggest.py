@@ -129,7 +129,10 @@ def _look_into(topic: _Topic, message: BagMessage, decoder: BagDecoder) -> None:
         return
     topic.has_stamp = topic.has_stamp and bool(stamp_of(values))
     if len(topic.values) < 2 or _head(values) is None:
-        topic.values.append(values)
+        if decoder.may_keep(message):
+            topic.values.append(values)
+        elif not topic.values:
+            topic.problem = "the bag holds too much to look into all of it"
 
 
 def _head(values: Values) -> PictureHead | None:

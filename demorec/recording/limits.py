@@ -98,6 +98,10 @@ class Budget:
         total: The most that all calls of `take` may take together.
         each: The most after each `begin`.
         what: It is, in the plural ("values").
+
+    Attributes:
+        used: Of it until now.
+        begun: `used` at the last `begin`.
     """
 
     def __init__(self, total: int, each: int, what: str) -> None:
@@ -107,6 +111,7 @@ class Budget:
 
     def begin(self) -> None:
         """Begin with the next message, or whatever `each` is of."""
+        self.begun = self.used
         self._most = min(self._total, self.used + self._each)
 
     def take(self, count: int = 1) -> None:
