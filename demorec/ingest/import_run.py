@@ -5,9 +5,10 @@ The same command again goes on: bags that import.json knows are not read, episod
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 
@@ -153,7 +154,7 @@ class _Import:
             features=tuple(described_feature(name, feature, lines, joints) for name, feature in rows.features.items()),
             cameras=tuple(described_camera(name, plan, lines) for name, plan in plans.items()),
             origin=Origin(kind="import", files=files, mapping_digest=self.mapping.digest),
-            versions={"demorec": version("demorec"), "av": version("av")},
+            versions=dict(_versions()),
         )
         subtasks = subtask_rows(self.bag, lines.streams, rows.window, rows.times_ns, self.mapping)
         return PlannedEpisode(info=info, rows=rows, plans=plans, subtasks=subtasks)
@@ -233,6 +234,11 @@ class _Import:
 
     def _unusable(self, topic: str, error: ValueError) -> BagError:
         return BagError(f"A picture of {topic} cannot be used, since {error}: {self.bag.path}")
+
+
+@cache
+def _versions() -> Mapping[str, str]:
+    return {name: version(name) for name in ("demorec", "av")}
 
 
 def _first_pictures(episodes: Iterable[PlannedEpisode]) -> dict[tuple[str, int], list[PlannedEpisode]]:

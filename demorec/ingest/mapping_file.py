@@ -10,6 +10,7 @@ import typing
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import islice
 from pathlib import Path
 from typing import Any, Literal
@@ -28,10 +29,11 @@ MAX_ELEMENTS = 4096
 MAX_SECONDS = 1e9
 """Of any time in a mapping: beyond it nanoseconds are no numbers of 64 bits."""
 _MAX_FILE_BYTES = 1 << 20
-_MAX_TABLES = 1000
+_MAX_TABLES, _MAX_VALUES = 1000, 50_000
 _MAX_TEXT = 10_000
 _MAX_TOLD = 8
-_DEEP_KEY = re.compile(r"""(?:[\w-]+|"[^"\n]*"|'[^'\n]*')(?:[ \t]*\.[ \t]*(?:[\w-]+|"[^"\n]*"|'[^'\n]*')){16}""")
+_PART = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
+_DEEP_KEY = re.compile(rf"(?<![\w-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{16}}")
 """What no mapping has: each part of a key makes a table, and takes as long as all before it."""
 
 
@@ -61,7 +63,7 @@ class Part:
 class AnyMapping(ABC):
     """A mapping, of whatever kind of file."""
 
-    @property
+    @cached_property
     def digest(self) -> str:
         """16 hex digits of all it says."""
         return digest(self)
@@ -167,9 +169,10 @@ def read_mapping_file[M: AnyMapping](path: Path, kind: type[M]) -> M:
 
 def _excess(data: Any) -> str:
     """What a mapping has too much of; "" for nothing."""
-    tables, waiting = 0, [data]
+    values, tables, waiting = 0, 0, [data]
     while waiting:
         value = waiting.pop()
+        values += 1
         if isinstance(value, dict):
             tables += 1
             waiting += [*value, *value.values()]
@@ -177,7 +180,10 @@ def _excess(data: Any) -> str:
             waiting += value
         elif isinstance(value, str) and len(value) > _MAX_TEXT:
             return f"a text has {len(value):,} characters, at most {_MAX_TEXT:,} are read"
-    return f"it has {tables:,} tables, at most {_MAX_TABLES:,} are read" if tables > _MAX_TABLES else ""
+    for count, most, what in ((tables, _MAX_TABLES, "tables"), (values, _MAX_VALUES, "values")):
+        if count > most:
+            return f"it has {count:,} {what}, at most {most:,} are read"
+    return ""
 
 
 def _unknown_keys(value: Any, kind: Any, place: str) -> Iterator[str]:

@@ -20,7 +20,7 @@ Key = tuple[str, int] | str
 
 _ROW_BYTES_PER_BYTE = 32
 """Bytes of rows for each of the bag: a long bag may be brought to a faster clock than any of its streams has."""
-_ROWS_OF_EPISODE = 50
+_ROWS_OF_EPISODE = 500
 """That count for an episode in addition to its own: millions of empty ones would take hours."""
 
 

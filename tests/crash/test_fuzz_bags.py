@@ -1,4 +1,4 @@
-"""Bags, their mappings and messages, fuzzed: a sentence or success, in bounded memory and time, and never a traceback."""
+"""Bags, their mappings and messages, fuzzed: a sentence or success within bounds, and never a traceback."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import contextlib
 import io
 import shutil
 from collections import Counter
-from pathlib import Path
 
 import pytest
 from support.fuzz import LimitedCommands, problem_of

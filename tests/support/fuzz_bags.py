@@ -16,6 +16,7 @@ import numpy as np
 from google.protobuf import descriptor_pb2
 from mcap.writer import CompressionType, Writer
 from PIL import Image
+
 from support import bag_mappings, bags
 from support.fuzz import changed_bytes
 
