@@ -116,8 +116,9 @@ def _nanoseconds(value: Any) -> int | None:
     if isinstance(value, Mapping):
         seconds = next((value[key] for key in _SECONDS if key in value), None)
         rest = next((value[key] for key in _NANOSECONDS if key in value), 0)
-        are_numbers = isinstance(seconds, int | float) and isinstance(rest, int | float)
-        if are_numbers and abs(seconds) < MAX_TIME_NS and abs(rest) < MAX_TIME_NS:
+        if not isinstance(seconds, int | float) or not isinstance(rest, int | float):
+            return None
+        if abs(seconds) < MAX_TIME_NS and abs(rest) < MAX_TIME_NS:  # no NaN either
             time_ns = int(seconds) * 1_000_000_000 + int(rest)
             return time_ns if abs(time_ns) < MAX_TIME_NS else None
     return None
@@ -126,7 +127,7 @@ def _nanoseconds(value: Any) -> int | None:
 def whole(values: Mapping[str, Any], name: str) -> int:
     """A whole number of a message, which JSON may have as anything; FieldError when it is none, or none of 32 bits."""
     value = values[name]
-    if isinstance(value, int | float | np.generic) and -(2**31) <= value < 2**32:
+    if isinstance(value, int | float | np.integer | np.floating) and -(2**31) <= value < 2**32:
         return int(value)
     raise FieldError(f"its {name} is no number of 32 bits")
 

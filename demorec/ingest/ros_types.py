@@ -103,7 +103,7 @@ def _whole(read: _Reader, data: memoryview, budget: Budget) -> Values:
     return values
 
 
-class _CountedMsgParser(MSGParser):
+class _CountedMsgParser(MSGParser):  # type: ignore[misc]
     """Counts its steps: what takes long is no matter of a text's length alone."""
 
     def __init__(self, text: str, steps: Budget) -> None:
@@ -115,7 +115,7 @@ class _CountedMsgParser(MSGParser):
         return super().regex(pos, pattern, flags)
 
 
-class _CountedIdlParser(IDLParser):
+class _CountedIdlParser(IDLParser):  # type: ignore[misc]
     def __init__(self, text: str, steps: Budget) -> None:
         super().__init__(text)
         self._steps = steps

@@ -19,6 +19,7 @@ import zstandard
 from google.protobuf import descriptor_pb2
 from mcap.writer import Writer
 from PIL import Image
+from rosbags.rosbag2 import StoragePlugin
 from support import bag_mappings, bags
 from support.fuzz import LimitedCommands, problem_of
 from support.fuzz_bags import MAPPING
@@ -90,7 +91,8 @@ def _proto() -> bytes:
     item = file.message_type.add(name="Item")
     for number in range(3000):
         item.field.add(name=f"f{number}", number=number + 1, type=9, label=1)
-    return descriptor_pb2.FileDescriptorSet(file=[file]).SerializeToString()
+    schema: bytes = descriptor_pb2.FileDescriptorSet(file=[file]).SerializeToString()
+    return schema
 
 
 def empty_elements_of_many_fields(folder: Path) -> Path:
@@ -120,7 +122,7 @@ def messages_that_claim_64_megabytes(folder: Path) -> Path:
 
 def _database(folder: Path, script: str) -> Path:
     """A .db3 of rosbag2 that was changed by a script."""
-    bag = bags.write_rosbag2(bags.in_order(bags.so101(0.3)), folder / "sql", storage=bags.StoragePlugin.SQLITE3)
+    bag = bags.write_rosbag2(bags.in_order(bags.so101(0.3)), folder / "sql", storage=StoragePlugin.SQLITE3)
     path = next(bag.glob("*.db3"))
     with closing(sqlite3.connect(path)) as database, database:
         database.executescript(script)
@@ -382,8 +384,10 @@ def test_odd_values_in_messages(key: str, tmp_path: Path, commands: LimitedComma
         MAPPING.replace("/image", "/joints").replace("position", "width").replace('info_topic = "/info"\n', ""),
         tmp_path / "mapping.toml",
     )
-    for arguments in (["--suggest", bag], [bag, "--mapping", mapping, "--out", tmp_path / "run"]):
-        told = commands.run("import", *arguments)
+    for told in (
+        commands.run("import", "--suggest", bag),
+        commands.run("import", bag, "--mapping", mapping, "--out", tmp_path / "run"),
+    ):
         assert problem_of(told) == "", told
 
 

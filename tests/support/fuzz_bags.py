@@ -16,6 +16,7 @@ import numpy as np
 from google.protobuf import descriptor_pb2
 from mcap.writer import CompressionType, Writer
 from PIL import Image
+from rosbags.rosbag2 import StoragePlugin
 
 from support import bag_mappings, bags
 from support.fuzz import changed_bytes
@@ -65,7 +66,7 @@ class FuzzedBags:
         self._plain = bags.write_mcap(notes, folder / "plain.mcap", compression="", use_chunking=False).read_bytes()
         self._chunked = bags.write_mcap(notes, folder / "chunked.mcap").read_bytes()
         self._trossen = bags.write_trossen(bags.in_order(bags.trossen(0.3)), folder / "trossen.mcap").read_bytes()
-        rosbag2 = bags.write_rosbag2(notes, folder / "rosbag2", storage=bags.StoragePlugin.SQLITE3)
+        rosbag2 = bags.write_rosbag2(notes, folder / "rosbag2", storage=StoragePlugin.SQLITE3)
         self._db3 = next(rosbag2.glob("*.db3")).read_bytes()
         self._metadata = (rosbag2 / "metadata.yaml").read_text()
         moment = bags.EPOCH_NS
@@ -225,13 +226,13 @@ class FuzzedBags:
                 moment = bags.EPOCH_NS + number * bags.NS // 30
                 stamp = {"sec": moment // bags.NS, "nsec": moment % bags.NS}
                 header = {"stamp": stamp, "frame_id": "camera"}
-                coded = base64.b64encode(self._still.tobytes() if number % 2 else self._still.tobytes()).decode()
+                coded = base64.b64encode(self._still.tobytes()).decode()
                 for name, values in (
                     ("/joints", {"header": dict(header), "name": ["a", "b"], "position": [0.1 * number, 0.2]}),
                     ("/image", {"header": dict(header), "encoding": "rgb8", "width": bags.WIDTH, "height": bags.HEIGHT,
                                 "step": 3 * bags.WIDTH, "is_bigendian": 0, "data": coded}),
-                    ("/info", {"header": dict(header), "width": 64, "height": 48, "K": [60.0, 0, 32, 0, 60.0, 24, 0, 0, 1],
-                               "D": [0.0] * 5}),
+                    ("/info", {"header": dict(header), "width": 64, "height": 48, "D": [0.0] * 5,
+                               "K": [60.0, 0, 32, 0, 60.0, 24, 0, 0, 1]}),
                     ("/text", {"header": dict(header), "data": ("start", "stop")[number // 2 % 2], "info":
                                {"event_type": number % 4, "sequence_number": number, "client_gid": "g"}}),
                 ):  # fmt: skip
@@ -315,8 +316,8 @@ class FuzzedBags:
                 "data": np.frombuffer(changed_bytes(data, chance) if chance.random() < 0.8 else data, np.uint8),
             }
             if is_raw:
-                body = {"encoding": encoding, "width": width, "height": height, "step": step,
-                        "data": np.frombuffer(self._still.tobytes()[: chance.choice((0, 100, 9216))], np.uint8)}  # fmt: skip
+                pixels = np.frombuffer(self._still.tobytes()[: chance.choice((0, 100, 9216))], np.uint8)
+                body = {"encoding": encoding, "width": width, "height": height, "step": step, "data": pixels}
             kind = "sensor_msgs/msg/Image" if is_raw else "sensor_msgs/msg/CompressedImage"
             notes.append(bags.Note(topic="/image", type=kind, log_ns=moment, header_ns=moment, body=body))
         path = bags.write_mcap(bags.in_order(notes), folder / "picture.mcap")
