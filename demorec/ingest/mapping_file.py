@@ -17,6 +17,7 @@ from typing import Any, Literal
 
 from demorec.errors import ConfigError, in_words
 from demorec.plain import digest, from_plain
+from demorec.recording.collected.validity import MAX_CAMERAS, MAX_FEATURES
 from demorec.registry import nearest_match
 from demorec.safety.files import read_text_limited
 
@@ -75,6 +76,9 @@ class AnyMapping(ABC):
 
 def feature_problems(features: Mapping[str, Sequence[Part]]) -> Iterator[str]:
     """What is impossible in features, whatever their parts are taken from."""
+    if len(features) > MAX_FEATURES:
+        yield f"it has {len(features)} features, at most {MAX_FEATURES} are recorded"
+        return
     if STATE not in features:
         yield f"there is no feature {STATE!r}"
     for name, parts in features.items():
@@ -110,6 +114,8 @@ def _part_problems(place: str, name: str, part: Part, features: Mapping[str, Seq
 
 def camera_name_problems(cameras: Mapping[str, object]) -> Iterator[str]:
     """Names that no camera can have."""
+    if len(cameras) > MAX_CAMERAS:
+        yield f"it has {len(cameras)} cameras, at most {MAX_CAMERAS} are recorded"
     for name in cameras:
         if not name.isidentifier():
             yield f"a camera cannot be called {name!r}: letters, digits and underscores are allowed"

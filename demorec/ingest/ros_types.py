@@ -17,7 +17,7 @@ from rosbags.typesys.base import make_typesdict
 from rosbags.typesys.idl import IDLParser
 from rosbags.typesys.msg import MSGParser
 
-from demorec.recording.limits import Budget
+from demorec.recording.limits import Budget, Limits, SpentError
 
 Values = dict[str, Any]
 """Field -> number, text, NumPy array (numbers), list (texts, messages) or Values."""
@@ -48,14 +48,15 @@ class Budgets:
         steps: Of parsing definitions, some 7 microseconds each. The largest definition of ROS, with all that it refers
             to, takes 2,200 of them as .msg, and one of 300 fields 130,000 to 790,000 as .idl.
         values: Fields and elements, 100 to 300 bytes each in memory. A message of joints has 30, a list of 100,000
-            points 400,000. Small files have a floor, which is read in some seconds.
+            points 400,000. Small files have a floor, 5 million, which are read in some seconds.
         numbers: Bytes of what streams keep of the messages.
     """
 
     def __init__(self, num_bytes: int = 0) -> None:
         self.steps = Budget(1_200_000, 800_000, "parts of definitions")
-        self.values = Budget(max(5_000_000, 12 * num_bytes), 500_000, "values")
-        numbers = max(64 << 20, 100 * num_bytes)
+        floor = Limits.of_file(num_bytes).floor
+        self.values = Budget(max(floor // 13, 12 * num_bytes), 500_000, "values")
+        numbers = max(floor, 100 * num_bytes)
         self.numbers = Budget(numbers, numbers, "bytes of numbers")
 
 
@@ -168,7 +169,7 @@ def _parsed_types(name: str, schema_encoding: str, schema: bytes, steps: Budget)
             raise ValueError(f"its definition is in {schema_encoding[:40]!r}")
     except RecursionError:
         raise ValueError("its definition is nested too deeply") from None
-    except (ValueError, MemoryError):
+    except (ValueError, MemoryError, SpentError):
         raise
     except Exception as error:  # the parser's own errors, and what it does not foresee
         raise ValueError("its definition cannot be read") from error

@@ -14,13 +14,16 @@ from demorec.ingest.clock import MISSING, NS, Chosen, Int, Timeline, choose, gri
 from demorec.ingest.episodes import Window
 from demorec.ingest.mapping import BagMapping, CameraSource, Sampling, Source
 from demorec.ingest.streams import BagStreams, Stream
+from demorec.recording.limits import VARIABLE, Limits
 
 Key = tuple[str, int] | str
 """A stream: (feature, number of its source), or the name of a camera."""
 
 _ROW_BYTES_PER_BYTE = 32
 """Bytes of rows for each of the bag: a long bag may be brought to a faster clock than any of its streams has."""
-_ROWS_OF_EPISODE = 500
+_BYTES_OF_WRITING = 100
+"""That count for each row in addition to its own: writing one takes some 15 microseconds."""
+_ROWS_OF_EPISODE = 300
 """That count for an episode in addition to its own: millions of empty ones would take hours."""
 
 
@@ -91,8 +94,10 @@ class Timelines:
         self.streams, self.mapping = streams, mapping
         pairs: tuple[tuple[Key, Stream], ...] = (*streams.sources.items(), *streams.cameras.items())
         self.lines = {key: _from_keyframe(timeline(stream, mapping)) for key, stream in pairs}
-        self._bytes_of_row = sum(_bytes_of_row(line) for line in self.lines.values())
-        self._free_bytes = self._most_bytes = (1 << 25) + _ROW_BYTES_PER_BYTE * streams.num_bytes
+        self._bytes_of_row = _BYTES_OF_WRITING + sum(map(_bytes_of_row, self.lines.values()))
+        self._free_bytes = self._most_bytes = (
+            Limits.of_file(streams.num_bytes).floor // 2 + _ROW_BYTES_PER_BYTE * streams.num_bytes
+        )
         if empty := [key for key, line in self.lines.items() if not len(line.times_ns)]:
             raise BagError(f"No message of {self._label(empty[0])} has a time at which it could be used")
 
@@ -202,7 +207,7 @@ class Timelines:
         if self._free_bytes < 0:
             raise BagError(
                 f"The mapping makes more rows and episodes of the bag, {self._most_bytes / 1e6:,.0f} MB of them, than "
-                "one of its size is read for: lower clock.fps, or import a part of it (episodes.times_s)"
+                f"one of its size is read for: lower clock.fps, import a part (episodes.times_s), or raise {VARIABLE}"
             )
 
     def _label(self, key: Key) -> str:

@@ -36,14 +36,14 @@ from demorec.ingest.mapping_file import listed
 from demorec.ingest.picture_messages import PictureHeads, picture_head
 from demorec.ingest.ros_types import Budgets, Values
 from demorec.ingest.service_calls import CallReader, ServiceCall
-from demorec.recording.limits import LimitError
+from demorec.recording.limits import SpentError
 from demorec.registry import nearest_match
 
 NO_STAMP = -(2**63)
 _BYTES_OF_MESSAGE = 40
 """That a stream keeps of each, beside its numbers."""
 _BYTES_OF_VALUE = 200
-_VALUES_OF_ADDING = 5
+_VALUES_OF_ADDING = 15
 """As long as reading so many takes to give a message to a stream, of which a topic may have many."""
 _MAX_NUMBERS = 16_384
 """Of all features together, in a row."""
@@ -256,7 +256,7 @@ class BagDecoder:
         used = self.budgets.values.used - self.budgets.values.begun
         try:
             self.budgets.numbers.take(len(message.data) + _BYTES_OF_VALUE * used)
-        except LimitError:
+        except SpentError:
             return False
         return True
 
@@ -269,8 +269,11 @@ def read_streams(bag: Bag, mapping: BagMapping) -> BagStreams:
     """
     reading = _Reading(mapping, bag.num_bytes)
     problems: list[str] = []
-    for message in bag.messages(problems):
-        reading.add(message)
+    try:
+        for message in bag.messages(problems):
+            reading.add(message)
+    except SpentError as error:
+        raise BagError(f"{error}: {bag.path}") from error
     reading.check(bag)
     return reading.finished(problems)
 

@@ -25,6 +25,7 @@ from demorec.ingest.picture_messages import VIDEO_FORMATS, PictureHead, picture_
 from demorec.ingest.ros_types import Values
 from demorec.ingest.streams import BagDecoder
 from demorec.ingest.words import SHOWN, first_numbers, quoted, unique_name
+from demorec.recording.limits import SpentError
 from demorec.scene.collected import DEPTH_UNITS
 
 _KEPT = 64
@@ -122,7 +123,7 @@ def _topics(bag: Bag, problems: list[str]) -> dict[str, _Topic]:
 def _look_into(topic: _Topic, message: BagMessage, decoder: BagDecoder) -> None:
     try:
         values = decoder.values(message)
-    except UnknownEncodingError as error:
+    except (UnknownEncodingError, SpentError) as error:
         topic.problem = str(error)
         return
     except (ValueError, RecursionError, OverflowError, TypeError):

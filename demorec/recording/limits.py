@@ -14,7 +14,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 
-from demorec.errors import ConfigError
+from demorec.errors import ConfigError, RecordingError
 
 VARIABLE = "DEMOREC_UNPACKED_MB"
 _DEFAULT_MB = 64
@@ -26,7 +26,11 @@ _BYTES_PER_RECORD = 16
 
 
 class LimitError(ValueError):
-    """A file would unpack to more than is allowed; `str` is the reason and what to do."""
+    """A file would unpack to more than is allowed, or a message holds more; `str` is the reason and what to do."""
+
+
+class SpentError(RecordingError):
+    """A file holds more in all than is read of one of its size: what is left of it is never silently left out."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,11 +119,13 @@ class Budget:
         self._most = min(self._total, self.used + self._each)
 
     def take(self, count: int = 1) -> None:
-        """Count so many; LimitError when they are too many."""
-        if self.used + count > self._most:
-            raise LimitError(
-                f"it holds more {self._what} than are read, {self._each:,} in one and {self._total:,} in all"
+        """Count so many; LimitError when they are too many for one, SpentError for all."""
+        if self.used + count > self._total:
+            raise SpentError(
+                f"The bag holds more than {self._total:,} {self._what}, too many for its size; {VARIABLE} raises this"
             )
+        if self.used + count > self._most:
+            raise LimitError(f"it holds more than {self._each:,} {self._what}")
         self.used += count
 
 
