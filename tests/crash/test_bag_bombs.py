@@ -266,7 +266,7 @@ def test_too_little_memory_is_no_fault_of_a_definition(
 
     bag = _joints(tmp_path)
     monkeypatch.setattr(ros_types, "_parsed", {})
-    monkeypatch.setattr(ros_types.MSGParser, "specification", lack)
+    monkeypatch.setattr(ros_types._CountedMsgParser, "specification", lack)
     assert exit_code("import", "--suggest", bag) == 1
     assert "This machine has too little memory for this" in capsys.readouterr().err
 
