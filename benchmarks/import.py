@@ -141,7 +141,7 @@ def lerobots(bag: Path, out: Path, mapping: Path) -> None:
     for name, feature in rows.features.items():
         features[name] = {"dtype": "float32", "shape": (len(feature.names),), "names": list(feature.names)}
     dataset = LeRobotDataset.create("local/x", fps=FPS, features=features, root=out / "dataset", use_videos=True)
-    decoder, kept = BagDecoder(), {name: list[NDArray[np.uint8]]() for name in rows.cameras}
+    decoder, kept = BagDecoder(opened.num_bytes), {name: list[NDArray[np.uint8]]() for name in rows.cameras}
     packets: dict[str, list[bytes]] = {name: [] for name in rows.cameras}
     topics = {camera.topic: name for name, camera in known.cameras.items()}
     for message in opened.messages([], topics.keys()):
@@ -170,7 +170,7 @@ def decoding_and_coding(bag: Path) -> None:
     from demorec.ingest.streams import BagDecoder
     from demorec.recording.video import make_encoder
 
-    decoder = BagDecoder()
+    decoder = BagDecoder(open_bag(bag).num_bytes)
     encoders = {topic: make_encoder(video=VideoConfig(), width=WIDTH, height=HEIGHT, fps=FPS) for topic in CAMERAS}
     for message in open_bag(bag).messages([], CAMERAS):
         encoders[message.channel.topic].encode(decode_picture(decoder.values(message)))

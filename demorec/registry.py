@@ -11,15 +11,20 @@ import importlib
 import inspect
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any, cast
 
 from demorec.errors import ConfigError, NotAllowedError
 from demorec.safety.user_modules import import_object, is_allowed, split_name
 
+_LONGEST = 100
+"""Characters of names that are compared with others, which takes the product of both and of how many there are."""
+
 
 def nearest_match(name: str, allowed: Iterable[str]) -> str:
     """Return " Did you mean 'x'?" for the closest allowed name, or an empty string."""
-    matches = difflib.get_close_matches(name, list(allowed), n=1, cutoff=0.5)
+    few = [other for other in islice(allowed, 5 * _LONGEST) if len(other) <= _LONGEST]
+    matches = difflib.get_close_matches(name, few, n=1, cutoff=0.5) if len(name) <= _LONGEST else []
     return f" Did you mean {matches[0]!r}?" if matches else ""
 
 

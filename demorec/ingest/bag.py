@@ -19,21 +19,24 @@ from typing import Any
 import zstandard
 
 from demorec.errors import ConfigError, resource_error
-from demorec.ingest.channel import BagError, BagMessage
+from demorec.ingest.channel import MAX_TIME_NS, BagError, BagMessage
 from demorec.ingest.mcap_bag import read_mcap
 from demorec.ingest.sqlite_bag import SQLITE_MAGIC, read_sqlite
 from demorec.lerobot.paths import INFO_PATH
-from demorec.recording.limits import Limits
+from demorec.recording.limits import Budget, LimitError, Limits, Unpacked
 from demorec.runs.run_file import sha256_of
 from demorec.safety.files import MCAP_MAGIC, open_regular, read_text_limited
 
 METADATA = "metadata.yaml"
 _SUFFIXES = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
 """Of files that a folder of bags holds; what else lies in it is nobody's bag."""
-_MAX_METADATA_BYTES = 4 << 20
+_MAX_METADATA_BYTES = 16 << 20
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _COPY_BYTES = 1 << 20
-_MAX_MESSAGE_BYTES = 1 << 28
+_MAX_EVENTS = 100_000
+"""Of YAML, 25 microseconds each; a bag of 500 topics with their settings has some 40,000."""
+_MAX_FILES = 10_000
+_MAX_PROBLEMS = 100
 _READERS = {MCAP_MAGIC: read_mcap, SQLITE_MAGIC: read_sqlite}
 
 
@@ -69,26 +72,38 @@ class Bag:
         """Its messages in the order in which they were written.
 
         Args:
-            problems: Gets a reason for each file that cannot be read to its end, or each message that is left out.
+            problems: Gets a reason for each file that cannot be read to its end, or each message that is left out; the
+                same one once.
             topics: That are wanted; None: all.
 
         Raises:
             BagError: A file cannot be read at all.
         """
+        unpacked = Unpacked(Limits.of_file(self.num_bytes))
         for path in self.files:
 
             def tell(reason: str, name: str = path.name) -> None:
-                problems.append(f"{name}: {reason}")
+                problem = f"{name}: {reason}"
+                if len(problems) < _MAX_PROBLEMS and problem not in problems:
+                    problems.append(problem)
 
-            with _unpacked(path) as (plain, magic):
-                for message in _READERS[magic](plain, tell):
-                    if topics is None or message.channel.topic in topics:
-                        yield self._unpack(message, tell) if self.messages_are_compressed else message
+            with _unpacked(path, unpacked) as (plain, magic):
+                for message in _READERS[magic](plain, tell, unpacked):
+                    if topics is not None and message.channel.topic not in topics:
+                        continue
+                    if not 0 <= message.log_ns < MAX_TIME_NS:
+                        tell(f"a message of {message.channel.topic} was recorded at no possible time")
+                        continue
+                    yield self._unpack(message, tell, unpacked) if self.messages_are_compressed else message
 
-    def _unpack(self, message: BagMessage, tell: Any) -> BagMessage:
+    def _unpack(self, message: BagMessage, tell: Any, unpacked: Unpacked) -> BagMessage:
         try:
-            data = zstandard.ZstdDecompressor().decompress(message.data, max_output_size=_MAX_MESSAGE_BYTES)
-        except zstandard.ZstdError as error:
+            blocks = []  # not at once: as much as the data claim would be reserved, whatever comes
+            for block in zstandard.ZstdDecompressor().read_to_iter(message.data, write_size=_COPY_BYTES):
+                unpacked.add(len(block))
+                blocks.append(block)
+            data = b"".join(blocks)
+        except (zstandard.ZstdError, LimitError) as error:
             tell(f"a message of {message.channel.topic} cannot be unpacked: {error}")
             data = b""
         return message._replace(data=data)
@@ -168,12 +183,12 @@ def _kind_of(path: Path) -> bytes:
 
 
 def _folder(path: Path) -> Bag:
-    from ruamel.yaml import YAML
-    from ruamel.yaml.error import YAMLError
-
     try:
-        text = read_text_limited(path / METADATA, _MAX_METADATA_BYTES)
-        information = YAML(typ="safe", pure=True).load(text)["rosbag2_bagfile_information"]
+        if (path / METADATA).is_symlink():
+            _refuse_link(path / METADATA)
+        information = _plain_yaml(read_text_limited(path / METADATA, _MAX_METADATA_BYTES))[
+            "rosbag2_bagfile_information"
+        ]
         names = [PurePath(str(name)).name for name in information["relative_file_paths"]]
         mode = str(information.get("compression_mode") or "").lower()
         compression = str(information.get("compression_format") or "")
@@ -186,35 +201,85 @@ def _folder(path: Path) -> Bag:
             f"The folder holds no {METADATA}, so it is no bag of rosbag2, and no bags (rosbag2 folders, "
             f"{', '.join('*' + suffix for suffix in _SUFFIXES)}): {path}"
         ) from None
-    except (OSError, UnicodeDecodeError, YAMLError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise BagError(f"The bag's {METADATA} cannot be read: {path}") from error
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        told = f" ({error})" if isinstance(error, LimitError) else ""
+        raise resource_error(error, path) or BagError(f"The bag's {METADATA} cannot be read{told}: {path}") from error
     if mode not in ("", "none") and compression != "zstd":
         raise BagError(f"The bag is compressed with {compression[:40]!r}, only zstd is read: {path}")
     if not names:
         raise BagError(f"The bag's {METADATA} names no files: {path}")
+    if len(names) > _MAX_FILES or len(set(names)) < len(names):
+        raise BagError(f"The bag's {METADATA} names a file twice, or more than {_MAX_FILES:,}: {path}")
     files = tuple(path / name for name in names)
     if missing := [file.name for file in files if not os.path.lexists(file)]:
-        raise BagError(f"The bag lacks its file {missing[0]}: {path}")
+        raise BagError(f"The bag lacks its file {missing[0][:80]}: {path}")
     for file in files:
+        _refuse_link(file)
         _kind_of(file)
     return Bag(path=path, files=files, messages_are_compressed=mode == "message")
 
 
+def _refuse_link(file: Path) -> None:
+    """BagError for a link out of the bag's folder: what lies elsewhere was not named by whoever gave the folder."""
+    if file.is_symlink() and file.resolve().parent != file.parent.resolve():
+        raise BagError(f"The bag's file is a link to another folder: name {file.name} itself, or copy it: {file}")
+
+
+def _plain_yaml(text: str) -> Any:
+    """Mappings, lists and texts of a YAML document: numbers and dates stay texts.
+
+    Raises:
+        ValueError: It is no YAML; LimitError for an alias, which may stand for anything any number of times, or more
+            than is read.
+    """
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+    from ruamel.yaml.events import (
+        AliasEvent,
+        MappingEndEvent,
+        MappingStartEvent,
+        ScalarEvent,
+        SequenceEndEvent,
+        SequenceStartEvent,
+    )
+
+    budget = Budget(_MAX_EVENTS, _MAX_EVENTS, "values")
+    root: list[Any] = []
+    open_lists = [root]
+    """What is begun: of mappings the keys and values in turn."""
+    try:
+        for event in YAML(typ="safe", pure=True).parse(text):
+            budget.take()
+            if isinstance(event, AliasEvent):
+                raise LimitError("it has aliases, which rosbag2 never writes")
+            if isinstance(event, ScalarEvent):
+                open_lists[-1].append(event.value)
+            elif isinstance(event, MappingStartEvent | SequenceStartEvent):
+                open_lists.append([])
+            elif isinstance(event, MappingEndEvent):
+                items = iter(open_lists.pop())
+                open_lists[-1].append({str(key): value for key, value in zip(items, items, strict=True)})
+            elif isinstance(event, SequenceEndEvent):
+                items_of_list = open_lists.pop()
+                open_lists[-1].append(items_of_list)
+    except (YAMLError, RecursionError, IndexError) as error:
+        raise ValueError("it is no YAML") from error
+    return root[0] if root else None
+
+
 @contextmanager
-def _unpacked(path: Path) -> Iterator[tuple[Path, bytes]]:
-    """A file and its kind; a compressed one is unpacked into a temporary file, within the limits of its size."""
+def _unpacked(path: Path, unpacked: Unpacked) -> Iterator[tuple[Path, bytes]]:
+    """A file and its kind; a compressed one is unpacked into a temporary file, within the limits of the bag."""
     magic = _kind_of(path)
     if magic != _ZSTD_MAGIC:
         yield path, magic
         return
     with tempfile.TemporaryDirectory(prefix="demorec-bag-") as folder:
         plain = Path(folder) / path.stem
-        limits, written = Limits.of_file(path.stat().st_size), 0
         try:
             with open_regular(path) as source, plain.open("wb") as file:
                 for block in zstandard.ZstdDecompressor().read_to_iter(source, write_size=_COPY_BYTES):
-                    written += len(block)
-                    limits.check_total(written)
+                    unpacked.add(len(block))
                     file.write(block)
             kind = _kind_of(plain)
         except (zstandard.ZstdError, ValueError) as error:

@@ -10,6 +10,11 @@ from demorec.errors import DemorecError
 MAX_SCHEMA_BYTES = 1 << 20
 """Of a message type's definition; the largest of ROS with all that it refers to have some 30 kB."""
 
+MAX_CHANNELS = 4096
+"""Of a bag; large systems have some hundred topics."""
+MAX_TIME_NS = 1 << 62
+"""Of a message, in the year 2116: the difference of two fits 64 bits."""
+
 
 class BagError(DemorecError):
     """A bag cannot be read, or does not hold what its mapping says."""

@@ -20,7 +20,6 @@ from demorec.ingest.streams import Stream
 NS = 1_000_000_000
 MISSING = 2**62
 """Age of what is not there."""
-MAX_ROWS = 10_000_000
 SKEW_S = 0.1
 """Between the times of headers and of recording: a camera's exposure and transport take less."""
 _PHASES = 64
@@ -217,8 +216,6 @@ def grid(begin_ns: int, end_ns: int, fps: int, streams: Sequence[Int] = ()) -> I
     decide.
     """
     count = max(0, (end_ns - begin_ns) * fps // NS + 1)
-    if count > MAX_ROWS:
-        raise ValueError(f"{count:,} rows, at most {MAX_ROWS:,} are made")
     inside = [times[(times >= begin_ns) & (times <= end_ns)] for times in streams]
 
     def fit(phase: int) -> tuple[int, int]:

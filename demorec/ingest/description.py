@@ -28,7 +28,7 @@ def urdf_text(name: str, mapping_path: Path) -> str:
     path = mapping_path.parent / name
     try:
         return read_text_limited(path, _MAX_URDF_BYTES)
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, ValueError) as error:  # no text, or NUL in the name
         raise ConfigError(f"The URDF cannot be read ({getattr(error, 'strerror', 'it is no text')}): {path}") from error
 
 
@@ -67,10 +67,8 @@ def described_camera(name: str, plan: PicturePlan, lines: Timelines) -> Collecte
     clock = "header" if lines.lines[name].is_header else "log"
     info = lines.streams.infos.get(name, {})
     matrix, distortion = _first(info, "k", "K"), _first(info, "d", "D")
-    fits = (int(info.get("width") or plan.head.width), int(info.get("height") or plan.head.height)) == (
-        plan.head.width,
-        plan.head.height,
-    )
+    size = (plan.head.width, plan.head.height)
+    fits = (info.get("width") or size[0], info.get("height") or size[1]) == size
     known = fits and len(matrix) == 9 and matrix[0] > 0 and bool(np.isfinite(matrix).all())
     return CollectedCamera(
         name=name,
@@ -85,5 +83,5 @@ def described_camera(name: str, plan: PicturePlan, lines: Timelines) -> Collecte
 
 def _first(values: Mapping[str, Any], *keys: str) -> list[float]:
     """The numbers of the first of these fields that is there."""
-    found = next((values[key] for key in keys if key in values), ())
-    return [float(number) for number in np.asarray(found, dtype=np.float64).reshape(-1)]
+    found = next((values[key] for key in keys if key in values), None)
+    return [float(number) for number in found.reshape(-1)] if isinstance(found, np.ndarray) and found.size <= 64 else []

@@ -49,6 +49,12 @@ class PicturePlan:
     positions: Int
 
     @property
+    def num_bytes(self) -> int:
+        """Of one in memory: of its pixels, or about those of what stays coded."""
+        pixels = self.head.width * self.head.height
+        return pixels // 10 if self.kept and self.kept not in DEPTH_UNITS else 3 * pixels
+
+    @property
     def told(self) -> str:
         """What becomes of them, for people."""
         shown = len(np.unique(self.positions))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import binascii
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from demorec.ingest.channel import MAX_TIME_NS
 from demorec.ingest.mapping import Source
 from demorec.ingest.mapping_file import MAX_ELEMENTS, Part, conversion_factor
 from demorec.ingest.ros_types import Values
@@ -76,7 +76,7 @@ def follow(values: Any, steps: Sequence[Step]) -> Any:
             else:
                 raise FieldError(f"there is no field {step!r} in {_kind_of(values)}")
         elif isinstance(step, int):
-            if not isinstance(values, list | np.ndarray) or step >= len(values):
+            if not isinstance(values, list | np.ndarray) or not 0 <= step < len(values):
                 raise FieldError(f"there is no element {step}")
             values = values[step]
         else:
@@ -116,9 +116,20 @@ def _nanoseconds(value: Any) -> int | None:
     if isinstance(value, Mapping):
         seconds = next((value[key] for key in _SECONDS if key in value), None)
         rest = next((value[key] for key in _NANOSECONDS if key in value), 0)
-        if isinstance(seconds, int | float) and isinstance(rest, int | float) and math.isfinite(seconds + rest):
-            return int(seconds) * 1_000_000_000 + int(rest)
+        if not isinstance(seconds, int | float) or not isinstance(rest, int | float):
+            return None
+        if abs(seconds) < MAX_TIME_NS and abs(rest) < MAX_TIME_NS:  # no NaN either
+            time_ns = int(seconds) * 1_000_000_000 + int(rest)
+            return time_ns if abs(time_ns) < MAX_TIME_NS else None
     return None
+
+
+def whole(values: Mapping[str, Any], name: str) -> int:
+    """A whole number of a message, which JSON may have as anything; FieldError when it is none, or none of 32 bits."""
+    value = values[name]
+    if isinstance(value, int | float | np.integer | np.floating) and -(2**31) <= value < 2**32:
+        return int(value)
+    raise FieldError(f"its {name} is no number of 32 bits")
 
 
 def frame_id_of(values: Values) -> str:
@@ -134,7 +145,7 @@ def picture_bytes(values: Mapping[str, Any]) -> bytes:
     if isinstance(data, str):
         try:
             return base64.b64decode(data, validate=True)
-        except binascii.Error as error:
+        except ValueError as error:  # binascii's, and of texts that are not ASCII
             raise FieldError("its picture is no base64") from error
     if isinstance(data, np.ndarray):
         return data.tobytes()

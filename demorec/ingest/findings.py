@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.ingest.clock import NS, SKEW_S, Int, Numbers, Timeline
+from demorec.ingest.fields import frame_id_of
 from demorec.ingest.mapping import BagMapping
 from demorec.ingest.mapping_file import ACTION, STATE
 from demorec.ingest.rows import Timelines
@@ -332,7 +333,7 @@ def _offset_findings(lines: Sequence[Timeline]) -> Iterator[Finding]:
 def _camera_findings(streams: BagStreams) -> Iterator[Finding]:
     """Cameras whose messages are those of another one, by coordinate frame or picture."""
     for name, stream in streams.cameras.items():
-        frame = str(streams.infos.get(name, {}).get("header", {}).get("frame_id", ""))
+        frame = frame_id_of(streams.infos.get(name, {}))
         if frame and stream.frame_ids and stream.frame_ids[0] and frame != stream.frame_ids[0]:
             text = f"its pictures are of {stream.frame_ids[0]!r}, its calibration is of {frame!r}"
             yield of_stream(stream, "swapped", text)

@@ -6,10 +6,10 @@ Several processes may read and write; bags are numbered and taken into the run i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from importlib.metadata import version
 from pathlib import Path
 
@@ -35,6 +35,7 @@ from demorec.ingest.rows import EpisodeRows, NoRowsError, Timelines
 from demorec.ingest.streams import BagDecoder, read_streams
 from demorec.recording.collected.frame_check import MAX_STAMP_NS, MAX_SUBTASK
 from demorec.recording.collected.validity import what_is_wrong
+from demorec.recording.limits import LimitError, Limits
 from demorec.recording.video import size_problem
 from demorec.runs.collected import (
     CollectedEpisode,
@@ -156,6 +157,7 @@ class _Import:
             episodes.append(episode)
             reports.append(_report(window, begin, episode))
         self._check_alike(episodes)
+        self._check_pictures(episodes)
         report = BagReport(
             name=self.bag.path.name,
             files=tuple(self.files.items()),
@@ -184,7 +186,7 @@ class _Import:
             features=tuple(described_feature(name, feature, lines, joints) for name, feature in rows.features.items()),
             cameras=tuple(described_camera(name, plan, lines) for name, plan in plans.items()),
             origin=Origin(kind="import", files=files, mapping_digest=self.mapping.digest),
-            versions={"demorec": version("demorec"), "av": version("av")},
+            versions=dict(_versions()),
         )
         subtasks = subtask_rows(self.bag, lines.streams, rows.window, rows.times_ns, self.mapping)
         episode = PlannedEpisode(info=info, rows=rows, plans=plans, subtasks=subtasks)
@@ -209,6 +211,15 @@ class _Import:
             if len(stamps) and not 0 <= stamps.min() <= stamps.max() <= MAX_STAMP_NS:
                 yield f"a message is of the time {stamps.min() / NS:.0f} s, allowed are 0 to {MAX_STAMP_NS // NS} s"
                 return
+
+    def _check_pictures(self, episodes: Sequence[PlannedEpisode]) -> None:
+        """BagError when the pictures unpack to more than a bag of its size holds: a PNG file of zeros is small."""
+        limits = Limits.of_file(self.bag.num_bytes)
+        plans = [plan for episode in episodes for plan in episode.plans.values()]
+        try:
+            limits.check_total(sum(len(plan.numbers) * plan.num_bytes for plan in plans))
+        except LimitError as error:
+            raise BagError(f"The pictures of the bag cannot be used, since {error}: {self.bag.path}") from error
 
     def _check_alike(self, episodes: Sequence[PlannedEpisode]) -> None:
         """ConfigError unless the episodes are of one kind."""
@@ -257,7 +268,7 @@ class _Import:
             for plan in episode.plans.values():
                 taken.setdefault(plan.topic, []).append(plan.numbers)
         wanted = {topic: np.bincount(np.concatenate(numbers)) > 0 for topic, numbers in taken.items()}
-        decoder, counts = BagDecoder(), dict.fromkeys(wanted, 0)
+        decoder, counts = BagDecoder(self.bag.num_bytes), dict.fromkeys(wanted, 0)
         for message in self.bag.messages([], wanted.keys()):
             topic = message.channel.topic
             number, counts[topic] = counts[topic], counts[topic] + 1
@@ -270,6 +281,11 @@ class _Import:
 
     def _unusable(self, topic: str, error: ValueError) -> BagError:
         return BagError(f"A picture of {topic} cannot be used, since {error}: {self.bag.path}")
+
+
+@cache
+def _versions() -> Mapping[str, str]:
+    return {name: version(name) for name in ("demorec", "av")}
 
 
 def _first_pictures(episodes: Iterable[PlannedEpisode]) -> dict[tuple[str, int], list[PlannedEpisode]]:

@@ -16,6 +16,7 @@ from typing import Literal
 from demorec.ingest.mapping_file import (
     ACTION,
     MAX_FPS,
+    MAX_SECONDS,
     AnyMapping,
     Part,
     camera_name_problems,
@@ -250,13 +251,17 @@ class BagMapping(AnyMapping):
             yield 'episodes.cut = "times" needs episodes.times_s'
         if any(not begin < end for begin, end in episodes.times_s):
             yield "episodes.times_s has an episode that ends before it begins"
-        if episodes.gap_s <= 0:
-            yield f"episodes.gap_s is {episodes.gap_s:g}, it must be above 0"
+        if not 0 < episodes.gap_s <= MAX_SECONDS:
+            yield f"episodes.gap_s is {episodes.gap_s:g}, it must be above 0 and at most {MAX_SECONDS:g}"
+        if not 0 <= clock.max_trim_s <= MAX_SECONDS:
+            yield f"clock.max_trim_s is {clock.max_trim_s:g}, it must be 0 to {MAX_SECONDS:g}"
+        if any(not -MAX_SECONDS <= time <= MAX_SECONDS for times in episodes.times_s for time in times):
+            yield f"episodes.times_s has a time beyond {MAX_SECONDS:g} s"
 
 
 def _age_problems(place: str, age: float | None) -> Iterator[str]:
-    if age is not None and not age > 0:
-        yield f"{place}.max_age_s is {age:g}, it must be above 0"
+    if age is not None and not 0 < age <= MAX_SECONDS:
+        yield f"{place}.max_age_s is {age:g}, it must be above 0 and at most {MAX_SECONDS:g}"
 
 
 def _source_problems(name: str, source: Source) -> Iterator[str]:

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 import tomllib
 import typing
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import islice
 from pathlib import Path
 from typing import Any, Literal
 
-from demorec.errors import ConfigError
+from demorec.errors import ConfigError, in_words
 from demorec.plain import digest, from_plain
+from demorec.recording.collected.validity import MAX_CAMERAS, MAX_FEATURES
 from demorec.registry import nearest_match
 from demorec.safety.files import read_text_limited
 
@@ -23,7 +27,15 @@ ACTION = "action"
 MAX_FPS = 1000
 MAX_ELEMENTS = 4096
 """Of a part: more is a picture or a point cloud, not a vector."""
+MAX_SECONDS = 1e9
+"""Of any time in a mapping: beyond it nanoseconds are no numbers of 64 bits."""
 _MAX_FILE_BYTES = 1 << 20
+_MAX_TABLES, _MAX_VALUES = 1000, 50_000
+_MAX_TEXT = 10_000
+_MAX_TOLD = 8
+_PART = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
+_DEEP_KEY = re.compile(rf"(?<![\w-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{16}}")
+"""What no mapping has: each part of a key makes a table, and takes as long as all before it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,7 +64,7 @@ class Part:
 class AnyMapping(ABC):
     """A mapping, of whatever kind of file."""
 
-    @property
+    @cached_property
     def digest(self) -> str:
         """16 hex digits of all it says."""
         return digest(self)
@@ -64,6 +76,9 @@ class AnyMapping(ABC):
 
 def feature_problems(features: Mapping[str, Sequence[Part]]) -> Iterator[str]:
     """What is impossible in features, whatever their parts are taken from."""
+    if len(features) > MAX_FEATURES:
+        yield f"it has {len(features)} features, at most {MAX_FEATURES} are recorded"
+        return
     if STATE not in features:
         yield f'there is no feature {STATE!r}: write [[features."{STATE}"]] and what it is taken from'
     for name, parts in features.items():
@@ -101,6 +116,8 @@ def _part_problems(place: str, name: str, part: Part, features: Mapping[str, Seq
 
 def camera_name_problems(cameras: Mapping[str, object]) -> Iterator[str]:
     """Names that no camera can have."""
+    if len(cameras) > MAX_CAMERAS:
+        yield f"it has {len(cameras)} cameras, at most {MAX_CAMERAS} are recorded"
     for name in cameras:
         if not name.isidentifier():
             yield f"a camera cannot be called {name!r}: letters, digits and underscores are allowed"
@@ -128,23 +145,53 @@ def recorded_unit(unit: str) -> str:
     return "deg" if unit == "degree" else unit
 
 
+def listed(problems: Iterable[str]) -> str:
+    """The first problems as one sentence's part, and how many more there are."""
+    told = list(problems)
+    more = [f"and {len(told) - _MAX_TOLD} more"] if len(told) > _MAX_TOLD else []
+    return "; ".join(told[:_MAX_TOLD] + more)
+
+
 def read_mapping_file[M: AnyMapping](path: Path, kind: type[M]) -> M:
-    """A mapping from its TOML file; ConfigError tells all that is wrong with it at once."""
+    """A mapping from its TOML file; ConfigError tells what is wrong with it at once."""
     try:
-        data = tomllib.loads(read_text_limited(path, _MAX_FILE_BYTES))
+        text = read_text_limited(path, _MAX_FILE_BYTES)
+        if _DEEP_KEY.search(text):
+            raise ValueError("a key has more than 16 parts")
+        data = tomllib.loads(text)
     except OSError as error:
         raise ConfigError(f"The mapping cannot be read ({error.strerror}): {path}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise ConfigError(f"The mapping is no valid TOML ({error}): {path}") from error
-    if unknown := list(_unknown_keys(data, kind, "")):
-        raise ConfigError(f"The mapping cannot be used: {'; '.join(unknown)}: {path}")
+    except (ValueError, RecursionError) as error:
+        raise ConfigError(f"The mapping is no valid TOML ({in_words(error)}): {path}") from error
+    problems = [problem] if (problem := _excess(data)) else list(islice(_unknown_keys(data, kind, ""), _MAX_TOLD))
+    if problems:
+        raise ConfigError(f"The mapping cannot be used: {'; '.join(problems)}: {path}")
     try:
         mapping = from_plain(data, kind)
     except ValueError as error:
         raise ConfigError(f"The mapping cannot be used: {error}: {path}") from error
     if problems := list(mapping.problems()):
-        raise ConfigError(f"The mapping cannot be used: {'; '.join(problems)}: {path}")
+        raise ConfigError(f"The mapping cannot be used: {listed(problems)}: {path}")
     return mapping
+
+
+def _excess(data: Any) -> str:
+    """What a mapping has too much of; "" for nothing."""
+    values, tables, waiting = 0, 0, [data]
+    while waiting:
+        value = waiting.pop()
+        values += 1
+        if isinstance(value, dict):
+            tables += 1
+            waiting += [*value, *value.values()]
+        elif isinstance(value, list):
+            waiting += value
+        elif isinstance(value, str) and len(value) > _MAX_TEXT:
+            return f"a text has {len(value):,} characters, at most {_MAX_TEXT:,} are read"
+    for count, most, what in ((tables, _MAX_TABLES, "tables"), (values, _MAX_VALUES, "values")):
+        if count > most:
+            return f"it has {count:,} {what}, at most {most:,} are read"
+    return ""
 
 
 def _unknown_keys(value: Any, kind: Any, place: str) -> Iterator[str]:

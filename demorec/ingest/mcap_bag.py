@@ -12,22 +12,22 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from demorec.errors import in_words, resource_error
-from demorec.ingest.channel import MAX_SCHEMA_BYTES, BagChannel, BagError, BagMessage
+from demorec.ingest.channel import MAX_CHANNELS, MAX_SCHEMA_BYTES, BagChannel, BagError, BagMessage
 from demorec.recording.chunks import MAX_RECORD_BYTES, RECORD_HEAD, chunk_content
-from demorec.recording.limits import LimitError, Limits
+from demorec.recording.limits import LimitError, Unpacked
 from demorec.safety.files import MCAP_MAGIC, open_regular
 
 _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _DATA_END, _FOOTER = 3, 4, 5, 6, 15, 2
 _MESSAGE_HEAD = struct.Struct("<HIQQ")
-_MAX_CHANNELS = 65_536
 
 
-def read_mcap(path: Path, tell: Callable[[str], None]) -> Iterator[BagMessage]:
+def read_mcap(path: Path, tell: Callable[[str], None], unpacked: Unpacked) -> Iterator[BagMessage]:
     """The messages of an MCAP file in the order of the file.
 
     Args:
         path: Of a file that begins with `MCAP_MAGIC`.
         tell: Called with the reason, for the inside of a sentence, when the file ends or is damaged before its end.
+        unpacked: What has been unpacked of the bag.
 
     Raises:
         BagError: It cannot be read at all.
@@ -39,7 +39,7 @@ def read_mcap(path: Path, tell: Callable[[str], None]) -> Iterator[BagMessage]:
     with file:
         size = os.fstat(file.fileno()).st_size
         file.seek(len(MCAP_MAGIC))
-        records = _Records(Limits.of_file(size))
+        records = _Records(unpacked)
         while True:
             head = file.read(RECORD_HEAD.size)
             if len(head) < RECORD_HEAD.size:
@@ -72,9 +72,8 @@ def read_mcap(path: Path, tell: Callable[[str], None]) -> Iterator[BagMessage]:
 class _Records:
     """What has been learnt from the records so far."""
 
-    def __init__(self, limits: Limits) -> None:
-        self._limits = limits
-        self._num_bytes = self._num_records = 0
+    def __init__(self, unpacked: Unpacked) -> None:
+        self._unpacked = unpacked
         self._schemas: dict[int, tuple[str, str, bytes]] = {0: ("", "", b"")}
         self._channels: dict[int, BagChannel] = {}
 
@@ -91,23 +90,22 @@ class _Records:
             self._read_channel(content)
 
     def _read_chunk(self, content: bytes) -> Iterator[BagMessage]:
-        unpacked = chunk_content(content, self._limits)
-        self._num_bytes += len(unpacked)
-        self._limits.check_total(self._num_bytes)
-        position, end = 0, len(unpacked)
+        unpacked = chunk_content(content, self._unpacked.limits)
+        self._unpacked.add(len(unpacked))
+        position, count, end = 0, 0, len(unpacked)
         while position < end:
             opcode, length = RECORD_HEAD.unpack_from(unpacked, position)
             start = position + RECORD_HEAD.size
             position = start + length
             if position > end:
                 raise ValueError("a record that reaches beyond its chunk")
-            self._num_records += 1
+            count += 1
             if opcode == _MESSAGE:
                 channel_id, _, log_ns, _ = _MESSAGE_HEAD.unpack_from(unpacked, start)
                 yield BagMessage(self._channels[channel_id], log_ns, unpacked[start + _MESSAGE_HEAD.size : position])
             elif opcode in (_SCHEMA, _CHANNEL):
                 yield from self.read(opcode, unpacked[start:position])
-        self._limits.check_records(self._num_records)
+        self._unpacked.add(0, count)
 
     def _read_schema(self, content: bytes) -> None:
         (number,) = struct.unpack_from("<H", content)
@@ -123,7 +121,7 @@ class _Records:
         topic, position = _string(content, 4)
         encoding, _ = _string(content, position)
         name, schema_encoding, definition = self._schemas[schema]
-        if len(self._channels) >= _MAX_CHANNELS:
+        if number not in self._channels and len(self._channels) >= MAX_CHANNELS:
             raise ValueError("too many channels")
         self._channels[number] = BagChannel(
             topic=topic, type=name, encoding=encoding, schema_encoding=schema_encoding, schema=definition

@@ -15,7 +15,7 @@ from PIL import Image
 from demorec.config import MAX_PIXELS
 from demorec.errors import in_words
 from demorec.ingest.compressed_depth import compressed_depth_head, decode_compressed_depth
-from demorec.ingest.fields import FieldError, picture_bytes
+from demorec.ingest.fields import FieldError, picture_bytes, whole
 from demorec.ingest.raw_pictures import RAW_ENCODINGS, check_raw, raw_picture
 from demorec.ingest.ros_types import Values
 from demorec.recording.video import is_keyframe
@@ -25,6 +25,8 @@ KEPT_FORMATS = ("jpeg", *VIDEO_FORMATS)
 """What stays as it is, byte for byte."""
 _JPEG, _PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
 _DECODERS = {"h264": "h264", "h265": "hevc", "av1": "libdav1d"}
+_MAX_UNITS = 256
+"""Of a coded picture before its first slice, that are looked at."""
 _SEQUENCE_BYTES = 24
 """Of an AV1 keyframe, within which its sequence header ends."""
 _ALIASES = {"hevc": "h265", "avc": "h264", "jpg": "jpeg"}
@@ -86,7 +88,8 @@ def picture_head(values: Values) -> PictureHead:
     if "data" not in values:
         raise FieldError("it holds no picture")
     if "encoding" in values and "width" in values and "height" in values:
-        head = _checked(PictureHead("raw", str(values["encoding"]), int(values["width"]), int(values["height"]), True))
+        size = whole(values, "width"), whole(values, "height")
+        head = _checked(PictureHead("raw", str(values["encoding"]), *size, True))
         check_raw(values)
         return head
     if "format" not in values:
@@ -104,7 +107,7 @@ def picture_head(values: Values) -> PictureHead:
         raise FieldError(f"its format {name[:40]!r} is not read; jpeg, png, {', '.join(VIDEO_FORMATS)} are")
     if not _starts_by_itself(codec, data):
         return PictureHead(codec, "", 0, 0, False)
-    return _checked(PictureHead(codec, "", *_video_size(codec, data), True))
+    return _checked(PictureHead(codec, "", *_sizes.of(codec, data), True))
 
 
 def _checked(head: PictureHead) -> PictureHead:
@@ -160,42 +163,71 @@ def _starts_by_itself(codec: str, data: bytes) -> bool:
 
 def _nal_units(codec: str, data: bytes) -> Iterator[tuple[int, int]]:
     """Type and place of those of an access unit, up to its first slice."""
-    position = data.find(b"\x00\x00\x01")
+    position, count = data.find(b"\x00\x00\x01"), 0
     while 0 <= position < len(data) - 3:
         head = data[position + 3]
         kind = head & 31 if codec == "h264" else (head >> 1) & 63
         yield kind, position
-        if kind in (1, 5) if codec == "h264" else kind < 32:
+        count += 1
+        if (kind in (1, 5) if codec == "h264" else kind < 32) or count == _MAX_UNITS:
             return
         position = data.find(b"\x00\x00\x01", position + 3)
 
 
-_sizes: dict[tuple[str, bytes], tuple[int, int]] = {}
-"""(codec, what is in front of a keyframe's picture) -> its size: the parameter sets say it, in bits."""
+class _VideoSizes:
+    """Sizes of keyframes: their parameter sets say them, in bits, and one picture of each kind is decoded for it."""
+
+    def __init__(self) -> None:
+        self._known: dict[tuple[str, bytes], tuple[int, int]] = {}
+        self._num_seen = self._num_decoded = 0
+
+    def of(self, codec: str, data: bytes) -> tuple[int, int]:
+        """Width and height of a keyframe; FieldError when it gives no picture."""
+        self._num_seen += 1
+        key = (codec, data[:_SEQUENCE_BYTES] if codec == "av1" else _parameter_sets(codec, data))
+        size = self._known.get(key)
+        if size is None:
+            if self._num_decoded > _FREE_SETS + self._num_seen // _FRAMES_OF_A_SET:
+                raise FieldError(f"its {codec} video has other parameters at every keyframe")
+            self._num_decoded += 1
+            frame = next(_frames(codec, [data]), None)
+            if frame is None:
+                raise FieldError(f"its {codec} keyframe gives no picture")
+            if len(self._known) > 1000:
+                self._known.clear()
+            size = self._known[key] = (frame.width, frame.height)
+        return size
 
 
-def _video_size(codec: str, data: bytes) -> tuple[int, int]:
-    end = _SEQUENCE_BYTES if codec == "av1" else [place for _, place in _nal_units(codec, data)][-1]
-    key = (codec, data[:end])
-    size = _sizes.get(key)
-    if size is None:
-        (picture,) = decode_video(codec, [data])
-        if len(_sizes) > 1000:
-            _sizes.clear()
-        size = _sizes[key] = (picture.shape[1], picture.shape[0])
-    return size
+_FREE_SETS, _FRAMES_OF_A_SET = 40, 20
+"""Decoding a picture takes up to a tenth of a second: cameras have one set of parameters, or a few."""
+_sizes = _VideoSizes()
+
+
+def _parameter_sets(codec: str, data: bytes) -> bytes:
+    """Those in front of a keyframe's picture, without what may differ from picture to picture beside them."""
+    units = list(_nal_units(codec, data))
+    kinds = (7, 8) if codec == "h264" else (32, 33, 34)
+    places = [place for _, place in units[1:]] + [units[-1][1]]
+    return b"".join(data[at:end] for (kind, at), end in zip(units, places, strict=True) if kind in kinds)
 
 
 def decode_video(codec: str, packets: Iterable[bytes]) -> Iterator[NDArray[np.uint8]]:
     """The pictures of packets, from a keyframe on; FieldError when they cannot be decoded."""
+    for frame in _frames(codec, packets):
+        try:
+            yield cast(NDArray[np.uint8], frame.to_ndarray(format="rgb24"))
+        except (av.FFmpegError, ValueError) as error:
+            raise FieldError(f"its {codec} video cannot be decoded") from error
+
+
+def _frames(codec: str, packets: Iterable[bytes]) -> Iterator[av.VideoFrame]:
     try:
         context = cast(av.VideoCodecContext, av.CodecContext.create(_DECODERS[codec], "r"))
         context.thread_count = 1
         context.options = {"max_pixels": str(MAX_PIXELS)}
         for data in packets:
-            for frame in context.decode(av.Packet(data)):
-                yield cast(NDArray[np.uint8], frame.to_ndarray(format="rgb24"))
-        for frame in context.decode(None):
-            yield cast(NDArray[np.uint8], frame.to_ndarray(format="rgb24"))
+            yield from context.decode(av.Packet(data))
+        yield from context.decode(None)
     except (av.FFmpegError, ValueError) as error:
         raise FieldError(f"its {codec} video cannot be decoded") from error

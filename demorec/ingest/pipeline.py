@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
 from typing import Any
 
-from demorec.errors import GenerationError
 from demorec.processes import SPAWN
 
 
@@ -27,22 +26,13 @@ class _Here(Executor):
 
 @contextmanager
 def processes(workers: int) -> Iterator[Executor]:
-    """So many processes, or this one alone. An interrupt ends them; what they were writing is left unfinished.
-
-    Raises:
-        GenerationError: One of them was killed, or crashed.
-    """
+    """So many processes, or this one alone. An interrupt ends them; what they were writing is left unfinished."""
     if workers == 1:
         yield _Here()
         return
     with ProcessPoolExecutor(workers, mp_context=SPAWN) as pool:
         try:
             yield pool
-        except BrokenExecutor as error:
-            raise GenerationError(
-                "A process of the import ended without a word (it was killed, or memory is short): give fewer "
-                "--workers, the same command goes on where this one ended."
-            ) from error
         except Exception:
             pool.shutdown(cancel_futures=True)
             raise

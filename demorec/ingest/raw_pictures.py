@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.ingest.fields import FieldError, picture_bytes
+from demorec.ingest.fields import FieldError, picture_bytes, whole
 from demorec.ingest.ros_types import Values
 
 Rgb = NDArray[np.uint8]
@@ -46,7 +46,7 @@ def raw_picture(values: Values) -> NDArray[Any]:
     Raises:
         FieldError: Its bytes are not those of its size and encoding.
     """
-    encoding, height = str(values["encoding"]), int(values["height"])
+    encoding, height = str(values["encoding"]), whole(values, "height")
     rows = _rows(values)
     if encoding in _DEPTH:
         kind = np.dtype(_DEPTH[encoding]).newbyteorder(">" if values.get("is_bigendian") else "<")
@@ -60,10 +60,11 @@ def raw_picture(values: Values) -> NDArray[Any]:
 
 def check_raw(values: Values) -> tuple[int, int]:
     """Bytes of a row, with and without what pads it; FieldError when a message's are not those of its size."""
-    encoding, width, height = str(values["encoding"]), int(values["width"]), int(values["height"])
+    encoding, width, height = str(values["encoding"]), whole(values, "width"), whole(values, "height")
     used = _bytes_of_row(encoding, width)
-    step = int(values.get("step") or used)
-    count = len(values["data"]) if not isinstance(values["data"], str) else len(picture_bytes(values))
+    step = whole(values, "step") if values.get("step") and height > 1 else used
+    data = values["data"]
+    count = len(data) if isinstance(data, bytes | np.ndarray) else len(picture_bytes(values))
     if step < used or count < step * (height - 1) + used:
         raise FieldError(f"its picture has {count:,} bytes, too few for {width}x{height} {encoding}")
     return step, used
@@ -78,7 +79,7 @@ def _bytes_of_row(encoding: str, width: int) -> int:
 def _rows(values: Values) -> NDArray[np.uint8]:
     """(H, B) bytes, without what pads each row."""
     step, used = check_raw(values)
-    height, data = int(values["height"]), np.frombuffer(picture_bytes(values), np.uint8)
+    height, data = whole(values, "height"), np.frombuffer(picture_bytes(values), np.uint8)
     if step == used:
         return data[: used * height].reshape(height, used)
     padded = np.zeros(step * height, np.uint8)

@@ -14,6 +14,7 @@ from demorec.ingest.clock import MISSING, NS, Chosen, Int, Timeline, choose, fol
 from demorec.ingest.episodes import Window
 from demorec.ingest.mapping import ROWS, BagMapping, CameraSource, Sampling, Source
 from demorec.ingest.streams import BagStreams, Stream
+from demorec.recording.limits import VARIABLE, Limits
 from demorec.scene.collected import DEPTH_UNITS
 
 RATE = 0.05
@@ -23,6 +24,13 @@ _SAME_COUNT = 2
 """Images that cameras of one rate differ by: one more or less at each end of an episode."""
 Key = tuple[str, int] | str
 """A stream: (feature, number of its source), or the name of a camera."""
+
+_ROW_BYTES_PER_BYTE = 32
+"""Bytes of rows for each of the bag: a long bag may be brought to a faster clock than any of its streams has."""
+_BYTES_OF_WRITING = 100
+"""That count for each row in addition to its own: writing one takes some 15 microseconds."""
+_ROWS_OF_EPISODE = 300
+"""That count for an episode in addition to its own: millions of empty ones would take hours."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -97,6 +105,12 @@ class Timelines:
             key: _from_keyframe(timeline(stream, by_header=(self._owner(key).stamp or mapping.clock.stamp) == "header"))
             for key, stream in pairs
         }
+        self._bytes_of_row = _BYTES_OF_WRITING + sum(map(_bytes_of_row, self.lines.values()))
+        self._free_bytes = self._most_bytes = (
+            Limits.of_file(streams.num_bytes).floor // 2 + _ROW_BYTES_PER_BYTE * streams.num_bytes
+        )
+        if empty := [key for key, line in self.lines.items() if not len(line.times_ns)]:
+            raise BagError(f"No message of {self._label(empty[0])} has a time at which it could be used")
 
     def _owner(self, key: Key) -> Source | CameraSource:
         return self.mapping.cameras[key] if isinstance(key, str) else self.mapping.features[key[0]][key[1]]
@@ -112,6 +126,7 @@ class Timelines:
 
     def rows(self, window: Window) -> EpisodeRows:
         """The rows of an episode; NoRowsError where a stream has nothing fit for them."""
+        self._reserve(_ROWS_OF_EPISODE)
         begin, end = self._extent(window)
         times, follows = self._times(window, begin, end)
         if len(times) < 2:
@@ -191,12 +206,17 @@ class Timelines:
             line = next((line for line in self.lines.values() if line.stream.topic == clock.rows), None)
             if line is None:
                 raise BagError(f"clock.rows is {clock.rows!r}, of which the mapping takes no feature or camera")
-            return line.times_ns[(line.times_ns >= begin) & (line.times_ns <= end)], line.stream.label
+            times = line.times_ns[(line.times_ns >= begin) & (line.times_ns <= end)]
+            self._reserve(len(times))
+            return times, line.stream.label
         if clock.rows == "camera" and (cameras := self._cameras_at_fps(begin, end)):
-            return self._followed(cameras, window, begin, end), f"camera {cameras[0]}"
+            times = self._followed(cameras, window, begin, end)
+            self._reserve(len(times))
+            return times, f"camera {cameras[0]}"
         # Of what comes more often than rows some is in none of them, wherever these are. (The median period of a stream
         # that jitters is off by a few hundredths.)
         slow = [line for line in self.lines.values() if line.is_regular and line.period_ns * clock.fps > 0.9 * NS]
+        self._reserve(max(0, (end - begin) * clock.fps // NS + 1))
         return grid(begin, end, clock.fps, [line.times_ns for line in slow]), ""
 
     def _cameras_at_fps(self, begin: int, end: int) -> list[str]:
@@ -229,6 +249,15 @@ class Timelines:
         are_latest = all(self.rule(name)[0] == "latest" for name in cameras)
         others = [self.lines[name].times_ns for name in cameras[1:]] if are_latest else []
         return followed(lead, others, period_ns=line.period_ns, end_ns=end)
+
+    def _reserve(self, count: int) -> None:
+        """Raise BagError for more rows, in all episodes, than a bag of this size gives; before memory is taken."""
+        self._free_bytes -= count * self._bytes_of_row
+        if self._free_bytes < 0:
+            raise BagError(
+                f"The mapping makes more rows and episodes of the bag, {self._most_bytes / 1e6:,.0f} MB of them, than "
+                f"one of its size is read for: lower clock.fps, import a part (episodes.times_s), or raise {VARIABLE}"
+            )
 
     def _label(self, key: Key) -> str:
         stream = self.lines[key].stream
@@ -302,6 +331,11 @@ def _from_keyframe(line: Timeline) -> Timeline:
     keyframes = np.flatnonzero(line.stream.heads.are_keyframes[line.order])
     first = int(keyframes[0]) if len(keyframes) else len(line.order)
     return replace(line, times_ns=line.times_ns[first:], order=line.order[first:]) if first else line
+
+
+def _bytes_of_row(line: Timeline) -> int:
+    """What a row takes of a stream while an episode is made: its numbers, which message, and how old that is."""
+    return 32 + (0 if line.stream.layout is None else 8 * len(line.stream.layout.names))
 
 
 def _first_rows(feature: FeatureRows, count: int) -> FeatureRows:

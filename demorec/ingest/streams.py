@@ -33,16 +33,27 @@ from demorec.ingest.fields import (
     stamp_of,
 )
 from demorec.ingest.mapping import BagMapping, Source
+from demorec.ingest.mapping_file import listed
 from demorec.ingest.picture_messages import PictureHeads, picture_head
-from demorec.ingest.ros_types import Values
+from demorec.ingest.ros_types import Budgets, Values
 from demorec.ingest.service_calls import CallReader, ServiceCall
 from demorec.ingest.words import quoted
+from demorec.recording.limits import SpentError
 from demorec.registry import nearest_match
 
 NO_STAMP = -(2**63)
+_BYTES_OF_MESSAGE = 40
+"""That a stream keeps of each, beside its numbers."""
+_BYTES_OF_VALUE = 200
+_VALUES_OF_ADDING = 15
+"""As long as reading so many takes to give a message to a stream, of which a topic may have many."""
+_MAX_NUMBERS = 16_384
+"""Of all features together, in a row."""
 _MAX_TEXT = 10_000
 _MAX_URDF = 4 << 20
 _SHOWN_JOINTS = 40
+_INFO_FIELDS = ("width", "height", "k", "K", "d", "D")
+"""Of a camera's calibration that are asked for."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -110,6 +121,7 @@ class BagStreams:
         texts: Topic -> its texts.
         calls: Topic of a service's events -> its calls.
         problems: Why parts of the bag could not be read.
+        num_bytes: Of the bag's files.
     """
 
     sources: dict[tuple[str, int], Stream]
@@ -118,6 +130,7 @@ class BagStreams:
     texts: dict[str, list[Text]]
     calls: dict[str, list[ServiceCall]]
     problems: list[str]
+    num_bytes: int
 
 
 @dataclass(kw_only=True, eq=False)
@@ -126,6 +139,7 @@ class _Growing:
 
     label: str
     topic: str
+    budgets: Budgets
     source: Source | None = None
     type: str = ""
     layout: SourceLayout | None = None
@@ -147,6 +161,8 @@ class _Growing:
         """Take one message."""
         self.type = self.type or message.channel.type
         try:
+            self.budgets.values.take(_VALUES_OF_ADDING)
+            self.budgets.numbers.take(_BYTES_OF_MESSAGE)
             if self.source is not None:
                 if self.reader is None:
                     self.layout = layout_of(self.source, values)
@@ -159,8 +175,8 @@ class _Growing:
         except OtherPublisherError as error:
             self.first_refusal = self.first_refusal or str(error)
             return
-        except ValueError as error:
-            self.malformed(str(error))
+        except (ValueError, RecursionError, OverflowError, TypeError) as error:
+            self.malformed(in_words(error))
             return
         stamp = stamp_of(values)
         self.log_ns.append(message.log_ns)
@@ -181,6 +197,7 @@ class _Growing:
         elif self.dtype != vector.dtype:  # float64 holds both
             self.vectors = bytearray(np.frombuffer(self.vectors, self.dtype).astype(np.float64).data)
             self.dtype = np.dtype(np.float64)
+        self.budgets.numbers.take(self.dtype.itemsize * len(vector))
         self.vectors += vector.astype(self.dtype, copy=False).data
 
     def finished(self) -> Stream:
@@ -208,10 +225,18 @@ class _Growing:
 
 
 class BagDecoder:
-    """Decoders of a bag's channels, made when they are first needed."""
+    """Decoders of a bag's channels, made when they are first needed.
 
-    def __init__(self) -> None:
-        self._decoders: dict[BagChannel, Decoder] = {}
+    Args:
+        num_bytes: Of the bag's files, by which grows what may be read of it.
+
+    Attributes:
+        budgets: What may still be made of it.
+    """
+
+    def __init__(self, num_bytes: int = 0) -> None:
+        self.budgets = Budgets(num_bytes)
+        self._decoders: dict[BagChannel, Decoder | UnknownEncodingError] = {}
 
     def values(self, message: BagMessage) -> Values:
         """Of a message.
@@ -222,8 +247,23 @@ class BagDecoder:
         """
         decoder = self._decoders.get(message.channel)
         if decoder is None:
-            decoder = self._decoders[message.channel] = decoder_of(message.channel)
+            try:
+                decoder = decoder_of(message.channel, self.budgets)
+            except UnknownEncodingError as error:
+                decoder = error
+            self._decoders[message.channel] = decoder
+        if isinstance(decoder, UnknownEncodingError):
+            raise UnknownEncodingError(str(decoder))
         return decoder(message.data)
+
+    def may_keep(self, message: BagMessage) -> bool:
+        """Whether the values that a message has just given are few enough to be kept beside those kept before."""
+        used = self.budgets.values.used - self.budgets.values.begun
+        try:
+            self.budgets.numbers.take(len(message.data) + _BYTES_OF_VALUE * used)
+        except SpentError:
+            return False
+        return True
 
 
 def _label(feature: str, source: Source, sources: Sequence[Source]) -> str:
@@ -252,26 +292,33 @@ def read_streams(bag: Bag, mapping: BagMapping) -> BagStreams:
     Raises:
         BagError: The mapping does not fit the bag; one message tells all problems.
     """
-    reading = _Reading(mapping)
+    reading = _Reading(mapping, bag.num_bytes)
     problems: list[str] = []
-    for message in bag.messages(problems):
-        reading.add(message)
-    reading.check(bag)
+    try:
+        for message in bag.messages(problems):
+            reading.add(message)
+    except SpentError as error:
+        raise BagError(f"{error}: {bag.path}") from error
+    reading.check(bag, problems)
     return reading.finished(problems)
 
 
 class _Reading:
-    def __init__(self, mapping: BagMapping) -> None:
-        self._mapping = mapping
-        self._decoder = BagDecoder()
+    def __init__(self, mapping: BagMapping, num_bytes: int) -> None:
+        self._mapping, self._num_bytes = mapping, num_bytes
+        self._decoder = BagDecoder(num_bytes)
+        budgets = self._decoder.budgets
         self._sources = {
-            (name, index): _Growing(label=_label(name, source, sources), topic=source.topic, source=source)
+            (name, index): _Growing(
+                label=_label(name, source, sources), topic=source.topic, budgets=budgets, source=source
+            )
             for name, sources in mapping.features.items()
             for index, source in enumerate(sources)
             if source.topic
         }
         self._cameras = {
-            name: _Growing(label=f"camera {name}", topic=camera.topic) for name, camera in mapping.cameras.items()
+            name: _Growing(label=f"camera {name}", topic=camera.topic, budgets=budgets)
+            for name, camera in mapping.cameras.items()
         }
         self._streams: dict[str, list[_Growing]] = {}
         for stream in (*self._sources.values(), *self._cameras.values()):
@@ -315,6 +362,9 @@ class _Reading:
         checksum = zlib.crc32(message.data)
         for stream in streams:
             stream.add(number, message, values, checksum)
+        if (topic in self._texts or topic in self._calls) and not self._decoder.may_keep(message):
+            self._refused[topic] = "it holds too much to be kept in memory"
+            return
         if topic in self._texts:
             self._add_text(topic, message, values)
         if topic in self._calls:
@@ -323,13 +373,19 @@ class _Reading:
             except FieldError as error:
                 self._refused[topic] = str(error)
         if topic in self._info_topics:
-            self._infos.setdefault(self._info_topics[topic], values)
+            kept = {key: values[key] for key in _INFO_FIELDS if key in values} | {"frame_id": frame_id_of(values)}
+            self._infos.setdefault(self._info_topics[topic], kept)
 
     def _add_text(self, topic: str, message: BagMessage, values: Values) -> None:
         try:
             value = follow(values, parse_path(self._fields[topic]))
         except ValueError as error:
             self._refused[topic] = str(error)
+            return
+        if isinstance(value, np.generic):
+            value = value.item()
+        if not isinstance(value, str | bool | int | float):
+            self._refused[topic] = f"the field {self._fields[topic]!r} is no text, number or boolean"
             return
         limit = _MAX_URDF if topic == self._mapping.robot.urdf_topic else _MAX_TEXT
         if isinstance(value, str) and len(value) > limit:
@@ -339,11 +395,11 @@ class _Reading:
         time_ns = message.log_ns if stamp is None else stamp
         self._texts[topic].append(Text(time_ns=time_ns, value=value, is_header=stamp is not None))
 
-    def check(self, bag: Bag) -> None:
-        """Raise BagError for all that the mapping names and the bag lacks."""
+    def check(self, bag: Bag, unread: Sequence[str]) -> None:
+        """Raise BagError for all that the mapping names and the bag lacks; `unread` says what of it could not be read."""
         problems = []
         if not self._counts:
-            raise BagError(f"The bag holds no messages: {bag.path}")
+            raise BagError(f"The bag holds no messages{f' ({unread[0]})' if unread else ''}: {bag.path}")
         for topic in sorted(self._wanted):
             if topic not in self._counts:
                 problems.append(f"there is no message of {topic!r}.{nearest_match(topic, self._counts)}".rstrip("."))
@@ -357,13 +413,16 @@ class _Reading:
                 problems.append(f"{stream.label} cannot be taken from {stream.topic} ({stream.type}): {reason}")
             if stream.reader is not None and (others := list(stream.reader.others)):
                 problems.append(_unnamed_joints(stream, others))
+        count = sum(len(stream.layout.names) for stream in self._sources.values() if stream.layout)
+        if count > _MAX_NUMBERS:
+            problems.append(f"its features have {count:,} numbers, at most {_MAX_NUMBERS:,} are read")
         problems += self._double_names()
         problems += self._lacking_stamps()
         for camera in self._cameras.values():
             if camera.heads and not camera.heads.are_keyframes.any():
                 problems.append(f"{camera.topic} has no keyframe with its parameter sets, so it cannot be decoded")
         if problems:
-            raise BagError(f"The mapping does not fit the bag: {'; '.join(problems)}: {bag.path}")
+            raise BagError(f"The mapping does not fit the bag: {listed(problems)}: {bag.path}")
 
     def _lacking_stamps(self) -> list[str]:
         features, cameras = self._mapping.features, self._mapping.cameras
@@ -399,4 +458,5 @@ class _Reading:
             texts=self._texts,
             calls={topic: reader.calls() for topic, reader in self._calls.items()},
             problems=problems,
+            num_bytes=self._num_bytes,
         )

@@ -29,6 +29,7 @@ from demorec.ingest.picture_messages import PictureHead, picture_head
 from demorec.ingest.ros_types import Values
 from demorec.ingest.streams import BagDecoder
 from demorec.ingest.words import SHOWN, first_numbers, quoted, task_in_name, unique_name
+from demorec.recording.limits import SpentError
 from demorec.scene.collected import DEPTH_UNITS
 
 _KEPT = 64
@@ -103,7 +104,7 @@ def suggested_mapping(path: Path, tell: Callable[[str], None]) -> list[str]:
     problems: list[str] = []
     topics = _topics(bag, problems)
     if not topics:
-        raise BagError(f"The bag holds no messages: {path}")
+        raise BagError(f"The bag holds no messages{f' ({problems[0]})' if problems else ''}: {path}")
     cameras = _cameras(topics)
     vectors = [
         replace(vector, has_stamp=topic.has_stamp)
@@ -132,7 +133,7 @@ def suggested_mapping(path: Path, tell: Callable[[str], None]) -> list[str]:
 
 def _topics(bag: Bag, problems: list[str]) -> dict[str, _Topic]:
     topics: dict[str, _Topic] = {}
-    decoder = BagDecoder()
+    decoder = BagDecoder(bag.num_bytes)
     for message in bag.messages(problems):
         topic = topics.setdefault(message.channel.topic, _Topic(type=message.channel.type, first_ns=message.log_ns))
         topic.count += 1
@@ -147,7 +148,7 @@ def _topics(bag: Bag, problems: list[str]) -> dict[str, _Topic]:
 def _look_into(topic: _Topic, message: BagMessage, decoder: BagDecoder) -> None:
     try:
         values = decoder.values(message)
-    except UnknownEncodingError as error:
+    except (UnknownEncodingError, SpentError) as error:
         topic.problem = str(error)
         return
     except (ValueError, RecursionError, OverflowError, TypeError):
@@ -158,7 +159,11 @@ def _look_into(topic: _Topic, message: BagMessage, decoder: BagDecoder) -> None:
         topic.skew_ns = topic.skew_ns or message.log_ns - stamp
         topic.stamps_ns.append(stamp)
     if len(topic.values) < 2 or (len(topic.values) < _KEPT and _head(values) is None):
-        topic.values.append(values)
+        if decoder.may_keep(message):
+            topic.values.append(values)
+        elif not topic.values:
+            topic.problem = "the bag holds too much to look into all of it"
+            return
         if not topic.vectors and _head(values) is None:
             topic.vectors = list(vectors_of(message.channel.topic, topic.type, values))
     names = next((names for vector in topic.vectors if (names := _names(vector, values))), ())

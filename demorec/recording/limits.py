@@ -14,7 +14,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 
-from demorec.errors import ConfigError
+from demorec.errors import ConfigError, RecordingError
 
 VARIABLE = "DEMOREC_UNPACKED_MB"
 _DEFAULT_MB = 64
@@ -26,7 +26,11 @@ _BYTES_PER_RECORD = 16
 
 
 class LimitError(ValueError):
-    """A file would unpack to more than is allowed; `str` is the reason and what to do."""
+    """A file would unpack to more than is allowed, or a message holds more; `str` is the reason and what to do."""
+
+
+class SpentError(RecordingError):
+    """A file holds more in all than is read of one of its size: what is left of it is never silently left out."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,6 +74,59 @@ class Limits:
             raise LimitError(
                 f"it holds more than {self.records:,} records, too many for a file of its size; {VARIABLE} raises this"
             )
+
+
+class Unpacked:
+    """What has been unpacked of a file, or of the files of one bag, and the limits that it stays within.
+
+    Args:
+        limits: Of all of it.
+    """
+
+    def __init__(self, limits: Limits) -> None:
+        self.limits = limits
+        self._num_bytes = self._num_records = 0
+
+    def add(self, num_bytes: int, num_records: int = 0) -> None:
+        """Count what comes; LimitError when all together is more than allowed."""
+        self._num_bytes += num_bytes
+        self._num_records += num_records
+        self.limits.check_total(self._num_bytes)
+        self.limits.check_records(self._num_records)
+
+
+class Budget:
+    """So much of something that is made of a file, taken bit by bit: what is built is counted, whatever it is told by.
+
+    Args:
+        total: The most that all calls of `take` may take together.
+        each: The most after each `begin`.
+        what: It is, in the plural ("values").
+
+    Attributes:
+        used: Of it until now.
+        begun: `used` at the last `begin`.
+    """
+
+    def __init__(self, total: int, each: int, what: str) -> None:
+        self._total, self._each, self._what = total, each, what
+        self.used = 0
+        self.begin()
+
+    def begin(self) -> None:
+        """Begin with the next message, or whatever `each` is of."""
+        self.begun = self.used
+        self._most = min(self._total, self.used + self._each)
+
+    def take(self, count: int = 1) -> None:
+        """Count so many; LimitError when they are too many for one, SpentError for all."""
+        if self.used + count > self._total:
+            raise SpentError(
+                f"The bag holds more than {self._total:,} {self._what}, too many for its size; {VARIABLE} raises this"
+            )
+        if self.used + count > self._most:
+            raise LimitError(f"it holds more than {self._each:,} {self._what}")
+        self.used += count
 
 
 def _check(size: int, allowed: int) -> None:

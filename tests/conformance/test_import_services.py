@@ -13,7 +13,7 @@ from support import bag_mappings, bags
 from support.commands import exit_code
 
 from demorec.ingest.fields import FieldError
-from demorec.ingest.ros_types import ros_decoder
+from demorec.ingest.ros_types import Budgets, ros_decoder
 from demorec.ingest.service_calls import CallReader
 from demorec.recording import CollectedRecording
 from demorec.runs.collected import load_collected_run
@@ -200,7 +200,7 @@ def test_other_messages_with_such_fields_are_no_events(changes: dict[str, object
 
 def test_events_without_their_definition_are_told() -> None:
     with pytest.raises(ValueError, match="it comes without the definition of the service std_srvs/srv/SetBool"):
-        ros_decoder(SET_BOOL, "ros2msg", b"", is_cdr=True)
+        ros_decoder(SET_BOOL, "ros2msg", b"", is_cdr=True, budgets=Budgets())
 
 
 @pytest.mark.parametrize("name", sorted(FAULTS))

@@ -69,7 +69,7 @@ def _rows(cameras: dict[str, list[int]], clock: Clock) -> tuple[Timelines, Episo
     streams = BagStreams(
         sources={(name, 0): _stream("joints", joints, is_camera=False) for name in ("observation.state", "action")},
         cameras={name: _stream(name, times, is_camera=True) for name, times in cameras.items()},
-        infos={}, texts={}, calls={}, problems=[],
+        infos={}, texts={}, calls={}, problems=[], num_bytes=1 << 30,
     )  # fmt: skip
     lines = Timelines(streams, mapping)
     return lines, lines.rows(Window(begin_ns=joints[0], end_ns=joints[-1]))

@@ -1,0 +1,450 @@
+"""Bags and mappings of less than a megabyte that claim, nest or compute without end: a sentence, in bounds.
+
+Expected is what the file itself says, by its format's definition; what it takes is measured in a process of its own.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import sqlite3
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zstandard
+from google.protobuf import descriptor_pb2
+from mcap.writer import Writer
+from PIL import Image
+from rosbags.rosbag2 import StoragePlugin
+from support import bag_mappings, bags
+from support.commands import exit_code
+from support.fuzz import LimitedCommands, problem_of
+from support.fuzz_bags import MAPPING
+
+_SEPARATOR = "=" * 80 + "\n"
+
+
+@pytest.fixture(scope="module")
+def commands() -> Iterator[LimitedCommands]:
+    with LimitedCommands(("demorec.ingest.suggest", "demorec.ingest.import_run")) as process:
+        yield process
+
+
+def _mcap(path: Path, kind: str, encoding: str, schema: bytes, of_message: str, messages: Sequence[bytes]) -> Path:
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        channel = writer.register_channel("/joints", of_message, writer.register_schema(kind, encoding, schema))
+        for number, data in enumerate(messages):
+            writer.add_message(channel, bags.EPOCH_NS + number * 10**7, data, 0)
+        writer.finish()
+    return path
+
+
+def _nested(line: str, depth: int, last: str) -> bytes:
+    """A definition of `depth` types, each with the lines `line`, which has the next one's number at %d."""
+    parts = [line.replace("%d", str(number + 1)) for number in range(depth)]
+    return _SEPARATOR.join(
+        [parts[0], *(f"MSG: a/T{k + 1}\n{part}" for k, part in enumerate([*parts[1:], last]))]
+    ).encode()
+
+
+def two_fields_a_type(folder: Path) -> Path:
+    """2^31 fields of 31 types."""
+    schema = _nested("a/T%d x\na/T%d y\n", 31, "uint8[0] x\n")
+    return _mcap(folder / "bag.mcap", "a/msg/T0", "ros2msg", schema, "cdr", [b"\x00\x01\x00\x00" + bytes(5000)] * 2)
+
+
+def two_empty_fields_a_type(folder: Path) -> Path:
+    """2^31 fields, of which ROS 1 writes no byte."""
+    return _mcap(folder / "bag.mcap", "a/T0", "ros1msg", _nested("a/T%d x\na/T%d y\n", 31, ""), "ros1", [bytes(9)] * 2)
+
+
+def a_thousand_of_a_thousand(folder: Path) -> Path:
+    """10^18 elements of no bytes."""
+    schema = _nested("a/T%d[1000] x\n", 6, "uint8[0] x\n")
+    return _mcap(folder / "bag.mcap", "a/T0", "ros1msg", schema, "ros1", [bytes(9000)] * 2)
+
+
+def a_definition_of_empty_lines(folder: Path) -> Path:
+    return _mcap(folder / "bag.mcap", "a/msg/T0", "ros2msg", b"\n" * 900_000, "cdr", [b"\x00\x01\x00\x00"])
+
+
+def a_definition_in_brackets(folder: Path) -> Path:
+    """The parser of IDL tries each bracket sixty times over."""
+    text = f"module a {{ module msg {{ const long X = {'(' * 9}1{')' * 9}; struct T0 {{ double x; }}; }}; }};"
+    return _mcap(folder / "bag.mcap", "a/msg/T0", "ros2idl", text.encode(), "cdr", [b"\x00\x01\x00\x00"])
+
+
+def a_definition_that_computes(folder: Path) -> Path:
+    text = "module a { module msg { const long X = 1 << 60000000000; struct T0 { double x; }; }; };"
+    return _mcap(folder / "bag.mcap", "a/msg/T0", "ros2idl", text.encode(), "cdr", [b"\x00\x01\x00\x00"])
+
+
+def _proto() -> bytes:
+    """A message with a list of messages of 3,000 fields."""
+    file = descriptor_pb2.FileDescriptorProto(name="a.proto", package="a", syntax="proto3")
+    file.message_type.add(name="Top").field.add(name="items", number=1, type=11, label=3, type_name=".a.Item")
+    item = file.message_type.add(name="Item")
+    for number in range(3000):
+        item.field.add(name=f"f{number}", number=number + 1, type=9, label=1)
+    schema: bytes = descriptor_pb2.FileDescriptorSet(file=[file]).SerializeToString()
+    return schema
+
+
+def empty_elements_of_many_fields(folder: Path) -> Path:
+    """20,000 elements of two bytes, each with 3,000 fields."""
+    return _mcap(folder / "bag.mcap", "a.Top", "protobuf", _proto(), "protobuf", [b"\x0a\x00" * 20_000] * 3)
+
+
+def lists_of_nothing(folder: Path) -> Path:
+    """JSON of 60 MB, which compresses to some kilobytes: 20 million lists."""
+    text = b'{"position": [' + b"[]," * 20_000_000 + b"[]]}"
+    return _mcap(folder / "bag.mcap", "x", "jsonschema", b"{}", "json", [text])
+
+
+def messages_that_claim_64_megabytes(folder: Path) -> Path:
+    """Each compressed by itself, as rosbag2 can: 40 images of zeros in 100 kB."""
+    packed = zstandard.ZstdCompressor(level=19).compress(bytes(64_000_000))
+    notes = bags.in_order(bags.so101(0.3))
+    folder = bags.write_rosbag2(notes, folder / "bag")
+    text = (folder / "metadata.yaml").read_text()
+    text = text.replace("compression_format: ''", "compression_format: zstd")
+    (folder / "metadata.yaml").write_text(text.replace("compression_mode: ''", "compression_mode: message"))
+    assert "compression_mode: message" in (folder / "metadata.yaml").read_text()
+    data = [bags.Note(topic=note.topic, type=note.type, log_ns=note.log_ns, header_ns=0, data=packed) for note in notes]
+    bags.write_mcap(data, next(folder.glob("*.mcap")))
+    return folder
+
+
+def _database(folder: Path, script: str) -> Path:
+    """A .db3 of rosbag2 that was changed by a script."""
+    bag = bags.write_rosbag2(bags.in_order(bags.so101(0.3)), folder / "sql", storage=StoragePlugin.SQLITE3)
+    path = next(bag.glob("*.db3"))
+    with closing(sqlite3.connect(path)) as database, database:
+        database.executescript(script)
+    return path
+
+
+_MANY = "WITH RECURSIVE n(k) AS (SELECT 1 UNION ALL SELECT k + 1 FROM n WHERE k < 300)"
+
+
+def columns_that_compute(folder: Path) -> Path:
+    return _database(
+        folder,
+        f"""DROP TABLE messages; CREATE TABLE messages (k, topic_id AS (1), timestamp AS (k), rowid AS (1000 - k),
+        data AS (zeroblob(100000000))); {_MANY} INSERT INTO messages (k) SELECT k FROM n;""",
+    )
+
+
+def a_column_called_rowid(folder: Path) -> Path:
+    """By which all would have to be sorted."""
+    return _database(folder, "ALTER TABLE messages ADD COLUMN rowid INTEGER;")
+
+
+def definitions_that_compute(folder: Path) -> Path:
+    return _database(
+        folder,
+        f"""DROP TABLE IF EXISTS message_definitions; CREATE TABLE message_definitions (k, topic_type AS (k), encoding
+        AS ('ros2msg'), encoded_message_definition AS (hex(zeroblob(400000)))); {_MANY}
+        INSERT INTO message_definitions (k) SELECT k FROM n;""",
+    )
+
+
+def a_view_of_messages(folder: Path) -> Path:
+    return _database(
+        folder,
+        f"""ALTER TABLE messages RENAME TO other; CREATE VIEW messages AS {_MANY.replace("300", "3000000000")}
+        SELECT 1 AS topic_id, k AS timestamp, zeroblob(10) AS data FROM n;""",
+    )
+
+
+def _folder(folder: Path, metadata: Callable[[str], str]) -> Path:
+    bag = bags.write_rosbag2(bags.in_order(bags.so101(0.3)), folder / "bag")
+    text = (bag / "metadata.yaml").read_text()
+    (bag / "metadata.yaml").write_text(metadata(text))
+    assert (bag / "metadata.yaml").read_text() != text
+    return bag
+
+
+def aliases(folder: Path) -> Path:
+    """10^9 elements."""
+    lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x, x]"]
+    lines += [f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 10)}]" for k in range(1, 9)]
+    names = "  relative_file_paths: *a8\n"
+    return _folder(folder, lambda text: "\n".join(lines) + "\nrosbag2_bagfile_information:\n" + names)
+
+
+def merge_keys(folder: Path) -> Path:
+    lines = ["a0: &a0 {x: 1}"] + [f"a{k}: &a{k} {{<<: [*a{k - 1}, *a{k - 1}], y{k}: 1}}" for k in range(1, 40)]
+    return _folder(folder, lambda text: "\n".join(lines) + "\n" + text)
+
+
+def many_names(folder: Path) -> Path:
+    return _folder(
+        folder, lambda text: text.replace("relative_file_paths:\n", "relative_file_paths:\n" + "  - b\n" * 120_000)
+    )
+
+
+def pictures_of_nothing(folder: Path) -> Path:
+    """60 PNG files of 4000x4000 pixels, all black."""
+    png = io.BytesIO()
+    Image.fromarray(np.zeros((4000, 4000), np.uint8)).save(png, format="PNG", compress_level=9)
+    data = np.frombuffer(png.getvalue(), np.uint8)
+    notes = bags.joints("/joints", ("a", "b"), bags.times(50, 2.2))
+    for moment in bags.times(30, 2.0):
+        body = {"format": "png", "data": data}
+        notes.append(
+            bags.Note(
+                topic="/image", type="sensor_msgs/msg/CompressedImage", log_ns=moment, header_ns=moment, body=body
+            )
+        )
+    return bags.write_mcap(bags.in_order(notes), folder / "bag.mcap")
+
+
+def lists_in_every_message(folder: Path) -> Path:
+    """Ten million elements of no bytes in all, few enough in one; never imported in part."""
+    schema = _nested("a/T%d[500] x\n", 1, "")
+    return _mcap(folder / "bag.mcap", "a/T0", "ros1msg", schema, "ros1", [bytes(500)] * 20_000)
+
+
+def many_messages(folder: Path) -> Path:
+    """Forty-five thousand, as JSON."""
+    text = json.dumps({"header": {"stamp": {"sec": 1, "nsec": 1}}, "position": [0.5] * 4}).encode()
+    return _mcap(folder / "bag.mcap", "x", "jsonschema", b"{}", "json", [text] * 45_000)
+
+
+BAGS = (
+    two_fields_a_type, two_empty_fields_a_type, a_thousand_of_a_thousand,
+    a_definition_that_computes, empty_elements_of_many_fields, lists_of_nothing, messages_that_claim_64_megabytes,
+    columns_that_compute, a_column_called_rowid, definitions_that_compute, a_view_of_messages, aliases, merge_keys,
+    pictures_of_nothing, lists_in_every_message, many_messages,
+)  # fmt: skip
+LONG = [
+    pytest.param(make, marks=pytest.mark.slow)
+    for make in (a_definition_of_empty_lines, a_definition_in_brackets, many_names)
+]
+
+
+def _size(bag: Path) -> int:
+    return sum(path.stat().st_size for path in (bag.iterdir() if bag.is_dir() else [bag]))
+
+
+@pytest.mark.parametrize("make", [*BAGS, *LONG])
+def test_a_small_bag_never_becomes_large(
+    make: Callable[[Path], Path], commands: LimitedCommands, tmp_path: Path
+) -> None:
+    bag = make(tmp_path)
+    assert _size(bag) < 1_000_000
+    text = MAPPING.replace('info_topic = "/info"\n', "")
+    if make is not pictures_of_nothing:
+        text = text[: text.index("[cameras")]
+    if bag.suffix == ".db3" or bag.is_dir():
+        text = bag_mappings.SO101
+    mapping = bag_mappings.write_mapping(text, tmp_path / "mapping.toml")
+    told = commands.run("import", bag, "--mapping", mapping, "--out", tmp_path / "run")
+    assert problem_of(told) == "", told
+    assert told.code == 1, told
+    assert told.text.count("\n") == 1, told.text
+    assert len(told.text) < 1500
+    suggested = commands.run("import", "--suggest", bag)
+    assert problem_of(suggested) == "", suggested
+    assert "has too little memory" not in told.text + suggested.text
+
+
+def test_too_little_memory_is_no_fault_of_a_definition(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from demorec.ingest import ros_types
+
+    def lack(_: object) -> None:
+        raise MemoryError
+
+    bag = _joints(tmp_path)
+    monkeypatch.setattr(ros_types, "_parsed", {})
+    monkeypatch.setattr(ros_types._CountedMsgParser, "specification", lack)
+    assert exit_code("import", "--suggest", bag) == 1
+    assert "This machine has too little memory for this" in capsys.readouterr().err
+
+
+def _joints(folder: Path, moments: Sequence[int] | None = None, names: Sequence[str] = ("a", "b")) -> Path:
+    moments = bags.times(50, 0.5) if moments is None else moments
+    return bags.write_mcap(bags.joints("/joints", names, moments), folder / "joints.mcap")
+
+
+_NO_CAMERA = MAPPING[: MAPPING.index("[cameras")]
+MAPPINGS: dict[str, tuple[str, str]] = {
+    "a key of 200,000 parts": ("[" + "a." * 200_000 + "a]\n", "a key has more than 16 parts"),
+    "12,000 features": (
+        _NO_CAMERA + "".join(f'[[features.f{k}]]\ntopic = "/joints"\n' for k in range(12_000)), "at most 1,000 are read"
+    ),
+    "60,000 episodes": (
+        _NO_CAMERA + f'[episodes]\ncut = "times"\ntimes_s = [{"[0, 1]," * 60_000}]\n', "at most 50,000 are read"
+    ),
+    "15,000 episodes": (
+        _NO_CAMERA + f'[episodes]\ncut = "times"\ntimes_s = [{"[0, 1]," * 15_000}]\n', "more rows and episodes"
+    ),
+    "20,000 unknown keys": (_NO_CAMERA + "[cloak]\n" + "".join(f"keyy{k} = 1\n" for k in range(20_000)), "unknown key"),
+    "a trim of 1e300 s": (_NO_CAMERA.replace("fps = 30", "fps = 30\nmax_trim_s = 1e300"), "max_trim_s is 1e+300"),
+    "an age of 1e300 s": (_NO_CAMERA.replace("fps = 30", "fps = 30\nmax_age_s = 1e300"), "max_age_s is 1e+300"),
+    "a number of 5,000 digits": (_NO_CAMERA.replace("fps = 30", f"fps = {'9' * 5000}"), "no valid TOML"),
+    "an infinity": (_NO_CAMERA.replace("fps = 30", "fps = 30\nmax_trim_s = inf"), "is no finite number"),
+    "NUL in urdf": (_NO_CAMERA.replace('name = "r"', 'name = "r"\nurdf = "a\\u0000b"'), "The URDF cannot be read"),
+    "NUL in a topic": (_NO_CAMERA.replace('"/joints"', '"/jo\\u0000nts"'), r"there is no message of '/jo\x00nts'"),
+    "a date": (_NO_CAMERA.replace("fps = 30", "fps = 2001-99-99"), "no valid TOML"),
+    "a long text": (_NO_CAMERA.replace("stack the cups", "x" * 20_000), "at most 10,000 are read"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", sorted(MAPPINGS))
+def test_a_mapping_is_bounded(name: str, commands: LimitedCommands, tmp_path: Path) -> None:
+    text, told = MAPPINGS[name]
+    mapping = bag_mappings.write_mapping(text, tmp_path / "mapping.toml")
+    answer = commands.run("import", _joints(tmp_path), "--mapping", mapping, "--out", tmp_path / "run")
+    assert problem_of(answer) == "", answer
+    assert answer.code in (1, 2)
+    assert told in answer.text, answer.text
+    assert answer.text.count("\n") == 1
+    assert len(answer.text) < 2000
+
+
+def test_rows_follow_the_size_of_the_bag(commands: LimitedCommands, tmp_path: Path) -> None:
+    """Two messages 23 days apart: 2,000 million rows."""
+    bag = _joints(tmp_path, [bags.EPOCH_NS, bags.EPOCH_NS + 2_000_000 * bags.NS])
+    text = _NO_CAMERA.replace("fps = 30", "fps = 1000\nmax_age_s = 1e9\nmax_trim_s = 1e9")
+    mapping = bag_mappings.write_mapping(text, tmp_path / "mapping.toml")
+    told = commands.run("import", bag, "--mapping", mapping, "--out", tmp_path / "run")
+    assert problem_of(told) == "", told
+    assert "lower clock.fps, import a part (episodes.times_s)" in told.text
+    assert told.text.count("\n") == 1
+
+
+def test_ten_million_rows_of_a_long_bag_are_no_claim() -> None:
+    """Three hours at 1 kHz, of a bag of 1 GB: 10.8 million rows of 14 joints."""
+    from demorec.ingest.clock import grid
+
+    rows = grid(bags.EPOCH_NS, bags.EPOCH_NS + 10_800 * bags.NS, 1000)
+    assert len(rows) == 10_800_001
+    assert int(rows[-1]) == bags.EPOCH_NS + 10_800 * bags.NS
+
+
+@pytest.mark.parametrize("value", ["NULL", "x'00ff'", "'text'", "''", "1e300"])
+@pytest.mark.parametrize(
+    "column", ["topics.id", "topics.name", "topics.type", "messages.topic_id", "messages.timestamp", "messages.data"]
+)
+def test_odd_values_in_a_database(column: str, value: str, tmp_path: Path, commands: LimitedCommands) -> None:
+    table, _, name = column.partition(".")
+    path = _database(
+        tmp_path,
+        f"CREATE TABLE changed AS SELECT * FROM {table}; DROP TABLE {table}; ALTER TABLE changed RENAME TO {table};"
+        f"UPDATE {table} SET {name} = {value};",
+    )
+    told = commands.run("import", "--suggest", path)
+    assert problem_of(told) == "", told
+
+
+@pytest.mark.parametrize("part", [0.1, 0.5, 0.9, 0.97])
+def test_a_database_that_is_cut_off(part: float, tmp_path: Path, commands: LimitedCommands) -> None:
+    path = _database(tmp_path, "")
+    path.write_bytes(path.read_bytes()[: int(path.stat().st_size * part)])
+    told = commands.run("import", "--suggest", path)
+    assert problem_of(told) == "", told
+    assert told.code == 0 or told.text.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "line", ["version: " + "9" * 5000, "version: 2001-99-99", "version: !!int abc", "version: !!float x", "a: '\\0'"]
+)
+def test_odd_values_in_metadata_say_nothing_of_the_bag(line: str, tmp_path: Path, commands: LimitedCommands) -> None:
+    """What is not asked for is not read."""
+    bag = _folder(tmp_path, lambda text: text.replace("  version: 9", f"  {line}"))
+    told = commands.run("import", "--suggest", bag)
+    assert problem_of(told) == "", told
+    assert told.code == 0, told.text
+
+
+def test_a_link_out_of_the_bag_is_not_followed(tmp_path: Path, commands: LimitedCommands) -> None:
+    bag = _folder(tmp_path, lambda text: text + "\n")
+    (file,) = bag.glob("*.mcap")
+    elsewhere = file.rename(tmp_path / "elsewhere.mcap")
+    file.symlink_to(elsewhere)
+    told = commands.run("import", "--suggest", bag)
+    assert told.code == 1
+    assert "is a link to another folder" in told.text
+    assert commands.run("import", "--suggest", elsewhere).code == 0
+    beside = elsewhere.rename(bag / "beside.mcap")
+    file.unlink()
+    file.symlink_to(beside.name)
+    assert commands.run("import", "--suggest", bag).code == 0
+
+
+ODD_NUMBERS: tuple[Any, ...] = (None, float("inf"), float("nan"), "text", [], {}, 10**19, -1, True)
+
+
+@pytest.mark.parametrize("key", ["width", "height", "step", "encoding", "data", "sec", "format"])
+def test_odd_values_in_messages(key: str, tmp_path: Path, commands: LimitedCommands) -> None:
+    """Of a JSON image, one odd value a message."""
+    messages = []
+    for value in (*ODD_NUMBERS, 1e30):
+        stamp = {"sec": 1, "nsec": 0}
+        values = {
+            "header": {"stamp": stamp},
+            "width": 2,
+            "height": 1,
+            "step": 6,
+            "encoding": "rgb8",
+            "data": "AAAAAAAA",
+        }
+        (stamp if key == "sec" else values)[key] = value
+        messages.append(json.dumps(values).encode())
+    bag = _mcap(tmp_path / "bag.mcap", "x", "jsonschema", b"{}", "json", messages)
+    mapping = bag_mappings.write_mapping(
+        MAPPING.replace("/image", "/joints").replace("position", "width").replace('info_topic = "/info"\n', ""),
+        tmp_path / "mapping.toml",
+    )
+    for told in (
+        commands.run("import", "--suggest", bag),
+        commands.run("import", bag, "--mapping", mapping, "--out", tmp_path / "run"),
+    ):
+        assert problem_of(told) == "", told
+
+
+def test_fields_that_are_called_like_methods(tmp_path: Path, commands: LimitedCommands) -> None:
+    names = ("DESCRIPTOR", "FromString", "ParseFromString", "HasField", "position")
+    file = descriptor_pb2.FileDescriptorProto(name="a.proto", package="a", syntax="proto3")
+    top = file.message_type.add(name="Top")
+    for number, name in enumerate(names, 1):
+        top.field.add(name=name, number=number, type=1, label=3)
+    top.nested_type.add(name="SerializeToString")
+    schema = descriptor_pb2.FileDescriptorSet(file=[file]).SerializeToString()
+    data = b"".join(bytes([number << 3 | 2, 16]) + np.array([number, 0.5]).tobytes() for number in range(1, 6))
+    bag = _mcap(tmp_path / "bag.mcap", "a.Top", "protobuf", schema, "protobuf", [data] * 9)
+    told = commands.run("import", "--suggest", bag)
+    assert told.code == 0, told.text
+    assert "DESCRIPTOR: [1, 0.5]; FromString: [2, 0.5]" in told.text
+    assert "position: [5, 0.5]" in told.text
+
+
+@pytest.mark.parametrize("codec", ["h264", "h265"])
+def test_a_keyframe_that_gives_no_picture(codec: str, tmp_path: Path, commands: LimitedCommands) -> None:
+    """Parameter sets, and the head of a picture without any of it."""
+    packet = bags.video([bags.picture(0, 0)], gop=1, codec={"h264": "libx264", "h265": "libx265"}[codec])[0]
+    units = packet.split(b"\x00\x00\x01")
+    slices = {"h264": (5,), "h265": (19, 20)}[codec]
+    kinds = [unit[0] & 31 if codec == "h264" else (unit[0] >> 1) & 63 for unit in units[1:]]
+    assert set(slices) & set(kinds)
+    cut = [unit[:3] if kind in slices else unit for unit, kind in zip(units[1:], kinds, strict=True)]
+    data = np.frombuffer(b"\x00\x00\x00\x01" + b"\x00\x00\x01".join(cut), np.uint8)
+    notes = [
+        bags.Note(topic="/image", type="sensor_msgs/msg/CompressedImage", log_ns=moment, header_ns=moment,
+                  body={"format": codec, "data": data})
+        for moment in bags.times(30, 0.3)
+    ]  # fmt: skip
+    bag = bags.write_mcap(notes, tmp_path / "bag.mcap")
+    told = commands.run("import", "--suggest", bag)
+    assert problem_of(told) == "", told
+    assert told.code == 0
