@@ -18,6 +18,7 @@ from demorec.errors import ConfigError
 from demorec.ingest.channel import BagError
 from demorec.ingest.dataset_pictures import DatasetCamera, ImageCamera, VideoCamera
 from demorec.ingest.frames_writer import FramesImport, write_frames
+from demorec.ingest.mapping_file import MAX_ELEMENTS
 from demorec.lerobot.layout import AUTOMATIC_FEATURES, DatasetInfo, Feature
 from demorec.lerobot.paths import INFO_PATH
 from demorec.lerobot.reader import EpisodePlace, RowReader, episode_places, read_tasks
@@ -172,6 +173,8 @@ def _why_left_out(name: str, feature: Feature) -> str:
         return "recordings of other robots have no place for depth"
     if feature.dtype not in ("video", "image", "float32", "float64"):
         return f"it is {feature.dtype}, and recordings of other robots hold float32 and float64"
+    if feature.is_numeric and feature.dtype != "image" and feature.shape[0] > MAX_ELEMENTS:
+        return f"it has {feature.shape[0]:,} numbers a row, and recordings of other robots hold up to {MAX_ELEMENTS:,}"
     if feature.is_numeric and feature.dtype != "image" and len(feature.shape) > 1:
         return f"it is an array of {'x'.join(map(str, feature.shape))}, and recordings of other robots hold vectors"
     return ""

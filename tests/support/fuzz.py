@@ -1,0 +1,161 @@
+"""Commands within bounds: each in a child of its own, whose memory and CPU time are limited and measured.
+
+Starting Python and its libraries takes longer than refusing a file. So one process loads them, and every command runs
+in a fork of it: a fuzz of thousands of cases starts Python once, and a case that hangs or dies ends alone.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import io
+import json
+import os
+import random
+import resource
+import signal
+import subprocess
+import sys
+import tempfile
+import traceback
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from demorec.cli import COMMANDS, main
+
+if __name__ != "__main__":
+    from support.commands import MOST_BYTES, Told
+
+MOST_SECONDS = 10.0
+"""Of CPU time, for an input of less than a megabyte."""
+_KILLED_SECONDS = 20
+"""After which a command is ended; more than allowed, so that what it took is told."""
+_MORE_ADDRESS_BYTES = 3 << 30
+"""Beyond what the loaded libraries take: a command that fills more gets a MemoryError before the machine suffers."""
+
+
+class LimitedCommands:
+    """Context manager over the process that runs commands in forks.
+
+    Args:
+        modules: Loaded before the first command, so that no case pays for them.
+    """
+
+    def __init__(self, modules: Sequence[str] = ()) -> None:
+        self._modules = modules
+
+    def __enter__(self) -> Self:
+        # -P: the modules beside this file (mcap, docs ...) must not stand before the libraries of their names.
+        command = [sys.executable, "-P", __file__, *self._modules]
+        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        return self
+
+    def __exit__(
+        self, exc_type: type[BaseException] | None, exc: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._process.kill()
+        self._process.communicate()
+
+    def run(self, *arguments: str | Path) -> Told:
+        """Run `demorec ARGUMENTS...`; the code is None when the command was ended by a signal or an exception."""
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._process.stdin.write(json.dumps([str(argument) for argument in arguments]) + "\n")
+        self._process.stdin.flush()
+        line = self._process.stdout.readline()
+        assert line, "the process that runs commands has ended"
+        return Told(*json.loads(line))
+
+
+def problem_of(told: Told) -> str:
+    """What is wrong with an answer to an input of any kind; "" when it is within the bounds.
+
+    Success, or exit code 1 or 2 with a sentence: no traceback, no request to report it, at most so much memory and time.
+    """
+    if told.code not in (0, 1, 2):
+        return f"exit code {told.code} after {told.seconds:.1f} s"
+    for words in ("please report it", "Traceback (most recent call last)"):
+        if words in told.text:
+            return f"says {words!r}"
+    if told.code and not told.text.strip():
+        return "fails without a word"
+    if told.peak_bytes > MOST_BYTES:
+        return f"takes {told.peak_bytes / 1e6:.0f} MB"
+    return f"takes {told.seconds:.1f} s" if told.seconds > MOST_SECONDS else ""
+
+
+def changed_bytes(data: bytes, chance: random.Random) -> bytes:
+    """The same with some bytes exchanged, taken out, doubled or cut off."""
+    changed = bytearray(data)
+    for _ in range(chance.choice((1, 1, 2, 4, 16))):
+        at = chance.randrange(max(1, len(changed)))
+        match chance.randrange(6):
+            case 0:
+                changed[at : at + 1] = bytes([chance.randrange(256)])
+            case 1:
+                changed[at : at + 1] = bytes([chance.choice((0, 1, 127, 128, 255))])
+            case 2:
+                size = chance.choice((2, 4, 8))
+                number = chance.choice((0, 1, 2**31 - 1, 2**31, 2**32 - 1, 2**63 - 1, 2**63, 2**64 - 1)) % 256**size
+                changed[at : at + size] = number.to_bytes(size, "little")
+            case 3:
+                del changed[at : at + chance.choice((1, 4, 64))]
+            case 4:
+                changed[at:at] = changed[at : at + chance.choice((1, 16, 256))]
+            case _:
+                if chance.random() < 0.3:
+                    del changed[at:]
+    return bytes(changed)
+
+
+def _serve(modules: Sequence[str]) -> None:
+    for name in COMMANDS.names():
+        COMMANDS.load(name)
+    for name in modules:
+        importlib.import_module(name)
+    answers = os.fdopen(os.dup(1), "w")
+    for line in sys.stdin:
+        with tempfile.TemporaryFile("w+") as said:
+            child = os.fork()
+            if child == 0:
+                _run(json.loads(line), said.fileno())
+            _, status, used = os.wait4(child, 0)
+            said.seek(0)
+            code = os.waitstatus_to_exitcode(status)
+            answer = (
+                code if 0 <= code < 100 else None,
+                said.read(),
+                1024 * used.ru_maxrss,
+                used.ru_utime + used.ru_stime,
+            )
+        answers.write(json.dumps(answer) + "\n")
+        answers.flush()
+
+
+def _run(arguments: list[str], output: int) -> None:
+    """Run a command in this process, a fork, which ends with it."""
+    code = 100
+    try:
+        os.dup2(output, 1)
+        os.dup2(output, 2)
+        sys.stdin = io.StringIO()
+        sys.stdout = sys.stderr = open(output, "w", closefd=False)  # noqa: SIM115
+        resource.setrlimit(resource.RLIMIT_CPU, (_KILLED_SECONDS, _KILLED_SECONDS + 2))
+        address = 4096 * int(Path("/proc/self/statm").read_text().split()[0]) + _MORE_ADDRESS_BYTES
+        resource.setrlimit(resource.RLIMIT_AS, (address, address))
+        signal.signal(signal.SIGXCPU, signal.SIG_DFL)
+        main(arguments)
+    except SystemExit as end:
+        code = int(end.code or 0)
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        with contextlib.suppress(OSError, ValueError):
+            sys.stdout.flush()
+        os._exit(code)
+
+
+if __name__ == "__main__":
+    _serve(sys.argv[1:])
