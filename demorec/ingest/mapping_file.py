@@ -9,10 +9,11 @@ import typing
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any, Literal
 
-from demorec.errors import ConfigError
+from demorec.errors import ConfigError, in_words
 from demorec.plain import digest, from_plain
 from demorec.registry import nearest_match
 from demorec.safety.files import read_text_limited
@@ -23,7 +24,13 @@ ACTION = "action"
 MAX_FPS = 1000
 MAX_ELEMENTS = 4096
 """Of a part: more is a picture or a point cloud, not a vector."""
+MAX_FEATURES, MAX_CAMERAS = 256, 64
+"""As recordings hold."""
 _MAX_FILE_BYTES = 1 << 20
+_MAX_DOTS = 1000
+"""In a line: the time that a key takes to be read grows with the square of its parts."""
+_MAX_TOLD = 8
+"""Mistakes that are told at once."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,6 +71,9 @@ class AnyMapping(ABC):
 
 def feature_problems(features: Mapping[str, Sequence[Part]]) -> Iterator[str]:
     """What is impossible in features, whatever their parts are taken from."""
+    if len(features) > MAX_FEATURES:
+        yield f"there are {len(features):,} features, allowed are up to {MAX_FEATURES}"
+        return
     if STATE not in features:
         yield f"there is no feature {STATE!r}"
     for name, parts in features.items():
@@ -98,7 +108,10 @@ def _part_problems(place: str, name: str, part: Part, features: Mapping[str, Seq
 
 
 def camera_name_problems(cameras: Mapping[str, object]) -> Iterator[str]:
-    """Names that no camera can have."""
+    """Names that no camera can have; too many cameras."""
+    if len(cameras) > MAX_CAMERAS:
+        yield f"there are {len(cameras):,} cameras, allowed are up to {MAX_CAMERAS}"
+        return
     for name in cameras:
         if not name.isidentifier():
             yield f"a camera cannot be called {name!r}: letters, digits and underscores are allowed"
@@ -127,20 +140,23 @@ def recorded_unit(unit: str) -> str:
 
 
 def read_mapping_file[M: AnyMapping](path: Path, kind: type[M]) -> M:
-    """A mapping from its TOML file; ConfigError tells all that is wrong with it at once."""
+    """A mapping from its TOML file; ConfigError tells what is wrong with it at once, of very much the first."""
     try:
-        data = tomllib.loads(read_text_limited(path, _MAX_FILE_BYTES))
+        text = read_text_limited(path, _MAX_FILE_BYTES)
+        if max(line.count(".") for line in text.split("\n")) > _MAX_DOTS:
+            raise ValueError(f"a line has more than {_MAX_DOTS:,} dots: write longer lists on several")
+        data = tomllib.loads(text)
     except OSError as error:
         raise ConfigError(f"The mapping cannot be read ({error.strerror}): {path}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise ConfigError(f"The mapping is no valid TOML ({error}): {path}") from error
-    if unknown := list(_unknown_keys(data, kind, "")):
+    except (ValueError, RecursionError) as error:
+        raise ConfigError(f"The mapping is no valid TOML ({in_words(error)}): {path}") from error
+    if unknown := list(islice(_unknown_keys(data, kind, ""), _MAX_TOLD)):
         raise ConfigError(f"The mapping cannot be used: {'; '.join(unknown)}: {path}")
     try:
         mapping = from_plain(data, kind)
     except ValueError as error:
         raise ConfigError(f"The mapping cannot be used: {error}: {path}") from error
-    if problems := list(mapping.problems()):
+    if problems := list(islice(mapping.problems(), _MAX_TOLD)):
         raise ConfigError(f"The mapping cannot be used: {'; '.join(problems)}: {path}")
     return mapping
 

@@ -36,6 +36,8 @@ def open_regular(path: Path) -> BufferedReader:
     Raises:
         OSError: There is none, it cannot be opened, or it is a folder, FIFO, socket or device; `strerror` says which.
     """
+    if "\0" in str(path):
+        raise OSError(errno.EINVAL, "its name holds a zero byte", str(path))
     _refuse_irregular(path, path.stat().st_mode)
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
