@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from demorec.cli.shared.output import counted, say, tell
+from demorec.cli.shared.paths import refuse_inside
 from demorec.config import VideoConfig
 from demorec.errors import ConfigError
 
@@ -58,6 +59,8 @@ class Import:
         """Import, or suggest a mapping, and say what was found."""
         if not self.bags:
             raise ConfigError("No bag is given: name one, e.g. demorec import --suggest monday.mcap.")
+        if self.out is not None:
+            refuse_inside([self.out])
         if self.bags[0] == _LEROBOT:
             return self._import_dataset()
         is_hdf5 = self.bags[0] == _HDF5

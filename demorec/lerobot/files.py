@@ -172,7 +172,8 @@ def _check_pages(path: Path, metadata: pq.FileMetaData, columns: Sequence[str] |
             texts[number] = max(texts.get(number, 0), dictionary)
     if sum(texts.values()) > allowed:
         raise _too_large(path, allowed)
-    return 1 + sum(texts.values()) + _BYTES_PER_VALUE * num_values // max(1, metadata.num_rows)
+    num_rows: int = metadata.num_rows
+    return 1 + sum(texts.values()) + _BYTES_PER_VALUE * num_values // max(1, num_rows)
 
 
 def _too_large(path: Path, allowed: int) -> ExportError:
