@@ -35,6 +35,7 @@ def making_commands(root: Path, configs: Mapping[str, Any], options: ExportOptio
         return []
     try:
         config = parse_config(next(iter(configs.values())), GenerateConfig, source="the configuration")
+        config.check_names(config.modules)
     except ConfigError:
         return []
     num_episodes = 1 + max(row["run_episode_index"] for row in rows)

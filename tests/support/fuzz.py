@@ -72,7 +72,7 @@ class LimitedCommands:
 def problem_of(told: Told) -> str:
     """What is wrong with an answer to an input of any kind; "" when it is within the bounds.
 
-    Success, or exit code 1 or 2 with a sentence: no traceback, no request to report it, at most so much memory and time.
+    Success, or exit code 1 or 2 with a sentence: no traceback, no request to report it, bounded memory and time.
     """
     if told.code not in (0, 1, 2):
         return f"exit code {told.code} after {told.seconds:.1f} s"

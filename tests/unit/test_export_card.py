@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 from support.export import export, make_run
 from support.mcap import rewritten
-from support.recording import frame_number
+from support.recording import frame_number, write_episode
 
 from demorec.cli.export import Export
 from demorec.cli.generate import Generate
