@@ -12,18 +12,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from PIL import Image
 
-DATA, EPISODES, TASKS = (
-    "data/chunk-000/file-000.parquet",
-    "meta/episodes/chunk-000/file-000.parquet",
-    "meta/tasks.parquet",
-)
-_COUNTERS = {
-    "timestamp": "float32",
-    "frame_index": "int64",
-    "episode_index": "int64",
-    "index": "int64",
-    "task_index": "int64",
-}
+DATA, TASKS = "data/chunk-000/file-000.parquet", "meta/tasks.parquet"
+EPISODES = "meta/episodes/chunk-000/file-000.parquet"
+_COUNTERS = {"timestamp": "float32", **dict.fromkeys(("frame_index", "episode_index", "index", "task_index"), "int64")}
 
 
 def write_foreign(root: Path, *, length: int = 8, episodes: int = 2, size: tuple[int, int] = (64, 48)) -> Path:

@@ -1,4 +1,4 @@
-"""Hostile datasets, HDF5 files, runs, recordings and policies, each from its number: valid ones with parts exchanged."""
+"""Hostile datasets, HDF5 files, runs, recordings, policies, each from its number: valid ones with parts exchanged."""
 
 from __future__ import annotations
 
@@ -30,8 +30,9 @@ from support.recording import write_episode
 
 _VALUES: tuple[Any, ...] = (
     None, True, False, 0, -1, 1, 0.5, 2**31, 2**63, 2**64, 10**30, -(10**30), 1e300, float("inf"), float("nan"),
-    "", "text", "0", "\x00", "a\x00b", "\ud800", "\x1b[2J\u202e<script>", "../../etc/passwd", "/dev/zero", "x" * 100_000,
-    "{chunk_index}", "{x}", "{", "data/{chunk_index:09999d}.parquet", "data/{file_index!r}", [], [[]], [None], ["a", "a"],
+    "", "text", "0", "\x00", "a\x00b", "\ud800", "\x1b[2J\u202e<script>", "../../etc/passwd", "/dev/zero",
+    "{chunk_index}", "{x}", "{", "data/{chunk_index:09999d}.parquet", "data/{file_index!r}", [], [[]], [None],
+    ["a", "a"], "x" * 100_000,
     [0] * 3, [1 << 24], [-1], [1e300], ["x"] * 5000, {}, {"a": 1}, {"": {}}, {"bytes": "x"}, [[1.0], []], [{}] * 2000,
 )  # fmt: skip
 _TYPES = (
@@ -46,7 +47,8 @@ _CELLS: tuple[Any, ...] = (
 )  # fmt: skip
 _TOML = (
     "0", "-1", "1", "9" * 30, "9" * 5000, "1e300", "inf", "nan", "true", '""', '"\\u0000"', '"a\\u0000b"', "[]", "[[]]",
-    "[[0, 1]]", "{}", "{a = 1}", "2001-99-99", "2001-01-01", '"data"', '"/"', '"../x"', '"obs"', '"' + "a/" * 3000 + '"',
+    "[[0, 1]]", "{}", "{a = 1}", "2001-99-99", "2001-01-01", '"data"', '"/"', '"../x"', '"obs"',
+    '"' + "a/" * 3000 + '"',
     '["a", "a"]', "[0, 0]", "[99999]", "[-1]", '"\\u202e<script>"', '"action"', '"degree"', '"percent"', "[[1, 0]]",
     '"' + "x" * 70_000 + '"', "'''\n'''", "[[-1e300, 1e300]]",
 )  # fmt: skip
@@ -97,8 +99,7 @@ class FuzzedData:
         """What was changed, and the arguments of the command that meets it."""
         chance = random.Random(number)
         made: Callable[[random.Random], Case] = chance.choice(
-            (self._dataset, self._dataset, self._dataset, self._hdf5, self._hdf5, self._mapping, self._run)
-            + (self._recording, self._recording, self._policy)
+            (self._dataset,) * 3 + (self._hdf5, self._recording) * 2 + (self._mapping, self._run, self._policy)
         )
         return made(chance)
 
@@ -210,8 +211,8 @@ _POLICY: dict[str, Any] = {
 }
 _EVALUATION = Evaluation(
     settings=Settings(
-        policy="p", policy_type="act", policy_digest="0" * 16, config=GenerateConfig(), action="joint", action_steps=None,
-        privileged=False, state="joint", episode_length=None,
+        policy="p", policy_type="act", policy_digest="0" * 16, config=GenerateConfig(), action="joint",
+        action_steps=None, privileged=False, state="joint", episode_length=None,
     ),
     versions={"demorec": "0.1.0"},
 )  # fmt: skip
