@@ -225,7 +225,8 @@ def test_the_longest_row_is_that_of_the_table(codec: str, version: Any, tmp_path
     rows[77] = ["abc"] * 1234
     table = pa.table({"x": pa.array(rows), "y": pa.array([[row, row[:3]] for row in rows])})
     path = tmp_path / "t.parquet"
-    pq.write_table(table, path, codec, data_page_version=version, row_group_size=3000, data_page_size=2000)
+    pages: dict[str, Any] = {"data_page_version": version, "data_page_size": 2000}
+    pq.write_table(table, path, 3000, compression=codec, **pages)
     metadata = pq.ParquetFile(path).metadata
     with path.open("rb") as file:
         for depth in (1, 2):
