@@ -325,6 +325,14 @@ def _fitting(cells: list[Any], kind: pa.DataType) -> list[Any]:
 
 
 def _change_hdf5(file: h5py.File, chance: random.Random) -> str:
+    """Change an open file; in words how. What the library refuses stays as it was."""
+    try:
+        return _changed_hdf5(file, chance)
+    except (OSError, ValueError, RuntimeError, KeyError, TypeError) as error:
+        return f"nothing ({error})"
+
+
+def _changed_hdf5(file: h5py.File, chance: random.Random) -> str:
     places: list[str] = []
     file.visit(places.append)
     place = chance.choice(places)
