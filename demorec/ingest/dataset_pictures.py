@@ -213,7 +213,7 @@ class ImageCamera(DatasetCamera):
         found = 0
         while found < place.length:
             index, value = next(self._rows, (-1, None))
-            if index < 0:
+            if index == -1:  # of another type in a damaged table
                 raise BagError(f"Episode {place.episode_index} has {place.length} frames, but {found} pictures: {path}")
             if index == place.from_index + found:
                 found += 1
