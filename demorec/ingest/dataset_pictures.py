@@ -213,7 +213,7 @@ class ImageCamera(DatasetCamera):
         found = 0
         while found < place.length:
             index, value = next(self._rows, (-1, None))
-            if index == -1:  # of another type in a damaged table
+            if index == -1:  # not "below 0": a damaged table has indices of any type
                 raise BagError(f"Episode {place.episode_index} has {place.length} frames, but {found} pictures: {path}")
             if index == place.from_index + found:
                 found += 1
