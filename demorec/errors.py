@@ -153,6 +153,8 @@ def in_words(error: BaseException) -> str:
         if isinstance(error, kind):
             return words
     lines = str(error).split("\n", 1)
+    if "set_int_max_str_digits" in lines[0]:
+        return "a whole number has more digits than are read"
     return lines[0].rstrip(".")[:_MAX_WORDS] or "no reason is given"
 
 

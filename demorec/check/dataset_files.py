@@ -6,6 +6,7 @@ import json
 import os
 import re
 import reprlib
+import signal
 import subprocess
 import sys
 import tempfile
@@ -14,7 +15,7 @@ import numpy as np
 
 from demorec.check.base import Measurement, dataset_check
 from demorec.check.dataset import Dataset
-from demorec.errors import ExportError, MissingDependencyError
+from demorec.errors import ExportError, MissingDependencyError, ResourceError
 from demorec.lerobot.inspect import dataset_problems, episode_digests
 from demorec.lerobot.reader import PacketReader
 from demorec.lerobot.verify import LEROBOT, lerobot_is_installed
@@ -138,9 +139,17 @@ def dataset_sidecar(dataset: Dataset) -> Measurement | None:
     return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{len(dataset.sidecar)} episodes")
 
 
+_PATIENCE_S = 600
+_NO_MEMORY = re.compile(
+    r"MemoryError|bad_alloc|out of memory|allocate memory|unable to allocate|(m|re)alloc of size|failed to map segment"
+    r"|can't start new thread",
+    re.IGNORECASE,
+)
+"""How Python, NumPy, PyTorch, Arrow and the dynamic linker say that there is too little."""
 _OPEN = """
 import json, sys
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+print("loaded", flush=True)
 dataset = LeRobotDataset(repo_id="local/check", root=sys.argv[1])
 frames = sorted({0, len(dataset) // 2, len(dataset) - 1})
 for frame in frames:
@@ -161,17 +170,26 @@ def dataset_opens(dataset: Dataset) -> Measurement:
         raise MissingDependencyError("Opening a dataset as a training does", "lerobot", f"pip install '{LEROBOT}'")
     with tempfile.TemporaryDirectory(prefix="demorec-check-") as cache:
         environment = {**os.environ, "HF_HUB_OFFLINE": "1", "HF_DATASETS_OFFLINE": "1", "HF_DATASETS_CACHE": cache}
-        done = subprocess.run(
-            [sys.executable, "-c", _OPEN, str(dataset.path)],
-            capture_output=True,
-            text=True,
-            env=environment,
-            timeout=600,
-            check=False,
-        )
+        try:
+            done = subprocess.run(
+                [sys.executable, "-c", _OPEN, str(dataset.path)],
+                capture_output=True,
+                text=True,
+                errors="replace",
+                env=environment,
+                timeout=_PATIENCE_S,
+                check=False,
+            )
+        except subprocess.TimeoutExpired:
+            return Measurement(value=1, detail=f"LeRobot has not opened it after {_PATIENCE_S} s")
     if done.returncode != 0:
         lines = [line for line in done.stderr.splitlines() if line.strip()]
         said = re.sub(r"^[\w.]+: ", "", lines[-1])[:200] if lines else f"it ends with the exit status {done.returncode}"
+        if not done.stdout.startswith("loaded") or done.returncode == -signal.SIGKILL or _NO_MEMORY.search(done.stderr):
+            raise ResourceError(
+                f"LeRobot could not be tried ({said.strip().rstrip('.')}): is there too little memory? Free some, or "
+                f"raise the limit (ulimit -v); whether the dataset is sound is not known: {dataset.path}"
+            )
         # It asks the Hub for files that are missing here, and complains that it may not.
         problems = dataset_problems(dataset.path, dataset.info)
         return Measurement(value=1, detail=f"LeRobot cannot open it ({problems[0] if problems else said})")

@@ -57,6 +57,10 @@ COMMANDS: Registry[type[Command]] = Registry(
 )
 
 
+_MAX_TOLD = 4000
+"""Characters of an error's sentence."""
+
+
 def main(argv: Sequence[str] | None = None) -> None:
     """Entry point of `demorec`."""
     args = list(sys.argv[1:] if argv is None else argv)
@@ -96,7 +100,7 @@ def run_command(command: type[Command], args: Sequence[str], *, prog: str) -> in
     try:
         return parse_command(command, args, prog=prog).run()
     except DemorecError as error:
-        tell(f"{prog}: {error.of_flag() if isinstance(error, OptionError) else error}")
+        tell(f"{prog}: {_shortened(error.of_flag() if isinstance(error, OptionError) else str(error))}")
         return error.exit_code
     except KeyboardInterrupt:
         tell(f"{prog}: interrupted.")
@@ -111,6 +115,11 @@ def run_command(command: type[Command], args: Sequence[str], *, prog: str) -> in
             return 1
         tell(f"{prog}: {lack}")
         return lack.exit_code
+
+
+def _shortened(text: str) -> str:
+    """A sentence without its middle where it quotes a file at great length."""
+    return text if len(text) <= _MAX_TOLD else f"{text[: _MAX_TOLD * 3 // 4]} ... {text[-_MAX_TOLD // 4 :]}"
 
 
 def parse_command(command: type[Command], args: Sequence[str], *, prog: str) -> Command:

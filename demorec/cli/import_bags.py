@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from demorec.cli.shared.output import counted, say, tell
+from demorec.cli.shared.paths import refuse_inside
 from demorec.cli.shared.progress import ProgressBar
 from demorec.config import VideoConfig
 from demorec.errors import ConfigError, check_option
@@ -67,6 +68,8 @@ class Import:
         """Import, or suggest a mapping, and say what was found; 1 when bags were skipped."""
         if not self.bags:
             raise ConfigError("No bag is given: name one, e.g. demorec import --suggest monday.mcap.")
+        if self.out is not None:
+            refuse_inside([self.out])
         check_option("workers", self.workers, 1, MAX_WORKERS)
         is_hdf5 = self.bags[0] == _HDF5
         if (is_hdf5 or self.bags[0] == _LEROBOT) and (self.skip_bad or self.workers > 1):

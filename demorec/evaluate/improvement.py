@@ -34,7 +34,7 @@ from demorec.plain import to_plain
 from demorec.processes import start_program
 from demorec.runs.lock import LOCK_NAME, run_lock
 from demorec.runs.run_file import free_name, load_run_file
-from demorec.safety.files import replace_text
+from demorec.safety.files import read_json_object, replace_text
 from demorec.scene.features import ActionKind, StateKind
 
 SETTINGS_NAME, TRAINED_NAME, LOG_NAME = "improve.json", "training.json", "training.log"
@@ -130,7 +130,7 @@ class Improvement:
         path = self._out / SETTINGS_NAME
         plan = to_plain(replace(self._plan, num_rounds=0, num_scenes=0))
         try:
-            settings = json.loads(self._plan.config_path.read_text())
+            settings = read_json_object(self._plan.config_path)
         except (OSError, ValueError) as error:
             raise ConfigError(
                 f"The settings of the training cannot be read ({in_words(error)}): {self._plan.config_path}"
@@ -147,7 +147,7 @@ class Improvement:
             replace_text(path, json.dumps(found, indent=1))
             return
         try:
-            before = {"state": "joint", **json.loads(path.read_text())}  # there was no other kind at first
+            before = {"state": "joint", **read_json_object(path)}  # there was no other kind at first
         except (OSError, ValueError, TypeError) as error:
             raise DemorecError(f"{SETTINGS_NAME} is damaged ({in_words(error)}): {path}") from error
         if lines := plain_differences(before, json.loads(json.dumps(found))):
@@ -218,11 +218,15 @@ class Improvement:
         folder = self._folder(number)
         done, train = folder / TRAINED_NAME, self.policy(number)
         if done.exists():
-            found = json.loads(done.read_text())
+            try:
+                found = read_json_object(done)
+                seconds = float(found["cpu_seconds"])
+            except (OSError, ValueError, KeyError, TypeError) as error:
+                raise DemorecError(f"{TRAINED_NAME} is damaged ({in_words(error)}): {done}") from error
             _, digest = policy_summary(find_checkpoint(train))
             if found.get("policy_digest") != digest:
                 raise DemorecError(f"The policy is not the one that was trained here (its digest differs): {train}")
-            return float(found["cpu_seconds"])
+            return seconds
         checkpoint = train / "checkpoints" / "last" / "pretrained_model" / TRAIN_CONFIG_NAME
         if checkpoint.exists():
             words = [f"--config_path={checkpoint}", "--resume=true"]

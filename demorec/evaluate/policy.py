@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import io
-import json
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 
 from demorec.errors import ConfigError, MissingDependencyError, NotAllowedError, OptionError, in_words
 from demorec.lerobot.paths import INFO_PATH
+from demorec.safety.files import read_json_object
 from demorec.safety.user_modules import is_allowed
 from demorec.scene.features import ActionKind
 
@@ -44,9 +44,9 @@ def policy_summary(checkpoint: Path) -> tuple[dict[str, Any], str]:
         if path.suffix in (".json", ".safetensors") and path.name != TRAIN_CONFIG_NAME:
             sha.update(path.name.encode() + b"\0" + path.read_bytes())
     try:
-        config: dict[str, Any] = json.loads((checkpoint / CONFIG_NAME).read_text())
-    except ValueError as error:
-        raise ConfigError(f"{CONFIG_NAME} of the policy is no JSON ({in_words(error)}): {checkpoint}") from error
+        config = read_json_object(checkpoint / CONFIG_NAME)
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{CONFIG_NAME} of the policy cannot be used ({in_words(error)}): {checkpoint}") from error
     return config, sha.hexdigest()[:16]
 
 
@@ -60,10 +60,9 @@ def check_steps(checkpoint: Path, allowed: Iterable[str]) -> None:
     """
     for path in sorted(checkpoint.glob("*.json")):
         try:
-            plain = json.loads(path.read_text())
+            steps = read_json_object(path).get("steps")
         except (OSError, ValueError):
             continue  # LeRobot cannot read it either, and says so
-        steps = plain.get("steps") if isinstance(plain, dict) else None
         for step in steps if isinstance(steps, list) else ():
             if not isinstance(step, dict) or "registry_name" in step or "class" not in step:
                 continue
@@ -78,8 +77,8 @@ def check_steps(checkpoint: Path, allowed: Iterable[str]) -> None:
 def trained_action(checkpoint: Path) -> ActionKind | None:
     """What the policy's actions mean, from the names in the dataset that it was trained on; None if that is gone."""
     try:
-        root = json.loads((checkpoint / TRAIN_CONFIG_NAME).read_text())["dataset"]["root"]
-        info = json.loads((Path(root) / INFO_PATH).read_text())
+        root = read_json_object(checkpoint / TRAIN_CONFIG_NAME)["dataset"]["root"]
+        info = read_json_object(Path(root) / INFO_PATH)
         names = info["features"]["action"]["names"]
         first = str(names[0] if isinstance(names, list) else next(iter(names.values()))[0])
     except (OSError, ValueError, KeyError, TypeError, IndexError, AttributeError, StopIteration):

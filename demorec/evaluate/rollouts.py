@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import functools
 import json
+import reprlib
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field, replace
@@ -37,7 +38,7 @@ from demorec.plain import from_plain, to_plain
 from demorec.recording import EpisodeWriter
 from demorec.runs.find import EVALUATION_NAME
 from demorec.runs.run_file import EPISODES, FAILED, Attempt
-from demorec.safety.files import replace_text
+from demorec.safety.files import read_json_object, replace_text
 from demorec.safety.replacing import (
     ReplaceableKind,
     check_replaceable,
@@ -136,9 +137,14 @@ def settings_for(
     checkpoint = find_checkpoint(policy)
     check_steps(checkpoint, allowed)
     plain, digest = policy_summary(checkpoint)
-    inputs: Mapping[str, Any] = plain.get("input_features") or {}
-    pictures = {name.removeprefix(IMAGE_PREFIX): value["shape"] for name, value in inputs.items()
-                if name.startswith(IMAGE_PREFIX)}  # fmt: skip
+    try:
+        inputs = {name: _shape(value["shape"]) for name, value in (plain.get("input_features") or {}).items()}
+        pictures = {name.removeprefix(IMAGE_PREFIX): shape for name, shape in inputs.items()
+                    if name.startswith(IMAGE_PREFIX)}  # fmt: skip
+        if any(len(shape) != 3 for shape in pictures.values()):
+            raise ValueError("an image of other than three dimensions")
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ConfigError(f"The inputs of the policy cannot be used ({in_words(error)}): {checkpoint}") from error
     if pictures:
         (_, height, width), *_ = pictures.values()
         own = {camera_name(name): name for name in config.cameras}
@@ -165,11 +171,17 @@ def settings_for(
     )
 
 
-def _state_kind(inputs: Mapping[str, Any], robot: RobotSpec) -> StateKind:
+def _shape(value: object) -> tuple[int, ...]:
+    if not isinstance(value, list) or not all(type(size) is int and size > 0 for size in value):
+        raise ValueError(f"a shape of {reprlib.repr(value)}")
+    return tuple(value)
+
+
+def _state_kind(inputs: Mapping[str, tuple[int, ...]], robot: RobotSpec) -> StateKind:
     """By how many numbers of observation.state the policy takes; "joint" for what is neither, which LeRobot refuses."""
     if STATE not in inputs:
         return "joint"
-    return "joint_ee" if list(inputs[STATE]["shape"]) == [len(state_names(robot, "joint_ee"))] else "joint"
+    return "joint_ee" if inputs[STATE] == (len(state_names(robot, "joint_ee")),) else "joint"
 
 
 def evaluate(
@@ -211,8 +223,7 @@ def load_evaluation(folder: Path) -> Evaluation:
     """Read evaluation.json; ConfigError where there is none, DemorecError where it is damaged."""
     path = folder / EVALUATION_NAME
     try:
-        plain = json.loads(path.read_text())
-        return from_plain(plain, Evaluation)
+        return from_plain(read_json_object(path), Evaluation)
     except FileNotFoundError as error:
         raise ConfigError(f"No {EVALUATION_NAME}, so this is no output of demorec evaluate: {folder}") from error
     except (OSError, ValueError) as error:

@@ -63,9 +63,7 @@ def foreign_recordings(folder: Path, place: str, *, known: frozenset[str] = froz
         return
     for name in files_below(folder / place):
         file = folder / place / name
-        is_ours = file.is_file() and (
-            f"{place}/{name}" in known or file.stat().st_size == 0 or RECORDING.recognises(file)
-        )
+        is_ours = file.is_file() and (f"{place}/{name}" in known or RECORDING.recognises(file))
         if not (_RECORDING.fullmatch(name) and is_ours):
             yield f"{place}/{name}"
 

@@ -39,6 +39,7 @@ from demorec.runs.run_file import (
 from demorec.safety.files import make_folder
 from demorec.safety.replacing import (
     check_replaceable,
+    check_unsettled_parts,
     files_below,
     has_unsettled_parts,
     obstacle,
@@ -175,7 +176,9 @@ def open_run(
     path = options.out.absolute()
     asked = RunFile(config=config, versions=deciding_versions(config), num_episodes=options.num_episodes)
     with _told_as_unusable(path):
-        if not has_unsettled_parts(path):
+        if has_unsettled_parts(path):
+            check_unsettled_parts(path, PARTS)
+        else:
             _check_request(path, asked, options, inspect=inspect)
     make_folder(path)
     with run_lock(path):  # from here on nobody else changes it, so what was found is looked at once more

@@ -20,6 +20,7 @@ from demorec.errors import ConfigError, in_words
 from demorec.ingest.channel import BagError
 from demorec.ingest.dataset_pictures import DatasetCamera, DepthCamera, ImageCamera, VideoCamera
 from demorec.ingest.frames_writer import FramesImport, write_frames
+from demorec.ingest.mapping_file import MAX_ELEMENTS
 from demorec.lerobot.data_stats import column_numbers
 from demorec.lerobot.depth import DepthScale
 from demorec.lerobot.files import open_table
@@ -212,6 +213,8 @@ def _why_left_out(name: str, feature: Feature) -> str:
         return _why_no_distances(feature)
     if feature.dtype not in ("video", "image", *_RECORDED):
         return f"it is {feature.dtype}, and recordings of other robots hold numbers"
+    if feature.is_numeric and feature.dtype != "image" and feature.shape[0] > MAX_ELEMENTS:
+        return f"it has {feature.shape[0]:,} numbers a row, and recordings of other robots hold up to {MAX_ELEMENTS:,}"
     if feature.is_numeric and feature.dtype != "image" and len(feature.shape) > 1:
         return f"it is an array of {'x'.join(map(str, feature.shape))}, and recordings of other robots hold vectors"
     return ""

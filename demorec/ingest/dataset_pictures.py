@@ -15,7 +15,6 @@ from typing import Any, cast
 
 import av
 import numpy as np
-import pyarrow as pa
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -23,7 +22,7 @@ from demorec.config import MAX_PIXELS
 from demorec.errors import in_words
 from demorec.ingest.channel import BagError
 from demorec.ingest.frames_writer import Picture
-from demorec.lerobot.files import check_video, open_table
+from demorec.lerobot.files import check_video, table_batches
 from demorec.lerobot.layout import VIDEO_PATH, DatasetInfo
 from demorec.lerobot.packets import PACKET_CODECS, PacketCodec, access_units, episode_distances
 from demorec.lerobot.reader import EpisodePlace
@@ -185,6 +184,13 @@ def _opened(path: Path) -> Iterator[tuple[av.container.InputContainer, av.video.
         raise BagError(f"The video cannot be read ({in_words(error)}): {path}") from error
 
 
+_LARGE_BYTES, _IMAGE_RATIO = 24 << 20, 200
+"""An image of more pixels than that, in RGB (8 million), takes at least so small a part of them as a file."""
+_PIXEL_BYTES, _FILE_RATIO = 512 << 20, 1000
+"""All images of a dataset may have so many bytes of pixels, or so many times its files: deflate reaches 1,032, and rows
+that share one image share its bytes."""
+
+
 class DepthCamera(DatasetCamera):
     """Distances in mp4 files, as codes: what LeRobot and our own exports make of them."""
 
@@ -213,6 +219,7 @@ class ImageCamera(DatasetCamera):
         self._root, self._template = root, info.data_path
         self._path: Path | None = None
         self._rows: Iterator[tuple[int, Any]] = iter(())
+        self._allowed = _PIXEL_BYTES
         first = next(self.pictures(places[0]))
         self.height, self.width = first.shape[:2]
         self._path = None
@@ -222,10 +229,11 @@ class ImageCamera(DatasetCamera):
         path = self._root / place.data.path(self._template)
         if path != self._path:
             self._path, self._rows = path, _image_rows(path, self.key)
+            self._allowed += _FILE_RATIO * path.stat().st_size if path.is_file() else 0
         found = 0
         while found < place.length:
             index, value = next(self._rows, (-1, None))
-            if index < 0:
+            if index == -1:  # not "below 0": a damaged table has indices of any type
                 raise BagError(f"Episode {place.episode_index} has {place.length} frames, but {found} pictures: {path}")
             if index == place.from_index + found:
                 found += 1
@@ -237,9 +245,15 @@ class ImageCamera(DatasetCamera):
             if not data:
                 raise ValueError("it is not in the table")
             with Image.open(io.BytesIO(data), formats=("PNG", "JPEG")) as image:
-                if image.width * image.height > MAX_PIXELS or image.mode not in ("RGB", "RGBA", "L", "P", "1"):
-                    raise ValueError(f"{image.width}x{image.height} pixels of the kind {image.mode}")
-                picture = np.asarray(image.convert("RGB"))
+                pixels, kind = image.width * image.height, f"{image.width}x{image.height} pixels"
+                if pixels > MAX_PIXELS or image.mode not in ("RGB", "RGBA", "L", "P", "1"):
+                    raise ValueError(f"{kind} of the kind {image.mode}")
+                self._allowed -= 3 * pixels
+                if 3 * pixels > max(_LARGE_BYTES, _IMAGE_RATIO * len(data)):
+                    raise ValueError(f"{kind} in {len(data):,} bytes are no image of a camera")
+                if self._allowed < 0:
+                    raise ValueError(f"{kind} in so many rows are too many for files of this size")
+                picture = np.asarray(image if image.mode == "RGB" else image.convert("RGB"))
         except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
             raise BagError(f"A picture of {self.key} cannot be read ({in_words(error)}): {path}") from error
         if self.width and picture.shape[:2] != (self.height, self.width):
@@ -249,8 +263,5 @@ class ImageCamera(DatasetCamera):
 
 def _image_rows(path: Path, key: str) -> Iterator[tuple[int, Any]]:
     """(index, picture) of each row."""
-    try:
-        for batch in open_table(path, ["index", key]).iter_batches(batch_size=16, columns=["index", key]):
-            yield from zip(batch.column("index").to_pylist(), batch.column(key).to_pylist(), strict=True)
-    except (OSError, ValueError, pa.ArrowException) as error:
-        raise BagError(f"The table cannot be read ({in_words(error)}): {path}") from error
+    for batch in table_batches(path, ["index", key], rows=16):
+        yield from zip(batch.column("index").to_pylist(), batch.column(key).to_pylist(), strict=True)

@@ -7,6 +7,7 @@ import math
 import re
 import reprlib
 import sys
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,11 @@ _RATES = ("fps", "env_args.env_kwargs.fps", "env_args.env_kwargs.control_freq")
 
 
 def episode_places(file: ForeignFile, episodes: Hdf5Episodes) -> list[str]:
-    """The groups of the episodes, demo_2 before demo_10; Hdf5Error when there are none, or not those of the mask."""
+    """The groups of the episodes, demo_2 before demo_10.
+
+    Raises:
+        Hdf5Error: There are none, not those of the mask, or one of them twice.
+    """
     group = episodes.group.strip("/")
     if not group:
         return [""]
@@ -40,7 +45,13 @@ def episode_places(file: ForeignFile, episodes: Hdf5Episodes) -> list[str]:
         raise Hdf5Error(
             f"{group}/{others[0]} is a link or a type, only groups within the file are episodes: {file.path}"
         )
-    return [f"{group}/{name}" for name in sorted(names, key=_natural)]
+    places = [f"{group}/{name}" for name in sorted(names, key=_natural)]
+    seen: dict[int, str] = {}
+    for place in places:
+        first = seen.setdefault(file.address(place), place)
+        if first != place:
+            raise Hdf5Error(f"{place} is the same group as {first}, an episode stands in a file once: {file.path}")
+    return places
 
 
 def _natural(name: str) -> list[Any]:
@@ -62,16 +73,22 @@ def found_attribute(file: ForeignFile, place: str, name: str) -> Scalar | None:
 
 
 def _in_json(text: str, keys: list[str]) -> Scalar | None:
-    try:
-        value = json.loads(text)
-    except (ValueError, RecursionError):
-        return None
+    value = _parsed(text)
     for key in keys:
         if isinstance(value, list):
             value = value[int(key)] if key.isdecimal() and len(key) < 10 and int(key) < len(value) else None
         else:
             value = value.get(key) if isinstance(value, dict) else None
     return value if isinstance(value, str | bool | int | float) else None
+
+
+@lru_cache(maxsize=4)
+def _parsed(text: str) -> Any:
+    """Of JSON, which may stand above a thousand episodes; None when it is none."""
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError):
+        return None
 
 
 def rate_of(file: ForeignFile, place: str, mapping: Hdf5Mapping) -> int:

@@ -33,6 +33,7 @@ _MAX_FILE_BYTES = 1 << 20
 _MAX_TABLES, _MAX_VALUES = 1000, 50_000
 _MAX_TEXT = 10_000
 _MAX_TOLD = 8
+"""Mistakes that are told at once."""
 _PART = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
 _DEEP_KEY = re.compile(rf"(?<![\w-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{16}}")
 """What no mapping has: each part of a key makes a table, and takes as long as all before it."""
@@ -77,7 +78,7 @@ class AnyMapping(ABC):
 def feature_problems(features: Mapping[str, Sequence[Part]]) -> Iterator[str]:
     """What is impossible in features, whatever their parts are taken from."""
     if len(features) > MAX_FEATURES:
-        yield f"it has {len(features)} features, at most {MAX_FEATURES} are recorded"
+        yield f"there are {len(features):,} features, allowed are up to {MAX_FEATURES}"
         return
     if STATE not in features:
         yield f'there is no feature {STATE!r}: write [[features."{STATE}"]] and what it is taken from'
@@ -115,9 +116,10 @@ def _part_problems(place: str, name: str, part: Part, features: Mapping[str, Seq
 
 
 def camera_name_problems(cameras: Mapping[str, object]) -> Iterator[str]:
-    """Names that no camera can have."""
+    """Names that no camera can have; too many cameras."""
     if len(cameras) > MAX_CAMERAS:
-        yield f"it has {len(cameras)} cameras, at most {MAX_CAMERAS} are recorded"
+        yield f"there are {len(cameras):,} cameras, allowed are up to {MAX_CAMERAS}"
+        return
     for name in cameras:
         if not name.isidentifier():
             yield f"a camera cannot be called {name!r}: letters, digits and underscores are allowed"

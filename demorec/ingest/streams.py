@@ -396,7 +396,7 @@ class _Reading:
         self._texts[topic].append(Text(time_ns=time_ns, value=value, is_header=stamp is not None))
 
     def check(self, bag: Bag, unread: Sequence[str]) -> None:
-        """Raise BagError for all that the mapping names and the bag lacks; `unread` says what of it could not be read."""
+        """Raise BagError for all that the mapping names and the bag lacks; `unread` is what could not be read of it."""
         problems = []
         if not self._counts:
             raise BagError(f"The bag holds no messages{f' ({unread[0]})' if unread else ''}: {bag.path}")

@@ -28,6 +28,7 @@ from demorec.lerobot.reader import read_tasks
 from demorec.lerobot.robots import ROBOTS_DIR
 from demorec.lerobot.thumbnails import THUMBNAILS_PATH, write_thumbnails
 from demorec.lerobot.writer import write_text
+from demorec.safety.text import markdown, printable
 from demorec.scene.features import (
     ACTION,
     COMMAND,
@@ -145,18 +146,19 @@ def _card(root: Path, info: DatasetInfo, about: CardFacts, has_sheet: bool) -> I
     yield from ("tags:", "- LeRobot", "- demorec", *(["- simulation"] if about.is_simulated else []))
     yield from ("configs:", "- config_name: default", "  data_files: data/*/*.parquet", "---", "")
     yield from (f"# {options.repo_id}", "")
+    robot = markdown(str(info.robot_type))
     plural = "" if info.total_episodes == 1 else "s"
     whose = (
-        f"scripted demonstration{plural} by a simulated {info.robot_type} arm in PyBullet"
+        f"scripted demonstration{plural} by a simulated {robot} arm in PyBullet"
         if about.is_simulated
-        else f"demonstration{plural} of {info.robot_type}"
+        else f"demonstration{plural} of {robot}"
     )
     yield (
         f"{info.total_episodes} {whose}, "
         f"{info.total_frames} frames at {info.fps} Hz ({minutes:.1f} minutes), in the LeRobot v3.0 format. Recorded "
         f"and exported by demorec; {pictures}."
     )
-    yield from ("", "## Task", "", *(f"- {task}" for task in tasks[:20]))
+    yield from ("", "## Task", "", *(f"- {markdown(task)}" for task in tasks[:20]))
     if len(tasks) > 20:
         yield f"- and {len(tasks) - 20} more"
     if has_sheet:
@@ -166,7 +168,8 @@ def _card(root: Path, info: DatasetInfo, about: CardFacts, has_sheet: bool) -> I
     yield from (f'dataset = LeRobotDataset("{options.repo_id}", video_backend="pyav")', "```", "")
     yield from ("## Features", "", "| feature | type | shape | meaning |", "|---|---|---|---|")
     for key, item in info.features.items():
-        yield f"| `{key}` | {item.dtype} | {list(item.shape)} | {_meaning(key, item, about)} |"
+        name = f"`{key}`" if markdown(key) == key else markdown(key)
+        yield f"| {name} | {markdown(item.dtype)} | {list(item.shape)} | {_meaning(key, item, about)} |"
     yield from ("", "Names of all components are in `meta/info.json`.", "", "## Contract", "")
     yield from (_SIMULATED_ROWS if about.is_simulated else _EXTERNAL_ROWS, "")
     yield from _success_section(_read_attempts(root))
@@ -204,7 +207,7 @@ def _meaning(key: str, item: Feature, about: CardFacts) -> str:
     if item.is_depth:
         return "distance along the optical axis, 12-bit logarithmic codes of 0.01 to 10 m; 0.01 m: nothing was hit"
     if key.startswith(IMAGE_PREFIX):
-        return f"camera {key.removeprefix(IMAGE_PREFIX)}, RGB"
+        return f"camera {markdown(key.removeprefix(IMAGE_PREFIX))}, RGB"
     if key in SENSED:
         return SENSED[key].meaning
     return _MEANING.get(key, "filled in by LeRobot's rules")
@@ -215,11 +218,11 @@ def _origin_section(root: Path, about: CardFacts) -> Iterable[str]:
     yield ""
     for digest, config in about.configs.items():
         chosen = ", ".join(f"{key} {config[key]}" for key in ("task", "robot", "renderer", "seed") if key in config)
-        yield f"- configuration `{digest or 'unknown'}`: {chosen or 'not recorded'}"
+        yield f"- configuration `{markdown(digest) or 'unknown'}`: {markdown(chosen) or 'not recorded'}"
     yield ""
     commands = making_commands(root, about.configs, about.options)
     if commands:
-        yield from ("Made by these commands:", "", "```sh", *commands, "```", "")
+        yield from ("Made by these commands:", "", "```sh", *map(printable, commands), "```", "")
         yield "This makes it again, from what this folder says about itself, and compares every episode to the bit:"
         yield from ("", "```sh", "demorec reproduce path/of/this/folder --out copy", "```", "")
 
@@ -275,7 +278,7 @@ def _success_section(attempts: _Attempts) -> Iterable[str]:
         if not success:
             counts[reason] = counts.get(reason, 0) + 1
     for reason, count in sorted(counts.items(), key=lambda item: (-item[1], item[0])):
-        yield f"- {count} failed: {reason or 'no reason recorded'}"
+        yield f"- {count} failed: {markdown(reason) or 'no reason recorded'}"
     yield ""
     for what, positions in attempts.positions.items():
         if total >= 2 and np.isfinite(positions).all():

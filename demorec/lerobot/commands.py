@@ -8,10 +8,9 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-import pyarrow.parquet as pq
-
 from demorec.config import GenerateConfig, parse_config
 from demorec.errors import ConfigError
+from demorec.lerobot.files import read_table
 from demorec.lerobot.options import ExportOptions
 from demorec.lerobot.paths import SIDECAR_DIR
 
@@ -31,11 +30,12 @@ def making_commands(root: Path, configs: Mapping[str, Any], options: ExportOptio
         options: Of the export.
     """
     files = sorted((root / SIDECAR_DIR / "episodes").glob("*/*.parquet"))
-    rows = [row for file in files for row in pq.read_table(file, columns=["run_episode_index", "origin"]).to_pylist()]
+    rows = [row for file in files for row in read_table(file, ["run_episode_index", "origin"]).to_pylist()]
     if options.append or len(configs) != 1 or any(row["origin"] for row in rows):
         return []
     try:
         config = parse_config(next(iter(configs.values())), GenerateConfig, source="the configuration")
+        config.check_names(config.modules)
     except ConfigError:
         return []
     num_episodes = 1 + max(row["run_episode_index"] for row in rows)

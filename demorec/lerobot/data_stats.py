@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from demorec.errors import ExportError
 from demorec.geometry import Array
-from demorec.lerobot.files import open_table
+from demorec.lerobot.files import table_batches
 from demorec.lerobot.layout import Feature
 from demorec.lerobot.stats import QUANTILES, Statistics, quantile_ranks
 
@@ -73,9 +73,8 @@ def data_statistics(files: Iterable[Path], features: Mapping[str, Feature]) -> d
 
 def _batches(paths: Sequence[Path], names: list[str]) -> Iterator[list[NDArray[Any]]]:
     for path in paths:
-        with open_table(path, names) as file:
-            for batch in file.iter_batches(batch_size=_BATCH_ROWS, columns=names):
-                yield [column_numbers(batch.column(name)) for name in names]
+        for batch in table_batches(path, names, rows=_BATCH_ROWS):
+            yield [column_numbers(batch.column(name)) for name in names]
 
 
 def column_numbers(column: pa.Array) -> NDArray[Any]:

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 
+from demorec.lerobot.files import open_table
 from demorec.lerobot.progress import STAGE_COLUMNS
 from demorec.recording import Recording
 from demorec.scene.episode import EpisodeColumns, SuccessCheck
@@ -49,11 +49,11 @@ def fact_type(name: str) -> pa.DataType | None:
 
 
 def facts_of(root: Path) -> tuple[str, ...]:
-    """Names of the columns of facts in the table of episodes of a dataset; ValueError or OSError when it is damaged."""
+    """Names of the columns of facts in the table of episodes of a dataset; ExportError when it is damaged."""
     tables = sorted((root / "meta" / "episodes").glob("*/*.parquet"))
     if not tables:
         return ()
-    schema = pq.read_schema(tables[0])
+    schema = open_table(tables[0]).schema_arrow
     return tuple(item.name for item in schema if (kind := fact_type(item.name)) is not None and kind == item.type)
 
 

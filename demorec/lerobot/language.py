@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from demorec.errors import ExportError, in_words
 from demorec.language.kinds import STATES
-from demorec.lerobot.files import open_table
+from demorec.lerobot.files import table_batches
 from demorec.scene.features import IMAGE_PREFIX
 
 if TYPE_CHECKING:
@@ -235,7 +235,7 @@ def spoken_episodes(root: Path) -> Iterator[SpokenEpisode]:
     names = ["episode_index", *COLUMNS]
     for path in sorted((root / "data").glob("*/*.parquet")):
         try:
-            for batch in open_table(path, names).iter_batches(batch_size=64, columns=names):
+            for batch in table_batches(path, names):
                 indices, persistent, events = (batch.column(name) for name in names)
                 if not is_language(persistent.type) or not is_language(events.type):
                     raise ValueError("language columns of another type")

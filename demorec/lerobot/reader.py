@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from demorec.errors import ExportError, in_words
 from demorec.lerobot.data_stats import column_numbers
-from demorec.lerobot.files import check_video, open_table, read_table
+from demorec.lerobot.files import check_video, read_table, table_batches
 from demorec.lerobot.language import column_digests
 from demorec.lerobot.layout import TASKS_PATH, VIDEO_PATH, DatasetInfo, FilePosition
 
@@ -116,15 +116,11 @@ class RowReader:
         if place.data != self._position:
             self._position = place.data
             path = self._root / place.data.path(self._info.data_path)
-            table = open_table(path, self.names)
             has_strings = any(feature.dtype in ("string", "language") for feature in self._info.features.values())
-            self._batches = table.iter_batches(batch_size=64 if has_strings else 4096, columns=self.names)
+            self._batches = table_batches(path, self.names, rows=64 if has_strings else 4096)
             self._held = {}
         while self._num_held() < place.length:
-            try:
-                batch = next(self._batches, None)
-            except (OSError, ValueError, pa.ArrowException) as error:
-                raise ExportError(f"The data of episode {place.episode_index} cannot be read: {self._root}") from error
+            batch = next(self._batches, None)
             if batch is None:
                 raise ExportError(
                     f"Episode {place.episode_index} has {place.length} frames, its data file ends before: {self._root}"

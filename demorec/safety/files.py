@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from demorec.errors import ConfigError
+from demorec.plain import parse_json
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 RERUN_MAGICS = (b"RRF", b"RRIO")
@@ -36,6 +37,8 @@ def open_regular(path: Path) -> BufferedReader:
     Raises:
         OSError: There is none, it cannot be opened, or it is a folder, FIFO, socket or device; `strerror` says which.
     """
+    if "\0" in str(path):
+        raise OSError(errno.EINVAL, "its name holds a zero byte", str(path))
     _refuse_irregular(path, path.stat().st_mode)
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
@@ -72,6 +75,23 @@ def read_json_limited(path: Path, limit: int) -> Any:
         return json.loads(read_text_limited(path, limit))
     except RecursionError:
         raise ValueError("its values are nested too deeply") from None
+
+
+MAX_SETTINGS_BYTES = 16 << 20
+"""Of a JSON file of settings or results; ours, and LeRobot's, have some kilobytes."""
+
+
+def read_json_object(path: Path) -> dict[str, Any]:
+    """The JSON object in a regular file of settings or results, nested no deeper than code can walk.
+
+    Raises:
+        OSError: As `read_text_limited`.
+        ValueError: It is no UTF-8, no JSON, no object, or nested too deeply.
+    """
+    found = parse_json(read_text_limited(path, MAX_SETTINGS_BYTES), allow_nan=True)
+    if not isinstance(found, dict):
+        raise ValueError("it is no JSON object")
+    return found
 
 
 def make_folder(path: Path) -> None:

@@ -72,7 +72,7 @@ def check_replaceable(
 ) -> None:
     """Raise unless `target` is free, or may be replaced by something of its kind and the user asks for that.
 
-    An empty file and an empty folder count as free.
+    An empty folder counts as free; an empty file does not, since somebody's lock or mark may be one.
 
     Args:
         target: Where something new shall be.
@@ -145,7 +145,7 @@ def protection(folder: Path) -> str:
 
 
 def _is_empty(path: Path) -> bool:
-    return not any(path.iterdir()) if path.is_dir() else path.is_file() and path.stat().st_size == 0
+    return path.is_dir() and not any(path.iterdir())
 
 
 def shown(names: Sequence[str]) -> str:
@@ -197,8 +197,18 @@ def replaced_parts(folder: Path, names: Sequence[str]) -> Iterator[None]:
 
 
 def has_unsettled_parts(folder: Path) -> bool:
-    """Whether a crash within `replaced_parts` has left something for `settle_parts`."""
-    return os.path.lexists(folder / _ASIDE)
+    """Whether a crash within `replaced_parts` has left something for `settle_parts`: what has its mark."""
+    return (folder / _ASIDE / _MARK).is_file()
+
+
+def check_unsettled_parts(folder: Path, names: Sequence[str]) -> None:
+    """Raise ConfigError where what is there by the name of such leftovers is not ours."""
+    aside = folder / _ASIDE
+    if not os.path.lexists(aside):
+        return
+    found = {path.name for path in aside.iterdir()} if aside.is_dir() and not aside.is_symlink() else {"no folder"}
+    if not found <= {_MARK, *names} or (found and not (aside / _MARK).is_file()):
+        raise ConfigError(f"This was not made by demorec and is in the way, move it elsewhere: {aside}")
 
 
 def settle_parts(folder: Path, names: Sequence[str]) -> None:
@@ -208,11 +218,9 @@ def settle_parts(folder: Path, names: Sequence[str]) -> None:
         ConfigError: A folder of that name is there and is not ours.
     """
     aside = folder / _ASIDE
+    check_unsettled_parts(folder, names)
     if not os.path.lexists(aside):
         return
-    found = set() if aside.is_symlink() or not aside.is_dir() else {path.name for path in aside.iterdir()}
-    if not found <= {_MARK, *names} or (found and not (aside / _MARK).is_file()):
-        raise ConfigError(f"This was not made by demorec and is in the way, move it elsewhere: {aside}")
     if os.path.lexists(folder / names[0]):
         _drop(aside, names)
     else:
@@ -233,7 +241,7 @@ def _put_back(folder: Path, names: Sequence[str]) -> None:
     aside = folder / _ASIDE
     for name in reversed(names):
         if os.path.lexists(aside / name):
-            if (folder / name).is_dir() and _is_empty(folder / name):
+            if _is_empty(folder / name):
                 (folder / name).rmdir()
             (aside / name).rename(folder / name)
     (aside / _MARK).unlink(missing_ok=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import unicodedata
 
 _VISIBLE = {"\n": "\\n", "\r": "\\r", "\t": "\\t"}
@@ -19,6 +20,16 @@ def printable(text: str) -> str:
     if text.isprintable():  # nearly always; a plain space counts as printable
         return text
     return "".join(_spelt(character) for character in text)
+
+
+_MARKS = re.compile(r"^[#+=-]|[\\`*\[\]|~$#]|(?<![^\W_])_|_(?![^\W_])")
+"""What acts in a line of Markdown; an underscore within a word does not."""
+_ENTITIES = {ord("&"): "&amp;", ord("<"): "&lt;", ord(">"): "&gt;"}
+
+
+def markdown(text: str) -> str:
+    """The same text for a line of Markdown, which can do nothing but be read: no HTML, link, table or emphasis."""
+    return _MARKS.sub(r"\\\g<0>", printable(text)).translate(_ENTITIES)
 
 
 def display_width(text: str) -> int:

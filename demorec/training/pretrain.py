@@ -27,7 +27,7 @@ from torch.utils.data import default_collate
 
 from demorec.errors import ConfigError, DemorecError, in_words
 from demorec.runs.lock import LOCK_NAME, run_lock
-from demorec.safety.files import replace_text
+from demorec.safety.files import read_json_object, replace_text
 from demorec.training.columns import numbers
 from demorec.training.dataset import FastDataset
 from demorec.training.encoder import KeyframeEncoder, loss_of
@@ -297,7 +297,7 @@ def _settle(out: Path, settings: dict[str, Any]) -> Taught | None:
         replace_text(path, json.dumps({"settings": settings}, indent=1))
         return None
     try:
-        found = json.loads(path.read_text())
+        found = read_json_object(path)
         before = found["settings"]
         taught = Taught(**found["taught"]) if "taught" in found else None
         others = sorted(name for name in settings if before.get(name) != settings[name])

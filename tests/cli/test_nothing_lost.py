@@ -189,6 +189,7 @@ def note_in_dataset(run: Path, made: Path) -> None:
 SPOILERS: dict[str, Callable[[Path, Path], object]] = {
     "episodes/notes.txt": lambda run, made: (run / "episodes/notes.txt").write_text("mine"),
     "episodes/episode_000077.mcap": lambda run, made: (run / "episodes/episode_000077.mcap").write_text("mine"),
+    "episodes/episode_000078.mcap": lambda run, made: (run / "episodes/episode_000078.mcap").touch(),
     "episodes/mine.mcap": lambda run, made: shutil.copy(made / "alone.mcap", run / "episodes/mine.mcap"),
     "failed/chapter/1.tex": write_a_chapter,
     "unfinished/ideas.txt": lambda run, made: (run / "unfinished/ideas.txt").write_text("mine"),
@@ -248,6 +249,24 @@ def test_an_overwriting_that_fails_puts_the_run_back(run: Path, monkeypatch: pyt
         run_fake(run, num_episodes=2, seed=1, overwrite=True)
     assert {name: data for name, data in files_of(run).items() if name != ".lock"} == before
     assert not (run / ".demorec-replaced").exists()
+
+
+@pytest.mark.parametrize("aside", ["notes.txt", "what-this-is.txt", ""])
+def test_somebodys_folder_that_is_called_like_what_was_set_aside(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], aside: str
+) -> None:
+    """Not even a lock is left in a folder that a run refuses."""
+    folder = tmp_path / "thesis"
+    (folder / ".demorec-replaced").mkdir(parents=True)
+    (folder / ".demorec-replaced" / "chapter_1.tex").write_text("years of work")
+    if aside:
+        (folder / ".demorec-replaced" / aside).write_text("years of work")
+    (folder / "thesis.tex").write_text("years of work")
+    before = files_of(folder)
+    for flags in ((), ("--overwrite",)):
+        assert exit_code("generate", "--num-episodes", 1, "--out", folder, *flags) == 2
+        assert len(capsys.readouterr().err.splitlines()) == 1
+        assert files_of(folder) == before
 
 
 @pytest.mark.parametrize("moment", ["before", "moving", "moved", "made"])
@@ -447,6 +466,27 @@ def test_pictures_replace_pictures_only(place: Path, capsys: pytest.CaptureFixtu
     assert files_of(place.parent) == before
 
 
+@pytest.mark.parametrize("suffix", ["mcap", "hdf5", "rrd", "html", "png"])
+def test_an_empty_file_is_not_replaced(place: Path, capsys: pytest.CaptureFixture[str], suffix: str) -> None:
+    """It may be somebody's lock or mark; nothing in it says that it is ours."""
+    target, recording = place / f"lock.{suffix}", place / "alone.mcap"
+    target.touch()
+    before = files_of(place)
+    commands: dict[str, tuple[object, ...]] = {
+        "mcap": ("recover", recording, "--out", target),
+        "hdf5": ("export", "hdf5", recording, "--out", target),
+        "rrd": ("view", recording, "--save", target),
+        "html": ("report", recording, "--out", target),
+        "png": ("check", place / "runs/run", "--coverage-picture", target),
+    }
+    for flags in ((), ("--overwrite",)):
+        assert exit_code(*commands[suffix], *flags) == 2
+        said = capsys.readouterr().err
+        assert len(said.splitlines()) == 1
+        assert str(target) in said
+        assert files_of(place) == before
+
+
 def test_a_report_replaces_reports_only(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (place / "thesis.html").write_text("<!doctype html>\n<p>years of work")
     (place / "link.html").symlink_to(place / "alone.mcap")
@@ -503,6 +543,17 @@ def test_nothing_is_written_into_another_run_or_dataset(
     assert exit_code(*words, place / "alone.mcap", flag, place / target) == 2
     assert "Nothing else is written into" in capsys.readouterr().err
     assert files_of(place) == before
+
+
+@pytest.mark.parametrize("part", ["episodes", "failed", "unfinished", "failed/new"])
+def test_nothing_is_imported_into_a_part_of_a_run(place: Path, capsys: pytest.CaptureFixture[str], part: str) -> None:
+    (place / "runs/run/run.json").write_text("{}")
+    (place / "runs/run/unfinished").mkdir()
+    before = files_of(place)
+    assert exit_code("import", "lerobot", place / "dataset", "--out", place / "runs/run" / part) == 2
+    assert "Nothing else is written into a run" in capsys.readouterr().err
+    assert files_of(place) == before
+    assert not (place / "runs/run" / part / "episodes").exists()
 
 
 def test_what_is_made_beside_the_parts_of_a_run_is_taken(place: Path) -> None:

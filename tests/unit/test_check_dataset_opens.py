@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from support.commands import exit_code
 from support.export import export
 
 from demorec.check import dataset_files
@@ -24,7 +25,7 @@ def test_a_missing_file_is_named_and_not_the_hub(tmp_path: Path, monkeypatch: py
     video.unlink()
 
     def run(command: list[str], **_: Any) -> subprocess.CompletedProcess[str]:
-        return subprocess.CompletedProcess(command, 1, stdout="", stderr=_OF_LEROBOT)
+        return subprocess.CompletedProcess(command, 1, stdout="loaded\n", stderr=_OF_LEROBOT)
 
     monkeypatch.setattr(dataset_files, "lerobot_is_installed", lambda: True)
     monkeypatch.setattr(subprocess, "run", run)
@@ -33,3 +34,45 @@ def test_a_missing_file_is_named_and_not_the_hub(tmp_path: Path, monkeypatch: py
     assert found.value == 1
     assert str(video.relative_to(tmp_path / "d")) in found.detail
     assert "HF_HUB_OFFLINE" not in found.detail
+
+
+@pytest.mark.parametrize(
+    "module",
+    [
+        "raise ImportError('libtorch_cpu.so: failed to map segment from shared object')",
+        "raise SystemError('error return without exception set')",
+        "class LeRobotDataset:\n    def __init__(self, **_): raise MemoryError('Unable to allocate 3 GiB')",
+        "class LeRobotDataset:\n    def __init__(self, **_): import os; os.kill(os.getpid(), 9)",
+    ],
+)
+def test_too_little_memory_says_nothing_about_the_dataset(
+    module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What LeRobot ends with under `ulimit -v`, and when the kernel takes its memory: by a LeRobot of our own."""
+    export(SAMPLE, tmp_path / "d")
+    fake = tmp_path / "fake" / "lerobot" / "datasets"
+    fake.mkdir(parents=True)
+    for path in (fake.parent / "__init__.py", fake / "__init__.py"):
+        path.touch()
+    (fake / "lerobot_dataset.py").write_text(module)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "fake"))
+    assert exit_code("check", tmp_path / "d", "--only", "dataset_opens") == 1
+    out, err = capsys.readouterr()
+    assert "failed" not in out
+    assert "is there too little memory?" in err
+    assert len(err.splitlines()) == 1
+
+
+def test_a_dataset_that_lerobot_refuses_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    export(SAMPLE, tmp_path / "d")
+    fake = tmp_path / "fake" / "lerobot" / "datasets"
+    fake.mkdir(parents=True)
+    for path in (fake.parent / "__init__.py", fake / "__init__.py"):
+        path.touch()
+    (fake / "lerobot_dataset.py").write_text(
+        "class LeRobotDataset:\n    def __init__(self, **_): raise ValueError('no')"
+    )
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "fake"))
+    found = dataset_files.dataset_opens.measure(Dataset(tmp_path / "d"))
+    assert isinstance(found, Measurement)
+    assert found.value == 1

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import shlex
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from PIL import Image
 from support.export import export, make_run
-from support.recording import frame_number
+from support.mcap import rewritten
+from support.recording import frame_number, write_episode
 
 from demorec.cli.export import Export
 from demorec.cli.generate import Generate
@@ -18,6 +21,7 @@ from demorec.cli.shared.flags import parse
 from demorec.config import GenerateConfig, VideoConfig
 from demorec.lerobot.commands import flags
 from demorec.lerobot.options import ExportOptions
+from demorec.recording import Recording
 from demorec.scene.variation import Ranges
 
 
@@ -137,3 +141,20 @@ def test_thumbnails_are_labelled(tmp_path: Path) -> None:
         22,
         30,
     ]
+
+
+def test_nothing_foreign_acts_in_a_card(tmp_path: Path) -> None:
+    """Markdown's own words, HTML and what a terminal obeys, in the texts of a recording that somebody passed on."""
+    hostile = "# <script>alert(1)</script> ![x](http://e.org) | `y` *z* \x1b[2J \u202e"
+    good = write_episode(tmp_path / "good.mcap", num_frames=6, cameras=())
+    with Recording(good) as recording:
+        info = json.loads(recording._container.metadata("demorec.episode")["info"])  # type: ignore[index]
+    info["instruction"] = hostile
+    info["config"]["renderer"] = hostile
+    (tmp_path / "bad.mcap").write_bytes(rewritten(good, change={"demorec.episode": {"info": json.dumps(info)}}))
+    export(tmp_path / "bad.mcap", tmp_path / "d")
+    card = (tmp_path / "d" / "README.md").read_text()
+    for acting in ("<script", "\x1b", "\u202e", "![x]", "*z*", "`y`"):
+        assert acting not in card
+    assert r"- \# &lt;script&gt;alert(1)&lt;/script&gt;" in card
+    assert pq.read_table(tmp_path / "d/meta/tasks.parquet").column("task").to_pylist() == [hostile]

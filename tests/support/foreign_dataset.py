@@ -1,0 +1,62 @@
+"""A LeRobot v3.0 dataset as somebody's own program may write it, by PyArrow and JSON alone: images in its rows."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from PIL import Image
+
+DATA, TASKS = "data/chunk-000/file-000.parquet", "meta/tasks.parquet"
+EPISODES = "meta/episodes/chunk-000/file-000.parquet"
+_COUNTERS = {"timestamp": "float32", **dict.fromkeys(("frame_index", "episode_index", "index", "task_index"), "int64")}
+
+
+def write_foreign(root: Path, *, length: int = 8, episodes: int = 2, size: tuple[int, int] = (64, 48)) -> Path:
+    """Some episodes of `length` rows at 10 Hz, with a state, an action and a camera of `size` (width, height)."""
+    for place in (DATA, EPISODES):
+        (root / place).parent.mkdir(parents=True)
+    rows, width = length * episodes, 3
+    shapes: dict[str, Any] = {
+        "observation.state": {"dtype": "float32", "shape": [width], "names": ["a", "b", "c"]},
+        "action": {"dtype": "float32", "shape": [width], "names": None},
+        "observation.images.top": {"dtype": "image", "shape": [size[1], size[0], 3], "names": None},
+        **{name: {"dtype": kind, "shape": [1], "names": None} for name, kind in _COUNTERS.items()},
+    }
+    template = {"chunks_size": 1000, "data_files_size_in_mb": 100, "video_files_size_in_mb": 200, "video_path": None}
+    info = {
+        "codebase_version": "v3.0", "fps": 10, "features": shapes, "total_episodes": episodes, "total_frames": rows,
+        "total_tasks": 1, "robot_type": "so100", "splits": {"train": f"0:{episodes}"}, **template,
+        "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+    }  # fmt: skip
+    (root / "meta/info.json").write_text(json.dumps(info))
+    shown = io.BytesIO()
+    Image.new("RGB", size).save(shown, "PNG")
+    numbers = pa.array(np.random.default_rng(0).normal(size=rows * width).astype(np.float32))
+    kind = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
+    columns: dict[str, Any] = {
+        "observation.state": pa.FixedSizeListArray.from_arrays(numbers, width),
+        "action": pa.FixedSizeListArray.from_arrays(numbers, width),
+        "observation.images.top": pa.array([{"bytes": shown.getvalue(), "path": None}] * rows, kind),
+        "timestamp": (np.tile(np.arange(length), episodes) / 10).astype(np.float32),
+        "frame_index": np.tile(np.arange(length), episodes),
+        "episode_index": np.repeat(np.arange(episodes), length),
+        "index": np.arange(rows),
+        "task_index": np.zeros(rows, np.int64),
+    }
+    pq.write_table(pa.table(columns), root / DATA)
+    pq.write_table(pa.table({"task": ["push it"], "task_index": [0]}), root / TASKS)
+    begins = length * np.arange(episodes)
+    table = {
+        "episode_index": np.arange(episodes), "length": [length] * episodes, "tasks": [["push it"]] * episodes,
+        "data/chunk_index": [0] * episodes, "data/file_index": [0] * episodes,
+        "dataset_from_index": begins, "dataset_to_index": begins + length,
+    }  # fmt: skip
+    pq.write_table(pa.table(table), root / EPISODES)
+    (root / "meta/stats.json").write_text("{}")
+    return root
