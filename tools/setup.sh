@@ -18,11 +18,14 @@ heartbeat() {
     awk -v passed="$SECONDS" '
       $1 == "Resolved" { resolved = 1 }
       $1 == "Prepared" { prepared = 1 }
-      $1 ~ /^(Building|Downloading)$/ { sub(/==.*/, "", $2); open[$2] = $1 == "Building" ? "building " $2 : "downloading " $2 }
-      $1 ~ /^(Built|Downloaded)$/ { sub(/==.*/, "", $2); delete open[$2] }
+      { sub(/==.*/, "", $2) }
+      $1 == "Building" { builds[$2] } $1 == "Built" { delete builds[$2] }
+      $1 == "Downloading" { loads[$2] } $1 == "Downloaded" { delete loads[$2] }
       END {
-        for (name in open) if (++count <= 4) line = line (line ? ", " : "") open[name]
-        if (count > 4) line = line " and " count - 4 " more"
+        for (name in builds) line = line (line ? ", " : "building ") name
+        for (name in loads) if (++count <= 3) names = names (names ? ", " : "downloading ") name
+        if (count > 3) names = names " and " count - 3 " more"
+        line = line (line && names ? "; " : "") names
         if (!line) line = prepared ? "installing" : resolved ? "downloading" : "choosing versions"
         printf "  %d:%02d  %s\n", passed / 60, passed % 60, line
       }' "$log"

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 
 from demorec.check.base import Result
-from demorec.report.charts import NUM_COLOURS, phase_bar
+from demorec.report.charts import phase_bar
 from demorec.report.content import STATES, ReportedEpisode, State
 from demorec.report.markup import Markup, table, tag
 
@@ -39,12 +39,12 @@ def episode_list(episodes: Sequence[ReportedEpisode]) -> Iterator[Markup]:
             f"Shown are {len(shown)} of {len(episodes)} episodes: those that failed or were flagged, as far as there "
             "is room, and others evenly spaced. All tables and plots count every episode.",
         )
-    colours: dict[str, int] = {}
+    colours: dict[str, str] = {}
     entries = [_entry(number, episode, colours) for number, episode in shown]
     if colours:
         yield tag(
             "div",
-            *(tag("span", _swatch(f"p{number % NUM_COLOURS}"), name) for name, number in colours.items()),
+            *(tag("span", _swatch(fill), name) for name, fill in colours.items()),
             class_="legend",
         )
     yield _filters(counts, len(episodes))
@@ -67,8 +67,8 @@ def _shown(episodes: Sequence[ReportedEpisode]) -> list[tuple[int, ReportedEpiso
     return sorted(chosen, key=lambda item: STATES.index(item[1].state))[:MOST_SHOWN]
 
 
-def _swatch(name: str) -> Markup:
-    return tag("svg", tag("rect", width=14, height=10, class_=name), viewBox="0 0 14 10", aria_hidden="true")
+def _swatch(fill: str) -> Markup:
+    return tag("svg", tag("rect", width=14, height=10, fill=fill), viewBox="0 0 14 10", aria_hidden="true")
 
 
 def _filters(counts: Counter[State], total: int) -> Markup:
@@ -82,7 +82,7 @@ def _filters(counts: Counter[State], total: int) -> Markup:
     return tag("div", *buttons, words, tag("output", class_="soft"), class_="filters", hidden="")
 
 
-def _entry(number: int, episode: ReportedEpisode, colours: dict[str, int]) -> Markup:
+def _entry(number: int, episode: ReportedEpisode, colours: dict[str, str]) -> Markup:
     retries = f"{episode.num_retries} {'retry' if episode.num_retries == 1 else 'retries'}"
     about = [
         f"{episode.num_frames / episode.fps:.1f} s, {episode.num_frames} frames" if episode.num_frames else "",
@@ -113,7 +113,7 @@ def _entry(number: int, episode: ReportedEpisode, colours: dict[str, int]) -> Ma
     )
 
 
-def _strip(episode: ReportedEpisode, colours: dict[str, int]) -> Markup | None:
+def _strip(episode: ReportedEpisode, colours: dict[str, str]) -> Markup | None:
     strip = episode.filmstrip
     if strip is None:
         return None
