@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.check.coverage import ticks
-from demorec.playback.style import PHASES
 from demorec.geometry import Array
+from demorec.playback.style import PHASES
 from demorec.report.content import PhaseSpan
 from demorec.report.histogram import Histogram
 from demorec.report.markup import Markup, joined, tag
