@@ -61,7 +61,7 @@ if [ -z "$uv" ]; then
   if [ ! -x $uv ]; then
     echo "Installing uv into .uv/"
     quietly python3 -m venv .uv
-    quietly .uv/bin/python -m pip install --disable-pip-version-check uv
+    quietly .uv/bin/python -m pip install -q uv
   fi
 fi
 echo "Setting up .venv/ (the first time 7 GB with PyTorch and LeRobot; $how)"
