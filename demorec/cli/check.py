@@ -199,7 +199,8 @@ def _passed(reports: Sequence[SubjectReport]) -> Iterator[str]:
     kinds = Counter("failed attempt" if report.is_failed_attempt else report.kind for report in reports)
     passed, skipped = (sum(report.count(level) for report in reports) for level in ("pass", "skip"))
     unmeasured = f", {skipped} not measured" if skipped else ""
-    yield f"pass  {', '.join(counted(number, kind) for kind, number in kinds.items())}: {passed} checks passed{unmeasured}"
+    things = ", ".join(counted(number, kind) for kind, number in kinds.items())
+    yield f"pass  {things}: {passed} checks passed{unmeasured}"
 
 
 def _result(result: Result) -> str:

@@ -156,9 +156,7 @@ def phase_bar(spans: Sequence[PhaseSpan], num_frames: int, moments: int, colours
         right = 0.5 + (moments - 1) * min(span.end, last) / last
         fill = colours.setdefault(span.name, "#" + bytes(PHASES[len(colours) % len(PHASES)]).hex())
         words = f"{span.name}, frames {span.first} to {span.end - 1}"
-        parts.append(
-            tag("rect", tag("title", words), x=left, y=0, width=max(right - left, 0.0), height=1, fill=fill)
-        )
+        parts.append(tag("rect", tag("title", words), x=left, y=0, width=max(right - left, 0.0), height=1, fill=fill))
     return tag(
         "svg", *parts, viewBox=f"0 0 {moments} 1", preserveAspectRatio="none", class_="phases", aria_hidden="true"
     )

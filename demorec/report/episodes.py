@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import base64
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
-from demorec.check.base import Result
+from demorec.check.base import Level, Result
 from demorec.report.charts import phase_bar
 from demorec.report.content import STATES, ReportedEpisode, State
 from demorec.report.markup import Markup, table, tag
@@ -23,14 +23,18 @@ WORDS: dict[State, str] = {
 }
 
 
+_LEVELS: Mapping[Level, str] = {"fail": "failed", "warn": "warned"}
+
+
 def episode_list(episodes: Sequence[ReportedEpisode]) -> Iterator[Markup]:
     """Legend, filters and one entry an episode."""
     shown = _shown(episodes)
     counts = Counter(episode.state for episode in episodes)
-    order = "Those that failed or were flagged come first." if set(counts) - {"succeeded", "unknown"} else ""
+    first = [WORDS[state] for state in STATES if counts[state] and state not in ("unknown", "succeeded")]
+    order = f"First come those marked {', '.join(first)}. " if first else ""
     yield tag(
         "p",
-        f"{order} A filmstrip runs from the first frame to the last; the bar below it shows the phases, so that the "
+        f"{order}A filmstrip runs from the first frame to the last; the bar below it shows the phases, so that the "
         "middle of each picture stands over its moment.",
     )
     if len(shown) < len(episodes):
@@ -151,7 +155,8 @@ def _flags(episode: ReportedEpisode) -> Markup | None:
     if not episode.flags:
         return None
     rows = [(tag("span", flag.level, class_=flag.level), flag.check, *measured(flag)) for flag in episode.flags]
-    words = f"{len(rows)} {'check' if len(rows) == 1 else 'checks'} failed or warned"
+    counts = Counter(flag.level for flag in episode.flags)
+    words = "checks: " + ", ".join(f"{counts[level]} {word}" for level, word in _LEVELS.items() if counts[level])
     if episode.success is False:
         words += ", as is to be expected of an attempt that failed"
     return tag("details", tag("summary", words), table(("level", "check", "found", "allowed", "where"), rows))

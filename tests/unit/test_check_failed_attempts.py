@@ -114,9 +114,7 @@ def test_where_no_chosen_check_applies_nothing_has_passed(capsys: pytest.Capture
     assert {item["kind"]: item["level"] for item in json.loads(out)} == {"run": "skip", "recording": "pass"}
 
 
-def test_what_passed_is_one_line_and_what_did_not_is_listed(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_what_passed_is_one_line_and_what_did_not_is_listed(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     run = make_run(tmp_path / "run", [0, 1, 2], cameras=())
     damaged = run / "episodes" / "episode_000001.mcap"
     only = ("--only", "opens", "checksums", "--no-pictures")
