@@ -37,6 +37,15 @@ def _start_viewer(*arguments: str, **options: Any) -> subprocess.Popen[Any]:
     return start_program(command, env=viewer_environment(), **options)
 
 
+def need_screen() -> None:
+    """Raise ConfigError unless a window can be opened."""
+    if not has_display():
+        raise ConfigError(
+            "There is no screen to open a window on: use --screenshot x.png, --web for a browser, or, unless it is an "
+            ".rrd file already, --save x.rrd."
+        )
+
+
 def show(recordings: Sequence[Path]) -> None:
     """Open a window with .rrd files and wait until it is closed.
 
@@ -44,11 +53,7 @@ def show(recordings: Sequence[Path]) -> None:
         ConfigError: There is no screen.
         RecordingError: The viewer failed.
     """
-    if not has_display():
-        raise ConfigError(
-            "There is no screen to open a window on: use --screenshot x.png, --web for a browser, or, unless it is an "
-            ".rrd file already, --save x.rrd."
-        )
+    need_screen()
     code = _start_viewer("--port", "auto", "--hide-welcome-screen", *map(str, recordings)).wait()
     if code:
         raise RecordingError(f"Rerun's viewer ended with exit code {code}.")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import time
 
 import pytest
 
@@ -80,6 +81,18 @@ def test_a_total_may_be_known_only_later(capsys: pytest.CaptureFixture[str]) -> 
         clock.now += 20
         bar.set(1, 3)
     assert capsys.readouterr().err == "exporting: 1 of 3 episodes (33 %), 20 s passed, about 40 s left\n"
+
+
+def test_a_start_that_takes_long_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    told = ""
+    with ProgressBar("generating", total=3, is_terminal=False, silence=0.01):
+        while not told:  # the limit of the tests' time ends it
+            time.sleep(0.01)
+            told = capsys.readouterr().err
+    assert re.match(r"generating: 0 of 3 episodes \(0 %\), \d+ s passed\n", told)
+    capsys.readouterr()
+    time.sleep(0.05)
+    assert capsys.readouterr().err == ""
 
 
 def test_a_terminal_gets_a_bar_and_no_lines(capsys: pytest.CaptureFixture[str]) -> None:
