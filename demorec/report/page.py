@@ -172,7 +172,8 @@ def _checks(report: Report) -> Iterator[Markup]:
         yield table(head, (_check_row(name, summary) for name, summary in bad))
     rest = [*found.get("pass", ()), *found.get("skip", ())]
     if rest:
-        words = f"{len(rest)} checks that found nothing wrong, with the worst value of each"
+        unmeasured = f", and {len(found['skip'])} not measured" if "skip" in found else ""
+        words = f"{len(found.get('pass', ()))} checks that passed, with the worst value of each{unmeasured}"
         yield tag("details", tag("summary", words), table(head, (_check_row(name, summary) for name, summary in rest)))
 
 
