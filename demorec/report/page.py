@@ -206,19 +206,19 @@ def _task_coverage(members: Sequence[tuple[int, ReportedEpisode, EpisodeInfo]]) 
     failed = np.array([episode.success is False for _, episode, _ in members])
     starts, goals = _places(members[:: max(1, -(-len(members) // _MOST_POINTS))])
     left = tag("div", floor_map(starts, goals)) if starts else None
-    words = ["dots: where objects start, in their colour", "rings: goals"] if starts else []
+    legend = ["dots: where objects start, in their colour", "rings: goals"] if starts else []
     if starts and failed.any():
-        words.append("crosses: attempts that failed")
+        legend.append("crosses: attempts that failed")
     scenes = [_covered(with_unit(name), values, failed) for name, values in randomised(infos).items()]
     if scenes:
         in_red = f", failures in red, {int(failed.sum())} in all" if failed.any() else ""
-        words.append(f"bars: attempts in each part of the range{in_red}")
+        legend.append(f"bars: attempts in each part of the range{in_red}")
     elif len(infos) < MIN_VALUES:
         there = "1 is there" if len(infos) == 1 else f"{len(infos)} are there"
         scenes = [tag("p", f"From {MIN_VALUES} episodes on the ranges of what is drawn are shown; {there}.")]
     else:
         scenes = [tag("p", f"No quantity of the scenes takes {MIN_VALUES} different values.")]
-    yield tag("div", *(tag("span", word) for word in words), class_="legend")
+    yield tag("div", *(tag("span", words) for words in legend), class_="legend")
     right = tag("div", *scenes, class_="charts")
     yield tag("div", left, right, class_="split") if left else right
     behaviour = drawn_columns([info.behaviour for info in infos])
