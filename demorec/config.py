@@ -10,7 +10,7 @@ import functools
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Literal
 
@@ -215,7 +215,15 @@ def deciding_versions(config: GenerateConfig | None = None) -> dict[str, str]:
 
 @functools.cache
 def _deciding_versions() -> tuple[tuple[str, str], ...]:
-    return tuple((name, version(name)) for name in ("demorec", "pybullet", "numpy", "numba", "av"))
+    try:
+        bullet = version("pybullet")
+    except PackageNotFoundError:  # the fork that is installed where nothing can be compiled (docs/install.md)
+        bullet = f"{version('pybullet-arm64')} (pybullet-arm64)"
+    return (
+        ("demorec", version("demorec")),
+        ("pybullet", bullet),
+        *((name, version(name)) for name in ("numpy", "numba", "av")),
+    )
 
 
 def read_toml(path: Path) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from demorec.scene.scene import Scene, yaw_of
 
 MIN_EPISODES = 50
 """With fewer, gaps are chance: the largest of 80 good runs of 50 is 0.26 of a range, of runs of 30 it is 0.38."""
-_MIN_VALUES = 10
+MIN_VALUES = 10
 """A quantity with fewer distinct values was not drawn from a range."""
 _MAX_SHARE = 1 / 8
 """A value that more of the episodes share was chosen and not drawn."""
@@ -46,7 +46,7 @@ def drawn_columns(rows: Sequence[Mapping[str, float]]) -> dict[str, Array]:
         return {}
     names = [name for name in rows[0] if all(name in row for row in rows)]
     columns = {name: np.array([row[name] for row in rows]) for name in names}
-    return {name: values for name, values in columns.items() if len(np.unique(values)) >= _MIN_VALUES}
+    return {name: values for name, values in columns.items() if len(np.unique(values)) >= MIN_VALUES}
 
 
 def with_unit(name: str) -> str:

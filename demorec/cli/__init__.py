@@ -94,7 +94,7 @@ def _run(name: str, args: Sequence[str], *, prog: str) -> int:
 def run_command(command: type[Command], args: Sequence[str], *, prog: str) -> int:
     """Parse the flags, run the command, turn its errors into one sentence and an exit code."""
     handler = logging.StreamHandler()
-    handler.setFormatter(PrintableFormatter("%(levelname)s: %(message)s"))
+    handler.setFormatter(PrintableFormatter())
     logging.basicConfig(level=logging.WARNING, handlers=[handler])
     logging.captureWarnings(True)  # so that Python's warnings, too, come through the formatter
     try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain
@@ -63,7 +64,7 @@ class Check:
     workers: int | None = None
     """Processes (auto: one for each core, or one alone where starting them would take longer than the checks)."""
     verbose: bool = False
-    """Print the checks that pass, too."""
+    """List what passed, too: every recording, run and dataset, and each of their checks."""
     allow: Allow = ()
     """A module or package of your own that may be imported for the tasks, robots and cameras that the files name, and
     beside which their models may be read."""
@@ -95,8 +96,10 @@ class Check:
             for report in check_subjects(subjects, options):
                 reports.append(report)
                 bar.advance()
-                if not self.json:
+                if not self.json and (self.verbose or report.level != "pass"):
                     say(*_lines(report, verbose=self.verbose))
+        if not (self.json or self.verbose):
+            say(*_passed([report for report in reports if report.level == "pass"]))
         if self.replay:
             for replayed, is_as_recorded in _replays(self.paths, self.replay, allowed):
                 replays.append((replayed, is_as_recorded))
@@ -201,6 +204,18 @@ def _lacking(reports: Sequence[SubjectReport]) -> Iterator[str]:
             f"{counted(lacking, 'check')} skipped, which need files beside code from outside of demorec: if you trust "
             f"it, add {' '.join(f'--allow {name}' for name in modules)}."
         )
+
+
+def _passed(reports: Sequence[SubjectReport]) -> Iterator[str]:
+    """One line about everything in which nothing was found."""
+    if len(reports) < 2:
+        yield from (line for report in reports for line in _lines(report, verbose=False))
+        return
+    kinds = Counter("failed attempt" if report.is_failed_attempt else report.kind for report in reports)
+    passed, skipped = (sum(report.count(level) for report in reports) for level in ("pass", "skip"))
+    unmeasured = f", {skipped} not measured" if skipped else ""
+    things = ", ".join(counted(number, kind) for kind, number in kinds.items())
+    yield f"pass  {things}: {passed} checks passed{unmeasured}"
 
 
 def _result(result: Result) -> str:

@@ -195,10 +195,11 @@ def _run_lines(path: Path, run: RunFile) -> list[str]:
     config = run.config
     frames = sum(attempt.num_frames for attempt in run.attempts)
     cameras = f"{', '.join(config.cameras)} at {config.width}x{config.height}, {config.video.codec}"
+    failed = f", {counted(len(run.failures), 'failed attempt')}" if run.failures else ""
     facts = [
         ("run", f"{path} ({'complete' if run.is_complete else 'unfinished'})"),
         ("task", f"{config.task} with {config.robot}, seed {config.seed}"),
-        ("episodes", f"{len(run.successes)} of {run.num_episodes}, {counted(len(run.failures), 'failed attempt')}"),
+        ("episodes", f"{len(run.successes)} of {run.num_episodes}{failed}"),
         ("frames", f"{frames} ({frames / config.fps:.1f} s at {config.fps} Hz)"),
         ("size", size_in_words(sum(attempt.num_bytes for attempt in run.attempts))),
         ("cameras", cameras if config.cameras else "none"),

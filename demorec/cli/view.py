@@ -75,9 +75,12 @@ class View:
         from demorec.playback.glyphs import DrawableText
         from demorec.playback.save import numbered, save, save_comparison, save_each
         from demorec.playback.sources import find_episodes, select
+        from demorec.playback.viewer import need_screen
 
         sources = select(find_episodes(self.paths, include_failures=self.include_failures), self.episodes)
         tell_unfinished(self.paths)
+        if self.save is None and self.screenshot is None and not self.web:
+            need_screen()  # before minutes of converting
         if self.compare:
             if len(sources) != 2:
                 raise ConfigError(f"--compare takes two episodes, found {len(sources)}: name two recordings.")

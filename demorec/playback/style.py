@@ -28,6 +28,8 @@ PHASES: tuple[Color, ...] = (
     (255, 130, 50),
     (240, 80, 110),
     (150, 160, 180),
+    (165, 105, 60),
+    (255, 170, 205),
 )
 """Of the phases, in the order in which they come up."""
 

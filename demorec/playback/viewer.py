@@ -37,6 +37,15 @@ def _start_viewer(*arguments: str, **options: Any) -> subprocess.Popen[Any]:
     return start_program(command, env=viewer_environment(), **options)
 
 
+def need_screen() -> None:
+    """Raise ConfigError unless a window can be opened."""
+    if not has_display():
+        raise ConfigError(
+            "There is no screen to open a window on: use --screenshot x.png, --web for a browser, or, unless it is an "
+            ".rrd file already, --save x.rrd."
+        )
+
+
 def show(recordings: Sequence[Path]) -> None:
     """Open a window with .rrd files and wait until it is closed.
 
@@ -44,11 +53,7 @@ def show(recordings: Sequence[Path]) -> None:
         ConfigError: There is no screen.
         RecordingError: The viewer failed.
     """
-    if not has_display():
-        raise ConfigError(
-            "There is no screen to open a window on: use --screenshot x.png, --web for a browser, or, unless it is an "
-            ".rrd file already, --save x.rrd."
-        )
+    need_screen()
     code = _start_viewer("--port", "auto", "--hide-welcome-screen", *map(str, recordings)).wait()
     if code:
         raise RecordingError(f"Rerun's viewer ended with exit code {code}.")
@@ -73,7 +78,7 @@ def why_it_ended(said: str) -> DemorecError:
 
 
 class HeadlessViewer(AbstractContextManager["HeadlessViewer"]):
-    """Context manager over a viewer without a screen that shows .rrd or .mcap files, the first one in front.
+    """Context manager over a viewer without a screen that shows .rrd or .mcap files in order, the first one in front.
 
     Raises:
         RecordingError: There is no graphics driver, the viewer does not come up or ends by itself, or it cannot load
@@ -87,10 +92,11 @@ class HeadlessViewer(AbstractContextManager["HeadlessViewer"]):
         self._said = tempfile.TemporaryFile(mode="w+", errors="replace")  # noqa: SIM115 (closed by close)
         self._process = _start_viewer(
             "--headless", "--port", str(self._port), "--window-size", f"{width}x{height}", "--hide-welcome-screen",
-            *map(str, recordings), stdout=subprocess.DEVNULL, stderr=self._said,
+            str(recordings[0]), stdout=subprocess.DEVNULL, stderr=self._said,
         )  # fmt: skip
         try:
             self.client = self._connect()
+            self._add(recordings[1:])
         except BaseException:
             self.close()
             raise
@@ -123,24 +129,32 @@ class HeadlessViewer(AbstractContextManager["HeadlessViewer"]):
                 raise self._reason()
             try:
                 client = ViewerClient.connect(f"rerun+http://127.0.0.1:{self._port}/proxy")
-                state = client.get_state()
+                if _loaded(client, 1):
+                    return client
             except (OSError, RuntimeError, ValueError):  # TimeoutError is an OSError
-                time.sleep(0.2)
-                continue
-            loaded = [recording for recording in state.recordings if recording.timelines]
-            if not state.loading and len(loaded) >= len(self._recordings):
-                if len(loaded) > 1:  # the viewer shows the one that it loaded last
-                    client.set_location(min(loaded, key=lambda recording: str(recording.store_id)).location)
-                return client
+                pass
             time.sleep(0.2)
-        raise RecordingError(
-            f"Rerun's viewer has not loaded the file within {_START_SECONDS:.0f} s: {self._recordings[0]}"
-        )
+        raise _not_loaded(self._recordings[0])
+
+    def _add(self, recordings: Sequence[Path]) -> None:
+        """Load more files; the viewer lists them as they come, but names and reads only what it has shown."""
+        for count, recording in enumerate(recordings, start=2):
+            self.client.open(str(recording), navigate=False)
+            deadline = time.monotonic() + _START_SECONDS
+            while not _loaded(self.client, count):
+                if time.monotonic() > deadline:
+                    raise _not_loaded(recording)
+                time.sleep(0.1)
+        listed = self.client.get_state().recordings
+        if len(listed) > 1:
+            for shown in (*listed[1:], listed[0]):
+                self.client.set_location(shown.location)
+                self._picture()
 
     @property
     def end(self) -> float:
         """Seconds of the last row of the recording in front; 0 when it has no such time line."""
-        first = min(self.client.get_state().recordings, key=lambda recording: str(recording.store_id))
+        first = self.client.get_state().recordings[0]
         return max((line.end / 1e9 for line in first.timelines if line.name == SECONDS), default=0.0)
 
     def seek(self, seconds: float) -> None:
@@ -187,6 +201,15 @@ class HeadlessViewer(AbstractContextManager["HeadlessViewer"]):
     def reports(self) -> list[tuple[str, Any]]:
         """Every warning and error of a view: (its name, what Rerun tells)."""
         return [(view.name, report) for view in self.client.get_state().views for report in view.reports]
+
+
+def _loaded(client: ViewerClient, count: int) -> bool:
+    state = client.get_state()
+    return not state.loading and sum(bool(recording.timelines) for recording in state.recordings) >= count
+
+
+def _not_loaded(recording: Path) -> RecordingError:
+    return RecordingError(f"Rerun's viewer has not loaded the file within {_START_SECONDS:.0f} s: {recording}")
 
 
 def moment(seconds: float | None, end: float) -> float:

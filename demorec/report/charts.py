@@ -1,4 +1,4 @@
-"""Pictures of numbers, as SVG that takes its colours from the page's style."""
+"""Numbers drawn as SVG, in the colours of the page's style; phases have those of the viewer."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from demorec.check.coverage import ticks
 from demorec.geometry import Array
+from demorec.playback.style import PHASES
 from demorec.report.content import PhaseSpan
 from demorec.report.histogram import Histogram
 from demorec.report.markup import Markup, joined, tag
@@ -139,29 +140,23 @@ def floor_map(starts: Sequence[Place], goals: Sequence[Place]) -> Markup:
     )
 
 
-def phase_bar(spans: Sequence[PhaseSpan], num_frames: int, moments: int, colours: dict[str, int]) -> Markup:
+def phase_bar(spans: Sequence[PhaseSpan], num_frames: int, moments: int, colours: dict[str, str]) -> Markup:
     """The phases in time, so that the middle of each of a filmstrip's pictures stands over its own moment.
 
     Args:
         spans: The phases.
         num_frames: Of the episode.
         moments: Pictures in the filmstrip above.
-        colours: Phase -> number of its colour; new phases are added.
+        colours: Phase -> its colour; new phases are added.
     """
     last = max(num_frames - 1, 1)
     parts = []
     for span in spans:
         left = 0.5 + (moments - 1) * span.first / last
         right = 0.5 + (moments - 1) * min(span.end, last) / last
-        number = colours.setdefault(span.name, len(colours)) % NUM_COLOURS
+        fill = colours.setdefault(span.name, "#" + bytes(PHASES[len(colours) % len(PHASES)]).hex())
         words = f"{span.name}, frames {span.first} to {span.end - 1}"
-        parts.append(
-            tag("rect", tag("title", words), x=left, y=0, width=max(right - left, 0.0), height=1, class_=f"p{number}")
-        )
+        parts.append(tag("rect", tag("title", words), x=left, y=0, width=max(right - left, 0.0), height=1, fill=fill))
     return tag(
         "svg", *parts, viewBox=f"0 0 {moments} 1", preserveAspectRatio="none", class_="phases", aria_hidden="true"
     )
-
-
-NUM_COLOURS = 10
-"""Of phases; the style has as many."""

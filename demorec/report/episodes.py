@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import base64
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
-from demorec.check.base import Result
-from demorec.report.charts import NUM_COLOURS, phase_bar
+from demorec.check.base import Level, Result
+from demorec.report.charts import phase_bar
 from demorec.report.content import STATES, ReportedEpisode, State
 from demorec.report.markup import Markup, table, tag
 
@@ -23,14 +23,18 @@ WORDS: dict[State, str] = {
 }
 
 
+_LEVELS: Mapping[Level, str] = {"fail": "failed", "warn": "warned"}
+
+
 def episode_list(episodes: Sequence[ReportedEpisode]) -> Iterator[Markup]:
     """Legend, filters and one entry an episode."""
     shown = _shown(episodes)
     counts = Counter(episode.state for episode in episodes)
-    order = "Those that failed or were flagged come first." if set(counts) - {"succeeded", "unknown"} else ""
+    first = [WORDS[state] for state in STATES if counts[state] and state not in ("unknown", "succeeded")]
+    order = f"First come those marked {', '.join(first)}. " if first else ""
     yield tag(
         "p",
-        f"{order} A filmstrip runs from the first frame to the last; the bar below it shows the phases, so that the "
+        f"{order}A filmstrip runs from the first frame to the last; the bar below it shows the phases, so that the "
         "middle of each picture stands over its moment.",
     )
     if len(shown) < len(episodes):
@@ -39,12 +43,12 @@ def episode_list(episodes: Sequence[ReportedEpisode]) -> Iterator[Markup]:
             f"Shown are {len(shown)} of {len(episodes)} episodes: those that failed or were flagged, as far as there "
             "is room, and others evenly spaced. All tables and plots count every episode.",
         )
-    colours: dict[str, int] = {}
+    colours: dict[str, str] = {}
     entries = [_entry(number, episode, colours) for number, episode in shown]
     if colours:
         yield tag(
             "div",
-            *(tag("span", _swatch(f"p{number % NUM_COLOURS}"), name) for name, number in colours.items()),
+            *(tag("span", _swatch(fill), name) for name, fill in colours.items()),
             class_="legend",
         )
     yield _filters(counts, len(episodes))
@@ -67,8 +71,8 @@ def _shown(episodes: Sequence[ReportedEpisode]) -> list[tuple[int, ReportedEpiso
     return sorted(chosen, key=lambda item: STATES.index(item[1].state))[:MOST_SHOWN]
 
 
-def _swatch(name: str) -> Markup:
-    return tag("svg", tag("rect", width=14, height=10, class_=name), viewBox="0 0 14 10", aria_hidden="true")
+def _swatch(fill: str) -> Markup:
+    return tag("svg", tag("rect", width=14, height=10, fill=fill), viewBox="0 0 14 10", aria_hidden="true")
 
 
 def _filters(counts: Counter[State], total: int) -> Markup:
@@ -82,7 +86,7 @@ def _filters(counts: Counter[State], total: int) -> Markup:
     return tag("div", *buttons, words, tag("output", class_="soft"), class_="filters", hidden="")
 
 
-def _entry(number: int, episode: ReportedEpisode, colours: dict[str, int]) -> Markup:
+def _entry(number: int, episode: ReportedEpisode, colours: dict[str, str]) -> Markup:
     retries = f"{episode.num_retries} {'retry' if episode.num_retries == 1 else 'retries'}"
     about = [
         f"{episode.num_frames / episode.fps:.1f} s, {episode.num_frames} frames" if episode.num_frames else "",
@@ -113,7 +117,7 @@ def _entry(number: int, episode: ReportedEpisode, colours: dict[str, int]) -> Ma
     )
 
 
-def _strip(episode: ReportedEpisode, colours: dict[str, int]) -> Markup | None:
+def _strip(episode: ReportedEpisode, colours: dict[str, str]) -> Markup | None:
     strip = episode.filmstrip
     if strip is None:
         return None
@@ -151,7 +155,8 @@ def _flags(episode: ReportedEpisode) -> Markup | None:
     if not episode.flags:
         return None
     rows = [(tag("span", flag.level, class_=flag.level), flag.check, *measured(flag)) for flag in episode.flags]
-    words = f"{len(rows)} {'check' if len(rows) == 1 else 'checks'} failed or warned"
+    counts = Counter(flag.level for flag in episode.flags)
+    words = "checks: " + ", ".join(f"{counts[level]} {word}" for level, word in _LEVELS.items() if counts[level])
     if episode.success is False:
         words += ", as is to be expected of an attempt that failed"
     return tag("details", tag("summary", words), table(("level", "check", "found", "allowed", "where"), rows))

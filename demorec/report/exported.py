@@ -201,8 +201,8 @@ def missing_in(root: Path, info: DatasetInfo, story: DatasetStory) -> Iterator[s
     """Sentences about what a dataset does not tell."""
     if not story.rows:
         yield (
-            f"The dataset has no folder {SIDECAR_DIR}/, so it was not exported by demorec, or lost it: scenes, random "
-            "seeds, phases and the conditions of success are not known, and no coverage of the randomised ranges."
+            f"The dataset has no folder {SIDECAR_DIR}/, which exports of demorec have: scenes, random seeds, phases, "
+            "the conditions of success and the coverage of the randomised ranges are not known."
         )
         if SUCCESS not in info.features:
             yield f"No column {SUCCESS} tells which episodes succeeded."

@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.check.coverage import drawn_columns, randomised, with_unit
+from demorec.check.coverage import MIN_VALUES, drawn_columns, randomised, with_unit
 from demorec.errors import ConfigError
 from demorec.evaluate.statistics import Rate
 from demorec.geometry import Array
 from demorec.report.charts import Place, coverage, distribution, floor_map
-from demorec.report.content import CheckSummaries, CheckSummary, Report, ReportedEpisode
+from demorec.report.content import CheckSummary, Report, ReportedEpisode
 from demorec.report.episodes import anchor, episode_list, measured
 from demorec.report.histogram import Histogram
 from demorec.report.markup import Markup, joined, table, tag
@@ -51,7 +51,7 @@ def page(report: Report) -> str:
     """The whole file."""
     sections = [
         ("outcomes", "Outcomes", joined(_outcomes(report.episodes))),
-        ("checks", "Checks", joined(_checks(report.checks))),
+        ("checks", "Checks", joined(_checks(report))),
         ("coverage", "Coverage of what is randomised", joined(_coverage(report.episodes))),
         ("distributions", "Distributions", joined(_distributions(report))),
         ("origin", "Origin", joined(_origin(report))),
@@ -150,7 +150,8 @@ def _links(numbers: Sequence[int], episodes: Sequence[ReportedEpisode]) -> Marku
 # ----------------------------------------------------------------------------------------------------------- checks
 
 
-def _checks(checks: CheckSummaries | None) -> Iterator[Markup]:
+def _checks(report: Report) -> Iterator[Markup]:
+    checks = report.checks
     if checks is None or not checks.by_name:
         return
     found: dict[str, list[tuple[str, CheckSummary]]] = {}
@@ -160,19 +161,19 @@ def _checks(checks: CheckSummaries | None) -> Iterator[Markup]:
         f"{len(found.get(level, ()))} {words}"
         for level, words in (("fail", "failed"), ("warn", "warned"), ("pass", "passed"), ("skip", "not measured"))
     )
-    yield tag(
-        "p",
-        f"Of {len(checks.by_name)} checks over {checks.num_subjects} "
-        f"{'file' if checks.num_subjects == 1 else 'files and folders'}: {counts}. Of attempts that failed only the "
-        "files are judged here; what else was found in them stands with each.",
-    )
+    apart = ""
+    if any(episode.success is False for episode in report.episodes):
+        apart = " Of attempts that failed only the files are judged here; what else was found in them stands with each."
+    subjects = "file" if checks.num_subjects == 1 else "files and folders"
+    yield tag("p", f"Of {len(checks.by_name)} checks over {checks.num_subjects} {subjects}: {counts}.{apart}")
     bad = [*found.get("fail", ()), *found.get("warn", ())]
     head = ("check", "worst", "found", "allowed", "where", "how often")
     if bad:
         yield table(head, (_check_row(name, summary) for name, summary in bad))
     rest = [*found.get("pass", ()), *found.get("skip", ())]
     if rest:
-        words = f"{len(rest)} checks that found nothing wrong, with the worst value of each"
+        unmeasured = f", and {len(found['skip'])} not measured" if "skip" in found else ""
+        words = f"{len(found.get('pass', ()))} checks that passed, with the worst value of each{unmeasured}"
         yield tag("details", tag("summary", words), table(head, (_check_row(name, summary) for name, summary in rest)))
 
 
@@ -205,17 +206,19 @@ def _task_coverage(members: Sequence[tuple[int, ReportedEpisode, EpisodeInfo]]) 
     failed = np.array([episode.success is False for _, episode, _ in members])
     starts, goals = _places(members[:: max(1, -(-len(members) // _MOST_POINTS))])
     left = tag("div", floor_map(starts, goals)) if starts else None
-    yield tag(
-        "div",
-        tag("span", "dots: where objects start, in their colour"),
-        tag("span", "rings: goals"),
-        tag("span", "crosses: attempts that failed"),
-        tag("span", f"bars: attempts in each part of the range, failures in red, {int(failed.sum())} in all"),
-        class_="legend",
-    )
+    legend = ["dots: where objects start, in their colour", "rings: goals"] if starts else []
+    if starts and failed.any():
+        legend.append("crosses: attempts that failed")
     scenes = [_covered(with_unit(name), values, failed) for name, values in randomised(infos).items()]
-    if not scenes:
-        scenes = [tag("p", "Nothing in the scenes was drawn from a range, or there are too few episodes to show one.")]
+    if scenes:
+        in_red = f", failures in red, {int(failed.sum())} in all" if failed.any() else ""
+        legend.append(f"bars: attempts in each part of the range{in_red}")
+    elif len(infos) < MIN_VALUES:
+        there = "1 is there" if len(infos) == 1 else f"{len(infos)} are there"
+        scenes = [tag("p", f"From {MIN_VALUES} episodes on the ranges of what is drawn are shown; {there}.")]
+    else:
+        scenes = [tag("p", f"No quantity of the scenes takes {MIN_VALUES} different values.")]
+    yield tag("div", *(tag("span", words) for words in legend), class_="legend")
     right = tag("div", *scenes, class_="charts")
     yield tag("div", left, right, class_="split") if left else right
     behaviour = drawn_columns([info.behaviour for info in infos])

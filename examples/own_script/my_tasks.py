@@ -26,6 +26,7 @@ from demorec.tasks.success import placement_checks
 from demorec.tasks.waiting import steady_width
 
 STARTS = Region(x=(0.40, 0.48), y=(-0.12, 0.12))
+"""Where the cube may start: metres in front of the robot's base and to its left."""
 CLEARANCE = 0.05
 """Between the cube and the hand before the push, metres."""
 PUSH_SPEED = 0.08

@@ -340,7 +340,7 @@ def test_an_evaluation_is_overwritten_and_what_lies_beside_stays(evaluation: Pat
 
 def test_an_evaluation_says_with_which_versions_it_was_made(evaluation: Path) -> None:
     plain = json.loads((evaluation / EVALUATION_NAME).read_text())
-    for package in ("demorec", "pybullet", "numpy", "lerobot", "torch"):
+    for package in ("demorec", "numpy", "lerobot", "torch"):
         assert plain["versions"][package] == version(package)
     plain["versions"]["torch"] = "1.0"
     (evaluation / EVALUATION_NAME).write_text(json.dumps(plain))

@@ -124,6 +124,16 @@ def test_several_episodes_are_several_files(run_folder: Path, tmp_path: Path) ->
     assert sorted(file.name for file in tmp_path.iterdir()) == ["x-0000.rrd", "x-0001.rrd"]
 
 
+@pytest.mark.viewer
+def test_episodes_are_listed_in_the_order_given(run_folder: Path, tmp_path: Path) -> None:
+    need_vulkan()
+    first, second = save_each(find_episodes([run_folder]), tmp_path)
+    with HeadlessViewer(second, first) as viewer:
+        state = viewer.client.get_state()
+    assert ["episode_000001" in recording.store_id for recording in state.recordings] == [True, False]
+    assert state.active_recording == state.recordings[0].store_id
+
+
 def _check_views(viewer: HeadlessViewer, cameras: tuple[str, ...] = ("front", "wrist")) -> None:
     """No view complains; the 3D view shows robot, table and frusta; the cameras show their moving red square."""
     assert viewer.reports() == []

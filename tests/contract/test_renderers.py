@@ -20,6 +20,7 @@ from demorec.errors import RenderError
 from demorec.geometry import Pose, quat_from_rotation, rotation_from_quat
 from demorec.render import Renderer
 from demorec.scene.scene import Light
+from demorec.sim.renderers.tiny import TinyRenderer
 from demorec.tables import RENDERERS
 
 
@@ -81,6 +82,35 @@ def warm_stage(request: pytest.FixtureRequest) -> Iterator[Stage]:
 def stage(warm_stage: Stage) -> Stage:
     warm_stage.client.resetSimulation()
     return warm_stage
+
+
+class _WithoutNumPy(TinyRenderer):
+    """TinyRenderer of a PyBullet that was built without NumPy, which gives an image as tuples of numbers."""
+
+    def _connect(self) -> Any:
+        client = super()._connect()
+        draw = client.getCameraImage
+
+        def image(*args: Any, **options: Any) -> tuple[Any, ...]:
+            return tuple(
+                tuple(part.ravel().tolist()) if isinstance(part, np.ndarray) else part
+                for part in draw(*args, **options)
+            )
+
+        client.getCameraImage = image
+        return client
+
+
+def test_a_pybullet_without_numpy_draws_the_same() -> None:
+    client = scenes.connect()
+    scenes.add(client, "box", (0.2, 0.2, 0.2))
+    with TinyRenderer() as usual, _WithoutNumPy() as without:
+        expected, found = (_render(renderer, client, scenes.camera(80, 60)) for renderer in (usual, without))
+    client.disconnect()
+    for name in ("color", "depth", "segmentation"):
+        assert getattr(found, name).dtype == getattr(expected, name).dtype
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+    assert len(np.unique(found.segmentation)) == 2
 
 
 def tilted(position: tuple[float, float, float]) -> Pose:

@@ -112,3 +112,19 @@ def test_where_no_chosen_check_applies_nothing_has_passed(capsys: pytest.Capture
     assert "1 checked, 0 failed, 0 with warnings. Of 1 nothing was measured." in out
     _, out = check(capsys, run, "--only", "opens", "--json")
     assert {item["kind"]: item["level"] for item in json.loads(out)} == {"run": "skip", "recording": "pass"}
+
+
+def test_what_passed_is_one_line_and_what_did_not_is_listed(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    run = make_run(tmp_path / "run", [0, 1, 2], cameras=())
+    damaged = run / "episodes" / "episode_000001.mcap"
+    only = ("--only", "opens", "checksums", "--no-pictures")
+    code, out = check(capsys, run / "episodes", *only)
+    assert code == 0
+    assert out.splitlines()[0] == "pass  3 recordings: 6 checks passed"  # two of each
+    damaged.write_bytes(damaged.read_bytes()[:200])
+    code, out = check(capsys, run / "episodes", *only)
+    assert code == 1
+    assert f"fail  recording {damaged}" in out
+    assert "pass  2 recordings: 4 checks passed" in out
+    assert "episode_000000" not in out
+    assert f"pass  recording {run / 'episodes' / 'episode_000000.mcap'}" in check(capsys, run, *only, "--verbose")[1]

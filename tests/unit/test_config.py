@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from demorec.config import GenerateConfig, VideoConfig, parse_config, read_toml
+from demorec.config import GenerateConfig, VideoConfig, _deciding_versions, deciding_versions, parse_config, read_toml
 from demorec.errors import ConfigError
 from demorec.scene.episode import frame_time_ns
 
@@ -83,6 +84,17 @@ def test_a_config_file_is_read(tmp_path: Path) -> None:
     path.write_text('seed = 3\ncameras = ["wrist"]\n[video]\ncodec = "av1"\n')
     config = parse_config(read_toml(path), GenerateConfig, source=str(path))
     assert (config.seed, config.cameras, config.video.codec) == (3, ("wrist",), "av1")
+
+
+def test_the_fork_in_pybullets_place_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    def version(name: str) -> str:
+        if name == "pybullet":
+            raise PackageNotFoundError(name)
+        return "3.2.8"
+
+    monkeypatch.setattr("demorec.config.version", version)
+    monkeypatch.setattr("demorec.config._deciding_versions", _deciding_versions.__wrapped__)
+    assert deciding_versions()["pybullet"] == "3.2.8 (pybullet-arm64)"
 
 
 def test_frame_times_are_exact_integers() -> None:

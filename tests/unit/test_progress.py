@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import time
 
 import pytest
 
@@ -107,6 +108,18 @@ def test_a_total_may_be_known_only_later(capsys: pytest.CaptureFixture[str]) -> 
         "exporting: 1 of 4 episodes (25 %), 20 s passed",
         "exporting: 2 of 4 episodes (50 %), 30 s passed, about 20 s left",
     ]
+
+
+def test_a_start_that_takes_long_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    told = ""
+    with ProgressBar("generating", total=3, is_terminal=False, silence=0.01):
+        while not told:  # the limit of the tests' time ends it
+            time.sleep(0.01)
+            told = capsys.readouterr().err
+    assert re.match(r"generating: 0 of 3 episodes \(0 %\), \d+ s passed\n", told)
+    capsys.readouterr()
+    time.sleep(0.05)
+    assert capsys.readouterr().err == ""
 
 
 def test_a_terminal_gets_a_bar_and_no_lines(capsys: pytest.CaptureFixture[str]) -> None:

@@ -20,6 +20,7 @@ from support.export import export, make_run
 from support.mcap import rewritten
 from support.recording import frame_number, write_episode
 
+from demorec.playback.style import phase_colors
 from demorec.recording import Recording
 from demorec.report.content import Filmstrip, Report
 from demorec.report.episodes import MOST_SHOWN
@@ -172,7 +173,7 @@ def test_a_dataset_of_others_says_what_is_missing(dataset: Path, tmp_path: Path)
     other = shutil.copytree(dataset, tmp_path / "other")
     shutil.rmtree(other / "demorec")
     found = report_on(other)
-    assert "was not exported by demorec" in found.words
+    assert "no folder demorec/, which exports of demorec have" in found.words
     assert "3 of 3 attempts succeeded" in found.words  # the column next.success tells
     assert len(list(found.all("img"))) == 3
     file = other / "meta" / "info.json"
@@ -277,6 +278,26 @@ def test_checks_are_summed_up(run: Path) -> None:
     for episode in flagged:
         (words,) = (words for words in found.articles if words.startswith(f"{episode.name} "))
         assert all(flag.check in words for flag in episode.flags)
+
+
+def test_nothing_is_said_of_failed_attempts_where_there_are_none(run: Path, tmp_path: Path) -> None:
+    for word in ("red", "crosses", "attempts that failed", "First come those marked failed"):
+        assert word in report_on(run, checks=True).words
+    good = parsed(page(gathered(make_run(tmp_path / "good", (24, 24)), checks=True)))
+    for word in ("in red", "crosses", "failed only", "marked failed"):
+        assert word not in good.words
+    assert "From 10 episodes on the ranges of what is drawn are shown; 2 are there." in good.words
+
+
+def test_phases_have_the_colours_of_the_viewer(run: Path) -> None:
+    episode = gathered(run).episodes[0]
+    colours = phase_colors(span.name for span in episode.phases)
+    legend, bars = (
+        [attributes["fill"] for attributes in report_on(run).all("rect") if attributes.get("height") == height]
+        for height in ("10", "1")
+    )
+    assert legend == [f"#{red:02x}{green:02x}{blue:02x}" for red, green, blue in colours.values()]
+    assert bars[: len(legend)] == legend
 
 
 def test_workers_find_the_same(run: Path) -> None:

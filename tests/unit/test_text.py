@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import io
+import logging
 import sys
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from demorec.cli.shared.output import OutputError, say, tell
+from demorec.cli.shared.output import OutputError, PrintableFormatter, say, tell
 from demorec.cli.shared.table import aligned
 from demorec.safety.text import display_width, printable
 
@@ -77,3 +78,9 @@ def test_columns_stand_below_each_other_whatever_is_in_them(cells: list[tuple[st
     rows = aligned([("name", "|"), *((name, "|") for name, _ in cells)])
     assert len({display_width(row.rpartition("|")[0]) for row in rows}) == 1
     assert all(printable(row) == row for row in rows)
+
+
+@pytest.mark.parametrize(("name", "line"), [("demorec.render.raster", "Compiling."), ("numba", "WARNING: Compiling.")])
+def test_only_lines_of_other_libraries_begin_with_their_level(name: str, line: str) -> None:
+    record = logging.LogRecord(name, logging.WARNING, "", 0, "Compiling.", None, None)
+    assert PrintableFormatter().format(record) == line

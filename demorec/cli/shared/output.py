@@ -66,8 +66,9 @@ def _write(stream: TextIO, lines: tuple[str, ...]) -> None:
 
 
 class PrintableFormatter(logging.Formatter):
-    """Log lines of libraries and of our own, as harmless as all others."""
+    """Log lines, as harmless as all others; those of libraries begin with their level, ours are sentences."""
 
     def format(self, record: logging.LogRecord) -> str:
         """One line, or several for a traceback, each made printable."""
-        return "\n".join(printable(line) for line in super().format(record).splitlines())
+        level = "" if record.name.startswith("demorec.") else f"{record.levelname}: "
+        return "\n".join(printable(line) for line in f"{level}{super().format(record)}".splitlines())

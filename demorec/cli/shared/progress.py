@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import threading
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -20,6 +21,8 @@ _QUIET_S = 10.0
 """Shortest time between two lines, and before the first: what is over by then needs none."""
 _SHARE = 0.05
 """Share of the whole after which the next line is due."""
+_SILENCE_S = 45.0
+"""Longest time without a line before the first thing ends and while the last one does, when libraries load."""
 _LONGEST_S = 300.0
 """Longest time without a line while something ends: in a run of days, a share takes hours."""
 _BAR = "{l_bar}{bar}| {n_fmt}/{total_fmt} [{elapsed}{postfix}]"
@@ -41,6 +44,7 @@ class ProgressBar(AbstractContextManager["ProgressBar"]):
         at_once: How many of them are worked on at the same time.
         is_terminal: Whether a person watches (default: whether standard error is a terminal).
         clock: Seconds, monotonic.
+        silence: Longest time without a line, seconds.
     """
 
     def __init__(
@@ -53,6 +57,7 @@ class ProgressBar(AbstractContextManager["ProgressBar"]):
         at_once: int = 1,
         is_terminal: bool | None = None,
         clock: Callable[[], float] = time.monotonic,
+        silence: float = _SILENCE_S,
     ) -> None:
         self._title, self._unit, self._clock = title, unit, clock
         self.done, self.total = done, total
@@ -63,14 +68,18 @@ class ProgressBar(AbstractContextManager["ProgressBar"]):
         self._told_done: int | None = None
         watched = sys.stderr.isatty() if is_terminal is None else is_terminal
         self._bar: tqdm[Any] | None = None
+        self._closed = threading.Event()
         if watched:
             self._bar = tqdm(desc=title, total=total, initial=done, unit=unit, dynamic_ncols=True)
+        else:
+            threading.Thread(target=self._break_silence, args=(silence,), daemon=True).start()
 
     def __exit__(self, *exc: object) -> None:
         self.close()
 
     def close(self) -> None:
         """Take the bar off the terminal's last line; harmless when called twice."""
+        self._closed.set()
         if self._bar is not None:
             self._bar.close()
 
@@ -98,6 +107,13 @@ class ProgressBar(AbstractContextManager["ProgressBar"]):
         self._note = text
         if self._bar is not None:
             self._bar.set_postfix_str(self._last_words())
+
+    def _break_silence(self, longest: float) -> None:
+        while not self._closed.wait(longest):
+            is_at_an_end = self._first_end is None or self.done >= self.total - 1
+            if is_at_an_end and self._clock() - self._told_at >= longest:
+                self._told_at = self._clock()
+                tell(self._line())
 
     def _is_due(self) -> bool:
         waited = self._clock() - self._told_at

@@ -7,7 +7,6 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.errors import RenderError
 from demorec.geometry import Array, Pose
 from demorec.render import RenderSetup
 from demorec.render.setup_checks import check_setup, world_from_camera
@@ -61,7 +60,6 @@ class ClientRenderer:
         check_setup(setup)
         if self._client is None:
             self._client = self._connect()
-            _require_numpy(self._client)
         self._mirror = SceneMirror(self._client, setup)
 
     def render(self, poses: Array) -> dict[str, CameraImages]:
@@ -95,24 +93,17 @@ class ClientRenderer:
             renderer=getattr(client, self.constant),
         )
         shape = (camera.height, camera.width)
-        color = np.ascontiguousarray(np.reshape(rgba, (*shape, 4))[:, :, :3], dtype=np.uint8)
+        # A PyBullet that was built without NumPy gives tuples of numbers.
+        color = np.ascontiguousarray(np.asarray(rgba, np.uint8).reshape(*shape, 4)[:, :, :3])
+        buffer = np.asarray(depth, np.float32).reshape(shape)
+        labels = np.asarray(segmentation, np.int32).reshape(shape) if setup.segmentation else None
         # PyBullet's background is always white.
-        color[np.reshape(depth, shape) >= _NOTHING_HIT] = [round(255 * v) for v in light.sky_color]
+        color[buffer >= _NOTHING_HIT] = [round(255 * v) for v in light.sky_color]
         return CameraImages(
             color=color,
-            depth=_metric_depth(np.reshape(depth, shape), camera) if setup.depth else None,
-            segmentation=mirror.original_labels(np.reshape(segmentation, shape)) if setup.segmentation else None,
+            depth=_metric_depth(buffer, camera) if setup.depth else None,
+            segmentation=None if labels is None else mirror.original_labels(labels),
             world_from_camera=pose,
-        )
-
-
-def _require_numpy(client: Any) -> None:
-    """Raise RenderError unless PyBullet returns pictures as arrays."""
-    if not client.isNumpyEnabled():
-        raise RenderError(
-            "PyBullet was compiled without NumPy, which makes pictures unusably slow: install numpy and setuptools "
-            "first, then run pip install --no-build-isolation --no-cache-dir --force-reinstall --no-deps pybullet "
-            "(or use uv, whose settings in pyproject.toml see to it)."
         )
 
 

@@ -1,0 +1,78 @@
+"""`make setup` with and without a C++ compiler; a stand-in for uv notes what it is asked to do."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+
+ROOT = Path(__file__).parents[2]
+PROGRAMS = ("bash", "awk", "cat", "cut", "getconf", "head", "make", "mkdir", "mktemp", "rm", "sleep", "sort", "touch")
+UV = """#!/bin/bash
+case $1 in
+  --version) echo "uv 9.9.9" ;;
+  venv) mkdir -p .venv/bin; printf '#!/bin/bash\\n' >.venv/bin/python; chmod +x .venv/bin/python ;;
+  pip) echo "$*" >>asked; for word; do case $word in *.override) cat "$word" >>override ;; esac; done ;;
+esac
+"""
+
+
+@pytest.fixture
+def checkout(tmp_path: Path) -> Path:
+    """What make needs of the repository, and a PATH without a compiler."""
+    (tmp_path / "tools").mkdir()
+    for name in ("Makefile", "pyproject.toml", "constraints.txt", ".python-version", "tools/setup.sh"):
+        shutil.copy(ROOT / name, tmp_path / name)
+    programs = tmp_path / "programs"
+    programs.mkdir()
+    for name in (*PROGRAMS, "chmod"):
+        (programs / name).symlink_to(str(shutil.which(name)))
+    (programs / "uv").write_text(UV)
+    (programs / "uv").chmod(0o755)
+    return tmp_path
+
+
+def make(checkout: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    environment = {key: value for key, value in os.environ.items() if not key.startswith(("MAKE", "PYBULLET"))}
+    environment["PATH"] = str(checkout / "programs")
+    command = [str(checkout / "programs" / "make"), "SHELL=" + str(checkout / "programs" / "bash"), *arguments]
+    return subprocess.run(command, cwd=checkout, env=environment, capture_output=True, text=True, check=False)
+
+
+def test_without_a_compiler_a_fork_takes_pybullets_place(checkout: Path) -> None:
+    done = make(checkout, "setup")
+    assert done.returncode == 0, done.stderr
+    assert "pybullet-arm64==3.2.8" in done.stdout
+    uninstalled, installed = (checkout / "asked").read_text().splitlines()
+    assert uninstalled.split()[:2] == ["pip", "uninstall"]
+    assert uninstalled.split()[-1] == "pybullet"  # whose files the fork has, too
+    assert "pybullet-arm64==3.2.8" in installed.split()
+    needed = Requirement((checkout / "override").read_text())  # instead of what demorec itself asks for
+    assert needed.name == "pybullet"
+    assert needed.marker is not None
+    assert not needed.marker.evaluate()
+    assert make(checkout, "setup").stdout == "make: Nothing to be done for 'setup'.\n"
+
+
+def test_a_compiler_is_asked_for_where_pybullet_shall_be_compiled(checkout: Path) -> None:
+    done = make(checkout, "setup", "PYBULLET=source")
+    assert done.returncode == 2
+    assert "install g++ or clang, or use PYBULLET=wheel" in done.stderr
+    assert "allowed are source and wheel" in make(checkout, "setup", "PYBULLET=gcc").stderr
+    assert not (checkout / "asked").exists()
+
+
+def test_the_official_package_is_the_default_and_another_choice_sets_up_again(checkout: Path) -> None:
+    (checkout / "programs" / "c++").symlink_to("bash")
+    for choice, last in ((), "pybullet-arm64"), (("PYBULLET=wheel",), "pybullet"), ((), None):
+        done = make(checkout, "setup", *choice)
+        assert done.returncode == 0, done.stderr
+        if last is None:  # what is there stays
+            assert "Nothing to be done" in done.stdout
+        else:
+            assert (checkout / "asked").read_text().splitlines()[-2].endswith(f" {last}")
+    assert [path.name for path in (checkout / ".venv").glob(".stamp*")] == [".stamp-wheel"]
