@@ -7,7 +7,6 @@ joints their names are. An action is compared with the state where its elements 
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -19,15 +18,13 @@ from demorec.check.base import Found, Measurement, NotMeasured, check, worst_ent
 from demorec.check.dataset import Dataset
 from demorec.check.rows import finest_lag
 from demorec.geometry import Array
+from demorec.lerobot.robots import ELEMENT_SUFFIX, recognised_robot
 from demorec.recording import CollectedRecording
-from demorec.scene.assets import asset_path
 from demorec.scene.features import ACTION, STATE, VELOCITY
 from demorec.scene.urdf import Urdf
-from demorec.tables import ROBOTS
 
 GRIPPER = "gripper.width"
 """The element that is the opening of a simulated gripper, metres."""
-_SUFFIX = re.compile(r"[._/](pos|position|vel|velocity|width)$")
 _REACH_S = 1.0
 """How far apart in time an action and the state that follows it are looked for, seconds."""
 _LATEST_S = 0.35
@@ -164,8 +161,8 @@ def _motion(
         if feature not in features:
             return None
         values, theirs = features[feature].astype(np.float64), names[feature]
-        places = {_SUFFIX.sub("", name): index for index, name in enumerate(theirs)}
-        columns = [places.get(_SUFFIX.sub("", name)) for name in elements]
+        places = {ELEMENT_SUFFIX.sub("", name): index for index, name in enumerate(theirs)}
+        columns = [places.get(ELEMENT_SUFFIX.sub("", name)) for name in elements]
         if all(column is None for column in columns):
             return None
         missing = np.full(len(state), np.nan)
@@ -206,26 +203,18 @@ def _of_dataset(dataset: Dataset) -> Iterator[Motion]:
         for name in (STATE, VELOCITY, ACTION)
         if name in features
     }
-    stranger = _recognised(names[STATE])
+    stranger = recognised_robot(tuple(names[STATE]))
     for number, rows in enumerate(dataset.rows):
-        (joints, units, urdf), opening = stranger, math.inf
-        if (digest := dataset.robot_digests.get(number)) is not None:
-            robot = dataset.robots[digest]
+        digest = dataset.robot_digests.get(number)
+        robot = stranger if digest is None else dataset.robots[digest]
+        joints: Sequence[str] = ()
+        units: Sequence[str] = ()
+        urdf, opening = None, math.inf
+        if robot is not None:
             joints, units = robot.record.joints.get(STATE, ()), robot.record.units.get(STATE, ())
             urdf, spec = robot.model, robot.record.spec
             opening = math.inf if spec is None else spec.gripper.max_width
         yield _motion(f"episode {number}", dataset.info.fps, rows, names, joints, units, urdf, opening=opening)
-
-
-def _recognised(names: Sequence[str]) -> tuple[Sequence[str], Sequence[str], Urdf | None]:
-    """Joints of the elements, their units, and the URDF of the robot of ours that has joints of these names."""
-    stems = [_SUFFIX.sub("", name) for name in names]
-    for row in ROBOTS.names():
-        robot = ROBOTS.load(row)
-        joints = [stem if stem in robot.joint_names else "" for stem in stems]
-        if set(robot.arm_joints) <= set(joints):
-            return joints, (), Urdf.load(asset_path(robot.urdf))
-    return (), (), None
 
 
 # -------------------------------------------------------------------------------------------------------------- laws

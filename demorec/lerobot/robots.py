@@ -20,14 +20,19 @@ from demorec.lerobot.files import MAX_JSON_BYTES
 from demorec.lerobot.paths import SIDECAR_DIR
 from demorec.lerobot.writer import write_text
 from demorec.plain import digest, from_json, to_json
+from demorec.recording.description import robot_description
 from demorec.safety.files import read_text_limited
 from demorec.scene.assets import asset_path
+from demorec.scene.features import STATE
 from demorec.scene.robot import RobotSpec
 from demorec.scene.urdf import MAX_BYTES, Urdf, parse_xml
 from demorec.scene.urdf_shapes import read_links
+from demorec.tables import ROBOTS
 
 ROBOTS_DIR = f"{SIDECAR_DIR}/robots"
 
+ELEMENT_SUFFIX = re.compile(r"[._/](pos|position|vel|velocity|width)$")
+"""What of the name of an element is not that of its joint."""
 _DIGEST = re.compile(r"[0-9a-f]{16}")
 _KEPT = ("material", "link", "joint")
 """What of a URDF places and draws links; the rest is for simulators and controllers, and full of paths."""
@@ -89,6 +94,23 @@ def robot_of(episode: ExportEpisode) -> DatasetRobot | None:
     return _robot(
         episode.recording.info.robot_name, urdf, tuple(episode.joints.items()), tuple(episode.units.items()), spec
     )
+
+
+@functools.cache
+def recognised_robot(names: tuple[str, ...]) -> DatasetRobot | None:
+    """The arm of ours whose joints the elements of observation.state are called after, "panda_joint1.pos" or the like.
+
+    Of a dataset that does not say what its robot is; lengths are those of the model.
+    """
+    stems = [ELEMENT_SUFFIX.sub("", name) for name in names]
+    for row in ROBOTS.names():
+        robot = ROBOTS.load(row)
+        if set(robot.arm_joints) <= set(stems):
+            urdf = robot_description(robot.urdf, 1.0)
+            joints = tuple(stem if stem in robot.joint_names else "" for stem in stems)
+            record = RobotRecord(name=robot.name, urdf_sha256=_sha256(urdf), joints={STATE: joints})
+            return DatasetRobot(record=record, urdf=urdf)
+    return None
 
 
 _ByFeature = tuple[tuple[str, tuple[str, ...]], ...]

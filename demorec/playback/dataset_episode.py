@@ -20,10 +20,10 @@ from demorec.lerobot.layout import DatasetInfo
 from demorec.lerobot.packets import PACKET_CODECS, episode_distances, episode_packets
 from demorec.lerobot.paths import SIDECAR_DIR
 from demorec.lerobot.reader import episode_places
-from demorec.lerobot.robots import DatasetRobot, read_robot
+from demorec.lerobot.robots import DatasetRobot, read_robot, recognised_robot
 from demorec.playback.episode import Box, Depth, Statements, Video, timed
 from demorec.scene.episode import frame_time_ns
-from demorec.scene.features import IMAGE_PREFIX
+from demorec.scene.features import IMAGE_PREFIX, STATE
 
 
 def dataset_rows(
@@ -32,9 +32,7 @@ def dataset_rows(
     """Rows of a table, of one episode or of all; RecordingError when there is no such table."""
     files = sorted((root / table).glob("*/*.parquet"))
     if not files:
-        raise RecordingError(
-            f"The dataset has no {table}: only datasets of demorec can be shown; rerun shows others: {root}"
-        )
+        raise RecordingError(f"The dataset has no {table}: {root}")
     rows = [row for file in files for row in read_table(file, columns).to_pylist()]
     return [row for row in rows if episode_index is None or row.get("episode_index") == episode_index]
 
@@ -45,7 +43,7 @@ class DatasetEpisode:
     Attributes:
         root: The dataset's folder.
         number: Of the episode.
-        row: Of it, in the sidecar.
+        row: Of it, in the sidecar; empty where none is, as in anybody else's dataset.
         described: info.json.
 
     Raises:
@@ -54,14 +52,13 @@ class DatasetEpisode:
 
     def __init__(self, root: Path, number: int) -> None:
         self.root, self.number = root, number
-        rows = dataset_rows(root, f"{SIDECAR_DIR}/episodes", None, number)
-        if not rows:
-            raise RecordingError(f"The dataset has no episode {number}: {root}")
-        self.row = rows[0]
+        has_sidecar = (root / SIDECAR_DIR / "episodes").is_dir()
+        rows = dataset_rows(root, f"{SIDECAR_DIR}/episodes", None, number) if has_sidecar else []
+        self.row: dict[str, Any] = rows[0] if rows else {}
         self.described = DatasetInfo.load(root)
         places = [place for place in episode_places(root, self.described) if place.episode_index == number]
         if not places:
-            raise RecordingError(f"The dataset has no episode {number} in its own tables: {root}")
+            raise RecordingError(f"The dataset has no episode {number}: {root}")
         self._place = places[0]
 
     @cached_property
@@ -91,9 +88,11 @@ class DatasetEpisode:
 
     @cached_property
     def robot(self) -> DatasetRobot | None:
-        """The arm; None in a dataset that does not keep it."""
-        name = self.row.get("robot_digest")
-        return None if name is None else read_robot(self.root, str(name))
+        """The arm that the sidecar keeps, or one of ours that has joints of these names; None for neither."""
+        if (name := self.row.get("robot_digest")) is not None:
+            return read_robot(self.root, str(name))
+        names = self.described.features[STATE].names if STATE in self.described.features else None
+        return recognised_robot(names) if names and not self.row else None
 
     def videos(self) -> dict[str, Video]:
         """Camera -> its coded pictures."""

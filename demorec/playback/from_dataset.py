@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from demorec.geometry import Array, Pose
 from demorec.lerobot.files import read_json
 from demorec.lerobot.layout import AUTOMATIC_FEATURES, DatasetInfo
 from demorec.lerobot.paths import SIDECAR_DIR
-from demorec.lerobot.reader import read_tasks
+from demorec.lerobot.reader import episode_places, read_tasks
 from demorec.lerobot.robots import DatasetRobot
 from demorec.plain import from_json
 from demorec.playback.dataset_episode import DatasetEpisode, dataset_rows
@@ -26,7 +26,7 @@ from demorec.recording.collected.transforms import JointPositions
 from demorec.scene.assets import asset_path
 from demorec.scene.collected import CollectedCamera, CollectedFeature, CollectedInfo, CollectedOutcome, Origin
 from demorec.scene.episode import EpisodeInfo, Outcome, SuccessCheck
-from demorec.scene.features import DEPTH_SUFFIX, ENVIRONMENT_STATE, STATE_KINDS, state_names
+from demorec.scene.features import DEPTH_SUFFIX, ENVIRONMENT_STATE, IMAGE_PREFIX, STATE_KINDS, state_names
 from demorec.scene.kinematics import ArmKinematics
 from demorec.scene.urdf import Urdf, check_primitives
 from demorec.scene.validity import read_episode_info
@@ -36,9 +36,9 @@ def dataset_episodes(root: Path) -> list[int]:
     """Numbers of the episodes in a dataset.
 
     Raises:
-        RecordingError: It was not exported by demorec, or is damaged.
+        RecordingError: It is damaged.
     """
-    return [int(row["episode_index"]) for row in dataset_rows(root, f"{SIDECAR_DIR}/episodes", ["episode_index"])]
+    return [place.episode_index for place in episode_places(root, DatasetInfo.load(root))]
 
 
 @contextmanager
@@ -58,7 +58,7 @@ def open_dataset_episode(root: Path, episode_index: int) -> Iterator[PlayedEpiso
 
 def _read_episode(root: Path, episode_index: int) -> PlayedEpisode | PlayedCollected:
     found = DatasetEpisode(root, episode_index)
-    if found.row["episode_info"] is None:
+    if found.row.get("episode_info") is None:
         return _collected(found)
     row, described = found.row, found.described
     export = dict(read_json(root / SIDECAR_DIR / "export.json"))
@@ -110,7 +110,7 @@ def _collected(found: DatasetEpisode) -> PlayedCollected:
     names = {
         name: described.features[name].names or tuple(str(index) for index in range(values.shape[1]))
         for name, values in data.items()
-        if name not in AUTOMATIC_FEATURES and name != "next.done"
+        if name not in AUTOMATIC_FEATURES and not name.startswith("next.")
     }
     tasks = read_tasks(root)
     joints, units = ({}, {}) if robot is None else (robot.record.joints, robot.record.units)
@@ -126,7 +126,7 @@ def _collected(found: DatasetEpisode) -> PlayedCollected:
         name=f"episode_{found.number:06d}",
         group=root.resolve().name,
         identity=hashlib.sha256(f"{root.resolve()} {found.number}".encode()).hexdigest()[:16],
-        source=str(row["source"]),
+        source=str(row.get("source", root.resolve().name)),
         info=CollectedInfo(
             episode_index=found.number,
             instruction=tasks[int(data["task_index"][0, 0])] if len(time_ns) else "",
@@ -134,14 +134,10 @@ def _collected(found: DatasetEpisode) -> PlayedCollected:
             fps=int(described.fps),
             urdf="" if robot is None else robot.urdf,
             features=features,
-            cameras=tuple(
-                CollectedCamera(name=camera["name"], width=camera["width"], height=camera["height"])
-                for camera in row["cameras"]
-                if camera["name"] in videos or camera["name"] in depth
-            ),
-            origin=from_json(row["origin"], Origin),
+            cameras=tuple(_camera(described, name) for name in [*videos, *depth]),
+            origin=from_json(row["origin"], Origin) if row else Origin(kind="dataset"),
         ),
-        outcome=CollectedOutcome(success=row["success"], num_frames=len(time_ns), reason=row["failure_reason"]),
+        outcome=_external_outcome(row, data, len(time_ns)),
         time_ns=time_ns,
         joint_position=dict(zip(positions.joints, values, strict=True)),
         curves={name: Curves(time_ns=time_ns, values=data[name], names=parts) for name, parts in names.items()},
@@ -149,6 +145,20 @@ def _collected(found: DatasetEpisode) -> PlayedCollected:
         depth=depth,
         statements=found.statements(),
     )
+
+
+def _camera(described: DatasetInfo, name: str) -> CollectedCamera:
+    height, width = described.features[IMAGE_PREFIX + name].shape[:2]
+    return CollectedCamera(name=name, width=width, height=height)
+
+
+def _external_outcome(row: Mapping[str, Any], data: Mapping[str, Array], num_frames: int) -> CollectedOutcome:
+    """As the sidecar has it, or else as the last row says."""
+    if row:
+        return CollectedOutcome(success=row["success"], num_frames=num_frames, reason=row["failure_reason"])
+    ends = data.get("next.success")
+    success = None if ends is None or not num_frames else bool(ends[-1, 0])
+    return CollectedOutcome(success=success, num_frames=num_frames)
 
 
 def _tcp_poses(info: EpisodeInfo, state: Array, robot: DatasetRobot | None) -> Array:

@@ -101,12 +101,12 @@ class Origin:
     """How a collected episode came here.
 
     Attributes:
-        kind: By the `Recorder` in somebody's program, or by `demorec import`.
+        kind: By the `Recorder` in somebody's program, by `demorec import`, or read in place from a dataset.
         files: What was imported.
         mapping_digest: Of the mapping by which it was imported.
     """
 
-    kind: Literal["recorder", "import"] = "recorder"
+    kind: Literal["recorder", "import", "dataset"] = "recorder"
     files: tuple[SourceFile, ...] = ()
     mapping_digest: str = ""
 

@@ -244,6 +244,24 @@ def test_a_collected_arm_moves_as_its_numbers_say(tmp_path: Path) -> None:
     assert meshes_in(tmp_path / "a.rrd") == {"base", "upper", "lower"}
 
 
+def test_a_dataset_of_somebody_else_is_shown_with_the_arm_that_its_joints_name(exported: Path, tmp_path: Path) -> None:
+    """Without anything of ours beside it: numbers, outcome and instruction from LeRobot's own tables."""
+    strange = tmp_path / "strange"
+    shutil.copytree(exported, strange)
+    with open_dataset_episode(exported, 0) as known:
+        assert isinstance(known, PlayedEpisode)
+    shutil.rmtree(strange / "demorec")
+    with open_dataset_episode(strange, 0) as episode:
+        assert isinstance(episode, PlayedCollected)
+        for index, name in enumerate(known.info.robot.arm_joints):
+            np.testing.assert_array_equal(episode.joint_position[name], known.joint_position[:, index])
+        assert (episode.info.instruction, episode.verdict) == (known.info.instruction, known.verdict)
+        assert list(episode.videos) == list(known.videos)
+    (source,) = find_episodes([strange])
+    save(source, tmp_path / "a.rrd")
+    assert {"panda_link0", "panda_link6", "panda_hand"} <= meshes_in(tmp_path / "a.rrd")
+
+
 def test_arms_that_differ_stand_in_one_dataset(tmp_path: Path) -> None:
     longer = URDF.replace('xyz="0.3 0 0"', 'xyz="0.4 0 0"')
     assert longer != URDF
