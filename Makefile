@@ -12,7 +12,7 @@ STAMP := .venv/.stamp-$(PYBULLET)
 # Containers often set this; every process would then compile LeRobot's and PyTorch's modules again, for 10 s each.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-slow setup lint constraints clean
+.PHONY: demo test test-slow test-long setup lint constraints clean
 
 demo: $(STAMP)
 	@echo "Generating five episodes into $(DEMO)"
@@ -24,8 +24,12 @@ test: $(STAMP)
 	$(BIN)/pytest -m "not slow" -n $(TEST_WORKERS) --dist loadfile
 
 test-slow: $(STAMP)
-	$(BIN)/pytest -m slow -n $(TEST_WORKERS) --dist loadfile --ignore tests/crash/test_ray.py
+	$(BIN)/pytest -m "slow and not long" -n $(TEST_WORKERS) --dist loadfile --ignore tests/crash/test_ray.py
 	$(BIN)/pytest -m slow -n 0 tests/crash/test_ray.py  # alone: a node of Ray gives up on a machine that is too busy
+
+# Before a release: what test-slow does in part.
+test-long: $(STAMP)
+	$(BIN)/pytest -m long -n $(TEST_WORKERS)
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

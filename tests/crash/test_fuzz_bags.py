@@ -47,7 +47,7 @@ def test_two_hundred_bags(fuzzed: FuzzedBags) -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-@pytest.mark.parametrize("part", range(5))
+@pytest.mark.parametrize("part", [0, *(pytest.param(part, marks=pytest.mark.long) for part in range(1, 5))])
 def test_two_and_a_half_thousand_bags(fuzzed: FuzzedBags, part: int) -> None:
     found = []
     with LimitedCommands(_MODULES) as commands:
