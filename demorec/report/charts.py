@@ -12,6 +12,7 @@ from demorec.check.coverage import ticks
 from demorec.geometry import Array
 from demorec.report.content import ReportedEpisode
 from demorec.report.histogram import Histogram
+from demorec.scene.episode import EpisodeInfo
 
 WIDTH, HEIGHT = 220, 70
 """Of a chart without its labels, in units of its SVG."""
@@ -78,53 +79,49 @@ def coverage(title: str, values: Array, failed: NDArray[np.bool_]) -> Chart:
     return Chart(title, paths, f"{edges[0]:.3g}", f"{edges[-1]:.3g}", f"up to {highest}")
 
 
-class Place(NamedTuple):
-    """A place on the table: where an object starts, or its goal. x and y in metres, in a `FloorMap` in its units."""
+def floor_map(
+    members: Sequence[tuple[int, ReportedEpisode, EpisodeInfo]],
+) -> dict[str, list[tuple[object, ...]]] | None:
+    """The table from above, the robot below: x points up, y to the left; None without goals.
 
-    x: float
-    y: float
-    fill: str
-    href: str
-    name: str
-    failed: bool
+    Args:
+        members: (number, episode, its info).
 
-
-class FloorMap(NamedTuple):
-    """The table from above, the robot below: x points up, y to the left.
-
-    Attributes:
-        rows, columns: (position, label) of the grid's lines.
-        starts, goals: Where they are drawn.
+    Returns:
+        "rows" and "columns" of the grid: (position, label); "goals": (x, y) in the map; "starts" of the objects:
+        (x, y, color, number and name of the episode, whether it failed), failures last.
     """
+    objects = [
+        (info.scene.body(goal.object), info.scene.world_from_goal(goal).position, goal.object, number, episode)
+        for number, episode, info in sorted(members, key=lambda member: member[1].success is False)
+        for goal in info.scene.goals
+    ]
+    if not objects:
+        return None
+    starts = np.array([body.world_from_body.position[:2] for body, *_ in objects])
+    goals = np.array([position[:2] for _, position, *_ in objects])
+    low, high = np.minimum(starts, goals).min(axis=0), np.maximum(starts, goals).max(axis=0)
+    side, middle = max(float((high - low).max()), 1e-6) * 1.1, (low + high) / 2
 
-    rows: list[tuple[float, str]]
-    columns: list[tuple[float, str]]
-    starts: list[Place]
-    goals: list[Place]
+    def drawn(points: Array) -> list[list[float]]:
+        """(N, 2) places in metres -> right and down in the map."""
+        found = MAP_SIDE / 2 - (points - middle)[:, ::-1] / side * MAP_SIDE + (MAP_MARGIN, 0)
+        return [[round(value, 1) for value in point] for point in found.tolist()]
 
+    def grid(axis: int) -> list[tuple[float, str]]:
+        values = ticks(middle[axis] - side / 2, middle[axis] + side / 2)
+        points = drawn(np.array([values, values]).T)
+        return [(point[1 - axis], f"{value:g}") for value, point in zip(values, points, strict=True)]
 
-def floor_map(starts: Sequence[Place], goals: Sequence[Place]) -> FloorMap:
-    """Places in metres in the world frame, drawn as `demorec check --coverage-picture` does."""
-    points = np.array([(place.x, place.y) for place in (*starts, *goals)])
-    low, high = points.min(axis=0), points.max(axis=0)
-    side = max(float((high - low).max()), 1e-6) * 1.1
-    middle_x, middle_y = ((low + high) / 2).tolist()
-
-    def right(y: float) -> float:
-        return round(MAP_MARGIN + MAP_SIDE / 2 - (y - middle_y) / side * MAP_SIDE, 1)
-
-    def down(x: float) -> float:
-        return round(MAP_SIDE / 2 - (x - middle_x) / side * MAP_SIDE, 1)
-
-    def drawn(places: Sequence[Place]) -> list[Place]:
-        return [place._replace(x=right(place.y), y=down(place.x)) for place in places]
-
-    return FloorMap(
-        rows=[(down(tick), f"{tick:g}") for tick in ticks(middle_x - side / 2, middle_x + side / 2)],
-        columns=[(right(tick), f"{tick:g}") for tick in ticks(middle_y - side / 2, middle_y + side / 2)],
-        starts=drawn(sorted(starts, key=lambda place: place.failed)),  # failures on top
-        goals=drawn(goals),
-    )
+    return {
+        "rows": grid(0),
+        "columns": grid(1),
+        "goals": drawn(goals),
+        "starts": [
+            (*point, css_color(body.rgba), number, f"{episode.name}: {name}", episode.success is False)
+            for point, (body, _, name, number, episode) in zip(drawn(starts), objects, strict=True)
+        ],
+    }
 
 
 def css_color(rgb: Sequence[float]) -> str:
@@ -139,8 +136,8 @@ def phase_bar(episode: ReportedEpisode, moments: int, colors: Mapping[str, str])
     """
     last = max(episode.num_frames - 1, 1)
     bars = []
-    for span in episode.phases:
-        left, right = (0.5 + (moments - 1) * min(frame, last) / last for frame in (span.first, span.end))
-        title = f"{span.name}, frames {span.first} to {span.end - 1}"
-        bars.append((title, f"{left:.6g}", f"{right - left:.6g}", colors[span.name]))
+    for name, first, end in episode.phases:
+        left, right = (0.5 + (moments - 1) * min(frame, last) / last for frame in (first, end))
+        title = f"{name}, frames {first} to {end - 1}"
+        bars.append((title, f"{left:.6g}", f"{right - left:.6g}", colors[name]))
     return bars

@@ -4,28 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 from numpy.typing import NDArray
 
 from demorec.check.base import Level, Result
 from demorec.evaluate.statistics import Rate
 from demorec.report.filmstrip import Filmstrip
 from demorec.report.histogram import Histogram
-from demorec.scene.episode import EpisodeInfo, SuccessCheck
+from demorec.scene.episode import EpisodeInfo, Outcome
 
+LEVELS: tuple[Level, ...] = ("skip", "pass", "warn", "fail")
 State = Literal["unreadable", "failed", "flagged", "unknown", "succeeded"]
 """Of an episode. "flagged" is a success for which a check failed or warned."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class PhaseSpan:
-    """A phase and its frames, from `first` up to but not including `end`."""
-
-    name: str
-    first: int
-    end: int
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -37,13 +29,10 @@ class ReportedEpisode:
         source: Its file, relative to the path of the report.
         problem: Why it cannot be read, or why nothing was recorded.
         instruction: As text.
-        success: None when unknown.
-        failure_phase, failure_reason: Of a failed attempt.
+        outcome: None when unknown.
         num_frames, fps: Length and frame rate.
-        num_retries: How often the expert tried again.
         seed: Root seed of the run.
-        phases: In order.
-        conditions: The task's conditions of success.
+        phases: (name, first frame, frame after the last) of each phase, in order.
         flags: Results of checks that failed or warned, failures first.
         filmstrip: None without images, and for some successes in a long report.
         info: Everything known before the first frame.
@@ -53,18 +42,19 @@ class ReportedEpisode:
     source: str = ""
     problem: str = ""
     instruction: str = ""
-    success: bool | None = None
-    failure_phase: str = ""
-    failure_reason: str = ""
+    outcome: Outcome | None = None
     num_frames: int = 0
     fps: int = 1
-    num_retries: int = 0
     seed: int | None = None
-    phases: tuple[PhaseSpan, ...] = ()
-    conditions: tuple[SuccessCheck, ...] = ()
+    phases: tuple[tuple[str, int, int], ...] = ()
     flags: tuple[Result, ...] = ()
     filmstrip: Filmstrip | None = None
     info: EpisodeInfo | None = None
+
+    @property
+    def success(self) -> bool | None:
+        """None when unknown."""
+        return None if self.outcome is None else self.outcome.success
 
     @property
     def state(self) -> State:
@@ -79,9 +69,11 @@ class ReportedEpisode:
 
     @property
     def failure(self) -> str:
-        """Why it failed and in which phase."""
-        reason = self.failure_reason or "no reason recorded"
-        return f"{reason} in phase {self.failure_phase}" if self.failure_phase else reason
+        """Why it failed and in which phase; "" of any other."""
+        if self.outcome is None or self.outcome.success:
+            return ""
+        reason, phase = self.outcome.failure_reason or "no reason recorded", self.outcome.failure_phase
+        return f"{reason} in phase {phase}" if phase else reason
 
 
 Components = dict[tuple[str, str], Histogram]
@@ -131,10 +123,14 @@ class CheckSummaries:
             if _rank(result) > _rank(summary.worst):
                 summary.worst, summary.where = result, where
 
+    def of(self, *levels: Level) -> list[tuple[str, CheckSummary]]:
+        """(name, summary) of the checks whose worst result has one of these levels, level by level."""
+        return [item for level in levels for item in self.by_name.items() if item[1].worst.level == level]
+
 
 def _rank(result: Result) -> tuple[int, float]:
     unknown = float("inf") if result.level == "fail" else float("-inf")
-    return ("skip", "pass", "warn", "fail").index(result.level), unknown if result.value is None else result.value
+    return LEVELS.index(result.level), unknown if result.value is None else result.value
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -163,18 +159,6 @@ class Report:
     missing: tuple[str, ...]
     configs: tuple[Mapping[str, Any], ...]
 
-    @property
-    def rate(self) -> Rate:
-        """Of success, over the attempts whose outcome is known."""
-        return success_rate(self.episodes)
-
-    @property
-    def lengths(self) -> Histogram:
-        """Of the episodes, seconds."""
-        lengths = Histogram()
-        lengths.add(np.array([episode.num_frames / episode.fps for episode in self.episodes if episode.num_frames]))
-        return lengths
-
 
 def success_rate(episodes: Sequence[ReportedEpisode]) -> Rate:
     """Over the attempts whose outcome is known."""
@@ -182,26 +166,17 @@ def success_rate(episodes: Sequence[ReportedEpisode]) -> Rate:
     return Rate(successes=sum(known), trials=len(known))
 
 
-def common_facts(episodes: Sequence[ReportedEpisode]) -> Iterator[tuple[str, str]]:
-    """Facts that recordings and datasets share."""
+def common_facts(episodes: Sequence[ReportedEpisode], files: Iterable[Path]) -> Iterator[tuple[str, str]]:
+    """Facts that recordings and datasets share; of the size, their files."""
     rate = success_rate(episodes)
     if rate.trials:
         yield "success", f"{rate}"
     seconds = sum(episode.num_frames / episode.fps for episode in episodes)
+    unit, factor = ("h", 3600) if seconds >= 7200 else ("min", 60) if seconds >= 120 else ("s", 1)
     rates = few(f"{episode.fps} Hz" for episode in episodes if episode.num_frames)
-    yield "frames", f"{sum(episode.num_frames for episode in episodes):,} ({_duration(seconds)} at {rates})"
-
-
-def _duration(seconds: float) -> str:
-    for unit, factor in (("h", 3600.0), ("min", 60.0)):
-        if seconds >= 2 * factor:
-            return f"{seconds / factor:.1f} {unit}"
-    return f"{seconds:.1f} s"
-
-
-def size_text(num_bytes: int) -> str:
-    """In kB or MB."""
-    return f"{num_bytes / 1000:.0f} kB" if num_bytes < 1_000_000 else f"{num_bytes / 1e6:.1f} MB"
+    yield "frames", f"{sum(episode.num_frames for episode in episodes):,} ({seconds / factor:.1f} {unit} at {rates})"
+    size = sum(file.stat().st_size for file in files)
+    yield "size", f"{size / 1000:.0f} kB" if size < 1_000_000 else f"{size / 1e6:.1f} MB"
 
 
 def few(values: Iterable[str]) -> str:

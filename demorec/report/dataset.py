@@ -18,11 +18,9 @@ from demorec.lerobot.paths import SIDECAR_DIR
 from demorec.lerobot.reader import EpisodePlace, RowReader, episode_places
 from demorec.lerobot.sidecar import CONFIGS_PATH, EPISODE_SCHEMA
 from demorec.lerobot.stills import pictures_at
-from demorec.report.content import (
-    CheckSummaries, Components, PhaseSpan, Report, ReportedEpisode, common_facts, count, size_text,
-)  # fmt: skip
+from demorec.report.content import CheckSummaries, Components, Report, ReportedEpisode, common_facts, count
 from demorec.report.filmstrip import MAX_SHOWN, Filmstrip, filmstrip, strip_budget
-from demorec.scene.episode import SuccessCheck
+from demorec.scene.episode import Outcome, SuccessCheck
 from demorec.scene.features import ACTION, IMAGE_PREFIX, STATE
 from demorec.scene.validity import read_episode_info
 
@@ -38,9 +36,7 @@ _ATTEMPT_COLUMNS = ("run_episode_index", "attempt", "success", "failure_phase", 
 _Row = Mapping[str, Any]
 
 
-def dataset_report(
-    root: Path, camera: str, checks: CheckOptions | None, advance: Callable[[int, int], None]
-) -> Report:
+def dataset_report(root: Path, camera: str, checks: CheckOptions | None, advance: Callable[[int, int], None]) -> Report:
     """The content of a page about a dataset; arguments and errors as of `demorec.report.gather.gather`."""
     info = DatasetInfo.load(root)
     rows, left_out, configs = _read_sidecar(root)
@@ -144,34 +140,41 @@ def _episode(place: EpisodePlace, fps: int, columns: Mapping[str, NDArray[Any]],
     name = f"episode {place.episode_index}"
     known = ReportedEpisode(name=name, instruction=", ".join(place.tasks), num_frames=place.length, fps=fps)
     if row is None:
-        return replace(known, success=bool(columns[_SUCCESS][-1, 0]) if len(columns.get(_SUCCESS, ())) else None)
+        success = columns.get(_SUCCESS, ())
+        return replace(known, outcome=_outcome({"success": bool(success[-1, 0])}) if len(success) else None)
     try:
+        known = replace(known, source=str(row["source"]), outcome=_outcome(row))
         if row["episode_info"] is None:  # without a scene there is no seed and no phase
-            source, reason = str(row["source"]), str(row["failure_reason"])
-            return replace(known, source=source, success=row["success"], failure_reason=reason)
+            return known
         return replace(
             known,
-            source=row["source"],
-            success=row["success"],
-            failure_phase=row["failure_phase"],
-            failure_reason=row["failure_reason"],
-            num_retries=row["num_retries"],
             seed=row["root_seed"],
-            phases=tuple(PhaseSpan(name=p["name"], first=p["from"], end=p["to"]) for p in row["phases"]),
-            conditions=tuple(SuccessCheck(**check) for check in row["checks"]),
+            phases=tuple((phase["name"], phase["from"], phase["to"]) for phase in row["phases"]),
             info=read_episode_info(row["episode_info"]),
         )
     except (ValueError, KeyError, TypeError) as error:
         raise ExportError(f"The sidecar's row of {name} cannot be used ({in_words(error)})") from error
 
 
+def _outcome(row: _Row) -> Outcome | None:
+    """As far as a row of the sidecar states it."""
+    if row["success"] is None:
+        return None
+    return Outcome(
+        success=row["success"],
+        checks=tuple(SuccessCheck(**check) for check in row.get("checks") or ()),
+        failure_phase=row.get("failure_phase") or "",
+        failure_reason=row.get("failure_reason") or "",
+        num_frames=0,
+        num_retries=row.get("num_retries") or 0,
+    )
+
+
 def _left_out(row: _Row) -> ReportedEpisode:
     return ReportedEpisode(
         name=f"run's episode {row['run_episode_index']}, attempt {row['attempt']}",
         problem="This attempt is not in the dataset; only how it ended is known.",
-        success=row["success"],
-        failure_phase=row["failure_phase"] or "",
-        failure_reason=row["failure_reason"] or "",
+        outcome=_outcome(row),
     )
 
 
@@ -217,7 +220,7 @@ def _facts(
     yield "episodes", str(info.total_episodes)
     if num_left_out:
         yield "attempts", f"{len(episodes)}, of which {num_left_out} are not in the dataset"
-    yield from common_facts(episodes)
+    yield from common_facts(episodes, (file for file in root.rglob("*") if file.is_file()))
     yield "robot", info.robot_type or "unknown"
     cameras = (
         f"{key.removeprefix(IMAGE_PREFIX)} {'x'.join(str(n) for n in info.features[key].shape[1::-1])}"
@@ -225,5 +228,4 @@ def _facts(
     )
     yield "cameras", ", ".join(cameras) or "none"
     yield "tasks", str(info.total_tasks)
-    yield "size", size_text(sum(file.stat().st_size for file in root.rglob("*") if file.is_file()))
     yield "format", "LeRobot v3.0"

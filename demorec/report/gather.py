@@ -1,4 +1,4 @@
-"""Gathers the content of a report: from recordings here, from a dataset in `demorec.report.dataset`."""
+"""Gathers the content of a report: from recordings here, from datasets in `demorec.report.dataset`."""
 
 from __future__ import annotations
 
@@ -6,21 +6,31 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 
 from demorec.check.report import CheckOptions, Subject, SubjectReport, check_subject, find_subjects
-from demorec.errors import without_path
+from demorec.errors import ConfigError, RecordingError, without_path
 from demorec.plain import to_plain
 from demorec.processes import SPAWN
+from demorec.recording import Recording
 from demorec.report.content import (
-    CheckSummaries, Components, Report, ReportedEpisode, common_facts, few, merge, size_text,
+    CheckSummaries,
+    Components,
+    Report,
+    ReportedEpisode,
+    common_facts,
+    count,
+    few,
+    merge,
 )  # fmt: skip
 from demorec.report.dataset import dataset_report
-from demorec.report.filmstrip import MAX_SHOWN, strip_budget
-from demorec.report.recording import read_recording
+from demorec.report.filmstrip import MAX_SHOWN, filmstrip, strip_budget
 from demorec.runs.find import EPISODE_FOLDERS, Found, PathKind, expect, expect_recordings
-from demorec.runs.run_file import RUN_NAME, Attempt, DamagedRunFileError, RunFile, load_run_file
-from demorec.scene.episode import EpisodeInfo
+from demorec.runs.run_file import FAILED, RUN_NAME, Attempt, DamagedRunFileError, RunFile, load_run_file
+from demorec.scene.episode import EpisodeInfo, Outcome
+from demorec.scene.features import ACTION, STATE, action_names, action_vectors, observation_names, observation_vectors
+from demorec.scene.sensed import ObservationRows
 
 _KINDS: Mapping[PathKind, str] = {
     "recording": "recording",
@@ -116,14 +126,53 @@ def _read_all(
 
 
 def _read(root: Path, camera: str, checks: CheckOptions | None, subject: Subject, strip_bytes: int) -> _Read:
-    """Read and check a recording, in any process."""
+    """Read and check a recording, in any process; a damaged one is reported as such."""
     checked = None if checks is None else check_subject(subject, checks)
     flags = [result for result in checked.results if result.level in ("warn", "fail")] if checked else []
     flags.sort(key=lambda result: result.level != "fail")
     path = subject.path
     source = path.name if path == root else path.relative_to(root).as_posix()
-    episode, components = read_recording(path, source, camera=camera, strip_bytes=strip_bytes)
-    return replace(episode, flags=tuple(flags)), components, checked
+    try:
+        with Recording(path) as recording:
+            episode, counts = _read_recording(recording, camera, strip_bytes)
+    except RecordingError as error:
+        episode, counts = ReportedEpisode(name=path.stem, problem=without_path(error, path)), {}
+    return replace(episode, source=source, flags=tuple(flags)), counts, checked
+
+
+def _read_recording(recording: Recording, camera: str, strip_bytes: int) -> tuple[ReportedEpisode, Components]:
+    info, columns = recording.info, recording.columns()
+    if camera and camera not in recording.cameras:
+        there = ", ".join(recording.cameras) or "none"
+        raise ConfigError(f"There is no camera {camera!r}, the cameras are {there}: {recording.path}")
+    strip = None
+    if strip_bytes and recording.cameras:
+        shown = camera or recording.cameras[0]
+        strip = filmstrip(
+            shown, recording.num_frames, lambda frames: recording.images_at(shown, frames), max_bytes=strip_bytes
+        )
+    changes = [frame for frame, (a, b) in enumerate(pairwise(columns.phase), 1) if a != b]
+    bounds = [0, *changes, columns.num_frames] if columns.num_frames else []
+    is_failed = recording.path.parent.name == FAILED
+    attempt = f", attempt {info.attempt}" if is_failed or info.attempt else ""
+    episode = ReportedEpisode(
+        name=f"episode {info.episode_index}{attempt}",
+        problem="A crash cut the recording off; it was recovered." if recording.outcome is None else "",
+        instruction=info.instruction,
+        outcome=recording.outcome,
+        num_frames=recording.num_frames,
+        fps=info.fps,
+        seed=info.root_seed,
+        phases=tuple((columns.phase[first], first, end) for first, end in pairwise(bounds)),
+        filmstrip=strip,
+        info=info,
+    )
+    counts: Components = {}
+    if columns.num_frames:  # state and action as an export with joint targets has them
+        state = observation_vectors(ObservationRows.of_columns(columns), info.robot, info.scene)[STATE]
+        count(counts, STATE, observation_names(info.robot, info.scene)[STATE], state)
+        count(counts, ACTION, action_names(info.robot, "joint"), action_vectors(columns, info.scene, "joint"))
+    return episode, counts
 
 
 def _run_file(found: Found) -> tuple[RunFile | None, list[str]]:
@@ -140,9 +189,9 @@ def _without_recording(attempt: Attempt) -> ReportedEpisode:
     return ReportedEpisode(
         name=f"episode {attempt.episode_index}, attempt {attempt.attempt}",
         problem="Nothing was recorded, since no scene could be laid out.",
-        success=False,
-        failure_phase=attempt.phase,
-        failure_reason=attempt.reason,
+        outcome=Outcome(
+            success=False, checks=(), failure_phase=attempt.phase, failure_reason=attempt.reason, num_frames=0
+        ),
         seed=attempt.seed,
     )
 
@@ -152,12 +201,11 @@ def _facts(found: Found, run: RunFile | None, episodes: Sequence[ReportedEpisode
     if run is not None:
         yield "episodes", f"{len(run.successes)} of {run.num_episodes} asked"
     yield "attempts" if found.failed else "recordings", str(len(episodes))
-    yield from common_facts(episodes)
+    yield from common_facts(episodes, (*found.recordings, *found.failed))
     yield "task", few(info.task for info in infos)
     yield "robot", few(info.robot.name for info in infos)
     yield "cameras", few(_cameras(info) for info in infos)
     yield "root seed", few(str(info.root_seed) for info in infos)
-    yield "size", size_text(sum(path.stat().st_size for path in (*found.recordings, *found.failed)))
     if run is not None:
         yield "variation", run.config.variation
         yield "run digest", run.digest

@@ -1,7 +1,7 @@
 """A report as one HTML file: no network, no font, no library; it can be read without scripts.
 
-The templates in templates/ hold all markup. Whatever they print is escaped, and invisible characters are spelled out, so
-no text from a file can act on the page.
+The templates in templates/ hold all markup. Whatever they print is escaped, and invisible characters are spelled out,
+so no text from a file can act on the page.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from jinja2.environment import TemplateStream
 from markupsafe import Markup
 
-from demorec.check.base import Level, Result
+from demorec.check.base import Result
 from demorec.check.coverage import MIN_VALUES, drawn_columns, randomised, with_unit
 from demorec.errors import ConfigError
 from demorec.playback.style import phase_colors
 from demorec.report import charts
-from demorec.report.charts import Chart, FloorMap, Place, css_color
-from demorec.report.content import CheckSummary, Report, ReportedEpisode, State
+from demorec.report.charts import Chart, css_color
+from demorec.report.content import LEVELS, Report, ReportedEpisode, State, success_rate
 from demorec.report.filmstrip import MAX_SHOWN
 from demorec.report.histogram import Histogram
 from demorec.safety.replacing import REPORT, REPORT_MARK, written_whole
@@ -45,7 +45,6 @@ _STATES: dict[State, str] = {
 _GOOD = ("success at the first try", "success after a retry")
 _MAX_POINTS = 4000
 """Of the map of starts and goals."""
-_Members = Sequence[tuple[int, ReportedEpisode, EpisodeInfo]]
 
 
 def write_page(report: Report, path: Path) -> int:
@@ -69,24 +68,30 @@ def page(report: Report) -> str:
 
 def _stream(report: Report) -> TemplateStream:
     shown = _shown(report.episodes)
-    phases = (span.name for _, episode in shown if episode.filmstrip for span in episode.phases)
+    phases = (name for _, episode in shown if episode.filmstrip for name, _, _ in episode.phases)
     colors = {name: css_color([channel / 255 for channel in rgb]) for name, rgb in phase_colors(phases).items()}
     style, script = _own_text("page.css"), _own_text("page.js")
-    return _environment().get_template("page.html").stream(
-        report=report,
-        mark=Markup(REPORT_MARK),
-        style=style,
-        script=script,
-        policy=f"default-src 'none'; img-src data:; style-src {_digest(style)}; script-src {_digest(script)}",
-        outcomes=_outcomes(report.episodes),
-        checks=_checks_by_level(report),
-        coverage=list(_coverage(report.episodes)),
-        distributions=list(_distributions(report)),
-        configs=[_config(config) for config in report.configs],
-        shown=shown,
-        counts=Counter(episode.state for episode in report.episodes),
-        states=_STATES,
-        colors=colors,
+    return (
+        _environment()
+        .get_template("page.html")
+        .stream(
+            report=report,
+            mark=Markup(REPORT_MARK),
+            style=style,
+            script=script,
+            policy=f"default-src 'none'; img-src data:; style-src {_digest(style)}; script-src {_digest(script)}",
+            outcomes=_outcomes(report.episodes),
+            checks=report.checks if report.checks and report.checks.by_name else None,
+            rate=success_rate(report.episodes),
+            coverage=list(_coverage(report.episodes)),
+            distributions=list(_distributions(report)),
+            configs=[
+                (config, json.dumps(config, indent=2, ensure_ascii=False).split("\n")) for config in report.configs
+            ],
+            shown=shown,
+            counts=Counter(episode.state for episode in report.episodes),
+            colors=colors,
+        )
     )
 
 
@@ -100,7 +105,7 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.globals.update(charts=charts, min_values=MIN_VALUES)
+    environment.globals.update(charts=charts, levels=LEVELS[::-1], min_values=MIN_VALUES, states=_STATES)
     environment.filters.update(
         fmt=format, base64=lambda data: base64.b64encode(data).decode(), about=_about, measured=_measured, words=_words
     )
@@ -132,29 +137,19 @@ def _outcomes(episodes: Sequence[ReportedEpisode]) -> list[tuple[str, list[int]]
     """(outcome, numbers of its episodes), failures first."""
     groups: dict[str, list[int]] = {}
     for number, episode in enumerate(episodes):
-        if episode.success is None:
+        if episode.outcome is None:
             outcome = "cannot be read" if episode.problem else "not recorded"
-        elif not episode.success:
+        elif not episode.outcome.success:
             outcome = f"failed: {episode.failure}"
         else:
-            outcome = _GOOD[episode.num_retries > 0]
+            outcome = _GOOD[episode.outcome.num_retries > 0]
         groups.setdefault(outcome, []).append(number)
     return sorted(groups.items(), key=lambda item: (item[0] in _GOOD, -len(item[1]), item[0]))
 
 
-def _checks_by_level(report: Report) -> dict[Level, list[tuple[str, CheckSummary]]]:
-    """Worst level -> (name, summary) of its checks; empty when there are none."""
-    found: dict[Level, list[tuple[str, CheckSummary]]] = {"fail": [], "warn": [], "pass": [], "skip": []}
-    if report.checks is None or not report.checks.by_name:
-        return {}
-    for name, summary in report.checks.by_name.items():
-        found[summary.worst.level].append((name, summary))
-    return found
-
-
 def _measured(result: Result) -> tuple[str, str, str]:
     """What was found, what is allowed, and where."""
-    unit = f" {result.unit}" if result.unit else ""
+    unit = f"\u00a0{result.unit}" if result.unit else ""
     value = "" if result.value is None else f"{result.value:.4g}{unit}"
     frame = "" if result.frame is None else f"frame {result.frame}"
     where = ": ".join(filter(None, (frame, result.detail)))
@@ -163,10 +158,10 @@ def _measured(result: Result) -> tuple[str, str, str]:
 
 def _about(episode: ReportedEpisode) -> str:
     """Length, retries, seed and source, as far as they are known."""
-    retries = "retry" if episode.num_retries == 1 else "retries"
+    num_retries = episode.outcome.num_retries if episode.outcome else 0
     parts = [
         f"{episode.num_frames / episode.fps:.1f} s, {episode.num_frames} frames" if episode.num_frames else "",
-        f"{episode.num_retries} {retries}" if episode.num_retries else "",
+        f"{num_retries} {'retry' if num_retries == 1 else 'retries'}" if num_retries else "",
         "" if episode.seed is None else f"seed {episode.seed}",
         episode.source,
     ]
@@ -176,13 +171,11 @@ def _about(episode: ReportedEpisode) -> str:
 def _words(episode: ReportedEpisode) -> str:
     """By which the page's filter finds an episode."""
     parts = [episode.name, episode.instruction, _about(episode), *(flag.check for flag in episode.flags)]
-    return " ".join([*parts, episode.failure if episode.success is False else ""]).lower()
+    return " ".join([*parts, episode.failure]).lower()
 
 
-def _coverage(
-    episodes: Sequence[ReportedEpisode],
-) -> Iterator[tuple[str, int, int, FloorMap | None, list[Chart], list[Chart]]]:
-    """For each task: its name, how many episodes, how many failed, the map, charts of scenes and of behavior."""
+def _coverage(episodes: Sequence[ReportedEpisode]) -> Iterator[dict[str, object]]:
+    """For each task the variables of its part of the section."""
     by_task: dict[str, list[tuple[int, ReportedEpisode, EpisodeInfo]]] = {}
     for number, episode in enumerate(episodes):
         if episode.info is not None:
@@ -190,38 +183,15 @@ def _coverage(
     for task, members in by_task.items():
         infos = [info for _, _, info in members]
         failed = np.array([episode.success is False for _, episode, _ in members])
-        starts, goals = _places(members[:: max(1, -(-len(members) // _MAX_POINTS))])
         behavior = drawn_columns([info.behaviour for info in infos])
-        yield (
-            task,
-            len(members),
-            int(failed.sum()),
-            charts.floor_map(starts, goals) if starts else None,
-            [charts.coverage(with_unit(name), values, failed) for name, values in randomised(infos).items()],
-            [charts.coverage(name.replace("_", " "), values, failed) for name, values in behavior.items()],
-        )
-
-
-def _places(members: _Members) -> tuple[list[Place], list[Place]]:
-    """Where objects start and where they should end."""
-    starts: list[Place] = []
-    goals: list[Place] = []
-    for number, episode, info in members:
-        for goal in info.scene.goals:
-            body = info.scene.body(goal.object)
-            start, end = body.world_from_body.position, info.scene.world_from_goal(goal).position
-            for places, position in ((starts, start), (goals, end)):
-                places.append(
-                    Place(
-                        x=float(position[0]),
-                        y=float(position[1]),
-                        fill=css_color(body.rgba),
-                        href=f"#e{number}",
-                        name=f"{episode.name}: {goal.object}",
-                        failed=episode.success is False,
-                    )
-                )
-    return starts, goals
+        yield {
+            "task": task,
+            "num_episodes": len(members),
+            "num_failed": int(failed.sum()),
+            "map": charts.floor_map(members[:: -(-len(members) // _MAX_POINTS)]),
+            "scenes": [charts.coverage(with_unit(name), values, failed) for name, values in randomised(infos).items()],
+            "behavior": [charts.coverage(name.replace("_", " "), values, failed) for name, values in behavior.items()],
+        }
 
 
 def _distributions(report: Report) -> Iterator[Chart]:
@@ -232,7 +202,8 @@ def _distributions(report: Report) -> Iterator[Chart]:
     for name, series in by_name.items():
         unit = _unit(name) if report.has_units else ""
         yield charts.distribution(f"{name} ({unit})" if unit else name, series)
-    lengths = report.lengths
+    lengths = Histogram()
+    lengths.add(np.array([episode.num_frames / episode.fps for episode in report.episodes if episode.num_frames]))
     if lengths.count > 1:
         yield charts.distribution("length of episodes (s)", [("state", lengths)])._replace(
             note=f"mean: {lengths.mean:.3g}"
@@ -245,10 +216,3 @@ def _unit(name: str) -> str:
     if part in ("pos", "delta", "rx", "ry", "rz"):
         return "rad"
     return "m" if part in ("width", "x", "y", "z", "dx", "dy", "dz") else ""
-
-
-def _config(config: object) -> tuple[str, list[str]]:
-    """Name and lines of a configuration."""
-    known = config if isinstance(config, dict) else {}
-    name = " ".join(str(known[key]) for key in ("task", "robot", "seed") if key in known)
-    return name, json.dumps(config, indent=2, ensure_ascii=False).split("\n")

@@ -226,9 +226,7 @@ def test_foreign_text_does_nothing(run: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize("count", [1000, 9000])
 def test_a_large_run_stays_small(run: Path, count: int) -> None:
     """As many episodes, each with a filmstrip that takes all that it may."""
-    strip = Filmstrip(
-        jpeg=bytes(strip_budget(count)), camera="front", moments=8, width=800, height=100
-    )
+    strip = Filmstrip(jpeg=bytes(strip_budget(count)), camera="front", moments=8, width=800, height=100)
     report = gathered(run)
     many = tuple(replace(report.episodes[number % 4], filmstrip=strip) for number in range(count))
     text = page(replace(report, episodes=many))
@@ -285,7 +283,7 @@ def test_nothing_is_said_of_failed_attempts_where_there_are_none(run: Path, tmp_
 
 def test_phases_have_the_colours_of_the_viewer(run: Path) -> None:
     episode = gathered(run).episodes[0]
-    colours = phase_colors(span.name for span in episode.phases)
+    colours = phase_colors(name for name, _, _ in episode.phases)
     legend, bars = (
         [attributes["fill"] for attributes in report_on(run).all("rect") if attributes.get("height") == height]
         for height in ("10", "1")
