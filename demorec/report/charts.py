@@ -24,7 +24,7 @@ class Chart(NamedTuple):
     """A small chart: areas and lines over a range of values.
 
     Attributes:
-        title: Its name, which is its alt text, too.
+        title: The quantity and its unit.
         paths: (CSS class, SVG path).
         low, high, middle: Labels below its left end, its right end and its middle.
         note: Below the title.
@@ -79,9 +79,7 @@ def coverage(title: str, values: Array, failed: NDArray[np.bool_]) -> Chart:
     return Chart(title, paths, f"{edges[0]:.3g}", f"{edges[-1]:.3g}", f"up to {highest}")
 
 
-def floor_map(
-    members: Sequence[tuple[int, ReportedEpisode, EpisodeInfo]],
-) -> dict[str, list[tuple[object, ...]]] | None:
+def floor_map(members: Sequence[tuple[int, ReportedEpisode, EpisodeInfo]]) -> dict[str, object] | None:
     """The table from above, the robot below: x points up, y to the left; None without goals.
 
     Args:

@@ -140,8 +140,8 @@ def _episode(place: EpisodePlace, fps: int, columns: Mapping[str, NDArray[Any]],
     name = f"episode {place.episode_index}"
     known = ReportedEpisode(name=name, instruction=", ".join(place.tasks), num_frames=place.length, fps=fps)
     if row is None:
-        success = columns.get(_SUCCESS, ())
-        return replace(known, outcome=_outcome({"success": bool(success[-1, 0])}) if len(success) else None)
+        success = bool(columns[_SUCCESS][-1, 0]) if len(columns.get(_SUCCESS, ())) else None
+        return replace(known, outcome=_outcome({"success": success}))
     try:
         known = replace(known, source=str(row["source"]), outcome=_outcome(row))
         if row["episode_info"] is None:  # without a scene there is no seed and no phase
