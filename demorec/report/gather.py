@@ -65,6 +65,13 @@ def gather(
     found = expect(path, "recording", "dataset", *EPISODE_FOLDERS)
     if found.kind == "dataset":
         return dataset_report(path, camera, checks, advance)
+    return _recordings_report(found, camera, checks, workers, advance)
+
+
+def _recordings_report(
+    found: Found, camera: str, checks: CheckOptions | None, workers: int, advance: Callable[[int, int], None]
+) -> Report:
+    path = found.path
     run, missing = _run_file(found)
     later = set() if run is None else {path / attempt.file for attempt in run.beyond}
     if later:
