@@ -71,27 +71,22 @@ def _stream(report: Report) -> TemplateStream:
     phases = (name for _, episode in shown if episode.filmstrip for name, _, _ in episode.phases)
     colors = {name: css_color([channel / 255 for channel in rgb]) for name, rgb in phase_colors(phases).items()}
     style, script = _own_text("page.css"), _own_text("page.js")
-    return (
-        _environment()
-        .get_template("page.html")
-        .stream(
-            report=report,
-            mark=Markup(REPORT_MARK),
-            style=style,
-            script=script,
-            policy=f"default-src 'none'; img-src data:; style-src {_digest(style)}; script-src {_digest(script)}",
-            outcomes=_outcomes(report.episodes),
-            checks=report.checks if report.checks and report.checks.by_name else None,
-            rate=success_rate(report.episodes),
-            coverage=list(_coverage(report.episodes)),
-            distributions=list(_distributions(report)),
-            configs=[
-                (config, json.dumps(config, indent=2, ensure_ascii=False).split("\n")) for config in report.configs
-            ],
-            shown=shown,
-            counts=Counter(episode.state for episode in report.episodes),
-            colors=colors,
-        )
+    template = _environment().get_template("page.html")
+    return template.stream(
+        report=report,
+        mark=Markup(REPORT_MARK),
+        style=style,
+        script=script,
+        policy=f"default-src 'none'; img-src data:; style-src {_digest(style)}; script-src {_digest(script)}",
+        outcomes=_outcomes(report.episodes),
+        checks=report.checks if report.checks and report.checks.by_name else None,
+        rate=success_rate(report.episodes),
+        coverage=list(_coverage(report.episodes)),
+        distributions=list(_distributions(report)),
+        configs=[(config, json.dumps(config, indent=2, ensure_ascii=False).split("\n")) for config in report.configs],
+        shown=shown,
+        counts=Counter(episode.state for episode in report.episodes),
+        colors=colors,
     )
 
 

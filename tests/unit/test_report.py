@@ -30,6 +30,7 @@ from demorec.report.page import page
 
 HOSTILE = "</p><script>document.title = 'taken'</script><img src=x onerror=alert(1)>\"'&\u202e"
 MOST_BYTES = 30_000_000
+TEMPLATES = Path(__file__).parents[2] / "demorec" / "report" / "templates"
 VOID = ("img", "meta", "input", "br")
 
 
@@ -217,7 +218,9 @@ def test_foreign_text_does_nothing(run: Path, tmp_path: Path) -> None:
     found = parsed(text)
     assert "\u202e" not in text
     assert [name for name, _ in found.tags].count("script") == 1
-    assert found.code["script"] == (Path(__file__).parents[2] / "demorec/report/templates/page.js").read_text()
+    assert not [key for _, attributes in found.tags for key in attributes if key.startswith("on")]
+    assert "|safe" not in "".join(file.read_text() for file in TEMPLATES.glob("*.html")).replace(" ", "")
+    assert found.code["script"] == (TEMPLATES / "page.js").read_text()
     shown = HOSTILE.replace("\u202e", "\\u202e")
     assert found.articles[0].count(shown) >= 4
     assert found.words.count(shown) >= 9
