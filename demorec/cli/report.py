@@ -59,18 +59,13 @@ class Report:
             raise ConfigError(f"--out: there is no folder {self.out.parent}.")
         check_replaceable(self.out, REPORT, overwrite=self.overwrite, sources=places_read([self.path]))
         refuse_inside([self.out])
-        from demorec.report.gather import ReportOptions, gather
+        from demorec.check.report import CheckOptions
+        from demorec.report.gather import gather
         from demorec.report.page import write_page
 
-        options = ReportOptions(
-            camera=self.camera,
-            checks=self.checks,
-            pictures=self.pictures,
-            workers=self.workers,
-            allowed=allowed_modules(self.allow),
-        )
+        checks = CheckOptions(pictures=self.pictures, allowed=allowed_modules(self.allow)) if self.checks else None
         with ProgressBar("reading", unit="item") as bar:
-            report = gather(self.path, options, bar.set)
+            report = gather(self.path, camera=self.camera, checks=checks, workers=self.workers, advance=bar.set)
         size = write_page(report, self.out)
         say(f"{counted(len(report.episodes), 'episode')}, {size / 1e6:.1f} MB: {self.out}")
         return 0

@@ -1,162 +1,141 @@
-"""Numbers drawn as SVG, in the colours of the page's style; phases have those of the viewer."""
+"""Geometry of the page's charts, which templates/charts.html draws as SVG."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from demorec.check.coverage import ticks
 from demorec.geometry import Array
-from demorec.playback.style import PHASES
-from demorec.report.content import PhaseSpan
+from demorec.report.content import ReportedEpisode
 from demorec.report.histogram import Histogram
-from demorec.report.markup import Markup, joined, tag
+from demorec.scene.episode import EpisodeInfo
 
-_WIDTH, _HEIGHT, _BELOW = 220, 70, 18
+WIDTH, HEIGHT = 220, 70
+"""Of a chart without its labels, in units of its SVG."""
+MAP_SIDE, MAP_MARGIN = 420, 44
 _COVERAGE_BINS = 14
-_SIDE, _EDGE = 420, 44
 
 
-def distribution(series: Sequence[tuple[str, Histogram]], title: str) -> Markup:
-    """Densities of one or two components over their common range, the first one filled, the second one a line.
+class Chart(NamedTuple):
+    """A small chart: areas and lines over a range of values.
 
-    Args:
-        series: (class of the curve, values).
-        title: For who cannot see it.
+    Attributes:
+        title: The quantity and its unit.
+        paths: (CSS class, SVG path).
+        low, high, middle: Labels below its left end, its right end and its middle.
+        note: Below the title.
     """
+
+    title: str
+    paths: list[tuple[str, str]]
+    low: str
+    high: str
+    middle: str = ""
+    note: str = ""
+
+
+def distribution(title: str, series: Sequence[tuple[str, Histogram]]) -> Chart:
+    """Densities of one or two components over their common range; of each its CSS class and its values."""
+    note = "mean: " + ", ".join(f"{name} {histogram.mean:.3g}" for name, histogram in series)
     low = min(histogram.minimum for _, histogram in series)
     high = max(histogram.maximum for _, histogram in series)
-    if low == high:  # one value, and bins too narrow to be seen
-        return _chart(_bar(_WIDTH / 2 - 2, 0, 4, _HEIGHT, series[0][0]), "", "", title, _number(low))
+    if low == high:  # a single value, whose bin would be too narrow to be seen
+        bar = f"M{WIDTH / 2 - 2:g} 0h4v{HEIGHT}h-4z"
+        return Chart(title, [(series[0][0], bar)], "", "", f"{low:.3g}", note)
     outlines = [(name, _outline(histogram)) for name, histogram in series]
-    most = max(density for _, points in outlines for _, density in points)
+    top = max(density for _, points in outlines for _, density in points)
     paths = []
     for name, points in outlines:
-        steps = [(_WIDTH * min(max((x - low) / (high - low), 0.0), 1.0), _HEIGHT * (1 - y / most)) for x, y in points]
-        paths.append(tag("path", d="M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in steps), class_=name))
-    return _chart(joined(paths), _number(low), _number(high), title)
+        steps = [(WIDTH * min(max((x - low) / (high - low), 0.0), 1.0), HEIGHT * (1 - y / top)) for x, y in points]
+        paths.append((name, "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in steps)))
+    return Chart(title, paths, f"{low:.3g}", f"{high:.3g}", "", note)
 
 
 def _outline(histogram: Histogram) -> list[tuple[float, float]]:
-    """Corners of the bins' outline: (value, share of all values in a unit), beginning and ending at 0."""
+    """Corners of the bins' outline: (value, density), beginning and ending at density 0."""
     points = []
-    first, last = min(histogram.bins), max(histogram.bins)
-    for number in range(first, last + 1):
+    for number in range(min(histogram.bins), max(histogram.bins) + 1):
         density = histogram.bins.get(number, 0) / histogram.count / histogram.width
         points += [(number * histogram.width, density), ((number + 1) * histogram.width, density)]
     return [(points[0][0], 0.0), *points, (points[-1][0], 0.0)]
 
 
-def coverage(values: Array, failed: NDArray[np.bool_], title: str) -> Markup:
-    """How many episodes lie in each part of a range: successes below, failures (N,) on top of them."""
+def coverage(title: str, values: Array, failed: NDArray[np.bool_]) -> Chart:
+    """Number of episodes in each part of a range of values (N,): successes below, failures (N,) on top of them."""
     counts, edges = np.histogram(values, bins=_COVERAGE_BINS)
     bad, _ = np.histogram(values[failed], bins=edges)
-    most, width = max(int(counts.max()), 1), _WIDTH / _COVERAGE_BINS
-    bars = []
-    for number, (count, wrong) in enumerate(zip(counts.tolist(), bad.tolist(), strict=True)):
-        top, middle = _HEIGHT * (1 - count / most), _HEIGHT * (1 - (count - wrong) / most)
-        left = round(number * width, 1)
-        if count > wrong:
-            bars.append(_bar(left, middle, width - 1, _HEIGHT - middle, "succeeded"))
-        if wrong:
-            bars.append(_bar(left, top, width - 1, middle - top, "failed"))
-    return _chart(joined(bars), _number(edges[0]), _number(edges[-1]), title, f"up to {most}")
+    highest, width = max(int(counts.max()), 1), WIDTH / _COVERAGE_BINS
+    bars: dict[str, str] = {"succeeded": "", "failed": ""}
+    for number, (total, wrong) in enumerate(zip(counts.tolist(), bad.tolist(), strict=True)):
+        for name, base, height in (("succeeded", 0, total - wrong), ("failed", total - wrong, wrong)):
+            if height:
+                bottom, up = HEIGHT * (1 - base / highest), HEIGHT * height / highest
+                bars[name] += f"M{number * width:.1f} {bottom:.1f}v{-up:.1f}h{width - 1:.1f}v{up:.1f}z"
+    paths = [(name, path) for name, path in bars.items() if path]
+    return Chart(title, paths, f"{edges[0]:.3g}", f"{edges[-1]:.3g}", f"up to {highest}")
 
 
-def _bar(x: float, y: float, width: float, height: float, name: str) -> Markup:
-    return tag("rect", x=x, y=round(y, 1), width=round(width, 1), height=round(height, 1), class_=name)
-
-
-def _chart(content: Markup, low: str, high: str, title: str, middle: str = "") -> Markup:
-    return tag(
-        "svg",
-        tag("title", title),
-        tag("path", d=f"M0 {_HEIGHT}H{_WIDTH}", class_="axis"),
-        content,
-        tag("text", low, x=0, y=_HEIGHT + 14),
-        tag("text", high, x=_WIDTH, y=_HEIGHT + 14, text_anchor="end"),
-        tag("text", middle, x=_WIDTH / 2, y=_HEIGHT + 14, text_anchor="middle") if middle else None,
-        viewBox=f"0 0 {_WIDTH} {_HEIGHT + _BELOW}",
-        role="img",
-    )
-
-
-def _number(value: float) -> str:
-    return f"{value:.3g}"
-
-
-@dataclass(frozen=True, kw_only=True)
-class Place:
-    """A point of the map, metres in the world frame: where an object starts or shall be, and of which episode."""
-
-    x: float
-    y: float
-    rgba: tuple[float, ...]
-    href: str
-    name: str
-    failed: bool
-
-
-def floor_map(starts: Sequence[Place], goals: Sequence[Place]) -> Markup:
-    """From above, the robot below, as `demorec check --coverage-picture` draws it: x upwards, y to the left."""
-    points = np.array([(place.x, place.y) for place in (*starts, *goals)])
-    low, high = points.min(axis=0), points.max(axis=0)
-    side = max(float((high - low).max()), 1e-6) * 1.1
-    middle_x, middle_y = float(low[0] + high[0]) / 2, float(low[1] + high[1]) / 2
-
-    def right(y: float) -> float:
-        return round(_EDGE + _SIDE / 2 - (y - middle_y) / side * _SIDE, 1)
-
-    def down(x: float) -> float:
-        return round(_SIDE / 2 - (x - middle_x) / side * _SIDE, 1)
-
-    parts = [tag("rect", x=_EDGE, y=0, width=_SIDE, height=_SIDE, class_="frame")]
-    for tick in ticks(middle_x - side / 2, middle_x + side / 2):
-        parts.append(tag("path", d=f"M{_EDGE} {down(tick)}h{_SIDE}", class_="grid"))
-        parts.append(tag("text", f"{tick:g}", x=_EDGE - 6, y=down(tick) + 4, text_anchor="end"))
-    for tick in ticks(middle_y - side / 2, middle_y + side / 2):
-        parts.append(tag("path", d=f"M{right(tick)} 0v{_SIDE}", class_="grid"))
-        parts.append(tag("text", f"{tick:g}", x=right(tick), y=_SIDE + 16, text_anchor="middle"))
-    parts.append(tag("text", "x (m)", x=_EDGE + 6, y=16))
-    parts.append(tag("text", "y (m)", x=_EDGE + _SIDE - 6, y=_SIDE - 8, text_anchor="end"))
-    for goal in goals:
-        parts.append(tag("circle", cx=right(goal.y), cy=down(goal.x), r=4, class_="goal"))
-    for start in sorted(starts, key=lambda place: place.failed):  # failures on top
-        x, y = right(start.y), down(start.x)
-        fill = "#" + "".join(f"{round(255 * min(max(channel, 0.0), 1.0)):02x}" for channel in start.rgba[:3])
-        mark = [tag("title", start.name), tag("circle", cx=x, cy=y, r=3, fill=fill, class_="start")]
-        if start.failed:
-            mark.append(tag("path", d=f"M{x - 5} {y - 5}l10 10m0 -10l-10 10", class_="cross"))
-        parts.append(tag("a", *mark, href=start.href))
-    return tag(
-        "svg",
-        tag("title", "Start places and goals from above"),
-        *parts,
-        viewBox=f"0 0 {_EDGE + _SIDE} {_SIDE + 24}",
-        class_="map",
-    )
-
-
-def phase_bar(spans: Sequence[PhaseSpan], num_frames: int, moments: int, colours: dict[str, str]) -> Markup:
-    """The phases in time, so that the middle of each of a filmstrip's pictures stands over its own moment.
+def floor_map(members: Sequence[tuple[int, ReportedEpisode, EpisodeInfo]]) -> dict[str, object] | None:
+    """The table from above, the robot below: x points up, y to the left; None without goals.
 
     Args:
-        spans: The phases.
-        num_frames: Of the episode.
-        moments: Pictures in the filmstrip above.
-        colours: Phase -> its colour; new phases are added.
+        members: (number, episode, its info).
+
+    Returns:
+        "rows" and "columns" of the grid: (position, label); "goals": (x, y) in the map; "starts" of the objects:
+        (x, y, color, number and name of the episode, whether it failed), failures last.
     """
-    last = max(num_frames - 1, 1)
-    parts = []
-    for span in spans:
-        left = 0.5 + (moments - 1) * span.first / last
-        right = 0.5 + (moments - 1) * min(span.end, last) / last
-        fill = colours.setdefault(span.name, "#" + bytes(PHASES[len(colours) % len(PHASES)]).hex())
-        words = f"{span.name}, frames {span.first} to {span.end - 1}"
-        parts.append(tag("rect", tag("title", words), x=left, y=0, width=max(right - left, 0.0), height=1, fill=fill))
-    return tag(
-        "svg", *parts, viewBox=f"0 0 {moments} 1", preserveAspectRatio="none", class_="phases", aria_hidden="true"
-    )
+    objects = [
+        (info.scene.body(goal.object), info.scene.world_from_goal(goal).position, goal.object, number, episode)
+        for number, episode, info in sorted(members, key=lambda member: member[1].success is False)
+        for goal in info.scene.goals
+    ]
+    if not objects:
+        return None
+    starts = np.array([body.world_from_body.position[:2] for body, *_ in objects])
+    goals = np.array([position[:2] for _, position, *_ in objects])
+    low, high = np.minimum(starts, goals).min(axis=0), np.maximum(starts, goals).max(axis=0)
+    side, middle = max(float((high - low).max()), 1e-6) * 1.1, (low + high) / 2
+
+    def drawn(points: Array) -> list[list[float]]:
+        """(N, 2) places in metres -> right and down in the map."""
+        found = MAP_SIDE / 2 - (points - middle)[:, ::-1] / side * MAP_SIDE + (MAP_MARGIN, 0)
+        return [[round(value, 1) for value in point] for point in found.tolist()]
+
+    def grid(axis: int) -> list[tuple[float, str]]:
+        values = ticks(middle[axis] - side / 2, middle[axis] + side / 2)
+        points = drawn(np.array([values, values]).T)
+        return [(point[1 - axis], f"{value:g}") for value, point in zip(values, points, strict=True)]
+
+    return {
+        "rows": grid(0),
+        "columns": grid(1),
+        "goals": drawn(goals),
+        "starts": [
+            (*point, css_color(body.rgba), number, f"{episode.name}: {name}", episode.success is False)
+            for point, (body, _, name, number, episode) in zip(drawn(starts), objects, strict=True)
+        ],
+    }
+
+
+def css_color(rgb: Sequence[float]) -> str:
+    """Of red, green and blue from 0 to 1."""
+    return "#" + "".join(f"{round(255 * min(max(channel, 0.0), 1.0)):02x}" for channel in rgb[:3])
+
+
+def phase_bar(episode: ReportedEpisode, moments: int, colors: Mapping[str, str]) -> list[tuple[str, str, str, str]]:
+    """(title, left, width, color) of each phase, in units of one image of the filmstrip above.
+
+    The middle of each image stands over its own moment.
+    """
+    last = max(episode.num_frames - 1, 1)
+    bars = []
+    for name, first, end in episode.phases:
+        left, right = (0.5 + (moments - 1) * min(frame, last) / last for frame in (first, end))
+        title = f"{name}, frames {first} to {end - 1}"
+        bars.append((title, f"{left:.6g}", f"{right - left:.6g}", colors[name]))
+    return bars

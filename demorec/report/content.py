@@ -1,91 +1,64 @@
-"""What a report tells, as plain data: gathered from recordings or from a dataset, laid out by `demorec.report.page`."""
+"""What a report shows, as plain data: gathered from recordings or from a dataset, laid out by `demorec.report.page`."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Literal
 
+from numpy.typing import NDArray
+
 from demorec.check.base import Level, Result
-from demorec.check.report import SubjectReport
+from demorec.evaluate.statistics import Rate
+from demorec.report.filmstrip import Filmstrip
 from demorec.report.histogram import Histogram
-from demorec.scene.episode import EpisodeInfo, SuccessCheck
+from demorec.scene.episode import EpisodeInfo, Outcome
 
+LEVELS: tuple[Level, ...] = ("skip", "pass", "warn", "fail")
 State = Literal["unreadable", "failed", "flagged", "unknown", "succeeded"]
-"""Of an episode, the worst first. "flagged" is a success of which a check failed or warned."""
-
-STATES: tuple[State, ...] = ("unreadable", "failed", "flagged", "unknown", "succeeded")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Filmstrip:
-    """Pictures of one camera beside each other, evenly spaced from the first frame to the last.
-
-    Attributes:
-        jpeg: All of them as one JPEG file.
-        camera: Name.
-        moments: How many pictures.
-        width, height: Of the whole, pixels.
-    """
-
-    jpeg: bytes
-    camera: str
-    moments: int
-    width: int
-    height: int
-
-
-@dataclass(frozen=True, kw_only=True)
-class PhaseSpan:
-    """A phase and its frames, from `first` to before `end`."""
-
-    name: str
-    first: int
-    end: int
+"""Of an episode. "flagged" is a success for which a check failed or warned."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ReportedEpisode:
-    """One attempt at one episode. What the source does not tell is None or empty.
+    """One attempt at one episode. What the source does not state is None or empty.
 
     Attributes:
-        name: "episode 3", or "episode 3, attempt 0" of a failed one.
-        source: The file that it lies in, relative to what is reported on.
-        problem: Why it cannot be read, or why nothing was recorded; "" otherwise.
-        instruction: In words.
-        success: None when nobody knows.
-        failure_phase, failure_reason: Of an attempt that failed.
-        num_frames: Length.
-        fps: Frames per second.
-        num_retries: How often the expert tried again.
+        name: "episode 3", or "episode 3, attempt 0" for one that failed.
+        source: Its file, relative to the path of the report.
+        problem: Why it cannot be read, or why nothing was recorded.
+        instruction: As text.
+        outcome: None when unknown.
+        num_frames, fps: Length and frame rate.
         seed: Root seed of the run.
-        phases: In order.
-        conditions: The task's conditions of success.
-        flags: Results of checks that failed or warned.
-        filmstrip: None without pictures, and in a long report of some successes.
-        info: All that was known before the first frame.
+        phases: (name, first frame, frame after the last) of each phase, in order.
+        flags: Results of checks that failed or warned, failures first.
+        filmstrip: None without images, and for some successes in a long report.
+        info: Everything known before the first frame.
     """
 
     name: str
     source: str = ""
     problem: str = ""
     instruction: str = ""
-    success: bool | None = None
-    failure_phase: str = ""
-    failure_reason: str = ""
+    outcome: Outcome | None = None
     num_frames: int = 0
     fps: int = 1
-    num_retries: int = 0
     seed: int | None = None
-    phases: tuple[PhaseSpan, ...] = ()
-    conditions: tuple[SuccessCheck, ...] = ()
+    phases: tuple[tuple[str, int, int], ...] = ()
     flags: tuple[Result, ...] = ()
     filmstrip: Filmstrip | None = None
     info: EpisodeInfo | None = None
 
     @property
+    def success(self) -> bool | None:
+        """None when unknown."""
+        return None if self.outcome is None else self.outcome.success
+
+    @property
     def state(self) -> State:
-        """How it stands, in a word."""
+        """Its status in one word."""
         if self.success is False:
             return "failed"
         if self.problem:
@@ -96,31 +69,42 @@ class ReportedEpisode:
 
     @property
     def failure(self) -> str:
-        """Why it failed and in which phase."""
-        reason = self.failure_reason or "no reason recorded"
-        return f"{reason} in phase {self.failure_phase}" if self.failure_phase else reason
+        """Why it failed and in which phase; "" of any other."""
+        if self.outcome is None or self.outcome.success:
+            return ""
+        reason, phase = self.outcome.failure_reason or "no reason recorded", self.outcome.failure_phase
+        return f"{reason} in phase {phase}" if phase else reason
 
 
 Components = dict[tuple[str, str], Histogram]
 """(feature, name of the component) -> its values over all frames."""
 
 
+def count(into: Components, feature: str, names: Iterable[str], values: NDArray[Any]) -> None:
+    """Count the values of a feature (T, D) by component, as far as there are names."""
+    for name, column in zip(names, values.T, strict=False):
+        into.setdefault((feature, name), Histogram()).add(column)
+
+
+def merge(into: Components, found: Components) -> None:
+    """Add the counts of one episode to those of all."""
+    for key, histogram in found.items():
+        into.setdefault(key, Histogram()).merge(histogram)
+
+
 @dataclass(kw_only=True)
 class CheckSummary:
-    """One check over everything that it looked at; filled by `CheckSummaries`.
+    """One check over everything that it looked at.
 
     Attributes:
-        counts: How many results have a level.
-        worst: The result that stands for it: of the highest level, and of the largest value in it.
+        counts: Number of results of each level.
+        worst: The result shown: of the highest level, and of those the one with the largest value.
         where: What that was found in.
     """
 
     worst: Result
     where: str
     counts: dict[Level, int] = field(default_factory=dict)
-
-
-_SEVERITY: Mapping[Level, int] = {"skip": 0, "pass": 1, "warn": 2, "fail": 3}
 
 
 class CheckSummaries:
@@ -131,7 +115,7 @@ class CheckSummaries:
         self.num_subjects = 0
 
     def add(self, results: Iterable[Result], where: str) -> None:
-        """Count the results about one recording, run or dataset."""
+        """Count the results for one recording, run or dataset."""
         self.num_subjects += 1
         for result in results:
             summary = self.by_name.setdefault(result.check, CheckSummary(worst=result, where=where))
@@ -139,15 +123,19 @@ class CheckSummaries:
             if _rank(result) > _rank(summary.worst):
                 summary.worst, summary.where = result, where
 
+    def of(self, *levels: Level) -> list[tuple[str, CheckSummary]]:
+        """(name, summary) of the checks whose worst result has one of these levels, level by level."""
+        return [item for level in levels for item in self.by_name.items() if item[1].worst.level == level]
+
 
 def _rank(result: Result) -> tuple[int, float]:
     unknown = float("inf") if result.level == "fail" else float("-inf")
-    return _SEVERITY[result.level], unknown if result.value is None else result.value
+    return LEVELS.index(result.level), unknown if result.value is None else result.value
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Report:
-    """All that a page shows.
+    """Everything that a page shows.
 
     Attributes:
         title: Name of the run, recording or dataset.
@@ -155,9 +143,9 @@ class Report:
         facts: (name, value) of the summary.
         episodes: Every attempt, in order.
         distributions: Of actions and states.
-        has_units: Whether their components have the names, and so the units, that we give them.
+        has_units: Whether their components have demorec's names, and so known units.
         checks: None when no checks were run.
-        missing: Sentences about what the source does not tell.
+        missing: Sentences about what the source does not contain.
         configs: Resolved configurations.
     """
 
@@ -172,7 +160,26 @@ class Report:
     configs: tuple[Mapping[str, Any], ...]
 
 
-def flags_of(report: SubjectReport) -> tuple[Result, ...]:
-    """What failed or warned of one recording, run or dataset, the failures first."""
-    found = [result for result in report.results if result.level in ("warn", "fail")]
-    return tuple(sorted(found, key=lambda result: result.level != "fail"))
+def success_rate(episodes: Sequence[ReportedEpisode]) -> Rate:
+    """Over the attempts whose outcome is known."""
+    known = [episode.success for episode in episodes if episode.success is not None]
+    return Rate(successes=sum(known), trials=len(known))
+
+
+def common_facts(episodes: Sequence[ReportedEpisode], files: Iterable[Path]) -> Iterator[tuple[str, str]]:
+    """Facts that recordings and datasets share; of the size, their files."""
+    rate = success_rate(episodes)
+    if rate.trials:
+        yield "success", f"{rate}"
+    seconds = sum(episode.num_frames / episode.fps for episode in episodes)
+    unit, factor = ("h", 3600) if seconds >= 7200 else ("min", 60) if seconds >= 120 else ("s", 1)
+    rates = few(f"{episode.fps} Hz" for episode in episodes if episode.num_frames)
+    yield "frames", f"{sum(episode.num_frames for episode in episodes):,} ({seconds / factor:.1f} {unit} at {rates})"
+    size = sum(file.stat().st_size for file in files)
+    yield "size", f"{size / 1000:.0f} kB" if size < 1_000_000 else f"{size / 1e6:.1f} MB"
+
+
+def few(values: Iterable[str]) -> str:
+    """The first three distinct values."""
+    distinct = list(dict.fromkeys(values))
+    return (", ".join(distinct[:3]) + (", ..." if len(distinct) > 3 else "")) or "unknown"

@@ -4,58 +4,73 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from demorec.report.content import Filmstrip
-
-_ALL_BYTES = 13_500_000
-"""Of all filmstrips of a page together; as text they take a third more, and a page stays below 30 MB."""
-_MOST_BYTES = 16_000
+MAX_SHOWN = 4000
+"""Episodes that a page shows one by one."""
+_TOTAL_BYTES = 13_500_000
+"""Of all filmstrips of a page together; as base64 they take a third more, and a page stays below 30 MB."""
+_MAX_BYTES = 16_000
 """Of one filmstrip."""
 _MOMENTS = 8
 _HEIGHTS = (120, 104, 88, 72, 56, 40, 28)
 """Pixels; the first at which the strip is within its budget is taken."""
-_WIDEST = 3.0
-"""Ratio of width to height up to which pictures are shown as they are; beyond it they are squeezed."""
+_MAX_ASPECT = 3.0
+"""Ratio of width to height up to which images keep their shape; wider ones are squeezed."""
 _QUALITY = 72
 
 
-def strip_budget(num_strips: int) -> int:
-    """How many bytes each of so many filmstrips on one page may have."""
-    return min(_MOST_BYTES, _ALL_BYTES // max(num_strips, 1))
+@dataclass(frozen=True, kw_only=True)
+class Filmstrip:
+    """Images of one camera side by side, evenly spaced from the first frame to the last.
+
+    Attributes:
+        jpeg: All of them as one JPEG file.
+        camera: Name.
+        moments: Number of images.
+        width, height: Of the whole strip, pixels.
+    """
+
+    jpeg: bytes
+    camera: str
+    moments: int
+    width: int
+    height: int
+
+
+def strip_budget(num_episodes: int) -> int:
+    """Size limit, in bytes, of each filmstrip on a page about that many episodes."""
+    return min(_MAX_BYTES, _TOTAL_BYTES // max(1, min(num_episodes, MAX_SHOWN)))
 
 
 def filmstrip(
-    camera: str,
-    num_frames: int,
-    pictures: Callable[[Sequence[int]], Iterable[NDArray[np.uint8]]],
-    *,
-    most_bytes: int,
+    camera: str, num_frames: int, images_at: Callable[[Sequence[int]], Iterable[NDArray[np.uint8]]], *, max_bytes: int
 ) -> Filmstrip | None:
-    """A strip of at most `most_bytes`; None where not even the smallest one is that small, or there is no frame.
+    """A strip of at most `max_bytes`; None if even the smallest is larger, or there is no frame.
 
     Args:
         camera: Its name.
         num_frames: Of the episode.
-        pictures: Frames in rising order -> their pictures, (H, W, 3) uint8.
-        most_bytes: Of the JPEG file.
+        images_at: Rising frame numbers -> their images, (H, W, 3) uint8.
+        max_bytes: Of the JPEG file.
     """
     if num_frames == 0:
         return None
     frames = np.unique(np.linspace(0, num_frames - 1, _MOMENTS).round().astype(int)).tolist()
-    images = [Image.fromarray(picture) for picture in pictures(frames)]
-    ratio = min(images[0].width / images[0].height, _WIDEST)
+    images = [Image.fromarray(image) for image in images_at(frames)]
+    aspect = min(images[0].width / images[0].height, _MAX_ASPECT)
     for height in _HEIGHTS:
-        width = max(1, round(height * ratio))
+        width = max(1, round(height * aspect))
         strip = Image.new("RGB", (width * len(images), height))
         for number, image in enumerate(images):
             strip.paste(image.resize((width, height), reducing_gap=2.0), (number * width, 0))
         file = io.BytesIO()
         strip.save(file, "JPEG", quality=_QUALITY, optimize=True)
-        if file.tell() <= most_bytes:
+        if file.tell() <= max_bytes:
             return Filmstrip(
                 jpeg=file.getvalue(), camera=camera, moments=len(images), width=strip.width, height=strip.height
             )

@@ -1,0 +1,231 @@
+"""A LeRobot dataset, whoever wrote it, as a report shows it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
+
+from demorec.check.report import CheckOptions, Subject, check_subject
+from demorec.errors import ConfigError, ExportError, in_words, without_path
+from demorec.lerobot.attempts import ATTEMPT_SCHEMA
+from demorec.lerobot.files import read_json, read_table
+from demorec.lerobot.layout import DatasetInfo
+from demorec.lerobot.paths import SIDECAR_DIR
+from demorec.lerobot.reader import EpisodePlace, RowReader, episode_places
+from demorec.lerobot.sidecar import CONFIGS_PATH, EPISODE_SCHEMA
+from demorec.lerobot.stills import pictures_at
+from demorec.report.content import CheckSummaries, Components, Report, ReportedEpisode, common_facts, count
+from demorec.report.filmstrip import MAX_SHOWN, Filmstrip, filmstrip, strip_budget
+from demorec.scene.episode import Outcome, SuccessCheck
+from demorec.scene.features import ACTION, IMAGE_PREFIX, STATE
+from demorec.scene.validity import read_episode_info
+
+_SUCCESS = "next.success"
+_NUMBERS = ("float32", "float64", "int64", "bool")
+_MAX_COMPONENTS = 64
+"""Of one feature that are drawn."""
+_EPISODE_COLUMNS = (
+    "episode_index", "source", "run_episode_index", "attempt", "root_seed", "success", "failure_phase",
+    "failure_reason", "num_retries", "checks", "phases", "episode_info",
+)  # fmt: skip
+_ATTEMPT_COLUMNS = ("run_episode_index", "attempt", "success", "failure_phase", "failure_reason", "in_dataset")
+_Row = Mapping[str, Any]
+
+
+def dataset_report(root: Path, camera: str, checks: CheckOptions | None, advance: Callable[[int, int], None]) -> Report:
+    """The content of a page about a dataset; arguments and errors as of `demorec.report.gather.gather`."""
+    info = DatasetInfo.load(root)
+    rows, left_out, configs = _read_sidecar(root)
+    missing = list(_missing(info, has_sidecar=bool(rows)))
+    key = _camera_key(info, camera, root)
+    wanted = {
+        name: item
+        for name, item in info.features.items()
+        if name in (STATE, ACTION, _SUCCESS) and item.dtype in _NUMBERS and len(item.shape) == 1
+    }
+    reader = RowReader(root, replace(info, features=wanted)) if wanted else None
+    total = info.total_episodes + len(left_out) + (checks is not None)
+    stride = max(1, -(-info.total_episodes // MAX_SHOWN))
+    components: Components = {}
+    episodes: list[ReportedEpisode] = []
+    for number, place in enumerate(episode_places(root, info)):
+        columns = {} if reader is None else reader.read(place)
+        _count_components(components, root, info, columns)
+        strip, problem = None, ""
+        if key is not None and number % stride == 0:
+            strip, problem = _strip(root, info, key, place)
+        episode = _episode(place, info.fps, columns, rows.get(place.episode_index))
+        episodes.append(replace(episode, filmstrip=strip, problem=problem))
+        advance(len(episodes), total)
+    episodes += [_left_out(row) for row in left_out]
+    summaries = CheckSummaries()
+    if checks is None:
+        missing.append("No checks were run (--no-checks).")
+    else:
+        summaries.add(check_subject(Subject(path=root, kind="dataset"), checks).results, "the dataset")
+    advance(total, total)
+    return Report(
+        title=root.resolve().name,
+        kind="LeRobot dataset",
+        facts=tuple(_facts(root, info, episodes, len(left_out))),
+        episodes=tuple(episodes),
+        distributions=components,
+        has_units=bool(rows),
+        checks=summaries if checks else None,
+        missing=tuple(missing),
+        configs=tuple(configs.values()),
+    )
+
+
+def _read_sidecar(root: Path) -> tuple[dict[int, _Row], list[_Row], _Row]:
+    """(episode index -> its row, rows of attempts outside of the dataset, configurations); empty without a sidecar.
+
+    Raises:
+        ExportError: It is damaged.
+    """
+    episodes, attempts = (
+        [
+            row
+            for file in sorted((root / SIDECAR_DIR / name).glob("*/*.parquet"))
+            for row in read_table(file, columns, schema=schema).to_pylist()
+        ]
+        for name, columns, schema in (
+            ("episodes", _EPISODE_COLUMNS, EPISODE_SCHEMA),
+            ("attempts", _ATTEMPT_COLUMNS, ATTEMPT_SCHEMA),
+        )
+    )
+    try:
+        configs = read_json(root / CONFIGS_PATH) if episodes else {}
+    except (OSError, ValueError) as error:
+        raise ExportError(f"The sidecar's configs.json cannot be read ({in_words(error)}): {root}") from error
+    rows = {row["episode_index"]: row for row in episodes}
+    return rows, [row for row in attempts if not row["in_dataset"]], configs if isinstance(configs, dict) else {}
+
+
+def _camera_key(info: DatasetInfo, camera: str, root: Path) -> str | None:
+    """The feature whose images are shown; None in a dataset without color videos.
+
+    Raises:
+        ConfigError: There is no such camera.
+    """
+    keys = [key for key in info.video_keys if not info.features[key].is_depth]
+    if not camera:
+        return keys[0] if keys else None
+    for key in keys:
+        if camera in (key, key.removeprefix(IMAGE_PREFIX)):
+            return key
+    there = ", ".join(key.removeprefix(IMAGE_PREFIX) for key in keys) or "none"
+    raise ConfigError(f"There is no camera {camera!r} with color videos, the cameras are {there}: {root}")
+
+
+def _strip(root: Path, info: DatasetInfo, key: str, place: EpisodePlace) -> tuple[Filmstrip | None, str]:
+    """The filmstrip, or why there is none."""
+    try:
+        strip = filmstrip(
+            key.removeprefix(IMAGE_PREFIX),
+            place.length,
+            lambda frames: pictures_at(root, info, key, place, frames),
+            max_bytes=strip_budget(info.total_episodes),
+        )
+    except ExportError as error:
+        return None, without_path(error, root)
+    return strip, ""
+
+
+def _episode(place: EpisodePlace, fps: int, columns: Mapping[str, NDArray[Any]], row: _Row | None) -> ReportedEpisode:
+    name = f"episode {place.episode_index}"
+    known = ReportedEpisode(name=name, instruction=", ".join(place.tasks), num_frames=place.length, fps=fps)
+    if row is None:
+        success = bool(columns[_SUCCESS][-1, 0]) if len(columns.get(_SUCCESS, ())) else None
+        return replace(known, outcome=_outcome({"success": success}))
+    try:
+        known = replace(known, source=str(row["source"]), outcome=_outcome(row))
+        if row["episode_info"] is None:  # without a scene there is no seed and no phase
+            return known
+        return replace(
+            known,
+            seed=row["root_seed"],
+            phases=tuple((phase["name"], phase["from"], phase["to"]) for phase in row["phases"]),
+            info=read_episode_info(row["episode_info"]),
+        )
+    except (ValueError, KeyError, TypeError) as error:
+        raise ExportError(f"The sidecar's row of {name} cannot be used ({in_words(error)})") from error
+
+
+def _outcome(row: _Row) -> Outcome | None:
+    """As far as a row of the sidecar states it."""
+    if row["success"] is None:
+        return None
+    return Outcome(
+        success=row["success"],
+        checks=tuple(SuccessCheck(**check) for check in row.get("checks") or ()),
+        failure_phase=row.get("failure_phase") or "",
+        failure_reason=row.get("failure_reason") or "",
+        num_frames=0,
+        num_retries=row.get("num_retries") or 0,
+    )
+
+
+def _left_out(row: _Row) -> ReportedEpisode:
+    return ReportedEpisode(
+        name=f"run's episode {row['run_episode_index']}, attempt {row['attempt']}",
+        problem="This attempt is not in the dataset; only how it ended is known.",
+        outcome=_outcome(row),
+    )
+
+
+def _count_components(into: Components, root: Path, info: DatasetInfo, columns: Mapping[str, NDArray[Any]]) -> None:
+    for feature in (STATE, ACTION):
+        if feature not in columns:
+            continue
+        values = columns[feature]
+        if values.dtype.kind not in "fiub":
+            raise ExportError(f"The column {feature} holds something else than numbers: {root}")
+        names = info.features[feature].names or ()
+        if len(names) != values.shape[1]:
+            names = tuple(f"component {number}" for number in range(values.shape[1]))
+        count(into, feature, names[:_MAX_COMPONENTS], values)
+
+
+def _missing(info: DatasetInfo, *, has_sidecar: bool) -> Iterator[str]:
+    """Sentences about what the dataset does not contain."""
+    if not has_sidecar:
+        yield (
+            f"The dataset has no folder {SIDECAR_DIR}/, which exports of demorec have: scenes, random seeds, phases, "
+            "the conditions of success and the coverage of the randomised ranges are not known."
+        )
+        if _SUCCESS not in info.features:
+            yield f"No column {_SUCCESS} states which episodes succeeded."
+    if any(item.dtype == "image" for item in info.features.values()):
+        yield "Its images lie as single files in the data tables, which are not shown."
+    elif all(info.features[key].is_depth for key in info.video_keys):
+        yield "It has no color videos, so there are no filmstrips."
+    for feature in (STATE, ACTION):
+        item = info.features.get(feature)
+        if item is None:
+            yield f"It has no column {feature}, so nothing is drawn of it."
+        elif item.dtype not in _NUMBERS or len(item.shape) != 1:
+            yield f"The column {feature} is not a vector of numbers (dtype {item.dtype}), so nothing is drawn of it."
+        elif item.shape[0] > _MAX_COMPONENTS:
+            yield f"Of the {item.shape[0]} components of {feature} the first {_MAX_COMPONENTS} are drawn."
+
+
+def _facts(
+    root: Path, info: DatasetInfo, episodes: list[ReportedEpisode], num_left_out: int
+) -> Iterator[tuple[str, str]]:
+    yield "episodes", str(info.total_episodes)
+    if num_left_out:
+        yield "attempts", f"{len(episodes)}, of which {num_left_out} are not in the dataset"
+    yield from common_facts(episodes, (file for file in root.rglob("*") if file.is_file()))
+    yield "robot", info.robot_type or "unknown"
+    cameras = (
+        f"{key.removeprefix(IMAGE_PREFIX)} {'x'.join(str(n) for n in info.features[key].shape[1::-1])}"
+        for key in info.video_keys
+    )
+    yield "cameras", ", ".join(cameras) or "none"
+    yield "tasks", str(info.total_tasks)
+    yield "format", "LeRobot v3.0"
