@@ -23,7 +23,7 @@ from demorec.ingest.channel import MAX_TIME_NS, BagError, BagMessage
 from demorec.ingest.mcap_bag import read_mcap
 from demorec.ingest.sqlite_bag import SQLITE_MAGIC, read_sqlite
 from demorec.lerobot.paths import INFO_PATH
-from demorec.recording.limits import Budget, LimitError, Limits, Unpacked
+from demorec.recording.limits import LimitError, Limits, Unpacked
 from demorec.runs.run_file import sha256_of
 from demorec.safety.files import MCAP_MAGIC, open_regular, read_text_limited
 
@@ -243,13 +243,13 @@ def _plain_yaml(text: str) -> Any:
         SequenceStartEvent,
     )
 
-    budget = Budget(_MAX_EVENTS, _MAX_EVENTS, "values")
     root: list[Any] = []
     open_lists = [root]
     """What is begun: of mappings the keys and values in turn."""
     try:
-        for event in YAML(typ="safe", pure=True).parse(text):
-            budget.take()
+        for number, event in enumerate(YAML(typ="safe", pure=True).parse(text)):
+            if number == _MAX_EVENTS:
+                raise LimitError(f"it holds more than {_MAX_EVENTS:,} values")
             if isinstance(event, AliasEvent):
                 raise LimitError("it has aliases, which rosbag2 never writes")
             if isinstance(event, ScalarEvent):

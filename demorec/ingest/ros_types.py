@@ -53,8 +53,8 @@ class Budgets:
     """
 
     def __init__(self, num_bytes: int = 0) -> None:
-        self.steps = Budget(1_200_000, 800_000, "parts of definitions")
         floor = Limits.of_file(num_bytes).floor
+        self.steps = Budget(floor // 56, 800_000, "parts of definitions")
         self.values = Budget(max(floor // 13, 12 * num_bytes), 500_000, "values")
         numbers = max(floor, 100 * num_bytes)
         self.numbers = Budget(numbers, numbers, "bytes of numbers")

@@ -169,8 +169,9 @@ class _Growing:
                     self.reader = SourceReader(self.source, self.layout)
                 self._add_vector(self.reader.read(values))
             else:
-                self.heads.append(picture_head(values))
-                self.picture_sums.append(zlib.crc32(picture_bytes(values)))
+                head, picture_sum = picture_head(values), zlib.crc32(picture_bytes(values))
+                self.heads.append(head)  # both or neither
+                self.picture_sums.append(picture_sum)
                 self.numbers.append(number)
         except OtherPublisherError as error:
             self.first_refusal = self.first_refusal or str(error)
