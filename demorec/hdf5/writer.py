@@ -65,7 +65,7 @@ class RobomimicWriter:
     def _write(self, demo: h5py.Group, episode: ExportEpisode) -> None:
         """Fill in the group of an episode."""
         observations, images = _observation_names(episode), _image_names(episode)
-        info, outcome, count = episode.recording.info, episode.recording.outcome, len(episode.rows)
+        info, count = episode.recording.info, len(episode.rows)
         demo.attrs["num_samples"] = count
         demo.attrs["instruction"] = info.instruction
         demo.attrs["episode_index"], demo.attrs["attempt"] = info.episode_index, info.attempt
@@ -74,8 +74,7 @@ class RobomimicWriter:
         if urdf := episode.urdf:
             demo.attrs["model_file"] = urdf
         dones = episode.scalar_columns[DONE].astype(np.int64)
-        success = False if episode.recording.has_failed else None if outcome is None else outcome.success
-        if success is not None:
+        if (success := episode.recording.success) is not None:
             demo.attrs["success"] = success
             demo["rewards"] = (dones * success).astype(np.float32)
         demo["dones"] = dones

@@ -7,7 +7,6 @@ each call of `messages`, in the memory of a chunk.
 from __future__ import annotations
 
 import os
-import re
 import stat
 import tempfile
 from collections.abc import Collection, Iterator
@@ -22,6 +21,7 @@ from demorec.errors import ConfigError, resource_error
 from demorec.ingest.channel import MAX_TIME_NS, BagError, BagMessage
 from demorec.ingest.mcap_bag import read_mcap
 from demorec.ingest.sqlite_bag import SQLITE_MAGIC, read_sqlite
+from demorec.ingest.words import in_natural_order
 from demorec.lerobot.paths import INFO_PATH
 from demorec.recording.limits import LimitError, Limits, Unpacked
 from demorec.runs.run_file import sha256_of
@@ -130,17 +130,11 @@ def bags_in(path: Path) -> list[Path]:
 
 def _entries(folder: Path) -> list[Path]:
     try:
-        return sorted(folder.iterdir(), key=_natural)
+        return sorted(folder.iterdir(), key=lambda path: in_natural_order(path.name))
     except OSError as error:
         raise resource_error(error, folder) or BagError(
             f"The folder cannot be read ({error.strerror}): {folder}"
         ) from error
-
-
-def _natural(path: Path) -> list[tuple[int, str]]:
-    """So that run_2 comes before run_10."""
-    parts = re.findall(r"[0-9]+|[^0-9]+", path.name)
-    return [(int(part), "") if part[0] in "0123456789" else (-1, part) for part in parts] + [(-1, path.name)]
 
 
 def open_bag(path: Path) -> Bag:

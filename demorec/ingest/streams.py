@@ -33,11 +33,11 @@ from demorec.ingest.fields import (
     stamp_of,
 )
 from demorec.ingest.mapping import BagMapping, Source
-from demorec.ingest.mapping_file import listed
 from demorec.ingest.picture_messages import PictureHeads, picture_head
 from demorec.ingest.ros_types import Budgets, Values
 from demorec.ingest.service_calls import CallReader, ServiceCall
 from demorec.ingest.words import quoted
+from demorec.plain import listed
 from demorec.recording.limits import SpentError
 from demorec.registry import nearest_match
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -14,7 +13,7 @@ from demorec.errors import without_path
 from demorec.evaluate.statistics import Rate
 from demorec.lerobot.layout import DatasetInfo
 from demorec.plain import to_plain
-from demorec.processes import SPAWN
+from demorec.processes import in_turn
 from demorec.report.content import CheckSummaries, Components, Report, ReportedEpisode, flags_of
 from demorec.report.episodes import MOST_SHOWN
 from demorec.report.exported import missing_in, read_episodes, read_story
@@ -81,23 +80,12 @@ def gather(path: Path, options: ReportOptions, advance: Callable[[int, int], Non
 _Done = tuple[ReportedEpisode, Components, SubjectReport | None]
 
 
-def _do(root: Path, options: ReportOptions, subject: Subject, strip_bytes: int) -> _Done:
-    """Read and check a recording, in any process."""
+def _do(root: Path, options: ReportOptions, given: tuple[Subject, int]) -> _Done:
+    """Read and check a recording, in any process; beside it the bytes that its strip may take."""
+    subject, strip_bytes = given
     checked = check_subject(subject, options.of_checks) if options.checks else None
     episode, components = read_recording(subject.path, root, camera=options.camera, strip_bytes=strip_bytes)
     return replace(episode, flags=() if checked is None else flags_of(checked)), components, checked
-
-
-def _all_done(
-    root: Path, options: ReportOptions, subjects: Sequence[Subject], strip_bytes: Sequence[int]
-) -> Iterator[_Done]:
-    do = partial(_do, root, options)
-    if options.workers == 1 or len(subjects) < 2:
-        yield from map(do, subjects, strip_bytes)
-        return
-    # Spawned: forked children would share decoders and libraries in the middle of something.
-    with ProcessPoolExecutor(max_workers=min(options.workers, len(subjects)), mp_context=SPAWN) as pool:
-        yield from pool.map(do, subjects, strip_bytes)
 
 
 def _of_recordings(found: Found, options: ReportOptions, advance: Callable[[int, int], None]) -> Report:
@@ -119,7 +107,9 @@ def _of_recordings(found: Found, options: ReportOptions, advance: Callable[[int,
     total = len(subjects) + len(wholes)
     episodes: list[ReportedEpisode] = []
     components: Components = {}
-    for episode, counted, checked in _all_done(found.path, options, subjects, strips):
+    for episode, counted, checked in in_turn(
+        partial(_do, found.path, options), list(zip(subjects, strips, strict=True)), options.workers
+    ):
         episodes.append(episode)
         merge(components, counted)
         if checked is not None:
