@@ -7,7 +7,7 @@ import json
 import math
 import re
 import reprlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from numbers import Integral, Real
 from typing import Any
 
@@ -28,7 +28,7 @@ _MAX_DIGITS = 20
 """Of a whole number: 64 bits need no more."""
 _LENGTH = re.compile(r"^(Not enough|Too many) values in .* to structure as (.*)$", re.DOTALL)
 """What cattrs says of a list that is not as long as it must be."""
-_MAX_TOLD = 8
+MAX_TOLD = 8
 """Mistakes that are told at once; a hostile file may have hundreds of thousands."""
 
 
@@ -130,6 +130,13 @@ def _in_words(error: BaseException, type_: type | None) -> str:
     return words if isinstance(error, ValueError) and " is no " in words else format_exception(error, type_)
 
 
+def listed(words: Iterable[str], most: int = MAX_TOLD, separator: str = "; ") -> str:
+    """The first of some words as one sentence's part, and how many more there are."""
+    told = list(words)
+    more = [f"and {len(told) - most:,} more"] if len(told) > most else []
+    return separator.join(told[:most] + more)
+
+
 def to_plain(value: object) -> Any:
     """Plain dicts, lists and scalars of a dataclass; floats keep every bit."""
     return _converter.unstructure(value)
@@ -145,8 +152,7 @@ def from_plain[T](data: object, cls: type[T]) -> T:
         return _converter.structure(data, cls)
     except cattrs.BaseValidationError as error:
         words = cattrs.transform_error(error, path=cls.__name__, format_exception=_in_words)
-        more = [f"and {len(words) - _MAX_TOLD} more"] if len(words) > _MAX_TOLD else []
-        raise ValueError("; ".join(words[:_MAX_TOLD] + more)) from None
+        raise ValueError(listed(words)) from None
     except (TypeError, AttributeError) as error:  # no object where the outermost one is expected
         raise ValueError(f"{reprlib.repr(data)} is no {cls.__name__}") from error
 

@@ -8,7 +8,9 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import contextmanager
 from multiprocessing import connection, resource_tracker
 from multiprocessing.context import SpawnContext, SpawnProcess
@@ -66,6 +68,35 @@ SPAWN = _Context()
 They end when the process that started them ends, whatever it dies of. All that they carry out is imported by name: a
 script that calls demorec needs no `if __name__ == "__main__"`, and a worker does not load the command line's libraries.
 """
+
+
+def in_turn[Item, Result](
+    function: Callable[[Item], Result], items: Sequence[Item], workers: int, *, ahead: int | None = None
+) -> Iterator[Result]:
+    """What a function returns of each item, in their order, by several processes if there is more than one.
+
+    Args:
+        function: Imported by name where it is called in other processes.
+        items: Things to be worked on.
+        workers: Processes; 1 works in this one.
+        ahead: Items that each process may be ahead of what is taken here: bounds the memory; None for all.
+    """
+    workers = min(workers, len(items))
+    if workers < 2:
+        yield from map(function, items)
+        return
+    waiting: deque[Future[Result]] = deque()
+    with ProcessPoolExecutor(workers, mp_context=SPAWN) as pool:
+        try:
+            for item in items:
+                waiting.append(pool.submit(function, item))
+                if ahead is not None and len(waiting) >= workers * ahead:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            for future in waiting:
+                future.cancel()
 
 
 def _start_tracker() -> None:

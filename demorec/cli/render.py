@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -17,7 +16,7 @@ from demorec.cli.shared.paths import refuse_sources
 from demorec.cli.shared.progress import ProgressBar
 from demorec.config import VideoConfig
 from demorec.errors import ConfigError, check_option
-from demorec.processes import SPAWN, available_cores
+from demorec.processes import available_cores, in_turn
 from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings
 from demorec.safety.user_modules import modules_of
 
@@ -98,7 +97,7 @@ class Render:
         reports: list[RerenderReport] = []
         try:
             with ProgressBar("rendering", total=len(jobs), at_once=workers) as bar:
-                for report in _rendered(jobs, options, self.overwrite, workers):
+                for report in in_turn(partial(_draw, options, self.overwrite), jobs, workers):
                     bar.advance()
                     reports.append(report)
                     for camera, frame in report.differing.items():
@@ -164,28 +163,10 @@ def _jobs(paths: Sequence[Path], out: Path) -> list[tuple[Path, Path]]:
     return jobs
 
 
-def _rendered(
-    jobs: Sequence[tuple[Path, Path]], options: RerenderOptions, overwrite: bool, workers: int
-) -> Iterator[RerenderReport]:
-    if workers <= 1:
-        for source, target in jobs:
-            yield _draw(source, target, options, overwrite)
-        return
-    # Spawned, as renderers and decoders do not survive a fork.
-    with ProcessPoolExecutor(max_workers=workers, mp_context=SPAWN) as pool:
-        futures = [pool.submit(_draw, source, target, options, overwrite) for source, target in jobs]
-        try:
-            for future in futures:
-                yield future.result()
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
-
-
-def _draw(source: Path, target: Path, options: RerenderOptions, overwrite: bool) -> RerenderReport:
+def _draw(options: RerenderOptions, overwrite: bool, job: tuple[Path, Path]) -> RerenderReport:
     from demorec.replay.rerender import rerender
 
-    return rerender(source, target, options, overwrite=overwrite, renderers=_renderers())
+    return rerender(*job, options, overwrite=overwrite, renderers=_renderers())
 
 
 @cache

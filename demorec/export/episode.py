@@ -34,7 +34,6 @@ SCALARS: Mapping[str, Literal["float32", "bool"]] = {
     SUCCESS: "bool",
 }
 """Features of one number a frame, and their type."""
-_SECOND_NS = 1_000_000_000
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,6 +10,7 @@ from demorec.errors import ConfigError
 from demorec.export.episode import ExportEpisode
 from demorec.export.exported import exported
 from demorec.export.options import CommonOptions, parse_episodes
+from demorec.plain import listed
 from demorec.recording import AnyRecording, open_recording
 from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings
 from demorec.scene.collected import CollectedOutcome
@@ -194,12 +195,9 @@ def _refuse_differences(
                 for difference in profile.differences(Profile.of(exported(recording, options))):
                     files_by_difference.setdefault(difference, []).append(source.path.name)
     if files_by_difference:
-        told = "; ".join(f"{difference} ({_some(files)})" for difference, files in files_by_difference.items())
+        told = "; ".join(
+            f"{difference} ({listed(files, 3, ', ')})" for difference, files in files_by_difference.items()
+        )
         raise ConfigError(
             f"These recordings do not go into one dataset with {reference.name}: {told}. Export them separately."
         )
-
-
-def _some(names: list[str]) -> str:
-    shown = ", ".join(names[:3])
-    return shown if len(names) <= 3 else f"{shown} and {len(names) - 3} more"

@@ -204,8 +204,8 @@ class ForeignFile(Closing):
         self._num_bytes += dataset.nbytes
         self._num_rows += len(dataset)
         self._limits.check_total(self._num_bytes)
-        if self._num_rows > max(_FLOOR_ROWS, self._size // _BYTES_PER_ROW):
-            raise LimitError(f"its datasets have more than {_FLOOR_ROWS:,} rows, too many for a file of its size")
+        if self._num_rows > (most := max(_FLOOR_ROWS, self._size // _BYTES_PER_ROW)):
+            raise LimitError(f"its datasets have more than {most:,} rows, too many for a file of its size")
 
     def names(self, place: str) -> list[str]:
         """A dataset of texts, as robomimic's masks are.

@@ -91,7 +91,7 @@ def walk(path: Path) -> None:
                     _read_attribute(found, h5py.h5a.open(found, name))
             if isinstance(found, h5py.h5d.DatasetID):
                 with _errors_ignored():
-                    _read_dataset(found)
+                    _read_dataset(found, end)
 
 
 @contextmanager
@@ -152,7 +152,7 @@ def _read_attribute(found: h5py.h5g.GroupID | h5py.h5d.DatasetID, attribute: h5p
         owner.attrs[attribute.name]
 
 
-def _read_dataset(found: h5py.h5d.DatasetID) -> None:
+def _read_dataset(found: h5py.h5d.DatasetID, end: float) -> None:
     """What is not simply a stretch of the file: texts, and chunks, of which the first and the last are read."""
     found.get_storage_size()
     is_chunked = found.get_create_plist().get_layout() == h5py.h5d.CHUNKED
@@ -168,7 +168,7 @@ def _read_dataset(found: h5py.h5d.DatasetID) -> None:
         for index in range(len(dataset) if dataset.ndim == 1 else 0):
             with _errors_ignored():
                 left -= len(dataset[index])
-            if left < 0 or time.process_time() > _WALK_SECONDS:
+            if left < 0 or time.process_time() > end:
                 return
         return
     if is_text:

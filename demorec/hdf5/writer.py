@@ -7,6 +7,7 @@ observations are those of robosuite's environments, which robomimic's example co
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable, Sequence
 from fractions import Fraction
 
 import h5py
@@ -17,11 +18,12 @@ from demorec.errors import ConfigError
 from demorec.export.episode import DONE, ExportEpisode, Simulated
 from demorec.hdf5.file import ENV_ARGUMENTS, EXTERNAL_ARGUMENTS, EXTERNAL_ENVIRONMENT, PICTURE_ARGUMENTS, NewFile
 from demorec.hdf5.options import Hdf5Options
-from demorec.hdf5.streams import GYM, add_pictures, add_vectors
 from demorec.scene.episode import EpisodeColumns, EpisodeInfo
 from demorec.scene.features import ACTION, EE_POSE, ENVIRONMENT_STATE, IMAGE_PREFIX, STATE, VELOCITY
 from demorec.tables import environment_name
 
+_GYM = 2
+"""`EnvType.GYM_TYPE` of robomimic."""
 _ROBOSUITE = {
     STATE: {"robot0_joint_pos": slice(None, -1), "robot0_gripper_qpos": slice(-1, None)},
     VELOCITY: {"robot0_joint_vel": slice(None, -1), "robot0_gripper_qvel": slice(-1, None)},
@@ -65,7 +67,7 @@ class RobomimicWriter:
     def _write(self, demo: h5py.Group, episode: ExportEpisode) -> None:
         """Fill in the group of an episode."""
         observations, images = _observation_names(episode), _image_names(episode)
-        info, outcome, count = episode.recording.info, episode.recording.outcome, len(episode.rows)
+        info, count = episode.recording.info, len(episode.rows)
         demo.attrs["num_samples"] = count
         demo.attrs["instruction"] = info.instruction
         demo.attrs["episode_index"], demo.attrs["attempt"] = info.episode_index, info.attempt
@@ -74,21 +76,20 @@ class RobomimicWriter:
         if urdf := episode.urdf:
             demo.attrs["model_file"] = urdf
         dones = episode.scalar_columns[DONE].astype(np.int64)
-        success = False if episode.recording.has_failed else None if outcome is None else outcome.success
-        if success is not None:
+        if (success := episode.recording.success) is not None:
             demo.attrs["success"] = success
             demo["rewards"] = (dones * success).astype(np.float32)
         demo["dones"] = dones
-        add_vectors(demo, "actions", episode.vectors[ACTION], episode.names[ACTION])
+        _add_vectors(demo, "actions", episode.vectors[ACTION], episode.names[ACTION])
         if (simulated := episode.simulated) is not None:
-            add_vectors(demo, "states", *_states(simulated.columns, episode.rows, simulated.recording.info))
+            _add_vectors(demo, "states", *_states(simulated.columns, episode.rows, simulated.recording.info))
         group = demo.create_group("obs")
         for name, (feature, elements) in observations.items():
-            add_vectors(group, name, episode.vectors[feature][:, elements], episode.names[feature][elements])
+            _add_vectors(group, name, episode.vectors[feature][:, elements], episode.names[feature][elements])
         for name, camera in zip(images, episode.cameras, strict=True):
             settings = episode.recording.video_settings(camera.name)
             shape = (count, settings.height, settings.width, 1 if camera.is_depth else 3)
-            add_pictures(group, name, shape, episode.images(camera), self.options.compression)
+            _add_pictures(group, name, shape, episode.images(camera), self.options.compression)
 
     def finish(self) -> None:
         """Write what is known of all episodes together: their number of samples, and who is for validation."""
@@ -146,7 +147,7 @@ def _attributes(episode: ExportEpisode) -> dict[str, str | int]:
     if (simulated := episode.simulated) is None:
         arguments["observations"] = [*_observation_names(episode), *_image_names(episode)]
         assert arguments.keys() == EXTERNAL_ARGUMENTS
-        described = {"env_name": EXTERNAL_ENVIRONMENT, "type": GYM, "env_kwargs": arguments}
+        described = {"env_name": EXTERNAL_ENVIRONMENT, "type": _GYM, "env_kwargs": arguments}
         return {"env_args": json.dumps(described), "fps": episode.fps}
     return {**_environment(simulated, episode, arguments), "fps": episode.fps}
 
@@ -161,7 +162,7 @@ def _environment(simulated: Simulated, episode: ExportEpisode, arguments: dict[s
         "privileged": options.privileged,
     }
     assert arguments.keys() - PICTURE_ARGUMENTS == ENV_ARGUMENTS
-    described = {"env_name": environment_name(info.task), "type": GYM, "env_kwargs": arguments}
+    described = {"env_name": environment_name(info.task), "type": _GYM, "env_kwargs": arguments}
     return {"env_args": json.dumps(described), "task": info.task}
 
 
@@ -178,3 +179,33 @@ def _states(
     names = [f"{joint}.{what}" for what in ("pos", "vel") for joint in joints]
     names += [f"{body}.{axis}" for body in columns.object_poses for axis in ("x", "y", "z", "qx", "qy", "qz", "qw")]
     return np.concatenate(parts, axis=1)[rows], tuple(names)
+
+
+def _add_vectors(group: h5py.Group, name: str, values: NDArray[np.generic], components: Sequence[str]) -> None:
+    """(T, D) numbers as a dataset whose attribute `names` has those of the D components."""
+    stored = group.create_dataset(name, data=values)
+    stored.attrs["names"] = json.dumps(components)
+
+
+def _add_pictures(
+    group: h5py.Group, name: str, shape: tuple[int, ...], pictures: Iterable[NDArray[np.generic]], compression: int
+) -> None:
+    """A stream of pictures, each a compressed chunk of its own, so that one is read by itself.
+
+    Args:
+        group: Where it goes.
+        name: Of the dataset.
+        shape: Of all pictures: (T, H, W, 3) of colours, uint8; (T, H, W, 1) of distances, float32.
+        pictures: One after the other.
+        compression: Level of gzip, 0 for none.
+    """
+    stored = group.create_dataset(
+        name,
+        shape,
+        np.uint8 if shape[-1] == 3 else np.float32,
+        chunks=(1, *shape[1:]),
+        compression="gzip" if compression else None,
+        compression_opts=compression or None,
+    )
+    for index, picture in enumerate(pictures):
+        stored[index] = picture.reshape(shape[1:])

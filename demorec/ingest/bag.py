@@ -7,7 +7,6 @@ each call of `messages`, in the memory of a chunk.
 from __future__ import annotations
 
 import os
-import re
 import stat
 import tempfile
 from collections.abc import Collection, Iterator
@@ -22,8 +21,9 @@ from demorec.errors import ConfigError, resource_error
 from demorec.ingest.channel import MAX_TIME_NS, BagError, BagMessage
 from demorec.ingest.mcap_bag import read_mcap
 from demorec.ingest.sqlite_bag import SQLITE_MAGIC, read_sqlite
+from demorec.ingest.words import in_natural_order
 from demorec.lerobot.paths import INFO_PATH
-from demorec.recording.limits import Budget, LimitError, Limits, Unpacked
+from demorec.recording.limits import LimitError, Limits, Unpacked
 from demorec.runs.run_file import sha256_of
 from demorec.safety.files import MCAP_MAGIC, open_regular, read_text_limited
 
@@ -130,17 +130,11 @@ def bags_in(path: Path) -> list[Path]:
 
 def _entries(folder: Path) -> list[Path]:
     try:
-        return sorted(folder.iterdir(), key=_natural)
+        return sorted(folder.iterdir(), key=lambda path: in_natural_order(path.name))
     except OSError as error:
         raise resource_error(error, folder) or BagError(
             f"The folder cannot be read ({error.strerror}): {folder}"
         ) from error
-
-
-def _natural(path: Path) -> list[tuple[int, str]]:
-    """So that run_2 comes before run_10."""
-    parts = re.findall(r"[0-9]+|[^0-9]+", path.name)
-    return [(int(part), "") if part[0] in "0123456789" else (-1, part) for part in parts] + [(-1, path.name)]
 
 
 def open_bag(path: Path) -> Bag:
@@ -243,13 +237,13 @@ def _plain_yaml(text: str) -> Any:
         SequenceStartEvent,
     )
 
-    budget = Budget(_MAX_EVENTS, _MAX_EVENTS, "values")
     root: list[Any] = []
     open_lists = [root]
     """What is begun: of mappings the keys and values in turn."""
     try:
-        for event in YAML(typ="safe", pure=True).parse(text):
-            budget.take()
+        for number, event in enumerate(YAML(typ="safe", pure=True).parse(text)):
+            if number == _MAX_EVENTS:
+                raise LimitError(f"it holds more than {_MAX_EVENTS:,} values")
             if isinstance(event, AliasEvent):
                 raise LimitError("it has aliases, which rosbag2 never writes")
             if isinstance(event, ScalarEvent):

@@ -23,7 +23,7 @@ from demorec.ingest.frames_writer import FramesImport, write_frames
 from demorec.ingest.mapping_file import MAX_ELEMENTS
 from demorec.lerobot.data_stats import column_numbers
 from demorec.lerobot.depth import DepthScale
-from demorec.lerobot.files import open_table
+from demorec.lerobot.files import table_batches
 from demorec.lerobot.language import COLUMNS, PERSISTENT, spoken_episodes
 from demorec.lerobot.layout import AUTOMATIC_FEATURES, DatasetInfo, Feature
 from demorec.lerobot.paths import INFO_PATH
@@ -243,7 +243,7 @@ def _is_exact(root: Path, name: str) -> bool:
     """Whether float64 holds all whole numbers of a column; BagError when they cannot be read."""
     for path in sorted((root / "data").glob("*/*.parquet")):
         try:
-            for batch in open_table(path, [name]).iter_batches(batch_size=4096, columns=[name]):
+            for batch in table_batches(path, [name], rows=4096):
                 numbers = column_numbers(batch.column(name))
                 if ((numbers > _EXACT) | (numbers < -_EXACT)).any():
                     return False

@@ -6,7 +6,6 @@ needs, where no picture is shown in another order than it was coded in.
 
 from __future__ import annotations
 
-import io
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -16,12 +15,12 @@ from typing import Any, cast
 import av
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from demorec.config import MAX_PIXELS
 from demorec.errors import in_words
 from demorec.ingest.channel import BagError
 from demorec.ingest.frames_writer import Picture
+from demorec.ingest.picture_messages import decode_file, file_head
 from demorec.lerobot.files import check_video, table_batches
 from demorec.lerobot.layout import VIDEO_PATH, DatasetInfo
 from demorec.lerobot.packets import PACKET_CODECS, PacketCodec, access_units, episode_distances
@@ -244,17 +243,15 @@ class ImageCamera(DatasetCamera):
         try:
             if not data:
                 raise ValueError("it is not in the table")
-            with Image.open(io.BytesIO(data), formats=("PNG", "JPEG")) as image:
-                pixels, kind = image.width * image.height, f"{image.width}x{image.height} pixels"
-                if pixels > MAX_PIXELS or image.mode not in ("RGB", "RGBA", "L", "P", "1"):
-                    raise ValueError(f"{kind} of the kind {image.mode}")
-                self._allowed -= 3 * pixels
-                if 3 * pixels > max(_LARGE_BYTES, _IMAGE_RATIO * len(data)):
-                    raise ValueError(f"{kind} in {len(data):,} bytes are no image of a camera")
-                if self._allowed < 0:
-                    raise ValueError(f"{kind} in so many rows are too many for files of this size")
-                picture = np.asarray(image if image.mode == "RGB" else image.convert("RGB"))
-        except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+            head = file_head(data)
+            num_bytes, kind = 3 * head.width * head.height, f"{head.width}x{head.height} pixels"
+            self._allowed -= num_bytes
+            if num_bytes > max(_LARGE_BYTES, _IMAGE_RATIO * len(data)):
+                raise ValueError(f"{kind} in {len(data):,} bytes are no image of a camera")
+            if self._allowed < 0:
+                raise ValueError(f"{kind} in so many rows are too many for files of this size")
+            picture = decode_file(data)
+        except ValueError as error:
             raise BagError(f"A picture of {self.key} cannot be read ({in_words(error)}): {path}") from error
         if self.width and picture.shape[:2] != (self.height, self.width):
             raise BagError(f"The pictures of {self.key} change their size: {path}")

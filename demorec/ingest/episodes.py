@@ -13,6 +13,7 @@ from demorec.ingest.fields import FieldError
 from demorec.ingest.mapping import BagMapping, Episodes
 from demorec.ingest.streams import BagStreams, Text
 from demorec.ingest.words import task_in_name
+from demorec.plain import listed
 
 _SHOWN, _MOST_TOLD = 40, 5
 """Characters of a marker, and markers, in an error."""
@@ -58,7 +59,7 @@ def windows(bag: Bag, streams: BagStreams, timelines: list[Timeline], mapping: B
     markers = _calls(bag, streams, episodes) if is_service else streams.texts[episodes.topic]
     if unknown := _unknown_words(markers, mapping):
         raise BagError(
-            f"{'Calls' if is_service else 'Markers'} of {episodes.topic} say {', '.join(unknown)}, which the mapping "
+            f"{'Calls' if is_service else 'Markers'} of {episodes.topic} say {unknown}, which the mapping "
             f"does not know: put it into episodes.discard (the episode is left out) or episodes.ignore, or set start, "
             f"stop, success or failure: {bag.path}"
         )
@@ -95,8 +96,8 @@ def _between_gaps(timelines: list[Timeline], gap_s: float) -> list[Window]:
     return [Window(begin_ns=int(times[a]), end_ns=int(times[b])) for a, b in zip(begins, ends, strict=True)]
 
 
-def _unknown_words(markers: list[Text], mapping: BagMapping) -> list[str]:
-    """What markers say that the mapping gives no meaning, each once, as it is shown; subtasks may share their topic."""
+def _unknown_words(markers: list[Text], mapping: BagMapping) -> str:
+    """What markers say that the mapping gives no meaning, each once; "" for nothing. Subtasks may share their topic."""
     words = mapping.episodes
     known = {True, False, "", words.start, words.stop, words.success, words.failure, *words.discard, *words.ignore}
     is_shared = words.topic == mapping.subtasks.topic
@@ -105,7 +106,7 @@ def _unknown_words(markers: list[Text], mapping: BagMapping) -> list[str]:
         return isinstance(value, str | int | float) and ((is_shared and isinstance(value, str)) or value in known)
 
     found = dict.fromkeys(repr(marker.value)[:_SHOWN] for marker in markers if not is_known(marker.value))
-    return [*found][:_MOST_TOLD] + [f"{len(found) - _MOST_TOLD} more"] * (len(found) > _MOST_TOLD)
+    return listed(found, _MOST_TOLD, ", ")
 
 
 def _between_markers(markers: list[Text], mapping: BagMapping) -> list[Window]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 import reprlib
 import sys
 from functools import lru_cache
@@ -15,10 +14,9 @@ import numpy as np
 from demorec.hdf5.foreign import ForeignFile, Hdf5Error, Scalar
 from demorec.ingest.hdf5_mapping import Hdf5Episodes, Hdf5Mapping
 from demorec.ingest.mapping_file import MAX_FPS
-from demorec.ingest.words import task_in_name
+from demorec.ingest.words import in_natural_order, task_in_name
 from demorec.registry import nearest_match
 
-_NUMBER = re.compile(r"(\d+)")
 _RATES = ("fps", "env_args.env_kwargs.fps", "env_args.env_kwargs.control_freq")
 """Attributes that say how many rows a second has: our own, and robosuite's."""
 
@@ -45,18 +43,13 @@ def episode_places(file: ForeignFile, episodes: Hdf5Episodes) -> list[str]:
         raise Hdf5Error(
             f"{group}/{others[0]} is a link or a type, only groups within the file are episodes: {file.path}"
         )
-    places = [f"{group}/{name}" for name in sorted(names, key=_natural)]
+    places = [f"{group}/{name}" for name in sorted(names, key=in_natural_order)]
     seen: dict[int, str] = {}
     for place in places:
         first = seen.setdefault(file.address(place), place)
         if first != place:
             raise Hdf5Error(f"{place} is the same group as {first}, an episode stands in a file once: {file.path}")
     return places
-
-
-def _natural(name: str) -> list[Any]:
-    parts = [(part.lstrip("0") if part.isdecimal() else part) for part in _NUMBER.split(name)]
-    return [(len(part) if part.isdecimal() else 0, part) for part in parts]
 
 
 def found_attribute(file: ForeignFile, place: str, name: str) -> Scalar | None:

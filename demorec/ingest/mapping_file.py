@@ -8,7 +8,7 @@ import re
 import tomllib
 import typing
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import islice
@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from demorec.errors import ConfigError, in_words
-from demorec.plain import digest, from_plain
+from demorec.plain import MAX_TOLD, digest, from_plain, listed
 from demorec.recording.collected.validity import MAX_CAMERAS, MAX_FEATURES
 from demorec.registry import nearest_match
 from demorec.safety.files import read_text_limited
@@ -32,8 +32,6 @@ MAX_SECONDS = 1e9
 _MAX_FILE_BYTES = 1 << 20
 _MAX_TABLES, _MAX_VALUES = 1000, 50_000
 _MAX_TEXT = 10_000
-_MAX_TOLD = 8
-"""Mistakes that are told at once."""
 _PART = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
 _DEEP_KEY = re.compile(rf"(?<![\w-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{16}}")
 """What no mapping has: each part of a key makes a table, and takes as long as all before it."""
@@ -147,13 +145,6 @@ def recorded_unit(unit: str) -> str:
     return "deg" if unit == "degree" else unit
 
 
-def listed(problems: Iterable[str]) -> str:
-    """The first problems as one sentence's part, and how many more there are."""
-    told = list(problems)
-    more = [f"and {len(told) - _MAX_TOLD} more"] if len(told) > _MAX_TOLD else []
-    return "; ".join(told[:_MAX_TOLD] + more)
-
-
 def read_mapping_file[M: AnyMapping](path: Path, kind: type[M]) -> M:
     """A mapping from its TOML file; ConfigError tells what is wrong with it at once."""
     try:
@@ -165,7 +156,7 @@ def read_mapping_file[M: AnyMapping](path: Path, kind: type[M]) -> M:
         raise ConfigError(f"The mapping cannot be read ({error.strerror}): {path}") from error
     except (ValueError, RecursionError) as error:
         raise ConfigError(f"The mapping is no valid TOML ({in_words(error)}): {path}") from error
-    problems = [problem] if (problem := _excess(data)) else list(islice(_unknown_keys(data, kind, ""), _MAX_TOLD))
+    problems = [problem] if (problem := _excess(data)) else list(islice(_unknown_keys(data, kind, ""), MAX_TOLD))
     if problems:
         raise ConfigError(f"The mapping cannot be used: {'; '.join(problems)}: {path}")
     try:

@@ -101,7 +101,7 @@ def picture_head(values: Values) -> PictureHead:
         decode_compressed_depth(data)
         return head
     if data.startswith((_JPEG, _PNG)):
-        return _checked(_file_head("jpeg" if data.startswith(_JPEG) else "png", data))
+        return file_head(data)
     codec = _ALIASES.get(name, name)
     if codec not in VIDEO_FORMATS:
         raise FieldError(f"its format {name[:40]!r} is not read; jpeg, png, {', '.join(VIDEO_FORMATS)} are")
@@ -118,7 +118,9 @@ def _checked(head: PictureHead) -> PictureHead:
     return head
 
 
-def _file_head(kind: str, data: bytes) -> PictureHead:
+def file_head(data: bytes) -> PictureHead:
+    """Of a JPEG or PNG file; FieldError when it is none, damaged, or too large."""
+    kind = "jpeg" if data.startswith(_JPEG) else "png"
     try:
         with Image.open(io.BytesIO(data), formats=(kind.upper(),)) as image:
             width, height = image.size
@@ -130,7 +132,7 @@ def _file_head(kind: str, data: bytes) -> PictureHead:
     end = b"\xff\xd9" if kind == "jpeg" else b"IEND\xaeB`\x82"
     if end not in data[-64:]:  # some cameras pad their pictures
         raise FieldError("its picture is cut off")
-    return PictureHead(kind, "", width, height, True)
+    return _checked(PictureHead(kind, "", width, height, True))
 
 
 def _check_mode(image: Image.Image) -> None:
@@ -144,8 +146,13 @@ def decode_picture(values: Values) -> NDArray[Any]:
         return raw_picture(values)
     if "compresseddepth" in str(values["format"]).lower():
         return decode_compressed_depth(picture_bytes(values))
+    return decode_file(picture_bytes(values))
+
+
+def decode_file(data: bytes) -> NDArray[np.uint8]:
+    """(H, W, 3) RGB of a JPEG or PNG file; FieldError when it cannot be decoded."""
     try:
-        with Image.open(io.BytesIO(picture_bytes(values)), formats=("JPEG", "PNG")) as image:
+        with Image.open(io.BytesIO(data), formats=("JPEG", "PNG")) as image:
             _check_mode(image)
             return np.asarray(image.convert("RGB"))
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:

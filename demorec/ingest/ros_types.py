@@ -16,6 +16,7 @@ from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.base import make_typesdict
 from rosbags.typesys.idl import IDLParser
 from rosbags.typesys.msg import MSGParser
+from rosbags.typesys.peg import Parser
 
 from demorec.recording.limits import Budget, Limits, SpentError
 
@@ -53,8 +54,8 @@ class Budgets:
     """
 
     def __init__(self, num_bytes: int = 0) -> None:
-        self.steps = Budget(1_200_000, 800_000, "parts of definitions")
         floor = Limits.of_file(num_bytes).floor
+        self.steps = Budget(floor // 56, 800_000, "parts of definitions")
         self.values = Budget(max(floor // 13, 12 * num_bytes), 500_000, "values")
         numbers = max(floor, 100 * num_bytes)
         self.numbers = Budget(numbers, numbers, "bytes of numbers")
@@ -104,7 +105,7 @@ def _whole(read: _Reader, data: memoryview, budget: Budget) -> Values:
     return values
 
 
-class _CountedMsgParser(MSGParser):  # type: ignore[misc]
+class _Counted(Parser):  # type: ignore[misc]
     """Counts its steps: what takes long is no matter of a text's length alone."""
 
     def __init__(self, text: str, steps: Budget) -> None:
@@ -116,15 +117,11 @@ class _CountedMsgParser(MSGParser):  # type: ignore[misc]
         return super().regex(pos, pattern, flags)
 
 
-class _CountedIdlParser(IDLParser):  # type: ignore[misc]
-    def __init__(self, text: str, steps: Budget) -> None:
-        super().__init__(text)
-        self._steps = steps
+class _CountedMsgParser(_Counted, MSGParser):  # type: ignore[misc]
+    pass
 
-    def regex(self, pos: int, pattern: str, flags: int = 0) -> Any:
-        self._steps.take()
-        return super().regex(pos, pattern, flags)
 
+class _CountedIdlParser(_Counted, IDLParser):  # type: ignore[misc]
     def _binop(self, pos: int, left: Any, op: str, right: Any) -> Any:
         found = super()._binop(pos, left, op, right)
         if getattr(getattr(found, "value", None), "op", "") in ("*", "<<"):  # numbers without end

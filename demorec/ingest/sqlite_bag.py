@@ -39,6 +39,10 @@ def read_sqlite(path: Path, tell: Callable[[str], None], unpacked: Unpacked) -> 
         with closing(sqlite3.connect(address, uri=True)) as database:
             _restrict(database, size)
             channels = _channels(database, path)
+            if (journal := Path(f"{path}-wal")).is_file() and journal.stat().st_size:
+                tell(
+                    f"messages in {journal.name} are not read: open a copy of the bag with sqlite3, which takes them in"
+                )
             # In the order of writing, which shows what came too late; it needs no sorting in memory either.
             num_bytes = 0
             for topic_id, log_ns, data in _rows(database, "messages", path, " ORDER BY rowid"):

@@ -33,11 +33,11 @@ from demorec.ingest.fields import (
     stamp_of,
 )
 from demorec.ingest.mapping import BagMapping, Source
-from demorec.ingest.mapping_file import listed
 from demorec.ingest.picture_messages import PictureHeads, picture_head
 from demorec.ingest.ros_types import Budgets, Values
 from demorec.ingest.service_calls import CallReader, ServiceCall
 from demorec.ingest.words import quoted
+from demorec.plain import listed
 from demorec.recording.limits import SpentError
 from demorec.registry import nearest_match
 
@@ -169,8 +169,9 @@ class _Growing:
                     self.reader = SourceReader(self.source, self.layout)
                 self._add_vector(self.reader.read(values))
             else:
-                self.heads.append(picture_head(values))
-                self.picture_sums.append(zlib.crc32(picture_bytes(values)))
+                head, picture_sum = picture_head(values), zlib.crc32(picture_bytes(values))
+                self.heads.append(head)  # both or neither
+                self.picture_sums.append(picture_sum)
                 self.numbers.append(number)
         except OtherPublisherError as error:
             self.first_refusal = self.first_refusal or str(error)

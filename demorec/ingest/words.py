@@ -20,6 +20,13 @@ def task_in_name(name: str) -> str:
     return _NUMBER.sub("", name).replace("_", " ").replace("-", " ").strip()
 
 
+def in_natural_order(name: str) -> list[tuple[int, str]]:
+    """What names are sorted by, so that run_2 comes before run_10."""
+    parts = re.findall(r"[0-9]+|[^0-9]+", name)
+    numbers = [(len(digits := part.lstrip("0")), digits) if part[0] in "0123456789" else (-1, part) for part in parts]
+    return [*numbers, (-1, name)]
+
+
 def unique_name(name: str, taken: Container[str]) -> str:
     """The name, or one like it where it is taken."""
     while name in taken:

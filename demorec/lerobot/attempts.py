@@ -64,7 +64,7 @@ class AttemptRecord:
             source=recording.path.name,
             run_episode_index=info.episode_index,
             attempt=info.attempt,
-            success=False if recording.has_failed else None if outcome is None else outcome.success,
+            success=recording.success,
             failure_phase="" if outcome is None else outcome.failure_phase,
             failure_reason=CUT_OFF if outcome is None else outcome.failure_reason,
             object=name,

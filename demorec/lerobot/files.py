@@ -193,43 +193,44 @@ def check_video(path: Path) -> None:
     try:
         with open_regular(path) as file:
             size = os.fstat(file.fileno()).st_size
-            claimed = sum(_samples(file, 0, size, size, [_MAX_BOXES]))
+            claimed = sum(_samples(file, size))
     except (OSError, ValueError, struct.error) as error:
         raise ExportError(f"The video cannot be opened ({in_words(error)}): {path}") from error
     if claimed > size:
         raise ExportError(f"The video claims {claimed:,} bytes or pictures, but has {size:,} bytes: {path}")
 
 
-def _samples(file: BinaryIO, start: int, end: int, size: int, left: list[int]) -> Iterator[int]:
-    """What the sample tables in part of an mp4 file claim: bytes of their samples, or their number where it is larger.
+def _samples(file: BinaryIO, size: int) -> Iterator[int]:
+    """What the sample tables of an mp4 file claim: bytes of their samples, or their number where it is larger.
 
     ISO/IEC 14496-12: a box has its length (1: 64 bits follow; 0: to the end) and its kind in front.
     """
-    while start + 8 <= end:
-        left[0] -= 1
-        if left[0] < 0:
-            raise ValueError(f"more than {_MAX_BOXES:,} boxes")
-        file.seek(start)
-        length, kind = struct.unpack(">I4s", file.read(8))
-        head = 8
-        if length == 1:
-            (length,) = struct.unpack(">Q", file.read(8))
-            head = 16
-        elif length == 0:
-            length = end - start
-        if length < head or start + length > end:
-            if start == 0:
-                raise ValueError("no mp4 file")
-            raise ValueError("a box that is cut off")
-        if kind in _PARENT_BOXES:
-            yield from _samples(file, start + head, start + length, size, left)
-        elif kind in (b"stsz", b"stz2"):
-            _, each, count = struct.unpack(">III", file.read(12))
-            if kind == b"stsz" and each == 0 and 4 * count <= length:
-                found = struct.iter_unpack(">I", file.read(4 * count))
-                yield max(count, sum(number for (number,) in found))
-            else:
-                yield max(count, each * count if kind == b"stsz" else 0)
-        elif kind == b"trun":
-            yield struct.unpack(">II", file.read(8))[1]
-        start += length
+    waiting, num_boxes = [(0, size)], 0
+    while waiting:
+        start, end = waiting.pop()
+        while start + 8 <= end:
+            num_boxes += 1
+            if num_boxes > _MAX_BOXES:
+                raise ValueError(f"more than {_MAX_BOXES:,} boxes")
+            file.seek(start)
+            length, kind = struct.unpack(">I4s", file.read(8))
+            head = 8
+            if length == 1:
+                (length,) = struct.unpack(">Q", file.read(8))
+                head = 16
+            elif length == 0:
+                length = end - start
+            if length < head or start + length > end:
+                raise ValueError("a box that is cut off" if start else "no mp4 file")
+            if kind in _PARENT_BOXES:
+                waiting.append((start + head, start + length))
+            elif kind in (b"stsz", b"stz2"):
+                _, each, count = struct.unpack(">III", file.read(12))
+                if kind == b"stsz" and each == 0 and 4 * count <= length:
+                    found = struct.iter_unpack(">I", file.read(4 * count))
+                    yield max(count, sum(number for (number,) in found))
+                else:
+                    yield max(count, each * count if kind == b"stsz" else 0)
+            elif kind == b"trun":
+                yield struct.unpack(">II", file.read(8))[1]
+            start += length

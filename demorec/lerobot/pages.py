@@ -55,7 +55,10 @@ def pages_of(file: BinaryIO, column: pq.ColumnChunkMetaData) -> Iterator[Page]:
         place += header.at
         head = fields.get(5) or fields.get(8) or {}
         levels = None if 8 not in fields else fields[8].get(6)
-        yield Page(kind == _DICTIONARY, unpacked, place, place + packed, head.get(1) or 0, levels)
+        num_values = head.get(1) or 0
+        if not 0 <= num_values <= column.num_values and kind != _DICTIONARY:
+            raise ValueError("a page of more values than its column")
+        yield Page(kind == _DICTIONARY, unpacked, place, place + packed, num_values, levels)
         place += packed
 
 
@@ -127,8 +130,6 @@ class _Compact:
 
     def struct(self, depth: int = 0) -> dict[int, Any]:
         """Number of a field -> its whole number, or the fields of a structure; None for one of any other kind."""
-        if depth > _MAX_NESTED:
-            raise ValueError("a page's header is nested too deeply")
         fields: dict[int, Any] = {}
         number = 0
         while head := self.byte():
@@ -138,6 +139,8 @@ class _Compact:
         return fields
 
     def _value(self, kind: int, depth: int) -> int | dict[int, Any] | None:
+        if depth > _MAX_NESTED:
+            raise ValueError("a page's header is nested too deeply")
         if _BYTE < kind < _DOUBLE:  # of 16, 32 and 64 bits
             return self._zigzag()
         if kind == _STRUCT:
@@ -145,6 +148,8 @@ class _Compact:
         if kind in (_LIST, _SET):
             head = self.byte()
             count = head >> 4 if head >> 4 < 15 else self.varint()
+            if count > len(self._data) - self.at:  # each takes a byte at least
+                raise ValueError("a page's header is cut off")
             for _ in range(count):
                 self._value(head & 15, depth + 1)
         else:

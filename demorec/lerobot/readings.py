@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 from demorec.export.exported import exported
@@ -15,7 +14,7 @@ from demorec.lerobot.attempts import AttemptRecord
 from demorec.lerobot.layout import Feature
 from demorec.lerobot.options import ExportOptions
 from demorec.lerobot.prepare import PreparedEpisode, dataset_features, prepare_episode, reasons_to_transcode
-from demorec.processes import SPAWN, available_cores
+from demorec.processes import available_cores, in_turn
 from demorec.recording import open_recording
 from demorec.scene.collected import CollectedOutcome
 from demorec.scene.episode import Outcome
@@ -88,10 +87,8 @@ def readings(
 ) -> Iterator[Reading]:
     """Every wanted recording in order; several processes read ahead where that pays, and leave pictures in `aside`."""
     workers = options.workers or _workers_that_pay(sources, options)
-    found: Iterator[Reading | None] = (read(source, options) for source in sources)
-    if workers > 1:
-        found = _in_processes(sources, options, workers, aside)
-    for done, reading in enumerate(found, start=1):
+    one = partial(read, options=options) if workers == 1 else partial(_read_aside, options=options, folder=aside)
+    for done, reading in enumerate(in_turn(one, sources, workers, ahead=_AHEAD), start=1):
         if reading is not None:
             yield reading
         if progress is not None:
@@ -112,20 +109,3 @@ def _read_aside(source: ExportSource, options: ExportOptions, folder: Path) -> R
     data = reading.prepared.data
     data = replace(data, videos={key: video.put_aside(folder) for key, video in data.videos.items()})
     return replace(reading, prepared=replace(reading.prepared, data=data))
-
-
-def _in_processes(
-    sources: Sequence[ExportSource], options: ExportOptions, workers: int, aside: Path
-) -> Iterator[Reading | None]:
-    waiting: deque[Future[Reading | None]] = deque()
-    with ProcessPoolExecutor(max_workers=workers, mp_context=SPAWN) as pool:
-        try:
-            for source in sources:
-                waiting.append(pool.submit(_read_aside, source, options, aside))
-                if len(waiting) >= workers * _AHEAD:
-                    yield waiting.popleft().result()
-            while waiting:
-                yield waiting.popleft().result()
-        finally:
-            for future in waiting:
-                future.cancel()

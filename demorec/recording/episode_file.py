@@ -93,6 +93,11 @@ class EpisodeFile[O: (Outcome, CollectedOutcome), C](Closing):
     def has_failed(self) -> bool:
         """Whether its attempt failed."""
 
+    @property
+    def success(self) -> bool | None:
+        """How its attempt ended; None where nobody said."""
+        return False if self.has_failed else None if self.outcome is None else self.outcome.success
+
     @abstractmethod
     def phases(self) -> Sequence[str]:
         """Phase of each frame; empty where nobody stated any."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
@@ -12,7 +11,7 @@ from pathlib import Path
 from demorec.check.report import CheckOptions, Subject, SubjectReport, check_subject, find_subjects
 from demorec.errors import ConfigError, RecordingError, without_path
 from demorec.plain import to_plain
-from demorec.processes import SPAWN
+from demorec.processes import in_turn
 from demorec.recording import Recording
 from demorec.report.content import (
     CheckSummaries,
@@ -123,17 +122,12 @@ def _read_all(
     stride = -(-len(subjects) // MAX_SHOWN)
     budget = strip_budget(len(subjects))
     strips = [0 if number % stride and not s.is_failed_attempt else budget for number, s in enumerate(subjects)]
-    read = partial(_read, root, camera, checks)
-    if workers == 1 or len(subjects) < 2:
-        yield from map(read, subjects, strips)
-        return
-    # Spawned: forked children would share decoders and libraries in the middle of something.
-    with ProcessPoolExecutor(max_workers=min(workers, len(subjects)), mp_context=SPAWN) as pool:
-        yield from pool.map(read, subjects, strips)
+    return in_turn(partial(_read, root, camera, checks), list(zip(subjects, strips, strict=True)), workers)
 
 
-def _read(root: Path, camera: str, checks: CheckOptions | None, subject: Subject, strip_bytes: int) -> _Read:
-    """Read and check a recording, in any process; a damaged one is reported as such."""
+def _read(root: Path, camera: str, checks: CheckOptions | None, given: tuple[Subject, int]) -> _Read:
+    """Read and check a recording, in any process, its strip within so many bytes; a damaged one is reported as such."""
+    subject, strip_bytes = given
     checked = None if checks is None else check_subject(subject, checks)
     flags = [result for result in checked.results if result.level in ("warn", "fail")] if checked else []
     flags.sort(key=lambda result: result.level != "fail")

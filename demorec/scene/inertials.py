@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator, Mapping
 
 import numpy as np
 
 from demorec.errors import ConfigError
 from demorec.geometry import Array
+from demorec.plain import listed
 from demorec.scene.assets import asset_path
 from demorec.scene.urdf import Urdf, parse_xml
 
@@ -59,7 +59,11 @@ def link_masses(text: str) -> dict[str, tuple[float, Array]]:
         if not mass and name != urdf.root:
             wrong.setdefault(name, "moves, but weighs nothing")
     if wrong:
-        raise ValueError(_sentence(wrong))
+        told = listed([f"{name!r} ({problem})" for name, problem in wrong.items()], _SHOWN, ", ")
+        raise ValueError(
+            f"its URDF does not say what these links weigh: {told}; give each the mass and inertia of a body (only "
+            "frames without shapes on fixed joints need none)"
+        )
     return {name: found for name, found in masses.items() if found[0]}
 
 
@@ -111,16 +115,3 @@ def _finite(words: list[str], problem: str) -> list[float]:
     if not all(map(math.isfinite, found)):
         raise ValueError(problem)
     return found
-
-
-def _sentence(wrong: Mapping[str, str]) -> str:
-    def parts() -> Iterator[str]:
-        for name, problem in list(wrong.items())[:_SHOWN]:
-            yield f"{name!r} ({problem})"
-        if len(wrong) > _SHOWN:
-            yield f"and {len(wrong) - _SHOWN} more"
-
-    return (
-        f"its URDF does not say what these links weigh: {', '.join(parts())}; give each the mass and inertia of a body "
-        "(only frames without shapes on fixed joints need none)"
-    )

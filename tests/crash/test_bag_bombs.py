@@ -448,3 +448,19 @@ def test_a_keyframe_that_gives_no_picture(codec: str, tmp_path: Path, commands: 
     told = commands.run("import", "--suggest", bag)
     assert problem_of(told) == "", told
     assert told.code == 0
+
+
+def test_a_database_with_a_journal_beside_it(tmp_path: Path, commands: LimitedCommands) -> None:
+    """A recorder that was killed in SQLite's mode WAL has left its last messages there."""
+    path, copy = _database(tmp_path, ""), tmp_path / "copy" / "bag.db3"
+    copy.parent.mkdir()
+    with closing(sqlite3.connect(path)) as database:
+        database.execute("PRAGMA journal_mode = WAL")
+        with database:
+            database.execute("INSERT INTO messages (topic_id, timestamp, data) SELECT 1, 7, x'00010000'")
+        copy.write_bytes(path.read_bytes())
+        (journal := Path(f"{copy}-wal")).write_bytes(Path(f"{path}-wal").read_bytes())
+    assert journal.stat().st_size > 0
+    told = commands.run("import", "--suggest", copy)
+    assert "bag.db3-wal" in told.text, told.text
+    assert copy.parent.joinpath("bag.db3-wal").stat().st_size > 0

@@ -6,6 +6,7 @@ What is honest and large is read as before: the last tests.
 from __future__ import annotations
 
 import json
+import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -18,9 +19,10 @@ import pytest
 from support.foreign_dataset import DATA, EPISODES, TASKS, write_foreign
 from support.fuzz import LimitedCommands, problem_of
 
+from demorec.errors import ExportError
 from demorec.hdf5.foreign import ForeignFile
-from demorec.lerobot.files import read_table
-from demorec.lerobot.pages import longest_row
+from demorec.lerobot.files import check_video, read_table
+from demorec.lerobot.pages import longest_row, pages_of
 
 _MODULES = ("demorec.check.run", "demorec.ingest.dataset_import", "demorec.ingest.hdf5_import", "demorec.report.gather")
 
@@ -256,3 +258,51 @@ def test_what_is_large_and_honest_is_read(tmp_path: Path) -> None:
         file.create_dataset("state", data=states, compression="gzip", compression_opts=1, chunks=(10_000, 7))
     with ForeignFile(tmp_path / "f.hdf5") as opened:
         assert len(opened.array("state")) == 720_000
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        b"\x19" * 60_000,
+        b"\x19\xf1" + b"\xff" * 8 + b"\x01",
+        b"\x15\x00\x15\x02\x15\x02\x2c\x15\xfe\xff\xff\xff\x0f\x00\x00",
+    ],
+    ids=["lists in lists", "a list without end", "more values than the column"],
+)
+def test_the_header_of_a_page_claims_very_much(header: bytes, tmp_path: Path) -> None:
+    """Bytes of Thrift's compact protocol: 0x19 is a list of one list, 0x1 of its elements a boolean."""
+    path = tmp_path / "t.parquet"
+    pq.write_table(pa.table({"x": ["a" * 100_000]}), path, compression="none", use_dictionary=False)
+    place = pq.ParquetFile(path).metadata.row_group(0).column(0).data_page_offset
+    data = path.read_bytes()
+    path.write_bytes(data[:place] + header + data[place + len(header) :])
+    column = pq.ParquetFile(path).metadata.row_group(0).column(0)
+    with path.open("rb") as file, pytest.raises(ValueError, match=r"header|more values than its column"):
+        list(pages_of(file, column))
+    with pytest.raises(ExportError):
+        read_table(path)
+
+
+def test_boxes_within_boxes(tmp_path: Path) -> None:
+    """3,000 of them, by ISO/IEC 14496-12: their length, their kind, what is in them."""
+    path, boxes = tmp_path / "t.mp4", b""
+    for _ in range(3000):
+        boxes = struct.pack(">I4s", 8 + len(boxes), b"moov") + boxes
+    path.write_bytes(struct.pack(">I4s", 16, b"ftyp") + b"isom\0\0\0\0" + boxes)
+    check_video(path)
+    path.write_bytes(path.read_bytes()[:-8] + struct.pack(">I4s", 99, b"trak"))
+    with pytest.raises(ExportError, match="cut off"):
+        check_video(path)
+
+
+def test_whole_numbers_are_looked_at_within_bounds(commands: LimitedCommands, tmp_path: Path) -> None:
+    """A column of 64 bits is looked through, whether float64 holds it; here it is one text of 50 MB in every row."""
+    root = write_foreign(tmp_path / "dataset")
+    info = json.loads((root / "meta/info.json").read_text())
+    info["features"]["counted"] = {"dtype": "int64", "shape": [1], "names": None}
+    (root / "meta/info.json").write_text(json.dumps(info))
+    table = pq.read_table(root / DATA)
+    text = pa.DictionaryArray.from_arrays(pa.array(np.zeros(len(table), np.int8)), ["x" * 50_000_000])
+    pq.write_table(table.append_column("counted", text), root / DATA, compression="zstd")
+    assert len(table) >= 16
+    assert "counted" in _told(commands, "import", "lerobot", root, "--out", tmp_path / "run")

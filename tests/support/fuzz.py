@@ -18,12 +18,14 @@ import subprocess
 import sys
 import tempfile
 import traceback
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Protocol, Self
 
-from demorec.cli import COMMANDS, main
+from demorec.cli import COMMANDS, main, parse_command
+from demorec.errors import DemorecError
 
 if __name__ != "__main__":
     from support.commands import MOST_BYTES, Told
@@ -108,6 +110,47 @@ def changed_bytes(data: bytes, chance: random.Random) -> bytes:
                 if chance.random() < 0.3:
                     del changed[at:]
     return bytes(changed)
+
+
+class Fuzzed(Protocol):
+    """Inputs by number, and what is left of a command that had one."""
+
+    def case(self, number: int) -> tuple[str, list[str]]:
+        """What was done to an input, and a command with it."""
+
+    def clear(self) -> None:
+        """Remove what the command has written."""
+
+
+def results_here(fuzzed: Fuzzed, numbers: Iterable[int]) -> Counter[str]:
+    """Of commands in this process, below the net for unforeseen errors: any other exception fails the test."""
+    results: Counter[str] = Counter()
+    for number in numbers:
+        what, (name, *arguments) = fuzzed.case(number)
+        said = io.StringIO()
+        try:
+            with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+                parse_command(COMMANDS.load(name), arguments, prog=f"demorec {name}").run()
+            results["done"] += 1
+        except DemorecError:
+            results["refused"] += 1
+        except Exception as error:
+            raise AssertionError(f"case {number}, {what}: demorec {name} {' '.join(arguments)}") from error
+        fuzzed.clear()
+    return results
+
+
+def problems_within_limits(fuzzed: Fuzzed, numbers: Iterable[int], modules: Sequence[str]) -> list[str]:
+    """Of commands in processes of their own, in little memory and time."""
+    found = []
+    with LimitedCommands(modules) as commands:
+        for number in numbers:
+            what, arguments = fuzzed.case(number)
+            told = commands.run(*arguments)
+            if problem := problem_of(told):
+                found.append(f"case {number}, {what}: {problem}: {told.text[-300:]}")
+            fuzzed.clear()
+    return found
 
 
 def _serve(modules: Sequence[str]) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import random
+import shutil
 import sqlite3
 import struct
 from collections.abc import Callable
@@ -83,6 +84,10 @@ class FuzzedBags:
             "16UC1; compressedDepth": bytes(12) + png.getvalue(),
             "16UC1; compressedDepth rvl": bytes(12) + struct.pack("<II", 64, 48) + bytes(200),
         }
+
+    def clear(self) -> None:
+        """Remove the run that a command has made."""
+        shutil.rmtree(self.folder / "run", ignore_errors=True)
 
     def case(self, number: int) -> tuple[str, list[str]]:
         """What it is, and the arguments of `demorec`."""

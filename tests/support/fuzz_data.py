@@ -95,6 +95,11 @@ class FuzzedData:
             names = ("demorec.episode", "demorec.outcome")
             self._metadata = {name: recording._container.metadata(name) or {} for name in names}
 
+    def clear(self) -> None:
+        """Remove what a command has made."""
+        for path in self.folder.glob("out*"):
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+
     def case(self, number: int) -> Case:
         """What was changed, and the arguments of the command that meets it."""
         chance = random.Random(number)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -14,7 +13,7 @@ from typing import Literal
 from demorec.config import deciding_versions
 from demorec.errors import DemorecError, resource_error
 from demorec.loop import Workshop
-from demorec.processes import SPAWN
+from demorec.processes import in_turn
 from demorec.recording import Recording
 from demorec.replay.deep.contents import Contents, coded_topics, content_differences
 from demorec.replay.deep.difference import Difference
@@ -132,5 +131,4 @@ def deep_checks(paths: Sequence[Path], *, workers: int = 1, allowed: Sequence[st
             for path in paths:
                 yield deep_check(path, workshop, allowed)
         return
-    with ProcessPoolExecutor(max_workers=min(workers, len(paths)), mp_context=SPAWN) as pool:
-        yield from pool.map(partial(deep_check, allowed=tuple(allowed)), paths)
+    yield from in_turn(partial(deep_check, allowed=tuple(allowed)), paths, workers)
