@@ -162,7 +162,7 @@ def _motion(
     def factor(feature: str) -> Array:
         """(D,) from the feature's own units: a leader may tell degrees of an arm that tells rad."""
         degrees = [math.radians(1) if unit in ("deg", "degree") else 1.0 for unit in units.get(feature, ())]
-        return np.array(degrees or [1.0] * len(names[feature]))
+        return np.array(degrees if len(degrees) == len(names[feature]) else [1.0] * len(names[feature]))
 
     def alike(feature: str) -> Array | None:
         """The elements of another feature that have the names of the state's, or all of as many without names."""
@@ -214,7 +214,8 @@ def _of_dataset(dataset: Dataset) -> Iterator[Motion]:
     }
     stranger = _recognised(names[STATE])
     for number, rows in enumerate(dataset.rows):
-        (joints, urdf), units, opening = stranger, {}, math.inf
+        (joints, urdf), opening = stranger, math.inf
+        units: Mapping[str, Sequence[str]] = {}
         if (digest := dataset.robot_digests.get(number)) is not None:
             robot = dataset.robots[digest]
             joints, units = robot.record.joints.get(STATE, ()), robot.record.units
