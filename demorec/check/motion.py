@@ -36,6 +36,10 @@ _FEWEST = 30
 _OWN = 0.5
 """Correlation with its own element above which an action is a target of the state: 0.97 and more in demonstrations of
 Panda and iiwa, where increments and poses have 0.3 and less."""
+_ALIKE = 3.0
+"""Times the movement of the state that an action of its unit may move: teleoperation is scaled to half or double."""
+_VELOCITY_S = 0.3
+"""Over which velocities are added up: filters of drivers are 20 to 100 ms late, which cancels over longer times."""
 _MOVES = 1e-3
 """Range, rad or m, below which an element stands still."""
 
@@ -118,7 +122,7 @@ def _action(motion: Motion) -> Array:
 
 
 def _scaled(values: Array, state: Array) -> Array:
-    return np.asarray((values - state.mean(axis=0)) / np.maximum(state.std(axis=0), _MOVES))
+    return np.asarray((values - values.mean(axis=0)) / np.maximum(state.std(axis=0), _MOVES))
 
 
 def _correlations(targets: Sequence[tuple[Array, Array]]) -> Array:
@@ -137,7 +141,7 @@ def _motion(
     features: Mapping[str, Array],
     names: Mapping[str, Sequence[str]],
     joints: Sequence[str],
-    units: Sequence[str],
+    units: Mapping[str, Sequence[str]],
     urdf: Urdf | None,
     *,
     opening: float = math.inf,
@@ -146,21 +150,22 @@ def _motion(
     state, elements = features[STATE].astype(np.float64), names[STATE]
     known = {} if urdf is None else {joint.name: joint for joint in urdf.joints}
     found = [known.get(joint) for joint in joints] or [None] * len(elements)
-    factor = np.array(
-        [math.radians(1) if unit in ("deg", "degree") else 1.0 for unit in units] or [1.0] * len(elements)
-    )
-
     lower = np.array([-math.inf if joint is None else joint.lower for joint in found])
     upper = np.array([math.inf if joint is None else joint.upper for joint in found])
     if opening < math.inf and GRIPPER in elements:
         place = list(elements).index(GRIPPER)
         lower[place], upper[place] = 0.0, opening
 
+    def factor(feature: str) -> Array:
+        """(D,) from the feature's own units: a leader may tell degrees of an arm that tells rad."""
+        degrees = [math.radians(1) if unit in ("deg", "degree") else 1.0 for unit in units.get(feature, ())]
+        return np.array(degrees if len(degrees) == len(names[feature]) else [1.0] * len(names[feature]))
+
     def alike(feature: str) -> Array | None:
         """The elements of another feature that have the names of the state's, or all of as many without names."""
         if feature not in features:
             return None
-        values, theirs = features[feature].astype(np.float64), names[feature]
+        values, theirs = features[feature].astype(np.float64) * factor(feature), names[feature]
         places = {ELEMENT_SUFFIX.sub("", name): index for index, name in enumerate(theirs)}
         columns = [places.get(ELEMENT_SUFFIX.sub("", name)) for name in elements]
         if all(column is None for column in columns):
@@ -174,9 +179,9 @@ def _motion(
         fps=fps,
         steps_s=np.full(len(state) - 1, 1 / fps) if time_ns is None else np.maximum(np.diff(time_ns) / 1e9, 0.5 / fps),
         names=tuple(elements),
-        state=state * factor,
-        velocity=None if velocity is None else velocity * factor,
-        action=None if action is None else action * factor,
+        state=state * factor(STATE),
+        velocity=velocity,
+        action=action,
         lower=lower,
         upper=upper,
         speed=np.array([math.inf if joint is None else joint.max_speed for joint in found]),
@@ -190,8 +195,11 @@ def _of_recording(recording: CollectedRecording) -> Iterator[Motion]:
         return
     state = described[STATE]
     names = {name: feature.names for name, feature in described.items()}
-    urdf = Urdf.parse(info.urdf) if info.urdf else None
-    yield _motion("", info.fps, columns.features, names, state.joints, state.units, urdf, time_ns=columns.time_ns)
+    joints, urdf = state.joints, Urdf.parse(info.urdf) if info.urdf else None
+    if urdf is None and (robot := recognised_robot(state.names)) is not None:
+        joints, urdf = robot.record.joints[STATE], robot.model
+    units = {name: feature.units for name, feature in described.items()}
+    yield _motion("", info.fps, columns.features, names, joints, units, urdf, time_ns=columns.time_ns)
 
 
 def _of_dataset(dataset: Dataset) -> Iterator[Motion]:
@@ -208,10 +216,10 @@ def _of_dataset(dataset: Dataset) -> Iterator[Motion]:
         digest = dataset.robot_digests.get(number)
         robot = stranger if digest is None else dataset.robots[digest]
         joints: Sequence[str] = ()
-        units: Sequence[str] = ()
+        units: Mapping[str, Sequence[str]] = {}
         urdf, opening = None, math.inf
         if robot is not None:
-            joints, units = robot.record.joints.get(STATE, ()), robot.record.units.get(STATE, ())
+            joints, units = robot.record.joints.get(STATE, ()), robot.record.units
             urdf, spec = robot.model, robot.record.spec
             opening = math.inf if spec is None else spec.gripper.max_width
         yield _motion(f"episode {number}", dataset.info.fps, rows, names, joints, units, urdf, opening=opening)
@@ -255,13 +263,15 @@ def state_matches_velocity(motions: Motions) -> Found:
     for motion in pairs:
         assert motion.velocity is not None
         mean = (motion.velocity[1:] + motion.velocity[:-1]) / 2
-        steps = np.diff(motion.state, axis=0) / motion.steps_s[:, None]
-        sums += [(steps * mean).sum(axis=0), (mean * mean).sum(axis=0), (steps * steps).sum(axis=0)]
+        ways = np.vstack([np.zeros(mean.shape[1]), np.cumsum(mean * motion.steps_s[:, None], axis=0)])
+        reach = min(max(1, round(_VELOCITY_S * motion.fps)), len(ways) - 1)
+        told, moved = ways[reach:] - ways[:-reach], motion.state[reach:] - motion.state[:-reach]
+        sums += [(moved * told).sum(axis=0), (told * told).sum(axis=0), (moved * moved).sum(axis=0)]
     known = np.flatnonzero(np.isfinite(sums[0]) & (sums[2] > 0))
     if not len(known):
         return None
-    product, square, moved = sums[:, known]
-    ratio, share = product / np.maximum(square, 1e-12), moved / moved.max()
+    product, square, total = sums[:, known]
+    ratio, share = product / np.maximum(square, 1e-12), total / total.max()
     # Of a joint that hardly moves, noise decides; at few frames a second two velocities say little of the way between.
     off = np.abs(ratio - 1) * (share > 0.01) * min(1.0, pairs[0].fps / 20)
     worst = int(np.argmax(off))
@@ -287,7 +297,8 @@ def state_follows_action(motions: Motions) -> Found:
     squares = np.zeros((len(lags), long[0][0].shape[1]))
     for state, action in long:
         core = slice(reach, len(state) - reach)
-        squares += [((state[core] - np.roll(action, lag, axis=0)[core]) ** 2).sum(axis=0) for lag in lags]
+        # The variance: a zero that is off, and weight, keep state and action apart whatever the lag.
+        squares += [len(state) * (state[core] - np.roll(action, lag, axis=0)[core]).var(axis=0) for lag in lags]
     off = np.sqrt(squares)
     told = np.flatnonzero(off.min(axis=0) < 0.8 * np.minimum(off[0], off[-1]))
     if not len(told):
@@ -318,8 +329,13 @@ def state_reaches_action(motions: Motions) -> Found:
     """A joint that is held comes to where it was sent, at least at some time: catches a zero that is off.
 
     Weight and friction keep an arm off by a few hundredths of a rad, and what a gripper holds keeps its fingers apart;
-    only a false zero does so always.
+    only a false zero does so always. Velocities, increments and shares of a range are no places to be at.
     """
+    if not (targets := motions.targets):
+        return NotMeasured(why=_NO_TARGETS)
+    spread = float(np.median([np.nanmedian(action.std(axis=0)) for _, action in targets]))
+    if not 1 / _ALIKE < spread < _ALIKE:
+        return NotMeasured(why=f"actions move {spread:.3g} times as far as the state, so they are in another unit")
     offsets: dict[str, list[Array]] = {}
     for motion in motions.all:
         if motion.action is None:

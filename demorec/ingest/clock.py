@@ -44,6 +44,7 @@ class Timeline:
         is_header: Whether times are those of the headers.
         period_ns: The usual distance of two, 0 for fewer than two.
         is_regular: Whether distances are alike; a stream that speaks only when something changes is not.
+        is_log_asked: Whether the mapping asks for the times of recording.
     """
 
     stream: Stream
@@ -52,6 +53,7 @@ class Timeline:
     is_header: bool
     period_ns: int
     is_regular: bool
+    is_log_asked: bool = False
 
     @property
     def stamps_ns(self) -> Int:
@@ -86,7 +88,13 @@ def timeline(stream: Stream, *, by_header: bool) -> Timeline:
         ordered, order = ordered[is_first], order[is_first]
     period, is_regular = _period(ordered)
     return Timeline(
-        stream=stream, times_ns=ordered, order=order, is_header=is_header, period_ns=period, is_regular=is_regular
+        stream=stream,
+        times_ns=ordered,
+        order=order,
+        is_header=is_header,
+        period_ns=period,
+        is_regular=is_regular,
+        is_log_asked=not by_header,
     )
 
 
@@ -239,7 +247,7 @@ def followed(lead: Int, others: Sequence[Int], *, period_ns: int, end_ns: int) -
     Images that several cameras take at about the same moment come now in this order, now in that. At each image of one
     of them, another one's would be a period old in one row and two newer in the next. So a row whose image of another
     camera was in the row before may wait for the next one, though not until an image would be skipped: up to the part
-    of a period, of `_WAITS`, with which fewest images are skipped, and the shortest of those.
+    of a period, of `_WAITS`, with which fewest images are skipped or shown twice, and the shortest of those.
 
     Args:
         lead: (R,) increasing.
@@ -251,9 +259,10 @@ def followed(lead: Int, others: Sequence[Int], *, period_ns: int, end_ns: int) -
     for part in _WAITS:
         rows = _waited(lead, others, round(part * period_ns), end_ns)
         steps = [np.diff(np.searchsorted(times, rows, side="right")) for times in others]
-        num_skipped = sum(int(np.maximum(step - 1, 0).sum()) for step in steps)
-        if fewest < 0 or num_skipped < fewest:
-            best, fewest = rows, num_skipped
+        # Skipped or repeated. Cameras that always come one after the other cost the same image at both ends else.
+        num_off = sum(int(np.abs(step - 1).sum()) for step in steps)
+        if fewest < 0 or num_off < fewest:
+            best, fewest = rows, num_off
         if not fewest:
             break
     return best

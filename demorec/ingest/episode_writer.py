@@ -62,7 +62,8 @@ class PicturePlan:
         kind = self.head.encoding if self.head.format == "raw" else self.head.format
         what += f"{self.kept} kept as it is" if self.kept else f"{kind}, coded once"
         repeated = len(self.positions) - shown
-        what += f", {repeated} rows show the picture of the row before" if repeated else ""
+        rows = "row shows" if repeated == 1 else "rows show"
+        what += f", {repeated} {rows} the picture of the row before" if repeated else ""
         return what + (f", {len(self.numbers) - shown} shown by no row" if len(self.numbers) > shown else "")
 
 

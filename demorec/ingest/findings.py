@@ -20,6 +20,7 @@ from demorec.ingest.mapping import BagMapping
 from demorec.ingest.mapping_file import ACTION, STATE
 from demorec.ingest.rows import Timelines
 from demorec.ingest.streams import NO_STAMP, BagStreams, Stream
+from demorec.scene.collected import DEPTH_UNITS
 
 _JITTER = 0.25
 """Of a period: what nine of ten steps of a sensor stay within."""
@@ -37,6 +38,10 @@ _EPOCH_S = 1e8
 """Between two clocks: three years. No clock is as wrong; one of the two counts from another beginning."""
 _SLOW = 1.15
 """Periods of the rows, from which on a stream is called slower than they are."""
+_EARLY_S = 0.05
+"""By which a header may be later than its recording, in which it was no more: clocks that NTP sets differ by less."""
+_DEGREES = (40.0, 80.0)
+"""Times the range of the same joints, of which one is in degrees: 57, and a leader does not reach as far as its arm."""
 LOST = 1.6
 """Periods, from which on a message is missing between two."""
 NOTE = "note"
@@ -71,7 +76,7 @@ def all_findings(lines: Timelines) -> tuple[Finding, ...]:
 def _findings(bag: Timelines, lines: Sequence[Timeline]) -> Iterator[Finding]:
     skews = _comparable_skews(lines)
     for line in lines:
-        found = (*_message_findings(line.stream), *_time_findings(line), *_clock_findings(skews[line]))
+        found = (*_message_findings(line), *_time_findings(line), *_clock_findings(skews[line]))
         for kind, text in (*found, *_picture_findings(line), *_value_findings(line)):
             yield of_stream(line.stream, kind, text)
     for problem in bag.streams.problems:
@@ -91,11 +96,12 @@ def of_stream(stream: Stream, kind: str, text: str) -> Finding:
     return Finding(kind=kind, stream=stream.label, text=f"{stream.topic}: {text}")
 
 
-def _message_findings(stream: Stream) -> Iterator[tuple[str, str]]:
+def _message_findings(line: Timeline) -> Iterator[tuple[str, str]]:
+    stream = line.stream
     if stream.num_malformed:
         yield "malformed", f"{stream.num_malformed} messages cannot be used, the first since {stream.first_problem}"
     unstamped = int(np.sum((stream.header_ns <= 0) & (stream.header_ns != NO_STAMP)))
-    if unstamped:
+    if unstamped and not line.is_log_asked:
         yield "unstamped", f"{unstamped} of {len(stream)} headers have no time"
     if len(stream.frame_ids) > 1:
         yield "frame_id", f"its messages name several coordinate frames ({', '.join(stream.frame_ids[:4])})"
@@ -116,18 +122,34 @@ def _time_findings(line: Timeline) -> Iterator[tuple[str, str]]:
         return
     steps = np.diff(line.times_ns)
     gaps = np.flatnonzero(steps > _GAP * line.period_ns)
-    lost = np.round(steps / line.period_ns).astype(np.int64) - 1
-    small = np.flatnonzero((lost > 0) & (steps <= _GAP * line.period_ns) & (steps > LOST * line.period_ns))
+    lost = lost_in(line)
+    small = np.flatnonzero((lost > 0) & (steps <= _GAP * line.period_ns))
     if len(gaps):
         longest = int(steps[gaps].max())
         begin = (line.times_ns[gaps[0]] - line.times_ns[0]) / NS
         yield "gap", f"{len(gaps)} gaps, the first at {begin:.2f} s, the longest of {longest / NS:.3f} s"
     if len(small):
         yield "drops", f"{int(lost[small].sum())} of {len(line.times_ns) + int(lost[small].sum())} messages are lost"
-    regular = steps[steps <= LOST * line.period_ns]
-    off = np.percentile(np.abs(regular - line.period_ns), 90) if len(regular) else 0.0
+    off = _unevenness(line)
     if off > _JITTER * line.period_ns:
         yield "jitter", f"its steps of {line.period_ns / 1e6:.1f} ms are off by {off / 1e6:.1f} ms (one of ten by more)"
+
+
+def _unevenness(line: Timeline) -> float:
+    """What nine of ten steps of a stream are off its period by at most, nanoseconds."""
+    steps = np.diff(line.times_ns)
+    regular = steps[steps <= LOST * line.period_ns]
+    return float(np.percentile(np.abs(regular - line.period_ns), 90)) if len(regular) else 0.0
+
+
+def lost_in(line: Timeline) -> Int:
+    """(M - 1,) how many messages of a regular stream are missing between each two.
+
+    Where its steps are uneven, a long one is no loss: nine of ten are within 1.6 deviations, nearly all within 4.
+    """
+    steps = np.diff(line.times_ns)
+    least = max(LOST * line.period_ns, line.period_ns + 4 / 1.6 * _unevenness(line))
+    return np.where(steps > least, np.round(steps / line.period_ns).astype(np.int64) - 1, 0)
 
 
 def _clock_findings(skew: Numbers) -> Iterator[tuple[str, str]]:
@@ -135,13 +157,18 @@ def _clock_findings(skew: Numbers) -> Iterator[tuple[str, str]]:
     if len(skew) < 8:
         return
     median = float(np.median(skew)) / NS
-    if abs(median) > SKEW_S:
-        yield "clock_offset", f"its headers are {median:+.3f} s behind the times of recording"
+    if median > SKEW_S:
+        yield "clock_offset", f"its headers are {median:.3f} s behind the times of recording"
+    elif median < -_EARLY_S:
+        yield "clock_offset", f"its headers are {-median:.3f} s later than the times of recording"
     width = max(3, min(20, len(skew) // 4))
     smooth = np.array([np.median(part) for part in np.array_split(skew, max(2, len(skew) // width))]) / NS
-    largest = int(np.argmax(np.abs(np.diff(smooth))))
-    step = float(np.diff(smooth)[largest])
-    rest = np.delete(np.diff(smooth), largest)
+    # A jump in the middle of a part is half in the step to it and half in the one from it.
+    steps = np.diff(smooth)
+    pairs = steps[:-1] + steps[1:] if len(steps) > 1 else steps
+    largest = int(np.argmax(np.abs(pairs)))
+    step = float(pairs[largest])
+    rest = np.delete(steps, [largest, min(largest + 1, len(steps) - 1)])
     total = float(smooth[-1] - smooth[0])
     if abs(step) > _STEP_S and abs(step) > 5 * (np.abs(rest).max(initial=0.0) + 1e-4):
         yield "clock_jump", f"its clock jumps by {-step:+.3f} s"
@@ -337,7 +364,7 @@ def _camera_findings(streams: BagStreams) -> Iterator[Finding]:
         if frame and stream.frame_ids and stream.frame_ids[0] and frame != stream.frame_ids[0]:
             text = f"its pictures are of {stream.frame_ids[0]!r}, its calibration is of {frame!r}"
             yield of_stream(stream, "swapped", text)
-        elif other := _claimed_by(name, streams):
+        elif stream.heads[0].encoding not in DEPTH_UNITS and (other := _claimed_by(name, streams)):  # registered to one
             text = f"its coordinate frame {stream.frame_ids[0]!r} is named like the topic of {other}"
             yield of_stream(stream, "swapped", text)
     for (name, stream), (other_name, other_stream) in pairwise(sorted(streams.cameras.items())):
@@ -404,6 +431,12 @@ def _action_findings(streams: BagStreams, mapping: BagMapping) -> Iterator[Findi
     if dead:
         name = state.layout.names[dead[0][0]]
         yield of_stream(state, "stuck", f"{name!r} never changes while the action of the same name does")
+    ratios = [_spread(state.values[:, ours]) / _spread(action.values[:, theirs]) for ours, theirs in moving]
+    ratio = float(np.median(ratios)) if len(ratios) > 1 else 1.0
+    wide, narrow = (state, action) if ratio > 1 else (action, state)
+    if _DEGREES[0] < max(ratio, 1 / max(ratio, 1e-9)) < _DEGREES[1]:
+        text = f"in degrees, it seems: joints move {max(ratio, 1 / ratio):.3g} times as far as those of {narrow.topic}"
+        yield of_stream(wide, "unit", text)
 
 
 def _spread(numbers: NDArray[Any]) -> float:

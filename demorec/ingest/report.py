@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from demorec.ingest.clock import NS
-from demorec.ingest.findings import NOTE, Finding
+from demorec.ingest.findings import NOTE, Finding, lost_in
 from demorec.ingest.rows import EpisodeRows, Timelines
 
 
@@ -109,7 +109,7 @@ def stream_reports(lines: Timelines, episodes: Sequence[EpisodeRows]) -> Iterato
         ages = [lines.chosen(key, rows.times_ns).reach_ns.max() for rows in episodes]
         usual = steps[(steps > 0.4 * line.period_ns) & (steps < 1.6 * line.period_ns)]
         skews = line.skews_ns
-        lost = int((np.round(steps / line.period_ns) - 1).clip(min=0).sum()) if line.is_regular else 0
+        lost = int(lost_in(line).sum()) if line.is_regular else 0
         yield StreamReport(
             label=stream.label,
             topic=stream.topic,

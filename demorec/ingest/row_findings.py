@@ -59,3 +59,5 @@ def _use_findings(name: str, lines: Timelines, episodes: Sequence[EpisodeRows]) 
             yield of_stream(line.stream, "skips", f"{told}: use fps = {max(1, round(rate))}")
         else:
             yield of_stream(line.stream, NOTE, told)
+    elif num_skipped and (follows := next((rows.follows for rows in episodes if rows.follows), "")):
+        yield of_stream(line.stream, NOTE, f"{skips}: rows follow {follows}")

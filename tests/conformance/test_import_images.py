@@ -133,6 +133,37 @@ def test_no_image_is_lost(name: str, rows: str, tmp_path: Path, capsys: pytest.C
         assert {time for time in times if begin <= time <= end} <= set(stamps)
 
 
+def test_cameras_that_come_one_after_the_other(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """All images of both, the first and the last ones too, and each row those of one moment."""
+    cameras = {FRONT: ticks(30, 90), SIDE: ticks(30, 90, phase=0.15)}
+    told, shown = imported(WRITERS["mcap"](bag(cameras), tmp_path), MAPPING, tmp_path, capsys)
+    assert "Nothing odd was found." in told
+    assert shown == {"front": cameras[FRONT], "side": cameras[SIDE]}
+
+
+def test_distances_registered_to_another_camera_are_no_swap(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Stereo cameras give them in the coordinate frame of the left one."""
+    left, right, depth = "/zed/left/image_rect_color", "/zed/right/image_rect_color", "/zed/depth/depth_registered"
+    notes = bag({left: ticks(15, 40)}) + bags.jpeg_pictures(right, ticks(15, 40), 1, "right")
+    for note in bags.raw_pictures(depth, ticks(15, 40), 2, "left"):
+        width, height = note.body["width"], note.body["height"]
+        data = np.linspace(0.3, 2.0, width * height, dtype=np.float32).view(np.uint8)
+        notes.append(bags.with_body(note, encoding="32FC1", step=4 * width, data=data))
+    path = WRITERS["mcap"](bags.in_order(notes), tmp_path)
+    told, _ = imported(path, suggested(path, capsys), tmp_path, capsys)
+    assert "swapped" not in told
+
+
+def test_images_that_no_row_has_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Rows follow the camera of which images are missing, and so have no place for as many of the other."""
+    side = [time for k, time in enumerate(ticks(30, 300, phase=0.1)) if k % 50 != 20]
+    told, shown = imported(
+        WRITERS["mcap"](bag({FRONT: ticks(30, 300), SIDE: side}), tmp_path), MAPPING, tmp_path, capsys
+    )
+    assert len(shown["front"]) == 294
+    assert "/front/image_raw/compressed: 1.67 % of its images are in no row: rows follow camera side" in told
+
+
 def test_cameras_of_slightly_different_clocks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """One has an image more each ten seconds, and its images come before those of the other, then after them."""
     slow, fast = ticks(30, 360, jitter_s=0.001), ticks(30.1, 360, phase=0.3, jitter_s=0.001)

@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from support import bag_mappings, bags
-from support.bag_faults import FAULTS, hurt
+from support.bag_faults import ACTION, FAULTS, FRONT, hurt
 
 from demorec.ingest.bag import open_bag
 from demorec.ingest.channel import BagError
@@ -89,6 +90,23 @@ def test_a_clean_bag_gives_no_finding(seed: int, tmp_path: Path) -> None:
     )
     bag = bags.write_mcap(bags.in_order(resting if seed % 2 else notes), tmp_path / "bag.mcap")
     assert _findings(bag, tmp_path) == set()
+
+
+def test_images_that_come_unevenly_are_not_lost(notes: bags.Notes, tmp_path: Path) -> None:
+    off_s = np.random.default_rng(4).normal(0, 0.012, 100).clip(-0.015, 0.015).tolist()
+    uneven = bags.changed(
+        notes, FRONT, lambda k, note: replace(note, header_ns=note.header_ns + round(off_s[k] * bags.NS))
+    )
+    assert _findings(bags.write_mcap(uneven, tmp_path / "bag.mcap"), tmp_path) == {"jitter"}
+
+
+def test_headers_without_time_are_no_finding_where_the_mapping_knows(notes: bags.Notes, tmp_path: Path) -> None:
+    """As of a JointTrajectory, whose time 0 means at once."""
+    unstamped = bags.changed(notes, ACTION, lambda k, note: replace(note, header_ns=0))
+    bag = bags.write_mcap(unstamped, tmp_path / "bag.mcap")
+    place = f'topic = "{ACTION}"'
+    assert _findings(bag, tmp_path, MAPPING) == {"unstamped"}
+    assert _findings(bag, tmp_path, MAPPING.replace(place, f'{place}\nstamp = "log"')) == set()
 
 
 def test_a_quaternion_of_the_other_sign_is_no_jump(tmp_path: Path) -> None:

@@ -142,6 +142,15 @@ FAULTS: dict[str, Fault] = {
     "a clock that jumps back": Fault(
         kind="clock_jump", hurt=_each(SIDE, lambda k, n: _later(n, -0.15) if k > 30 else n)
     ),
+    "a clock that jumps back a little": Fault(
+        kind="clock_jump", hurt=_each(SIDE, lambda k, n: _later(n, -0.08) if k > 37 else n)
+    ),
+    "images that are stamped after their recording": Fault(
+        kind="clock_offset", hurt=_each(SIDE, lambda k, n: _later(n, 0.08))
+    ),
+    "a leader that tells degrees": Fault(
+        kind="unit", hurt=_each(ACTION, lambda k, n: with_body(n, position=np.degrees(n.body["position"])))
+    ),
     "a clock that drifts": Fault(kind="clock_drift", hurt=_each(STATE, lambda k, n: _later(n, 0.0008 * k))),
     "headers without time": Fault(kind="unstamped", hurt=_each(STATE, lambda k, n: replace(n, header_ns=0))),
     "some headers without time": Fault(
