@@ -42,6 +42,7 @@ class Timeline:
         order: (M,) which of the stream's messages they are. Those of equal times are left out but the first, and so
             are those whose header has no time where others have.
         is_header: Whether times are those of the headers.
+        is_chosen: Whether the mapping wants it so.
         period_ns: The usual distance of two, 0 for fewer than two.
         is_regular: Whether distances are alike; a stream that speaks only when something changes is not.
     """
@@ -50,6 +51,7 @@ class Timeline:
     times_ns: Int
     order: Int
     is_header: bool
+    is_chosen: bool
     period_ns: int
     is_regular: bool
 
@@ -86,7 +88,13 @@ def timeline(stream: Stream, *, by_header: bool) -> Timeline:
         ordered, order = ordered[is_first], order[is_first]
     period, is_regular = _period(ordered)
     return Timeline(
-        stream=stream, times_ns=ordered, order=order, is_header=is_header, period_ns=period, is_regular=is_regular
+        stream=stream,
+        times_ns=ordered,
+        order=order,
+        is_header=is_header,
+        is_chosen=is_header == by_header,
+        period_ns=period,
+        is_regular=is_regular,
     )
 
 

@@ -71,7 +71,7 @@ def all_findings(lines: Timelines) -> tuple[Finding, ...]:
 def _findings(bag: Timelines, lines: Sequence[Timeline]) -> Iterator[Finding]:
     skews = _comparable_skews(lines)
     for line in lines:
-        found = (*_message_findings(line.stream), *_time_findings(line), *_clock_findings(skews[line]))
+        found = (*_message_findings(line), *_time_findings(line), *_clock_findings(skews[line]))
         for kind, text in (*found, *_picture_findings(line), *_value_findings(line)):
             yield of_stream(line.stream, kind, text)
     for problem in bag.streams.problems:
@@ -91,11 +91,12 @@ def of_stream(stream: Stream, kind: str, text: str) -> Finding:
     return Finding(kind=kind, stream=stream.label, text=f"{stream.topic}: {text}")
 
 
-def _message_findings(stream: Stream) -> Iterator[tuple[str, str]]:
+def _message_findings(line: Timeline) -> Iterator[tuple[str, str]]:
+    stream = line.stream
     if stream.num_malformed:
         yield "malformed", f"{stream.num_malformed} messages cannot be used, the first since {stream.first_problem}"
     unstamped = int(np.sum((stream.header_ns <= 0) & (stream.header_ns != NO_STAMP)))
-    if unstamped:
+    if unstamped and (line.is_header or not line.is_chosen):  # times of recording that the mapping asks for need none
         yield "unstamped", f"{unstamped} of {len(stream)} headers have no time"
     if len(stream.frame_ids) > 1:
         yield "frame_id", f"its messages name several coordinate frames ({', '.join(stream.frame_ids[:4])})"

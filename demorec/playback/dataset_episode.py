@@ -33,7 +33,8 @@ def dataset_rows(
     files = sorted((root / table).glob("*/*.parquet"))
     if not files:
         raise RecordingError(
-            f"The dataset has no {table}: only datasets of demorec can be shown; rerun shows others: {root}"
+            f"The dataset has no {table}, and only datasets of demorec can be shown; of others demorec import lerobot "
+            f"{root} --out RUN makes a run that can: {root}"
         )
     rows = [row for file in files for row in read_table(file, columns).to_pylist()]
     return [row for row in rows if episode_index is None or row.get("episode_index") == episode_index]
