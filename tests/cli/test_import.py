@@ -67,7 +67,8 @@ def test_simulated_time_begins_with_zero(tmp_path: Path, capsys: pytest.CaptureF
     seen: set[str] = set()
     shifted = []
     for note in notes:
-        is_first, _ = note.topic not in seen, seen.add(note.topic)
+        is_first = note.topic not in seen
+        seen.add(note.topic)
         shifted.append(replace(note, header_ns=0 if is_first else note.header_ns and note.header_ns - first + 1))
     bag = bags.write_mcap(shifted, tmp_path / "bag.mcap")
     assert _run("import", "--suggest", bag) == 0
