@@ -18,6 +18,7 @@ heartbeat() {
     awk -v passed="$SECONDS" '
       $1 == "Resolved" { resolved = 1 }
       $1 == "Prepared" { prepared = 1 }
+      $1 == "Warming" { warming = 1 }
       { sub(/==.*/, "", $2) }
       $1 == "Building" { builds[$2] } $1 == "Built" { delete builds[$2] }
       $1 == "Downloading" { loads[$2] } $1 == "Downloaded" { delete loads[$2] }
@@ -26,7 +27,7 @@ heartbeat() {
         for (name in loads) if (++count <= 3) names = names (names ? ", " : "downloading ") name
         if (count > 3) names = names " and " count - 3 " more"
         line = line (line && names ? "; " : "") names
-        if (!line) line = prepared ? "installing" : resolved ? "downloading" : "choosing versions"
+        if (!line) line = warming ? "compiling the renderer" : prepared ? "installing" : resolved ? "downloading" : "choosing versions"
         printf "  %d:%02d  %s\n", passed / 60, passed % 60, line
       }' "$log"
   done
@@ -72,6 +73,7 @@ quietly "$uv" pip uninstall -p .venv $other
 quietly "$uv" pip install -p .venv -c constraints.txt -e . --group dev "${arguments[@]}"
 quietly .venv/bin/python -c "import pybullet"
 echo "Compiling the renderer for this machine"
+echo "Warming" >>"$log"
 quietly .venv/bin/python -c "from demorec.render.warm import warm_up_renderer; warm_up_renderer('raster')"
 touch .venv/.stamp-"$pybullet"
 printf 'Set up in %d:%02d min.\n' $((SECONDS / 60)) $((SECONDS % 60))

@@ -100,7 +100,8 @@ class Check:
         """One line for `demorec list checks`."""
         unit = f" {self.unit}" if self.unit else ""
         warn = "" if self.warn == self.fail else f"warns above {self.warn:g}{unit}, "
-        return f"{self.scope}, {self.group}: {self.measures}; {warn}fails above {self.fail:g}{unit}"
+        fail = "never fails" if math.isinf(self.fail) else f"fails above {self.fail:g}{unit}"
+        return f"{self.scope}, {self.group}: {self.measures}; {warn}{fail}"
 
     def run(self, subject: object) -> Result:
         """Measure and judge; an error while reading or computing is a failure of this check, a missing package is none.

@@ -220,8 +220,9 @@ def collected_distinct_cameras(recording: CollectedRecording) -> Found:
             digests[camera] = zlib.crc32(packet.data, digests[camera])
     if len(digests) < 2:
         return None
-    twins = [camera for camera, digest in digests.items() if list(digests.values()).count(digest) > 1 and digest]
-    return Measurement(value=len(twins) // 2, detail=" and ".join(twins))
+    twins = [[camera for camera in digests if digests[camera] == digest] for digest in set(digests.values()) - {0}]
+    pairs = sorted(" and ".join(cameras) for cameras in twins if len(cameras) > 1)
+    return Measurement(value=sum(len(cameras) // 2 for cameras in twins), detail="; ".join(pairs))
 
 
 @check(

@@ -123,7 +123,8 @@ def run_files(run: CheckedRun) -> Measurement:
     listed = {line["file"]: line for line in run.lines}
     there = {str(path.relative_to(run.path)) for path in run.recordings}
     wrong += [f"{file} is missing" for file in sorted(listed.keys() - there)]
-    wrong += [f"{file} is not in run.json" for file in sorted(there - listed.keys())]
+    hint = "" if run.run.get("complete", True) else " yet; the command that began the run takes it in and goes on"
+    wrong += [f"{file} is not in run.json{hint}" for file in sorted(there - listed.keys())]
     for file in sorted(there & listed.keys()):
         try:
             with open_regular(run.path / file) as stream:

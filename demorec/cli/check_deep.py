@@ -46,7 +46,9 @@ def deep_summary(remade: Sequence[DeepReport], different: Sequence[DeepReport]) 
     """
     impossible = sum(bool(report.error) for report in remade)
     made, differ = len(remade) - impossible, sum(not report.error for report in different)
-    text = f" {made} made again, {differ} not as recorded." if made else ""
+    warned = sum(report.level == "warn" for report in remade if not report.error)
+    aside = f" ({warned} with a warning)" if warned else ""
+    text = f" {made} made again{aside}, {differ} not as recorded." if made else ""
     return text + (f" {impossible} could not be made again." if impossible else "")
 
 

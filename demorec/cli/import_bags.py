@@ -84,18 +84,21 @@ class Import:
                 "Name HDF5 files after the word hdf5: demorec import hdf5 demo.hdf5 --mapping demo.toml --out "
                 "runs/demo. A bag of that name is given with its folder."
             )
+        from demorec.ingest.bag import bags_in, open_bag
+
         if self.suggest:
             if is_hdf5:
                 from demorec.ingest.hdf5_suggest import suggested_hdf5_mapping
 
                 say(*suggested_hdf5_mapping(files[0]))
             else:
-                from demorec.ingest.bag import bags_in
                 from demorec.ingest.suggest import suggested_mapping
 
                 say(*suggested_mapping(bags_in(files[0])[0], tell))
             return 0
         if self.mapping is None or self.out is None:
+            if not is_hdf5:
+                open_bag(bags_in(files[0])[0])  # what is no bag is told what it is first
             example = f"hdf5 {files[0]} --suggest > demo.toml" if is_hdf5 else f"--suggest {files[0]} > robot.toml"
             raise ConfigError(f"An import needs --mapping and --out: demorec import {example} writes a mapping.")
         self.video.validate()

@@ -99,9 +99,15 @@ class ExportEpisode(ABC):
         self, names: Mapping[str, tuple[str, ...]], scalars: tuple[str, ...], cameras: Collection[ExportCamera]
     ) -> None:
         """Take what is offered, and of the cameras those that are wanted."""
-        check_feature_names(self.options, [*names, *(camera.feature for camera in cameras), *scalars])
+        offered = [*names, *(camera.feature for camera in cameras), *scalars]
+        check_feature_names(self.options, [*offered, *(name for name in self.on_request if name not in offered)])
         self.names, self.scalars = names, scalars
         self.cameras = tuple(camera for camera in cameras if self.options.takes(camera.feature))
+
+    @property
+    def on_request(self) -> tuple[str, ...]:
+        """Features that a dataset has only when they are named."""
+        return ()
 
     @property
     def depth_left_out(self) -> tuple[str, ...]:

@@ -70,6 +70,11 @@ class _Simulated(ExportEpisode):
         scalars = (*((INTERVENTION,) if getattr(options, "intervention", False) else ()), REWARD, DONE, SUCCESS)
         self._settle({**names, ACTION: action_names(info.robot, options.action)}, scalars, cameras)
 
+    @property
+    def on_request(self) -> tuple[str, ...]:
+        """What was sensed beside the usual, and the executed command."""
+        return (*(name for name in SENSED if self._has(name)), COMMAND)
+
     def _has(self, name: str) -> bool:
         return name != "observation.wrench" or channels.WRENCH in self.simulated.recording.topics
 

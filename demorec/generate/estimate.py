@@ -80,10 +80,11 @@ def estimate(config: GenerateConfig, options: RunOptions, *, maker: str = MAKE_E
         for name in (EPISODES, FAILED, UNFINISHED):
             (folder / name).mkdir()
         measured = _make(maker, folder, config, _MEASURED, workers=1)
-        count = min(_TRIED, options.num_episodes)
-        tried = _make(maker, folder, replace(config, cameras=()), count, workers=min(workers, available_cores()))
         recordings = [folder / report.attempt.file for report in measured if report.attempt.file]
         dataset_bytes = _added_to_dataset(recordings, folder) if options.export else 0
+        # Last, since these have the names of the measured ones, and no images.
+        count = min(_TRIED, options.num_episodes)
+        tried = _make(maker, folder, replace(config, cameras=()), count, workers=min(workers, available_cores()))
     last, out = measured[-1].attempt, options.out.absolute()
     return Estimate(
         attempts=len(tried),

@@ -173,6 +173,11 @@ def _kind_of(path: Path) -> bytes:
             f"This is a bag of ROS 1; rosbags-convert --src {path.name} --dst {path.stem} makes a rosbag2 folder of "
             f"it, which is read: {path}"
         )
+    if head.startswith(b"\x89HDF"):
+        raise ConfigError(
+            f"This is an HDF5 file, no bag: demorec import hdf5 {path} --suggest > demo.toml writes a mapping for it: "
+            f"{path}"
+        )
     raise BagError(f"This is no bag: MCAP files, .db3 files and rosbag2 folders are read: {path}")
 
 

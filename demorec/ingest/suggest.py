@@ -119,7 +119,8 @@ def suggested_mapping(path: Path, tell: Callable[[str], None]) -> list[str]:
     lines += [f"# {problem}" for problem in problems[:5]]
     lines += list(_listed(topics))
     robot = re.sub(r"[^A-Za-z0-9_]+", "_", bag.name).strip("_") or "robot"
-    model = next((name for name in sorted(topics) if name.endswith("robot_description")), "")
+    models = (name for name in topics if name.endswith("robot_description"))
+    model = min(models, key=lambda name: (name.count("/"), name), default="")  # those below may be of objects
     lines += ["", "[robot]", f"name = {quoted(robot)}"]
     lines += [f"urdf_topic = {quoted(model)}" if model else '# urdf = "robot.urdf"']
     lines += ["", "[task]", *_task(topics, bag)]
@@ -154,7 +155,7 @@ def _look_into(topic: _Topic, message: BagMessage, decoder: BagDecoder) -> None:
     except (ValueError, RecursionError, OverflowError, TypeError):
         return
     stamp = stamp_of(values)
-    topic.has_stamp = topic.has_stamp and bool(stamp)
+    topic.has_stamp = bool(stamp or topic.stamps_ns)  # simulated time begins with 0, which looks like none
     if stamp and 0 < stamp < 2**63:
         topic.skew_ns = topic.skew_ns or message.log_ns - stamp
         topic.stamps_ns.append(stamp)

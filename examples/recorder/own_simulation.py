@@ -72,4 +72,4 @@ def main(folder: str, num_episodes: int = 2, num_frames: int = 45) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    main(sys.argv[1] if len(sys.argv) > 1 else "runs/mine")

@@ -75,4 +75,4 @@ def main(folder: str, num_episodes: int = 2, seconds: float = 2.0) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    main(sys.argv[1] if len(sys.argv) > 1 else "runs/mine")

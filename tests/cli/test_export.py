@@ -47,6 +47,7 @@ def test_options_reach_the_export(run: Path, tmp_path: Path) -> None:
     ("arguments", "code", "message"),
     [
         (("--features", "observation.stat"), 2, "'observation.state'"),
+        (("--features", "observation.effor"), 2, "Did you mean 'observation.effort'?"),
         (("--fps", "7"), 2, "does not divide"),
         (("--episodes", "5:2"), 2, "5:2 ends before it begins"),
         (("--repo-id", "cubes"), 2, "must be OWNER/NAME"),

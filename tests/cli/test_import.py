@@ -9,11 +9,13 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import h5py
 import pytest
 from rosbags.rosbag2 import StoragePlugin
 from support import bag_mappings, bags
 
 from demorec.cli import main
+from demorec.lerobot.paths import INFO_PATH
 from demorec.recording import CollectedRecording
 from demorec.runs.collected import load_collected_run
 
@@ -57,6 +59,47 @@ def test_a_suggested_mapping_works_as_it_is(name: str, tmp_path: Path, capsys: p
         sizes = {feature.name: len(feature.names) for feature in recording.info.features}
         assert (sizes["observation.state"], sizes["action"], len(recording.info.cameras)) == FEATURES[name]
         assert recording.num_frames == episode.num_frames >= 30
+
+
+def test_simulated_time_begins_with_zero(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    notes = bags.in_order(bags.so101(1.0))
+    first = min(note.header_ns for note in notes if note.header_ns)
+    seen: set[str] = set()
+    shifted = []
+    for note in notes:
+        is_first = note.topic not in seen
+        seen.add(note.topic)
+        shifted.append(replace(note, header_ns=0 if is_first else note.header_ns and note.header_ns - first + 1))
+    bag = bags.write_mcap(shifted, tmp_path / "bag.mcap")
+    assert _run("import", "--suggest", bag) == 0
+    text = capsys.readouterr().out
+    assert "/follower/joint_states" in text
+    assert "no time" not in text
+
+
+def test_the_robot_is_described_by_the_outermost_topic(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    notes = bags.so101(0.5)
+    notes += [
+        bags.Note(
+            topic=topic, type="std_msgs/msg/String", log_ns=notes[0].log_ns, header_ns=0, body={"data": "<robot/>"}
+        )
+        for topic in ("/a/cup/robot_description", "/robot_description")
+    ]
+    assert _run("import", "--suggest", bags.write_mcap(bags.in_order(notes), tmp_path / "bag.mcap")) == 0
+    assert tomllib.loads(capsys.readouterr().out)["robot"]["urdf_topic"] == "/robot_description"
+
+
+def test_headers_need_no_time_where_that_of_recording_is_asked_for(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    notes = [replace(note, header_ns=0) for note in bags.in_order(bags.so101(1.0))]
+    bag = bags.write_mcap(notes, tmp_path / "bag.mcap")
+    assert _run("import", "--suggest", bag) == 0
+    text = capsys.readouterr().out
+    assert 'stamp = "log"' in text
+    mapping = bag_mappings.write_mapping(text, tmp_path / "robot.toml")
+    assert _run("import", bag, "--mapping", mapping, "--out", tmp_path / "run") == 0
+    assert "unstamped" not in capsys.readouterr().out
 
 
 def test_a_doubtful_topic_is_commented_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -103,6 +146,8 @@ BAD: dict[str, tuple[int, str]] = {
     "two types on a topic": (1, "has messages of several types"),
     "a text file": (1, "This is no bag"),
     "an empty file": (1, "The bag is empty"),
+    "an HDF5 file": (2, "This is an HDF5 file, no bag: demorec import hdf5"),
+    "a dataset without a mapping": (2, "This is a LeRobot dataset, no bag: demorec import lerobot"),
     "somebody's folder": (2, "choose another"),
     "a URDF that is not there": (2, "The URDF cannot be read"),
     "a folder without metadata": (1, "holds no metadata.yaml"),
@@ -135,6 +180,12 @@ def test_bad_input_is_refused_in_one_sentence(name: str, tmp_path: Path, capsys:
             bag.write_text("hello")
         case "an empty file":
             bag.write_bytes(b"")
+        case "an HDF5 file":
+            h5py.File(bag, "w").close()
+        case "a dataset without a mapping":
+            bag = tmp_path / "dataset"
+            (bag / INFO_PATH).parent.mkdir(parents=True)
+            (bag / INFO_PATH).write_text("{}")
         case "a URDF that is not there":
             text = text.replace('name = "so101"', 'name = "so101"\nurdf = "none.urdf"')
         case "somebody's folder":
@@ -151,7 +202,12 @@ def test_bad_input_is_refused_in_one_sentence(name: str, tmp_path: Path, capsys:
     if name == "a mapping that is not there":
         mapping = tmp_path / "none.toml"
     words: list[str | Path] = [bag, "--mapping", mapping, "--out", run]
-    words = {"no bag": words[1:], "no mapping": words[:1], "codec": [*words, "--gop", "0"]}.get(name, words)
+    words = {
+        "no bag": words[1:],
+        "no mapping": words[:1],
+        "a dataset without a mapping": words[:1],
+        "codec": [*words, "--gop", "0"],
+    }.get(name, words)
     before = sorted(path for path in tmp_path.rglob("*"))
     assert _run("import", *words) == code
     out, err = capsys.readouterr()

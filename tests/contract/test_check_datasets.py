@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -73,6 +74,18 @@ def test_a_missing_file(run: Path, tmp_path: Path) -> None:
     spoilt = copy(run, tmp_path / "run")
     (spoilt / "episodes/episode_000001.mcap").unlink()
     assert level_of(spoilt, "run_files", "run") == "fail"
+
+
+@pytest.mark.parametrize("complete", [True, False])
+def test_what_a_killed_run_has_not_listed_yet(run: Path, tmp_path: Path, complete: bool) -> None:
+    spoilt = copy(run, tmp_path / "run")
+    shutil.copy(spoilt / "episodes/episode_000001.mcap", spoilt / "episodes/episode_000007.mcap")
+    told = json.loads((spoilt / "run.json").read_text())
+    (spoilt / "run.json").write_text(json.dumps({**told, "complete": complete}))
+    results = checked(spoilt, "run", pictures=False).results
+    (found,) = [result for result in results if result.check == "run_files"]
+    assert "episode_000007.mcap is not in run.json" in found.detail
+    assert ("the command that began the run takes it in" in found.detail) != complete
 
 
 def test_another_seed_in_run_json(run: Path, tmp_path: Path) -> None:

@@ -138,6 +138,14 @@ def test_a_good_episode_passes(tmp_path: Path) -> None:
     assert found["penetration"] == "skip"
 
 
+def test_cameras_that_are_the_same_are_named_together(tmp_path: Path) -> None:
+    episode = steady()
+    twice = replace(episode, pictures={**episode.pictures, "side": episode.pictures["top"]})
+    report = check_subject(Subject(path=write_collected(tmp_path / "a.mcap", twice), kind="recording"), CheckOptions())
+    (found,) = [result for result in report.results if result.check == "collected_distinct_cameras"]
+    assert (found.value, found.detail) == (1, "top and side")
+
+
 def test_a_label_that_never_changes_is_no_stuck_sensor(tmp_path: Path) -> None:
     """LeRobot's `intervention` is false in most episodes."""
     episode = steady()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -23,6 +24,11 @@ def test_what_is_impossible_is_counted_apart() -> None:
     assert deep_summary([good, impossible], [impossible]) == (
         " 1 made again, 0 not as recorded. 1 could not be made again."
     )
+
+
+def test_other_versions_are_counted_as_they_are_told() -> None:
+    other = replace(report(), versions=("version of pybullet is 1 there and 2 here",))
+    assert deep_summary([report(), other], []) == " 2 made again (1 with a warning), 0 not as recorded."
 
 
 def test_a_collected_episode_cannot_be_made_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

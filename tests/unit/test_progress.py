@@ -122,6 +122,26 @@ def test_a_start_that_takes_long_is_told(capsys: pytest.CaptureFixture[str]) -> 
     assert capsys.readouterr().err == ""
 
 
+def test_a_pause_in_the_midst_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    with ProgressBar("generating", total=10, is_terminal=False, silence=0.01) as bar:
+        bar.set(4)
+        told = ""
+        while "4 of 10" not in told:  # the limit of the tests' time ends it
+            time.sleep(0.01)
+            told += capsys.readouterr().err
+
+
+def test_what_is_done_has_no_time_left(capsys: pytest.CaptureFixture[str]) -> None:
+    with ProgressBar("exporting", total=2, is_terminal=False, silence=0.01) as bar:
+        bar.set(1)
+        bar.set(2)
+        told = ""
+        while "2 of 2" not in told:
+            time.sleep(0.01)
+            told += capsys.readouterr().err
+    assert "left" not in told
+
+
 def test_a_terminal_gets_a_bar_and_no_lines(capsys: pytest.CaptureFixture[str]) -> None:
     clock = Clock()
     with ProgressBar("generating", total=3, is_terminal=True, clock=clock) as bar:

@@ -22,9 +22,9 @@ _QUIET_S = 10.0
 _SHARE = 0.05
 """Share of the whole after which the next line is due."""
 _SILENCE_S = 45.0
-"""Longest time without a line before the first thing ends and while the last one does, when libraries load."""
+"""Longest time without a line, in the midst of long work 5 % of the time since its start."""
 _LONGEST_S = 300.0
-"""Longest time without a line while something ends: in a run of days, a share takes hours."""
+"""Longest time without a line in the midst of any work: in a run of days, a share takes hours."""
 _BAR = "{l_bar}{bar}| {n_fmt}/{total_fmt} [{elapsed}{postfix}]"
 """Without tqdm's own time that is left, which counts the start as work."""
 
@@ -33,8 +33,9 @@ class ProgressBar(AbstractContextManager["ProgressBar"]):
     """Counts what is done of one job; a context manager.
 
     On a terminal a bar. Elsewhere a line after ten seconds and then for every 5 % of the whole, but neither more often
-    than every ten seconds nor, while anything ends, less often than every five minutes. The time that is left is
-    counted from the first end on, when all that has to start has started, and told after one more round.
+    than every ten seconds nor less often than every `silence` seconds (later every 5 % of the time that has passed, at
+    most five minutes). The time that is left is counted from the first end on, when all that has to start has started,
+    and told after one more round.
 
     Args:
         title: What is being done, as in "exporting".
@@ -109,10 +110,11 @@ class ProgressBar(AbstractContextManager["ProgressBar"]):
             self._bar.set_postfix_str(self._last_words())
 
     def _break_silence(self, longest: float) -> None:
-        while not self._closed.wait(longest):
-            is_at_an_end = self._first_end is None or self.done >= self.total - 1
-            if is_at_an_end and self._clock() - self._told_at >= longest:
-                self._told_at = self._clock()
+        while not self._closed.wait(longest / 9):  # so that a line is hardly later than it should be
+            now, is_at_an_end = self._clock(), self._first_end is None or self.done >= self.total - 1
+            allowed = longest if is_at_an_end else max(longest, min(_LONGEST_S, _SHARE * (now - self._started)))
+            if now - self._told_at >= allowed:
+                self._told_at = now
                 tell(self._line())
 
     def _is_due(self) -> bool:
@@ -133,7 +135,7 @@ class ProgressBar(AbstractContextManager["ProgressBar"]):
     def _last_words(self) -> str:
         """How much time is left, if that can be told, and the note."""
         words = [self._note] if self._note else []
-        if self._first_end is not None and self.total:
+        if self._first_end is not None and self.done < self.total:
             began, done_then = self._first_end
             if (since := self.done - done_then) >= self._at_once:
                 left = (self._clock() - began) * (self.total - self.done) / since
