@@ -13,7 +13,7 @@ from demorec.cli import run_command
 from demorec.cli.view import View
 from demorec.errors import DemorecError, RecordingError
 from demorec.playback.episode import PlayedEpisode
-from demorec.playback.glyphs import BOX, DRAWABLE, DrawableText
+from demorec.playback.glyphs import DRAWABLE, drawable, drawable_source
 from demorec.playback.layout import episode_layout
 from demorec.playback.scene import log_episode, new_recording
 from demorec.playback.sources import find_episodes
@@ -55,8 +55,8 @@ def foreign(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_all_text_of_a_layout_is_drawable(foreign: Path) -> None:
     (source,) = find_episodes([foreign])
-    text = DrawableText()
-    with text.source(source).open() as episode:
+    missing: set[str] = set()
+    with drawable_source(source, missing).open() as episode:
         assert isinstance(episode, PlayedEpisode)
         written = [
             summary(episode),
@@ -70,21 +70,21 @@ def test_all_text_of_a_layout_is_drawable(foreign: Path) -> None:
         recording = new_recording(episode)
         log_episode(recording, episode)  # bodies, goals, cameras and poses still belong together
         episode_layout(episode)
-        assert episode.info.instruction == BOX * len(INSTRUCTION)
+        assert episode.info.instruction == "".join(f"U+{ord(character):X}" for character in INSTRUCTION)
         assert set(episode.phase) == {"U+62ACU+8D77", "U+653EU+4E0B"}
         assert "U+65B9U+5757" in episode.object_poses
         assert [camera.name for camera in episode.info.scene.cameras] == list(episode.videos) == ["U+524D"]
     assert re.fullmatch(f"[{DRAWABLE}]*", "".join(written))
-    assert set(INSTRUCTION) <= text.missing
+    assert set(INSTRUCTION) <= missing
     with source.open() as episode:  # the source itself is as it was
         assert episode.info.instruction == INSTRUCTION
 
 
 def test_drawable_text_is_left_alone() -> None:
-    text = DrawableText()
+    missing: set[str] = set()
     for sentence in ("move the red cube", "Bewege den Würfel an das Ende · 3 °", "Передвинь куб", "e\u0301"):
-        assert text.sentence(sentence) in (sentence, "é")
-    assert text.missing == set()
+        assert drawable(sentence, missing) in (sentence, "é")
+    assert missing == set()
 
 
 @pytest.mark.slow
