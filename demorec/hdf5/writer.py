@@ -7,6 +7,7 @@ observations are those of robosuite's environments, which robomimic's example co
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable, Sequence
 from fractions import Fraction
 
 import h5py
@@ -17,7 +18,6 @@ from demorec.errors import ConfigError
 from demorec.export.episode import DONE, ExportEpisode, Simulated
 from demorec.hdf5.file import ENV_ARGUMENTS, EXTERNAL_ARGUMENTS, EXTERNAL_ENVIRONMENT, PICTURE_ARGUMENTS, NewFile
 from demorec.hdf5.options import Hdf5Options
-from demorec.hdf5.streams import GYM, add_pictures, add_vectors
 from demorec.scene.episode import EpisodeColumns, EpisodeInfo
 from demorec.scene.features import ACTION, EE_POSE, ENVIRONMENT_STATE, IMAGE_PREFIX, STATE, VELOCITY
 from demorec.tables import environment_name
@@ -29,6 +29,10 @@ _ROBOSUITE = {
     ENVIRONMENT_STATE: {"object": slice(None)},
 }
 """Of simulated arms: feature -> robosuite's observations, and which elements each of them has."""
+
+
+GYM = 2
+"""`EnvType.GYM_TYPE` of robomimic."""
 
 
 class RobomimicWriter:
@@ -178,3 +182,33 @@ def _states(
     names = [f"{joint}.{what}" for what in ("pos", "vel") for joint in joints]
     names += [f"{body}.{axis}" for body in columns.object_poses for axis in ("x", "y", "z", "qx", "qy", "qz", "qw")]
     return np.concatenate(parts, axis=1)[rows], tuple(names)
+
+
+def add_vectors(group: h5py.Group, name: str, values: NDArray[np.generic], components: Sequence[str]) -> None:
+    """(T, D) numbers as a dataset whose attribute `names` has those of the D components."""
+    stored = group.create_dataset(name, data=values)
+    stored.attrs["names"] = json.dumps(components)
+
+
+def add_pictures(
+    group: h5py.Group, name: str, shape: tuple[int, ...], pictures: Iterable[NDArray[np.generic]], compression: int
+) -> None:
+    """A stream of pictures, each a compressed chunk of its own, so that one is read by itself.
+
+    Args:
+        group: Where it goes.
+        name: Of the dataset.
+        shape: Of all pictures: (T, H, W, 3) of colours, uint8; (T, H, W, 1) of distances, float32.
+        pictures: One after the other.
+        compression: Level of gzip, 0 for none.
+    """
+    stored = group.create_dataset(
+        name,
+        shape,
+        np.uint8 if shape[-1] == 3 else np.float32,
+        chunks=(1, *shape[1:]),
+        compression="gzip" if compression else None,
+        compression_opts=compression or None,
+    )
+    for index, picture in enumerate(pictures):
+        stored[index] = picture.reshape(shape[1:])

@@ -128,7 +128,7 @@ def _with_hints(info: StructTypeInfo) -> StructConstructorSpec | None:
     fields = []
     for field in (field for field in spec.fields if field.name != OTHERS):
         hint = "(required)" if field.default is MISSING_NONPROP else "" if field.default in (None, "", ()) else None
-        kind = field.type if hint is None else Annotated[field.type, tyro.conf.arg(help_behavior_hint=hint)]
+        kind: Any = field.type if hint is None else Annotated[field.type, tyro.conf.arg(help_behavior_hint=hint)]
         text = field.helptext() if callable(field.helptext) else field.helptext
         fields.append(dataclasses.replace(field, type=kind, helptext=" ".join((text or "").split())))
     return dataclasses.replace(spec, fields=tuple(fields))
