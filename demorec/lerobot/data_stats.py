@@ -60,16 +60,18 @@ def _quantiles(paths: Sequence[Path], name: str, shape: tuple[int, int]) -> dict
     """Quantile -> (D,) of one feature of `shape` (D, T)."""
     ranks = {key: quantile_ranks(q, shape[1]) for key, q in QUANTILES.items()}
     wanted = sorted({rank for low, high, _ in ranks.values() for rank in (low, high)})
-    with tempfile.TemporaryFile(dir=paths[0].parent) as file:  # beside the data: /tmp may be memory
-        columns: NDArray[Any] | None = None
+    found = np.empty((shape[0], len(wanted)))
+    # One component after another, in a file beside the data: /tmp may be memory.
+    with tempfile.TemporaryFile(dir=paths[0].parent, buffering=0) as file:
         start = 0
         for (array,) in _batches(paths, [name]):
-            if columns is None:
-                columns = np.memmap(file, dtype=array.dtype, mode="w+", shape=shape)
-            columns[:, start : start + len(array)] = array.T
+            for index, part in enumerate(array.T):
+                file.seek((index * shape[1] + start) * array.itemsize)
+                file.write(part.tobytes())
             start += len(array)
-        assert columns is not None
-        found = np.array([np.partition(column, wanted)[wanted] for column in columns], dtype=np.float64)
+        file.seek(0)
+        for values in found:
+            values[:] = np.partition(np.fromfile(file, array.dtype, shape[1]), wanted)[wanted]
     place = {rank: found[:, index] for index, rank in enumerate(wanted)}
     return {key: place[low] + (place[high] - place[low]) * weight for key, (low, high, weight) in ranks.items()}
 
