@@ -65,14 +65,14 @@ RENDERERS: Registry[type[Renderer]] = Registry(
     kind="renderer",
     rows={
         "raster": "demorec.render.raster:RasterRenderer",
-        "tiny": "demorec.sim.renderers.tiny:TinyRenderer",
+        "tiny": "demorec.sim.renderers.client_renderer:TinyRenderer",
         "egl": "demorec.sim.renderers.egl:EglRenderer",
     },
 )
 
 EXPORTERS: Registry[Exporter[Any]] = Registry(
     kind="format",
-    rows={"lerobot": "demorec.lerobot.exporter:LEROBOT", "hdf5": "demorec.hdf5.exporter:HDF5"},
+    rows={"lerobot": "demorec.lerobot.options:LEROBOT", "hdf5": "demorec.hdf5.options:HDF5"},
 )
 
 CHECKS: Registry[Check] = Registry(
@@ -121,8 +121,7 @@ CHECKS: Registry[Check] = Registry(
         ("dataset_motion", "dataset_duplicates", "dataset_coverage"),
         ("dataset_motion", "dataset_forward_kinematics", "dataset_action_lag"),
         ("dataset_files", "dataset_sidecar"),
-        ("dataset_robots", "dataset_robots"),
-        ("dataset_facts", "dataset_facts", "dataset_progress"),
+        ("dataset_facts", "dataset_robots", "dataset_facts", "dataset_progress"),
         ("dataset_language", "dataset_language", "dataset_language_truth"),
         ("dataset_files", "dataset_opens"),
     ),

@@ -13,10 +13,12 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from demorec.check.base import NotMeasured
-from demorec.check.dataset_drawn import compare_beginning
+from demorec.check.cells import Cells
 from demorec.check.dataset_video import EpisodePictures, episode_pictures
-from demorec.check.drawn import PictureComparison
+from demorec.check.drawn import NOT_DRAWABLE, PictureComparison, compare, draw, frames_to_draw
+from demorec.check.episode_drawn import drawable_scene
 from demorec.errors import ConfigError, ExportError, in_words
+from demorec.geometry import Array
 from demorec.lerobot.files import open_table, read_table
 from demorec.lerobot.language import COLUMNS, SpokenEpisode, spoken_episodes
 from demorec.lerobot.layout import AUTOMATIC_FEATURES, DatasetInfo
@@ -24,6 +26,7 @@ from demorec.lerobot.paths import SIDECAR_DIR
 from demorec.lerobot.reader import EpisodePlace, RowReader, episode_places, read_tasks
 from demorec.lerobot.robots import DatasetRobot, read_robot
 from demorec.lerobot.sidecar import EPISODE_SCHEMA
+from demorec.render.recorded import RecordedWorld
 from demorec.scene.episode import EpisodeInfo
 from demorec.scene.features import (
     ACTION,
@@ -38,6 +41,13 @@ from demorec.scene.features import (
 from demorec.scene.validity import read_episode_info
 
 Rows = Mapping[str, NDArray[Any]]
+
+
+_DRAWN_SECONDS = 3.0
+"""Of an episode that are drawn, at most."""
+_CLOSING = 1e-3
+"""Metres that the opening shrinks by from frame to frame when the fingers begin to close."""
+_MIN_DRAWN = 3
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -205,3 +215,40 @@ class Dataset:
         """What observation.state holds, by the names of its components; None when it is none of ours."""
         names = self.info.features[STATE].names if STATE in self.info.features else None
         return next((kind for kind in STATE_KINDS if state_names(info.robot, kind) == names), None)
+
+
+def compare_beginning(
+    info: EpisodeInfo, state: Array, fps: int, seen: Mapping[str, Cells]
+) -> Mapping[str, PictureComparison] | NotMeasured:
+    """Camera -> its pictures until the fingers first close against what states and scene make of them.
+
+    Until then nothing but the robot moves, and the sidecar says where the objects stood, so everything is known.
+
+    Args:
+        info: Of the episode, from the sidecar.
+        state: (T, n_arm + 1) joint positions (rad) and opening (m) of each row.
+        fps: Rows a second.
+        seen: Camera -> its pictures in cells.
+    """
+    if (renderer := info.config.get("renderer", "raster")) != "raster":
+        return NotMeasured(why=f"colours of the renderer {renderer!r} are others than those that are drawn here")
+    if not seen:
+        return {}
+    num_arm = len(info.robot.arm_joints)
+    opening = state[:, num_arm]
+    closing = np.flatnonzero(np.diff(opening) < -_CLOSING)
+    count = min([len(state), round(_DRAWN_SECONDS * fps), *(closing[:1] + 1).tolist()])
+    if count < _MIN_DRAWN:
+        return NotMeasured(why="the fingers close at once")
+    joints = np.concatenate([state[:count, :num_arm], info.robot.gripper.joint_position(opening[:count])], axis=1)
+    objects = {body.name: np.tile(body.world_from_body.vector(), (count, 1)) for body in info.scene.movable}
+    try:
+        scene = drawable_scene(info)
+        world = RecordedWorld(info.robot, scene, joint_position=joints, object_poses=objects)
+        grids = {name: (cells.shape[2], cells.shape[1]) for name, cells in seen.items()}
+        beginning = {name: cells[:count] for name, cells in seen.items()}
+        frames = frames_to_draw(beginning.values(), world.all_poses[:count])
+        drawn = draw(world, scene.cameras, frames, dict.fromkeys(seen, ("color",)), grids)
+    except NOT_DRAWABLE as error:
+        return NotMeasured(why=f"the scene cannot be drawn here: {error}")
+    return {name: compare(cells, drawn.cells[name, "color"], drawn.frames) for name, cells in beginning.items()}

@@ -1,4 +1,4 @@
-"""Do the columns that episodes are chosen by, and the progress of each frame, agree with what is kept beside them."""
+"""What a dataset keeps beside its rows, against the rows: arms, columns that episodes are chosen by, progress."""
 
 from __future__ import annotations
 
@@ -8,9 +8,44 @@ import numpy as np
 
 from demorec.check.base import Measurement, dataset_check
 from demorec.check.dataset import Dataset
+from demorec.errors import ExportError, without_path
 from demorec.lerobot.facts import facts_of
 from demorec.lerobot.files import open_table, read_table
 from demorec.lerobot.progress import PROGRESS_PATH, STAGE_COLUMNS, progress_table, read_progress
+from demorec.lerobot.robots import read_robot
+
+
+@dataset_check(
+    measures="descriptions of robots that are missing, changed or of another robot",
+    reads=("demorec/",),
+)
+def dataset_robots(dataset: Dataset) -> Measurement | None:
+    """The URDF beside each episode is there, unchanged, and of the robot, joints and TCP that the episode has.
+
+    That it is the arm that moved shows in the kinematics: the EE pose follows from it (`dataset_forward_kinematics`).
+    """
+    used = {name: number for number, name in reversed(dataset.robot_digests.items()) if name is not None}
+    if not used:
+        return None
+    wrong, specs = [], {each.number: each.info.robot for each in dataset.described()}
+    for name, number in used.items():
+        try:
+            robot = read_robot(dataset.path, name)
+        except ExportError as error:
+            wrong.append(without_path(error, dataset.path))
+            continue
+        if robot.record.name != dataset.info.robot_type:
+            wrong.append(f"{name} is of a {robot.record.name}, the dataset of a {dataset.info.robot_type}")
+        for feature, joints in robot.record.joints.items():
+            there = dataset.info.features.get(feature)
+            if there is not None and there.shape != (len(joints),):
+                wrong.append(f"{name} has joints for {len(joints)} elements of {feature}, it has {there.shape}")
+        spec = specs.get(number)
+        if robot.record.spec != spec:
+            wrong.append(f"{name} is not the robot of episode {number}")
+        elif spec is not None and spec.tcp_link not in robot.model.link_poses({}):
+            wrong.append(f"the URDF of {name} has no link {spec.tcp_link}")
+    return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{len(used)} robot{'s' * (len(used) > 1)}")
 
 
 @dataset_check(

@@ -72,7 +72,7 @@ class View:
         allow_models(allowed_modules(self.allow))
         if any(path.suffix == ".rrd" for path in self.paths):
             return self._show_rrd()
-        from demorec.playback.glyphs import DrawableText
+        from demorec.playback.glyphs import drawable_source
         from demorec.playback.save import numbered, save, save_comparison, save_each
         from demorec.playback.sources import find_episodes, select
         from demorec.playback.viewer import need_screen
@@ -100,9 +100,9 @@ class View:
                     say(f"{_size(target)}: {target}")
             if self.screenshot is None:
                 return 0
-        text = DrawableText()
+        missing: set[str] = set()
         if self.screenshot is not None:
-            sources = [text.source(source) for source in sources]
+            sources = [drawable_source(source, missing) for source in sources]
         with tempfile.TemporaryDirectory(prefix="demorec-view-") as folder:
             if self.compare:
                 files = [Path(folder) / "comparison.rrd"]
@@ -110,10 +110,10 @@ class View:
             else:
                 files = save_each(sources, Path(folder))
             code = self._show(files, sources)
-        if text.missing:
+        if missing:
             tell(
-                f"The picture lacks {len(text.missing)} characters for which Rerun's viewer without a screen has no "
-                f"font ({''.join(sorted(text.missing)[:20])}); the window, --web and --save keep them."
+                f"The picture lacks {len(missing)} characters for which Rerun's viewer without a screen has no "
+                f"font ({''.join(sorted(missing)[:20])}); the window, --web and --save keep them."
             )
         return code
 

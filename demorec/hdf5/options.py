@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from demorec.errors import OptionError, check_option
+from demorec.export.exporter import Exporter
 from demorec.export.options import CommonOptions
 
 
@@ -23,3 +24,10 @@ class Hdf5Options(CommonOptions):
         if not 0 <= self.valid_share < 1:
             raise OptionError("valid_share", f"is {self.valid_share}, it must be at least 0 and below 1.")
         check_option("compression", self.compression, 0, 9)
+
+
+HDF5 = Exporter(
+    summary="robomimic's layout, one HDF5 file: decoded pictures, the same numbers, masks for training and validation",
+    options=Hdf5Options,
+    function="demorec.hdf5.export:export_hdf5",
+)

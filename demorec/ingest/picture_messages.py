@@ -10,14 +10,14 @@ from typing import Any, NamedTuple, cast
 import av
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from demorec.config import MAX_PIXELS
 from demorec.errors import in_words
-from demorec.ingest.compressed_depth import compressed_depth_head, decode_compressed_depth
 from demorec.ingest.fields import FieldError, picture_bytes, whole
 from demorec.ingest.raw_pictures import RAW_ENCODINGS, check_raw, raw_picture
 from demorec.ingest.ros_types import Values
+from demorec.recording.depth import decode_millimetres
 from demorec.recording.video import is_keyframe
 
 VIDEO_FORMATS = ("h264", "h265", "av1")
@@ -30,6 +30,13 @@ _MAX_UNITS = 256
 _SEQUENCE_BYTES = 24
 """Of an AV1 keyframe, within which its sequence header ends."""
 _ALIASES = {"hevc": "h265", "avc": "h264", "jpg": "jpeg"}
+
+
+_FREE_SETS, _FRAMES_OF_A_SET = 40, 20
+"""Decoding a picture takes up to a tenth of a second: cameras have one set of parameters, or a few."""
+_HEAD_BYTES = 12
+"""ConfigHeader: a format and two parameters, which mean something for 32FC1 alone."""
+_PNG = b"\x89PNG\r\n\x1a\n"
 
 
 class PictureHead(NamedTuple):
@@ -206,8 +213,6 @@ class _VideoSizes:
         return size
 
 
-_FREE_SETS, _FRAMES_OF_A_SET = 40, 20
-"""Decoding a picture takes up to a tenth of a second: cameras have one set of parameters, or a few."""
 _sizes = _VideoSizes()
 
 
@@ -238,3 +243,46 @@ def _frames(codec: str, packets: Iterable[bytes]) -> Iterator[av.VideoFrame]:
         yield from context.decode(None)
     except (av.FFmpegError, ValueError) as error:
         raise FieldError(f"its {codec} video cannot be decoded") from error
+
+
+def compressed_depth_head(form: str, data: bytes) -> tuple[str, int, int]:
+    """Encoding, width and height of a picture; FieldError when it is none, or does not hold whole millimetres."""
+    encoding = form.split(";")[0].strip()
+    if encoding != "16UC1":
+        raise FieldError(
+            f"its compressedDepth is of {encoding[:20]!r}, which does not keep what was measured; 16UC1, and 32FC1 "
+            "that is not compressed, are read"
+        )
+    width, height = _size(data)
+    return encoding, width, height
+
+
+def decode_compressed_depth(data: bytes) -> NDArray[np.uint16]:
+    """(H, W) millimetres; FieldError when they cannot be decoded."""
+    width, height = _size(data)
+    try:
+        if data.startswith(_PNG, _HEAD_BYTES):
+            with Image.open(io.BytesIO(data[_HEAD_BYTES:]), formats=("PNG",)) as image:
+                if image.mode not in ("I;16", "I"):
+                    raise ValueError(f"its pixels are {image.mode}, not of 16 bits")
+                return np.asarray(image).astype(np.uint16)
+        return decode_millimetres(data, (height, width))
+    except UnidentifiedImageError as error:
+        raise FieldError("its distances cannot be decoded (they are no whole PNG file)") from error
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise FieldError(f"its distances cannot be decoded ({in_words(error)})") from error
+
+
+def _size(data: bytes) -> tuple[int, int]:
+    """Width and height, within bounds."""
+    if data.startswith(_PNG, _HEAD_BYTES):
+        size = data[_HEAD_BYTES + 16 : _HEAD_BYTES + 24]  # of the first chunk, IHDR
+        order = "big"
+    else:
+        size, order = data[_HEAD_BYTES : _HEAD_BYTES + 8], "little"
+    if len(size) < 8:
+        raise FieldError("its distances are cut off")
+    width, height = (int.from_bytes(size[at : at + 4], order) for at in (0, 4))  # type: ignore[arg-type]
+    if not 1 <= width * height <= MAX_PIXELS:
+        raise FieldError(f"its picture has {width}x{height} pixels, at most {MAX_PIXELS} are read")
+    return width, height

@@ -16,7 +16,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
 
+from demorec.export.staging import sync_file
 from demorec.lerobot.attempts import ATTEMPT_SCHEMA
 from demorec.lerobot.commands import making_commands
 from demorec.lerobot.files import read_table
@@ -24,9 +26,9 @@ from demorec.lerobot.language import EVENTS, PERSISTENT
 from demorec.lerobot.layout import AUTOMATIC_FEATURES, DatasetInfo, Feature
 from demorec.lerobot.options import ExportOptions
 from demorec.lerobot.paths import CARD_PATH, SIDECAR_DIR
-from demorec.lerobot.reader import read_tasks
+from demorec.lerobot.reader import episode_places, read_tasks
 from demorec.lerobot.robots import ROBOTS_DIR
-from demorec.lerobot.thumbnails import THUMBNAILS_PATH, write_thumbnails
+from demorec.lerobot.stills import pictures_at
 from demorec.lerobot.writer import write_text
 from demorec.safety.text import markdown, printable
 from demorec.scene.features import (
@@ -45,27 +47,9 @@ SECOND_CARD_PATH = f"{SIDECAR_DIR}/README.md"
 """Where the card goes if the dataset has a README.md that demorec did not write."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class CardFacts:
-    """What the card tells that is not in the dataset's tables.
-
-    Attributes:
-        options: Of the export.
-        configs: Config digest -> configuration of the runs.
-        is_transcoded: Whether any pictures were coded anew.
-        is_simulated: Whether demorec simulated the episodes.
-    """
-
-    options: ExportOptions
-    configs: Mapping[str, Any]
-    is_transcoded: bool
-    is_simulated: bool
-
-
 _MARK = "<!-- written by demorec, which renews it at every export unless it was edited ({digest}) -->\n"
 """The last line of a card: with it a card that was edited is known from one that was not."""
 _CELLS = 4
-
 _MEANING = {
     STATE: "joint positions (rad), gripper opening (m)",
     VELOCITY: "joint velocities (rad/s), speed of the gripper's opening (m/s)",
@@ -109,6 +93,25 @@ _BESIDE_SIMULATED = (
     "camera intrinsics and extrinsics, poses, the complete scene of every episode), `camera_poses/` (of moving "
     "cameras, per frame, world_from_camera, OpenCV axes), `attempts/` (failed ones too), `configs.json`."
 )
+THUMBNAILS_PATH = f"{SIDECAR_DIR}/thumbnails.jpg"
+_EPISODES, _MOMENTS, _SIDE, _LABEL, _GAP = 4, 5, 160, 18, 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class CardFacts:
+    """What the card tells that is not in the dataset's tables.
+
+    Attributes:
+        options: Of the export.
+        configs: Config digest -> configuration of the runs.
+        is_transcoded: Whether any pictures were coded anew.
+        is_simulated: Whether demorec simulated the episodes.
+    """
+
+    options: ExportOptions
+    configs: Mapping[str, Any]
+    is_transcoded: bool
+    is_simulated: bool
 
 
 def write_card(root: Path, info: DatasetInfo, about: CardFacts) -> None:
@@ -307,3 +310,35 @@ def success_table(positions: NDArray[np.float64], success: NDArray[np.bool_]) ->
             here = (index[:, 0] == row) & (index[:, 1] == column)
             texts.append(f"{int(success[here].sum())} / {int(here.sum())}" if here.any() else "")
         yield f"| {span(0, row)} | " + " | ".join(texts) + " |"
+
+
+def write_thumbnails(root: Path, info: DatasetInfo) -> bool:
+    """A labelled row per episode, from its first to its last picture; False for a dataset without cameras."""
+    key = next((name for name, item in info.features.items() if item.is_video and not item.is_depth), None)
+    if key is None:
+        return False
+    wanted = set(np.linspace(0, info.total_episodes - 1, _EPISODES).round().astype(int).tolist())
+    places = [place for place in episode_places(root, info) if place.episode_index in wanted]
+    height, width, _ = info.features[key].shape
+    scale = _SIDE / max(height, width)
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    sheet = Image.new("RGB", ((size[0] + _GAP) * _MOMENTS - _GAP, (size[1] + _LABEL) * len(places)), "white")
+    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(size=12)
+    for row, place in enumerate(places):
+        top = row * (size[1] + _LABEL)
+        label = f"episode {place.episode_index}, camera {key.removeprefix(IMAGE_PREFIX)}: {', '.join(place.tasks)}"
+        draw.text((4, top + 1), printable(label), fill="black", font=font)
+        moments = np.linspace(0, place.length - 1, _MOMENTS).round().astype(int).tolist()
+        for column, picture in enumerate(pictures_at(root, info, key, place, moments)):
+            corner = column * (size[0] + _GAP), top + _LABEL
+            sheet.paste(Image.fromarray(picture).resize(size, reducing_gap=1.0), corner)
+            time = f"{moments[column] / info.fps:.1f} s"
+            left, above, right, below = draw.textbbox((corner[0] + 4, corner[1] + 1), time, font=font)
+            draw.rectangle((left - 3, above - 2, right + 2, below + 2), fill="black")
+            draw.text((corner[0] + 4, corner[1] + 1), time, fill="white", font=font)
+    path = root / THUMBNAILS_PATH
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.unlink(missing_ok=True)
+    sheet.save(path, quality=85)
+    sync_file(path)
+    return True

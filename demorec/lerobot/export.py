@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from demorec.errors import ConfigError
+from demorec.errors import ConfigError, ExportError, MissingDependencyError, in_words
 from demorec.export.options import ExportReport, ProgressCallback
 from demorec.export.sources import ExportSource, Intake, find_recordings, places_of
 from demorec.export.staging import CODED, staged_folder
@@ -21,10 +21,9 @@ from demorec.lerobot.boxes import BoxWriter
 from demorec.lerobot.card import CardFacts, has_own_card, write_card
 from demorec.lerobot.digest import combined_digest
 from demorec.lerobot.existing import Existing, features_to_append, link_files, open_existing
-from demorec.lerobot.hub import push_to_hub
 from demorec.lerobot.inspect import episode_digests
 from demorec.lerobot.kind import DATASET, GROWING_DATASET
-from demorec.lerobot.layout import DatasetInfo
+from demorec.lerobot.layout import CODEBASE_VERSION, DatasetInfo
 from demorec.lerobot.options import ExportOptions
 from demorec.lerobot.paths import CARD_PATH
 from demorec.lerobot.progress import STAGE_COLUMNS, EpisodeProgress, read_progress, write_progress
@@ -249,3 +248,41 @@ class _Export:
             **({"progress": True} if options.progress else {}),
             **({} if options.language is None else {"language": options.spoken}),
         }
+
+
+def push_to_hub(folder: Path, repo_id: str, *, private: bool) -> str:
+    """Upload the folder as a dataset repository, tagged with the format's version as LeRobot expects it.
+
+    Returns:
+        Its address.
+
+    Raises:
+        ExportError: No token, no network, no right to write there; the folder stays as it is.
+        MissingDependencyError: The Hub's client, which comes with LeRobot, is not installed.
+    """
+    try:
+        from huggingface_hub import HfApi, get_token
+    except ImportError as error:
+        raise MissingDependencyError(
+            f"Uploading the dataset, which is kept ({folder}),", "huggingface_hub", "pip install huggingface_hub"
+        ) from error
+    if get_token() is None:
+        raise ExportError(
+            "The dataset was not uploaded, there is no Hugging Face token: type hf auth login, or set HF_TOKEN, and "
+            f"then: hf upload {repo_id} {folder} --repo-type dataset"
+        )
+    hub = HfApi()
+    try:
+        url = hub.create_repo(repo_id, repo_type="dataset", private=private, exist_ok=True)
+        hub.upload_folder(
+            repo_id=repo_id,
+            folder_path=folder,
+            repo_type="dataset",
+            commit_message="Upload dataset",
+        )
+        hub.create_tag(repo_id, tag=CODEBASE_VERSION, repo_type="dataset", exist_ok=True)
+    except Exception as error:  # the hub's client raises errors of several HTTP libraries
+        raise ExportError(
+            f"The dataset was not uploaded to {repo_id} ({in_words(error)}); it is kept: {folder}"
+        ) from error
+    return str(url)

@@ -8,6 +8,7 @@ from typing import Literal
 
 from demorec.config import VideoConfig
 from demorec.errors import ConfigError, OptionError
+from demorec.export.exporter import Exporter
 from demorec.export.options import CommonOptions
 from demorec.language.kinds import KINDS, LanguageKind
 from demorec.scene.features import STATE_KINDS, StateKind
@@ -99,3 +100,10 @@ def check_repo_id(repo_id: str) -> None:
             f"is {repo_id!r}, but must be OWNER/NAME, for example me/cubes, of letters, digits and underscores "
             "with single dots and dashes between them.",
         )
+
+
+LEROBOT = Exporter(
+    summary="LeRobot v3.0, a folder: recorded video as it is, numbers bit for bit, statistics, card",
+    options=ExportOptions,
+    function="demorec.lerobot.export:export_lerobot",
+)

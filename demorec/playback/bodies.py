@@ -16,9 +16,9 @@ from demorec.geometry import Array, Pose
 from demorec.playback.episode import PlayedEpisode
 from demorec.playback.meshes import SurfaceMesh, joined, mesh_file, of_trimesh, sphere_mesh, urdf_meshes
 from demorec.playback.paths import Paths
-from demorec.playback.poses import log_pose, send_poses
 from demorec.playback.robot import as_mesh3d
 from demorec.playback.style import GOAL
+from demorec.playback.times import log_pose, send_poses
 from demorec.scene.assets import asset_path
 from demorec.scene.scene import Body, Rgba, Shape, Texture
 from demorec.scene.textures import texture_pixels

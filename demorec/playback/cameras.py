@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from demorec.playback.episode import Depth, Distances, PlayedCollected, PlayedEpisode, Video, timed
 from demorec.playback.paths import Paths
-from demorec.playback.poses import log_pose, send_poses
 from demorec.playback.style import FRUSTUM, segment_colors
-from demorec.playback.times import indexes
+from demorec.playback.times import indexes, log_pose, send_poses
 
 _CODECS = {"h264": rr.VideoCodec.H264, "h265": rr.VideoCodec.H265, "av1": rr.VideoCodec.AV1}
 _PACKETS_AT_ONCE, _PICTURES_AT_ONCE = 256, 64

@@ -14,7 +14,7 @@ from demorec.geometry import Array, Pose, quat_multiply
 from demorec.playback.episode import PlayedCollected, PlayedEpisode
 from demorec.playback.meshes import SurfaceMesh, skeleton_meshes, urdf_meshes
 from demorec.playback.paths import Paths
-from demorec.playback.poses import log_pose, send_poses
+from demorec.playback.times import log_pose, send_poses
 from demorec.scene.assets import asset_path
 from demorec.scene.scene import Rgba
 from demorec.scene.urdf import Urdf, UrdfJoint

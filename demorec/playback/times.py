@@ -1,10 +1,12 @@
-"""The two time lines of every recording: seconds since the episode's start, and frame numbers."""
+"""The two time lines of every recording (seconds since the episode's start, frame numbers), and poses along them."""
 
 from __future__ import annotations
 
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
+
+from demorec.geometry import Array
 
 SECONDS = "time"
 FRAMES = "frame"
@@ -16,3 +18,14 @@ def indexes(time_ns: NDArray[np.int64], frame_times: NDArray[np.int64] | None) -
     if frame_times is None:
         return [seconds]
     return [seconds, rr.TimeColumn(FRAMES, sequence=np.searchsorted(frame_times, time_ns))]
+
+
+def log_pose(recording: rr.RecordingStream, entity: str, pose: Array) -> None:
+    """Of an entity that stays where it is."""
+    recording.log(entity, rr.Transform3D(translation=pose[:3], quaternion=pose[3:]), static=True)
+
+
+def send_poses(recording: rr.RecordingStream, entity: str, time_ns: NDArray[np.int64], poses: Array) -> None:
+    """Of an entity that moves, at every frame."""
+    columns = rr.Transform3D.columns(translation=poses[:, :3], quaternion=poses[:, 3:])
+    recording.send_columns(entity, indexes(time_ns, time_ns), columns)

@@ -10,8 +10,10 @@ from __future__ import annotations
 import io
 import os
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from pathlib import Path
 from typing import Literal, Protocol, cast
 
 import av
@@ -21,7 +23,6 @@ from PIL import Image, UnidentifiedImageError
 
 from demorec.config import VideoConfig
 from demorec.errors import ConfigError, RecordingError, in_words
-from demorec.recording.scheduling import ordinary_scheduling
 
 Rgb = NDArray[np.uint8]
 Codec = Literal["h264", "h265", "av1", "jpeg", "16UC1", "32FC1"]
@@ -35,6 +36,10 @@ _LIMITED_RANGE = 1
 _PRIMARIES_BT709 = 1
 _TRANSFER_SRGB = 13
 _MATRIX_BT601 = 6
+
+
+_PIXEL_FORMATS = {"jpeg": "yuvj420p", "16UC1": "gray16le", "32FC1": "grayf32le"}
+"""Codec -> FFmpeg's name of the pixel format, of codecs whose every picture stands by itself."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,10 +70,6 @@ class VideoSettings:
     preset: str
     options: dict[str, str]
     jpeg_quality: int | None = None
-
-
-_PIXEL_FORMATS = {"jpeg": "yuvj420p", "16UC1": "gray16le", "32FC1": "grayf32le"}
-"""Codec -> FFmpeg's name of the pixel format, of codecs whose every picture stands by itself."""
 
 
 def settings_of_coded(codec: Codec, width: int, height: int, fps: int) -> VideoSettings:
@@ -314,3 +315,33 @@ def _obu_types(data: bytes) -> Iterator[int]:
             if not byte & 128:
                 break
         position += size
+
+
+@contextmanager
+def ordinary_scheduling() -> Iterator[None]:
+    """Give the threads of this process back, at the end, how they were scheduled before; new ones are as the caller is.
+
+    SVT-AV1 gives its threads, and the one that starts it, the highest real-time priority when root runs it (as in most
+    containers): all that the process starts later inherits that, and whatever else runs on the machine stands still.
+    """
+    if not hasattr(os, "sched_setscheduler"):  # not Linux
+        yield
+        return
+    own = (os.sched_getscheduler(0), os.sched_getparam(0))
+    before = dict(_scheduling())
+    try:
+        yield
+    finally:
+        for thread, found in _scheduling():
+            wanted = before.get(thread, own)
+            if found[0] != wanted[0]:
+                with suppress(ProcessLookupError):
+                    os.sched_setscheduler(thread, *wanted)
+
+
+def _scheduling() -> Iterator[tuple[int, tuple[int, os.sched_param]]]:
+    """(thread, (policy, parameters)) of every thread of this process."""
+    for task in Path("/proc/self/task").iterdir():
+        with suppress(ProcessLookupError):  # it has ended meanwhile
+            thread = int(task.name)
+            yield thread, (os.sched_getscheduler(thread), os.sched_getparam(thread))

@@ -64,6 +64,18 @@ def test_a_default_is_told_only_where_it_is_a_value(
     assert "{None" not in text
 
 
+@pytest.mark.parametrize("program", PROGRAMS[1:])
+def test_every_flag_is_described(
+    program: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows = [line.strip("│ ") for line in help_of(program, 1000, capsys, monkeypatch) if line.startswith("│ ")]
+    flags = [number for number, row in enumerate(rows) if row.startswith("-")]
+    assert len(flags) > 1
+    for number in flags:
+        below = next(iter(rows[number + 1 :]), "-")
+        assert "  " in rows[number] or not below.startswith("-"), rows[number]
+
+
 def test_required_flags_say_so(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     lines = help_of("demorec export", 80, capsys, monkeypatch)
     assert any(line.startswith("│ --out PATH") and "(required)" in line for line in lines)

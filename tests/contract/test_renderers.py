@@ -20,7 +20,7 @@ from demorec.errors import RenderError
 from demorec.geometry import Pose, quat_from_rotation, rotation_from_quat
 from demorec.render import Renderer
 from demorec.scene.scene import Light
-from demorec.sim.renderers.tiny import TinyRenderer
+from demorec.sim.renderers.client_renderer import TinyRenderer
 from demorec.tables import RENDERERS
 
 

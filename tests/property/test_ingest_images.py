@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 from demorec.ingest.episodes import Window
 from demorec.ingest.fields import layout_of
 from demorec.ingest.findings import all_findings
+from demorec.ingest.import_run import row_findings
 from demorec.ingest.mapping import BagMapping, CameraSource, Clock, Robot, Source, TaskText
 from demorec.ingest.picture_messages import PictureHead, PictureHeads
-from demorec.ingest.row_findings import row_findings
 from demorec.ingest.rows import EpisodeRows, Timelines
 from demorec.ingest.streams import BagStreams, Stream
 

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from demorec.check.base import Result
 from demorec.check.cells import CellGrid, ImageKind
 from demorec.check.drawn import PictureComparison
-from demorec.check.episode import CheckedEpisode
-from demorec.check.pictures_summary import PictureSummary
+from demorec.check.episode import CheckedEpisode, PictureSummary
 from demorec.scene.episode import EpisodeColumns, EpisodeInfo, Outcome
 from demorec.scene.scene import Camera
 from demorec.tables import CHECKS

@@ -9,7 +9,7 @@ import pytest
 from support.collected import write_collected
 
 from demorec.cli import main
-from demorec.cli.check_deep import deep_summary
+from demorec.cli.check import deep_summary
 from demorec.replay.deep import DeepReport
 
 

@@ -15,7 +15,7 @@ from demorec.cli import COMMANDS, main
 from demorec.errors import ExportError, MissingDependencyError
 from demorec.evaluate.policy import Policy
 from demorec.lerobot import ExportOptions, export_lerobot
-from demorec.lerobot.hub import push_to_hub
+from demorec.lerobot.export import push_to_hub
 from demorec.lerobot.verify import LEROBOT
 from demorec.tables import CHECKS
 from demorec.training.command import train

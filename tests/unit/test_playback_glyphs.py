@@ -6,20 +6,22 @@ from pathlib import Path
 
 import pytest
 import rerun as rr
+from support.collected import make_collected, write_collected
 from support.recording import make_episode
 from support.viewer import need_vulkan
 
 from demorec.cli import run_command
 from demorec.cli.view import View
 from demorec.errors import DemorecError, RecordingError
-from demorec.playback.episode import PlayedEpisode
-from demorec.playback.glyphs import BOX, DRAWABLE, DrawableText
+from demorec.playback.episode import PlayedCollected, PlayedEpisode
+from demorec.playback.glyphs import DRAWABLE, drawable, drawable_source
 from demorec.playback.layout import episode_layout
 from demorec.playback.scene import log_episode, new_recording
 from demorec.playback.sources import find_episodes
 from demorec.playback.summary import summary
 from demorec.playback.viewer import HeadlessViewer, why_it_ended
 from demorec.recording import EpisodeWriter
+from demorec.scene.urdf import Urdf
 
 INSTRUCTION = "把红色方块放到绿色托盘里"
 
@@ -55,8 +57,8 @@ def foreign(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_all_text_of_a_layout_is_drawable(foreign: Path) -> None:
     (source,) = find_episodes([foreign])
-    text = DrawableText()
-    with text.source(source).open() as episode:
+    missing: set[str] = set()
+    with drawable_source(source, missing).open() as episode:
         assert isinstance(episode, PlayedEpisode)
         written = [
             summary(episode),
@@ -70,21 +72,40 @@ def test_all_text_of_a_layout_is_drawable(foreign: Path) -> None:
         recording = new_recording(episode)
         log_episode(recording, episode)  # bodies, goals, cameras and poses still belong together
         episode_layout(episode)
-        assert episode.info.instruction == BOX * len(INSTRUCTION)
+        assert episode.info.instruction == "".join(f"U+{ord(character):X}" for character in INSTRUCTION)
         assert set(episode.phase) == {"U+62ACU+8D77", "U+653EU+4E0B"}
         assert "U+65B9U+5757" in episode.object_poses
         assert [camera.name for camera in episode.info.scene.cameras] == list(episode.videos) == ["U+524D"]
     assert re.fullmatch(f"[{DRAWABLE}]*", "".join(written))
-    assert set(INSTRUCTION) <= text.missing
+    assert set(INSTRUCTION) <= missing
     with source.open() as episode:  # the source itself is as it was
         assert episode.info.instruction == INSTRUCTION
 
 
+def test_joints_of_a_robot_without_a_scene_still_belong_together(tmp_path: Path) -> None:
+    path = tmp_path / "episode_000000.mcap"
+    given = make_collected()
+    joint = next(iter(Urdf.parse(given.info.urdf).joints)).name
+    features = tuple(
+        replace(f, joints=tuple("关节" if j == joint else j for j in f.joints)) for f in given.info.features
+    )
+    info = replace(given.info, urdf=given.info.urdf.replace(f'"{joint}"', '"关节"'), features=features, robot="机器人")
+    write_collected(path, replace(given, info=info))
+    (source,) = find_episodes([path])
+    missing: set[str] = set()
+    with drawable_source(source, missing).open() as episode:
+        assert isinstance(episode, PlayedCollected)
+        assert missing == set("关节机器人")
+        assert "U+5173U+8282" in episode.joint_position
+        assert "U+5173U+8282" in {found.name for found in Urdf.parse(episode.info.urdf).joints}
+        log_episode(new_recording(episode), episode)
+
+
 def test_drawable_text_is_left_alone() -> None:
-    text = DrawableText()
+    missing: set[str] = set()
     for sentence in ("move the red cube", "Bewege den Würfel an das Ende · 3 °", "Передвинь куб", "e\u0301"):
-        assert text.sentence(sentence) in (sentence, "é")
-    assert text.missing == set()
+        assert drawable(sentence, missing) in (sentence, "é")
+    assert missing == set()
 
 
 @pytest.mark.slow

@@ -14,8 +14,7 @@ from support.recording import Codec, make_episode
 
 from demorec.config import VideoConfig
 from demorec.errors import RecordingError
-from demorec.recording.scheduling import ordinary_scheduling
-from demorec.recording.video import VideoPacket, decode, is_keyframe, make_encoder
+from demorec.recording.video import VideoPacket, decode, is_keyframe, make_encoder, ordinary_scheduling
 
 ENCODE = """
 import hashlib, sys

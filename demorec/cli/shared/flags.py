@@ -8,10 +8,8 @@ from __future__ import annotations
 
 import codecs
 import dataclasses
-import functools
 import inspect
 import io
-import re
 import shutil
 import sys
 import textwrap
@@ -19,29 +17,30 @@ from collections.abc import Sequence
 from contextlib import redirect_stdout
 from pathlib import Path
 from types import NoneType
-from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, get_args, get_origin
 
-import docstring_parser
 import tyro
 from tyro.constructors import (
     MISSING_NONPROP,
+    ConstructorRegistry,
     PrimitiveConstructorSpec,
     PrimitiveTypeInfo,
     StructConstructorSpec,
-    StructFieldSpec,
     StructTypeInfo,
 )
 
 from demorec.cli.shared.output import say, tell
 from demorec.safety.text import printable
 
-FLAG_TYPES = tyro.constructors.ConstructorRegistry()
+FLAG_TYPES = ConstructorRegistry()
 
 OTHERS = "others"
 """Field of a command that takes the words that are not its own, for another program."""
 
 _NARROWEST = 40
 """Columns; on a narrower terminal lines are broken there, as tyro breaks the table of flags."""
+_HINTED = object()
+"""Marks a type for which tyro's own rule is asked."""
 
 
 def terminal_width() -> int:
@@ -110,59 +109,29 @@ def _parse(command: type[Any], args: Sequence[str], *, prog: str, defaults: obje
 
 
 def laid_out(page: str, width: int) -> list[str]:
-    """tyro's help in lines that fit: the boxes do, usage and paragraphs are filled, indented lines (examples) stay."""
+    """tyro's help, which breaks its boxes alone, in lines that fit; indented ones (examples) stay."""
     lines: list[str] = []
     for line in page.splitlines():
-        if line.startswith("usage:"):
-            together = re.sub(r" (?!\[|--)", "\xa0", line)  # a flag and its value
-            parts = textwrap.wrap(together, width, subsequent_indent="       ", break_on_hyphens=False)
-            lines += [part.replace("\xa0", " ") for part in parts]
-        elif len(line) > width and not line.startswith(" "):
-            lines += textwrap.wrap(line, width, break_on_hyphens=False, break_long_words=False)
-        elif line.strip(" │|") or (not line and lines and lines[-1]):  # an empty hint may leave an empty row
-            lines.append(line.rstrip())
-    return lines
+        lines += [line] if line.startswith(" ") else textwrap.wrap(line, width, break_on_hyphens=False) or [""]
+    lines = [line.rstrip() for line in lines if line.strip(" │|") or not line]  # an empty hint may leave an empty row
+    return [line for line, before in zip(lines, ["", *lines], strict=False) if line or before]
 
 
 @FLAG_TYPES.struct_rule
-def _options(info: StructTypeInfo) -> StructConstructorSpec | None:
-    """A dataclass: its fields with the docstrings below them, and a hint at the default where that is a value."""
-    if not dataclasses.is_dataclass(info.type):
+def _with_hints(info: StructTypeInfo) -> StructConstructorSpec | None:
+    """A dataclass as tyro has it, with each text in one paragraph and a hint at the default where that is a value."""
+    if _HINTED in info.markers:
         return None
-    types = get_type_hints(info.type, include_extras=True)
-    texts = _field_texts(info.type)
+    spec = ConstructorRegistry.get_struct_spec(dataclasses.replace(info, markers=(*info.markers, _HINTED)))
+    if not isinstance(spec, StructConstructorSpec):
+        return None
     fields = []
-    for field in dataclasses.fields(info.type):
-        if field.name == OTHERS:
-            continue
-        default = _default(field, info.default)
-        kind = types[field.name]
-        hint = "(required)" if default is MISSING_NONPROP else "" if default in (None, "", ()) else None
-        if hint is not None:
-            kind = Annotated[kind, tyro.conf.arg(help_behavior_hint=hint)]
-        fields.append(StructFieldSpec(name=field.name, type=kind, default=default, helptext=texts[field.name]))
-    return StructConstructorSpec(instantiate=info.type, fields=tuple(fields))
-
-
-@functools.cache
-def _field_texts(kind: type) -> dict[str, str]:
-    """Field -> the docstring below it, in one line; also of the fields that come from a base class."""
-    texts = {}
-    for base in reversed([base for base in kind.__mro__ if dataclasses.is_dataclass(base)]):
-        for text in docstring_parser.parse_from_object(base).params:
-            texts[text.arg_name] = " ".join((text.description or "").split())
-    return texts
-
-
-def _default(field: dataclasses.Field[Any], instance: Any) -> Any:
-    """A field's value in the instance that gives the defaults, or its own default."""
-    if dataclasses.is_dataclass(instance):
-        return getattr(instance, field.name)
-    if field.default is not dataclasses.MISSING:
-        return field.default
-    if field.default_factory is not dataclasses.MISSING:
-        return field.default_factory()
-    return MISSING_NONPROP
+    for field in (field for field in spec.fields if field.name != OTHERS):
+        hint = "(required)" if field.default is MISSING_NONPROP else "" if field.default in (None, "", ()) else None
+        kind: Any = field.type if hint is None else Annotated[field.type, tyro.conf.arg(help_behavior_hint=hint)]
+        text = field.helptext() if callable(field.helptext) else field.helptext
+        fields.append(dataclasses.replace(field, type=kind, helptext=" ".join((text or "").split())))
+    return dataclasses.replace(spec, fields=tuple(fields))
 
 
 @FLAG_TYPES.primitive_rule
