@@ -201,8 +201,9 @@ def test_distances_are_those_of_the_dataset(tmp_path: Path) -> None:
             found += list(recording.distances(name))
     assert len(found) == sum(LENGTHS)
     for number, (metres, code) in enumerate(zip(found, codes, strict=True)):
-        expected = dequantize_depth(code, output_unit="m", output_tensor=False)
-        np.testing.assert_allclose(metres, np.squeeze(expected), atol=1e-5, err_msg=str(number))
+        expected = np.squeeze(dequantize_depth(code, output_unit="m", output_tensor=False))
+        expected = np.where(np.squeeze(code) == 0, 0, expected)  # nothing was measured, or noise was encoded badly
+        np.testing.assert_allclose(metres, expected, atol=1e-5, err_msg=str(number))
 
 
 def test_what_an_export_says_of_distances_comes_back(tmp_path: Path) -> None:

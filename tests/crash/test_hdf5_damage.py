@@ -81,7 +81,7 @@ def test_a_sound_file_is_walked_through_whole(file: Path, monkeypatch: pytest.Mo
     attributes: list[bytes] = []
     datasets: list[bytes] = []
     monkeypatch.setattr(trial, "_read_attribute", lambda found, attribute: attributes.append(attribute.name))
-    monkeypatch.setattr(trial, "_read_dataset", lambda found: datasets.append(h5py.h5i.get_name(found)))
+    monkeypatch.setattr(trial, "_read_dataset", lambda found, end: datasets.append(h5py.h5i.get_name(found)))
     trial.walk(file)
     names: list[str] = []
     attributes_of: list[int] = []
@@ -120,7 +120,7 @@ def test_an_object_that_cannot_be_read_hides_no_other(file: Path, monkeypatch: p
 
     monkeypatch.setattr(trial, "_names", spoilt)
     monkeypatch.setattr(trial, "_read_attribute", attribute)
-    monkeypatch.setattr(trial, "_read_dataset", lambda found: seen.append(h5py.h5i.get_name(found)))
+    monkeypatch.setattr(trial, "_read_dataset", lambda found, end: seen.append(h5py.h5i.get_name(found)))
     trial.walk(file)
     with h5py.File(file, "r") as opened:
         others = [name for name in opened["data"] if name != "demo_0"]
