@@ -29,6 +29,8 @@ _REACH_S = 1.0
 """How far apart in time an action and the state that follows it are looked for, seconds."""
 _LATEST_S = 0.35
 """How far behind its action a state may be, seconds: hobby servos under teleoperation need 0.1 to 0.2."""
+_FEW_FPS = 20
+"""Frames a second below which exploration noise moves a joint to and fro between two frames."""
 _HELD_S = 0.3
 """How long an action has not changed before its joint should be there, seconds."""
 _FEWEST = 30
@@ -270,12 +272,16 @@ def state_matches_velocity(motions: Motions) -> Found:
     known = np.flatnonzero(np.isfinite(sums[0]) & (sums[2] > 0))
     if not len(known):
         return None
-    product, square, total = sums[:, known]
+    names = [pairs[0].names[element] for element in known]
+    found = sums[:, known]
+    if pairs[0].fps < _FEW_FPS:  # two velocities say little of the way between: what joints do in truth shows in all
+        found, names = found.sum(axis=1, keepdims=True), ["all joints"]
+    product, square, total = found
     ratio, share = product / np.maximum(square, 1e-12), total / total.max()
-    # Of a joint that hardly moves, noise decides; at few frames a second two velocities say little of the way between.
-    off = np.abs(ratio - 1) * (share > 0.01) * min(1.0, pairs[0].fps / 20)
+    # Of a joint that hardly moves, noise decides.
+    off = np.abs(ratio - 1) * (share > 0.01) * min(1.0, pairs[0].fps / _FEW_FPS)
     worst = int(np.argmax(off))
-    return Measurement(value=float(off[worst]), detail=f"{pairs[0].names[known[worst]]}: ratio {ratio[worst]:.3f}")
+    return Measurement(value=float(off[worst]), detail=f"{names[worst]}: ratio {ratio[worst]:.3f}")
 
 
 @motion_check(
