@@ -26,11 +26,11 @@ from pathlib import Path
 from demorec.check.base import Result
 from demorec.check.limits import TABLE, LimitCalibration, LimitTable, read_table
 from demorec.check.report import CheckOptions, Subject, check_subject
-from demorec.config import EpisodePlan, GenerateConfig, VideoConfig
-from demorec.errors import SceneError
+from demorec.core.config import EpisodePlan, GenerateConfig, VideoConfig
+from demorec.core.errors import SceneError
+from demorec.core.tables import ROBOTS, TASKS
 from demorec.loop import ScriptAgent, Session, make_renderer, make_world, prepare
-from demorec.recording import EpisodeWriter
-from demorec.tables import ROBOTS, TASKS
+from demorec.mcap import EpisodeWriter
 
 SIZES = ((128, 128), (224, 224), (96, 96), (64, 64), (320, 240), (640, 480))
 RATES = (30, 30, 60, 10, 20)

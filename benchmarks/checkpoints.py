@@ -17,10 +17,10 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from demorec.config import GenerateConfig
-from demorec.evaluate.rollouts import Evaluation, evaluate, settings_for
-from demorec.evaluate.statistics import cells
-from demorec.processes import available_cores
+from demorec.core.config import GenerateConfig
+from demorec.core.processes import available_cores
+from demorec.learn.evaluate.rollouts import Evaluation, evaluate, settings_for
+from demorec.learn.evaluate.statistics import cells
 
 
 @dataclass(frozen=True, kw_only=True)

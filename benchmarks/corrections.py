@@ -29,11 +29,11 @@ import pyarrow.parquet as pq
 import torch
 from learning import ACTION, ENVIRONMENT, STATE, SWITCHED_OFF, Data, Variant, command, statistics, train
 
-from demorec.config import GenerateConfig
-from demorec.evaluate.improvement import corrected_episodes
-from demorec.evaluate.moments import TakeOver
-from demorec.evaluate.rollouts import Evaluation, evaluate, settings_for
-from demorec.evaluate.statistics import Rate, cells
+from demorec.core.config import GenerateConfig
+from demorec.learn.evaluate.improvement import corrected_episodes
+from demorec.learn.evaluate.moments import TakeOver
+from demorec.learn.evaluate.rollouts import Evaluation, evaluate, settings_for
+from demorec.learn.evaluate.statistics import Rate, cells
 
 INTERVENTION = "intervention"
 CORRECTION_SEED = 1

@@ -16,9 +16,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from demorec.check.report import CheckOptions, Subject, check_subject
-from demorec.config import EpisodePlan, GenerateConfig
+from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.loop import ScriptAgent, Session, Workshop, prepare
-from demorec.recording import EpisodeWriter
+from demorec.mcap import EpisodeWriter
 from demorec.replay.deep import deep_check
 
 

@@ -34,9 +34,9 @@ from mcap.records import Chunk
 from mcap.stream_reader import StreamReader
 from numpy.typing import NDArray
 
-from demorec.lerobot import ExportOptions, export_lerobot
-from demorec.recording import EpisodeWriter
-from demorec.scene.episode import EpisodeInfo, Frame, Outcome
+from demorec.datasets.lerobot import ExportOptions, export_lerobot
+from demorec.episode.episode import EpisodeInfo, Frame, Outcome
+from demorec.mcap import EpisodeWriter
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 
@@ -199,7 +199,7 @@ def growth(args: argparse.Namespace, work: Path) -> list[dict[str, float]]:
     program = (
         "import resource, sys, time\n"
         "from pathlib import Path\n"
-        "from demorec.lerobot import ExportOptions, export_lerobot\n"
+        "from demorec.datasets.lerobot import ExportOptions, export_lerobot\n"
         "files = sorted(Path(sys.argv[1]).glob('*.mcap'))[: int(sys.argv[2])]\n"
         "export_lerobot(files[:1], Path(sys.argv[3] + '.warm'), ExportOptions(verify=False))\n"
         "cpu = time.process_time()\n"

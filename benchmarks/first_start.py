@@ -24,7 +24,7 @@ STEPS = ("libraries loaded", "renderer compiled", "first frame")
 
 def tell_steps() -> None:
     """Make one frame and print the CPU seconds of this process after each step."""
-    from demorec.config import EpisodePlan, GenerateConfig
+    from demorec.core.config import EpisodePlan, GenerateConfig
     from demorec.loop import ScriptAgent, Session, make_world, prepare
     from demorec.render.raster import RasterRenderer
 

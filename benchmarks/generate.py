@@ -31,7 +31,7 @@ from typing import Any
 
 import psutil
 
-from demorec.config import EpisodePlan
+from demorec.core.config import EpisodePlan
 from demorec.runs.run_file import Attempt
 
 OURS = ("demorec 1 worker", "demorec 2 workers", "demorec ray 2")
@@ -177,7 +177,7 @@ def be_today(args: argparse.Namespace) -> None:
     import numpy as np
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    from demorec.config import GenerateConfig
+    from demorec.core.config import GenerateConfig
     from demorec.loop import ScriptAgent, Session, make_renderer, make_world, prepare
 
     config = GenerateConfig(
@@ -327,7 +327,7 @@ def make_nothing(plan: EpisodePlan, folder: Path) -> Attempt:
 
 def driver(args: argparse.Namespace) -> dict[str, Any]:
     """What an episode costs the driver, and what run.json costs it at several lengths of a run."""
-    from demorec.config import GenerateConfig
+    from demorec.core.config import GenerateConfig
     from demorec.generate.options import RunOptions
     from demorec.generate.run import generate
     from demorec.runs.run_file import load_run_file, save_run_file

@@ -27,17 +27,17 @@ import numpy as np
 
 from demorec.check.fingers import Convex, depth_in
 from demorec.check.rows import LinkMatrices, inverse, matrices
-from demorec.config import EpisodePlan, GenerateConfig
-from demorec.errors import SceneError
-from demorec.geometry import Array
+from demorec.core.config import EpisodePlan, GenerateConfig
+from demorec.core.errors import SceneError
+from demorec.core.geometry import Array
+from demorec.core.tables import ROBOTS, TASKS
+from demorec.episode.episode import Frame
+from demorec.episode.scene import Body
 from demorec.loop import ScriptAgent, Session, make_world, prepare
 from demorec.loop.prepare import Episode
-from demorec.scene.assets import asset_path, mesh_path
-from demorec.scene.episode import Frame
-from demorec.scene.scene import Body
-from demorec.scene.urdf import Urdf
-from demorec.scene.urdf_shapes import UrdfLink, read_links
-from demorec.tables import ROBOTS, TASKS
+from demorec.robots.assets import asset_path, mesh_path
+from demorec.robots.urdf import Urdf
+from demorec.robots.urdf_shapes import UrdfLink, read_links
 
 LIMIT = 0.001
 """Of depth and slip, metres."""

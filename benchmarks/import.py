@@ -108,11 +108,11 @@ def make_bag(path: Path, seconds: float, pictures: str, gop: int) -> Path:
 
 def ours(bags_: list[Path], out: Path, mapping: Path, *, exports: bool) -> None:
     """The bags to a run, and with `exports` on to a LeRobot dataset."""
-    from demorec.ingest.import_run import import_bags
+    from demorec.sources.import_run import import_bags
 
     import_bags(bags_, mapping, out / "run")
     if exports:
-        from demorec.lerobot import ExportOptions, export_lerobot
+        from demorec.datasets.lerobot import ExportOptions, export_lerobot
 
         export_lerobot([out / "run"], out / "dataset", ExportOptions(verify=False))
 
@@ -121,13 +121,13 @@ def lerobots(bag: Path, out: Path, mapping: Path) -> None:
     """The same rows through LeRobotDataset.add_frame and save_episode, with its defaults."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    from demorec.ingest.bag import open_bag
-    from demorec.ingest.episodes import windows
-    from demorec.ingest.fields import picture_bytes
-    from demorec.ingest.mapping import read_mapping
-    from demorec.ingest.picture_messages import decode_picture, decode_video
-    from demorec.ingest.rows import Timelines
-    from demorec.ingest.streams import BagDecoder, read_streams
+    from demorec.sources.bag import open_bag
+    from demorec.sources.episodes import windows
+    from demorec.sources.fields import picture_bytes
+    from demorec.sources.mapping import read_mapping
+    from demorec.sources.picture_messages import decode_picture, decode_video
+    from demorec.sources.rows import Timelines
+    from demorec.sources.streams import BagDecoder, read_streams
 
     known = read_mapping(mapping)
     opened = open_bag(bag)
@@ -164,11 +164,11 @@ def lerobots(bag: Path, out: Path, mapping: Path) -> None:
 
 def decoding_and_coding(bag: Path) -> None:
     """Every picture of the bag decoded and coded once as the export codes it, and nothing else."""
-    from demorec.config import VideoConfig
-    from demorec.ingest.bag import open_bag
-    from demorec.ingest.picture_messages import decode_picture
-    from demorec.ingest.streams import BagDecoder
-    from demorec.recording.video import make_encoder
+    from demorec.core.config import VideoConfig
+    from demorec.mcap.video import make_encoder
+    from demorec.sources.bag import open_bag
+    from demorec.sources.picture_messages import decode_picture
+    from demorec.sources.streams import BagDecoder
 
     decoder = BagDecoder(open_bag(bag).num_bytes)
     encoders = {topic: make_encoder(video=VideoConfig(), width=WIDTH, height=HEIGHT, fps=FPS) for topic in CAMERAS}
@@ -213,9 +213,6 @@ def _child(
     candidate: str, bags_: list[Path], out: Path, mapping: Path, answer: multiprocessing.queues.Queue[Cost]
 ) -> None:
     import pandas as pd  # noqa: F401, the export loads it when it first needs it
-
-    import demorec.ingest.import_run
-    import demorec.lerobot  # noqa: F401
 
     if candidate == "lerobot":
         import lerobot.datasets.lerobot_dataset  # noqa: F401

@@ -23,7 +23,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from demorec.lerobot import ExportOptions, export_lerobot
+from demorec.datasets.lerobot import ExportOptions, export_lerobot
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 
@@ -78,7 +78,7 @@ def items(run: Path, work: Path, rounds: int, *, pictures: bool) -> None:
     import torch
     from lerobot.datasets import LeRobotDataset
 
-    from demorec.training.dataset import FastDataset
+    from demorec.learn.training.dataset import FastDataset
 
     torch.set_num_threads(1)  # threads that wait for each other count as CPU time
     features = () if pictures else ("observation.state", "action")

@@ -156,7 +156,7 @@ def statistics(values: torch.Tensor) -> dict[str, torch.Tensor]:
 
 def plain_increments(dataset: Path) -> NDArray[np.float32]:
     """Increments of the clean targets alone, from the same recordings."""
-    from demorec.recording import Recording
+    from demorec.mcap import Recording
 
     rows = []
     count = json.loads((dataset / "meta" / "info.json").read_text())["total_episodes"]
@@ -236,9 +236,9 @@ def train(data: Data, variant: Variant, args: argparse.Namespace, *, seed: int, 
 
 def measure(name: str, args: argparse.Namespace) -> dict[str, Any]:
     """One row of the table."""
-    from demorec.config import GenerateConfig
-    from demorec.evaluate.rollouts import evaluate, settings_for
-    from demorec.evaluate.statistics import Rate
+    from demorec.core.config import GenerateConfig
+    from demorec.learn.evaluate.rollouts import evaluate, settings_for
+    from demorec.learn.evaluate.statistics import Rate
 
     variant = VARIANTS[name]
     dataset = make_dataset(variant, args)

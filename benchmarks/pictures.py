@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from demorec.config import EpisodePlan, GenerateConfig
+from demorec.core.config import EpisodePlan, GenerateConfig
+from demorec.core.tables import TASKS
 from demorec.loop import ScriptAgent, Session, make_renderer, make_world, prepare
-from demorec.tables import TASKS
 
 Picture = NDArray[np.uint8]
 WIDTH, HEIGHT = 320, 240

@@ -21,15 +21,15 @@ from pathlib import Path
 import numpy as np
 import rerun as rr
 
-from demorec.playback.episode import PlayedEpisode
-from demorec.playback.layout import episode_layout
-from demorec.playback.motion import log_curves, log_ee_path, log_events, log_phases
-from demorec.playback.paths import Paths
-from demorec.playback.programs import free_port, viewer_environment, viewer_program
-from demorec.playback.robot import joint_columns, log_robot, robot_model
-from demorec.playback.save import save
-from demorec.playback.scene import new_recording
-from demorec.playback.sources import find_episodes
+from demorec.view.episode import PlayedEpisode
+from demorec.view.layout import episode_layout
+from demorec.view.motion import log_curves, log_ee_path, log_events, log_phases
+from demorec.view.paths import Paths
+from demorec.view.programs import free_port, viewer_environment, viewer_program
+from demorec.view.robot import joint_columns, log_robot, robot_model
+from demorec.view.save import save
+from demorec.view.scene import new_recording
+from demorec.view.sources import find_episodes
 
 
 def as_columns(episode: PlayedEpisode, target: Path) -> None:
@@ -129,7 +129,7 @@ def measure_view(num_episodes: int) -> None:
             number = str(num_episodes)
             generating = _children_cpu([*generate, *flags, "--out", str(run), "--num-episodes", number], "")
             files = sorted(str(path) for path in run.glob("episodes/*.mcap"))
-            sender = [sys.executable, "-m", "demorec.playback.live", url]
+            sender = [sys.executable, "-m", "demorec.view.live", url]
             one = _children_cpu(sender, files[0] + "\n")
             sending = _children_cpu(sender, "".join(f"{file}\n" for file in files))
     finally:

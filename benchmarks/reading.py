@@ -47,7 +47,7 @@ def pictures_of(args: argparse.Namespace, size: int, episode: int) -> Pictures:
 
 
 def written_by_demorec(folder: Path, args: argparse.Namespace, size: int) -> Path:
-    from demorec.lerobot import ExportOptions, export_lerobot
+    from demorec.datasets.lerobot import ExportOptions, export_lerobot
 
     (folder / "run" / "episodes").mkdir(parents=True)
     for episode in range(args.episodes):
@@ -83,7 +83,7 @@ def without_pictures(folder: Path, args: argparse.Namespace) -> Path:
     """The numbers of demorec's default features, 13 columns, of as many episodes as a training has."""
     from support.recording import write_episode
 
-    from demorec.lerobot import ExportOptions, export_lerobot
+    from demorec.datasets.lerobot import ExportOptions, export_lerobot
 
     (folder / "run" / "episodes").mkdir(parents=True)
     for episode in range(10 * args.episodes):
@@ -120,7 +120,7 @@ def compare(name: str, root: Path, windows: dict[str, list[float]], workers: int
     import torch
     from lerobot.datasets import LeRobotDataset
 
-    from demorec.training import FastDataset
+    from demorec.learn.training import FastDataset
 
     arguments = {"root": root, "video_backend": args.backend, "return_uint8": True, "delta_timestamps": windows}
     datasets = {

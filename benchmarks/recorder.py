@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec import Recorder
-from demorec.config import VideoConfig
-from demorec.recording import CollectedRecording
+from demorec.core.config import VideoConfig
+from demorec.mcap import CollectedRecording
 
 HEIGHT, WIDTH = 480, 640
 NUM_PICTURES = 64

@@ -18,12 +18,12 @@ from pathlib import Path
 
 import numpy as np
 
-from demorec.config import EpisodePlan, GenerateConfig, VideoConfig
-from demorec.geometry import Array
+from demorec.core.config import EpisodePlan, GenerateConfig, VideoConfig
+from demorec.core.geometry import Array
+from demorec.episode.episode import CameraImages, EpisodeInfo, Frame, Outcome
 from demorec.loop import ScriptAgent, Session, make_renderer, make_world, prepare
-from demorec.recording import EpisodeWriter, video
+from demorec.mcap import EpisodeWriter, video
 from demorec.render import Renderer, RenderSetup
-from demorec.scene.episode import CameraImages, EpisodeInfo, Frame, Outcome
 
 WAYS = [VideoConfig(codec=codec, gop=gop) for codec in ("h264", "av1") for gop in (2, 10, 30)]
 
@@ -181,7 +181,7 @@ def main() -> None:
 
 def psnr(path: Path, frames: list[Frame]) -> float:
     """Of the decoded pictures, all cameras together."""
-    from demorec.recording import Recording
+    from demorec.mcap import Recording
 
     errors = []
     with Recording(path) as recording:

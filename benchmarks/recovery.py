@@ -15,13 +15,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from demorec.config import EpisodePlan, GenerateConfig
-from demorec.evaluate.statistics import Rate
-from demorec.geometry import Array, Pose
+from demorec.core.config import EpisodePlan, GenerateConfig
+from demorec.core.geometry import Array, Pose
+from demorec.core.tables import TASKS
+from demorec.episode.episode import Action
+from demorec.learn.evaluate.statistics import Rate
 from demorec.loop import Episode, ScriptAgent, Session, make_world, prepare
-from demorec.scene.episode import Action
 from demorec.sim.world import World
-from demorec.tables import TASKS
 from demorec.tasks.skills import Expert, GaveUp
 
 KINDS = ("script", "flailing", "moved")

@@ -21,15 +21,15 @@ from typing import Any
 
 import psutil
 
-from demorec.config import EpisodePlan, GenerateConfig
-from demorec.errors import RenderError
-from demorec.geometry import Array, Pose
+from demorec.core.config import EpisodePlan, GenerateConfig
+from demorec.core.errors import RenderError
+from demorec.core.geometry import Array, Pose
+from demorec.core.tables import RENDERERS
+from demorec.episode.scene import Camera
 from demorec.loop import Episode, ScriptAgent, Session, make_world, prepare
 from demorec.render import Renderer
 from demorec.render.painter import Painter
-from demorec.scene.scene import Camera
 from demorec.sim.world import World
-from demorec.tables import RENDERERS
 
 SIZES = ((96, 96), (224, 224), (640, 480))
 

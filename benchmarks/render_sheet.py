@@ -11,9 +11,9 @@ import numpy as np
 from PIL import Image
 from render import painter_for, plan, run_episode
 
-from demorec.errors import RenderError
+from demorec.core.errors import RenderError
+from demorec.core.tables import RENDERERS
 from demorec.loop import make_world
-from demorec.tables import RENDERERS
 
 SIZES = ((96, 96), (224, 224), (640, 480))
 TILE_HEIGHT = 240

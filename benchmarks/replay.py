@@ -18,9 +18,9 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from demorec.check.report import CheckOptions, Subject, check_subject
-from demorec.config import EpisodePlan, GenerateConfig
+from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.loop import ScriptAgent, Session, Workshop, prepare
-from demorec.recording import EpisodeWriter, Recording
+from demorec.mcap import EpisodeWriter, Recording
 from demorec.render.warm import WarmRenderer
 from demorec.replay import ReplayOptions, open_file, replay_all
 from demorec.replay.rerender import RerenderOptions, rerender

@@ -15,11 +15,11 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from demorec.config import EpisodePlan, GenerateConfig
-from demorec.errors import SceneError
+from demorec.core.config import EpisodePlan, GenerateConfig
+from demorec.core.errors import SceneError
+from demorec.core.tables import ROBOTS, TASKS
+from demorec.episode.episode import Outcome
 from demorec.loop import ScriptAgent, Session, make_world, prepare
-from demorec.scene.episode import Outcome
-from demorec.tables import ROBOTS, TASKS
 
 
 def measure(config: GenerateConfig, *, first: int, episodes: int) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from demorec.recorder import Recorder
+    from demorec.mcap.recorder import Recorder
 
 __all__ = ["Recorder"]
 
@@ -13,7 +13,7 @@ __all__ = ["Recorder"]
 def __getattr__(name: str) -> Any:
     """`from demorec import Recorder`, without loading the recorder for those who do not ask for it."""
     if name == "Recorder":
-        from demorec.recorder import Recorder
+        from demorec.mcap.recorder import Recorder
 
         return Recorder
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -19,21 +19,21 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from demorec.config import EpisodePlan, GenerateConfig
-from demorec.errors import ConfigError, SceneError
+from demorec.core.config import EpisodePlan, GenerateConfig
+from demorec.core.errors import ConfigError, SceneError
+from demorec.core.registry import check_choice
+from demorec.core.tables import CAMERAS, TASKS, environment_name
+from demorec.episode import features
+from demorec.episode.episode import POLICY_PHASE, Action, CameraImages, EpisodeInfo, Frame, Observation, SuccessCheck
+from demorec.episode.features import STATE_KINDS, ActionKind, StateKind
+from demorec.episode.scene import Scene
+from demorec.episode.sensed import ObservationRows
+from demorec.episode.variation import Preset
 from demorec.loop import Decision, Episode, Session, Workshop, prepare
 from demorec.loop.actions import ACTION_KINDS, ActionDecoder, action_bounds
-from demorec.registry import check_choice
 from demorec.render.painter import Painter
 from demorec.render.warm import WarmRenderer
-from demorec.scene import features
-from demorec.scene.episode import POLICY_PHASE, Action, CameraImages, EpisodeInfo, Frame, Observation, SuccessCheck
-from demorec.scene.features import STATE_KINDS, ActionKind, StateKind
-from demorec.scene.scene import Scene
-from demorec.scene.sensed import ObservationRows
-from demorec.scene.variation import Preset
 from demorec.sim.world import World
-from demorec.tables import CAMERAS, TASKS, environment_name
 
 SUCCESS_FRAMES = 5
 """For how many frames in a row every check of the task must hold."""
@@ -77,8 +77,8 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
     """One task: the robot acts until the task's strict conditions have held for 5 frames, or time is up.
 
     Observation (a dict): `agent_pos` (observation.state), `velocity`, `ee_pose`, with `privileged`
-    `environment_state`, with cameras `pixels` (camera name -> (H, W, 3) uint8): see `demorec.scene.features`.
-    Action: float32 of one of the kinds of `demorec.scene.features.action_vectors`; float64 is taken as it is. Targets
+    `environment_state`, with cameras `pixels` (camera name -> (H, W, 3) uint8): see `demorec.episode.features`.
+    Action: float32 of one of the kinds of `demorec.episode.features.action_vectors`; float64 is taken as it is. Targets
     are held within the joint limits in position and velocity; a pose out of reach keeps the last target.
     Reward: 1 at the step that completes a success, else 0, as `next.reward` of the datasets.
     `info["is_success"]` says that the conditions have held for so long (the datasets' `next.success` is how an episode

@@ -10,8 +10,8 @@ import numpy as np
 from demorec.check.base import Found, Measurement, alignment_check
 from demorec.check.episode import CheckedEpisode
 from demorec.check.rows import finest_lag
-from demorec.geometry import Array
-from demorec.scene.scene import POSITION_GAIN
+from demorec.core.geometry import Array
+from demorec.episode.scene import POSITION_GAIN
 
 MAX_LAG = 5
 

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.check.limits import limit_table
-from demorec.errors import DemorecError, MissingDependencyError, NotAllowedError, resource_error
-from demorec.geometry import Array
+from demorec.core.errors import DemorecError, MissingDependencyError, NotAllowedError, resource_error
+from demorec.core.geometry import Array
 
 Level = Literal["pass", "warn", "fail", "skip"]
 Scope = Literal["recording", "collected", "run", "collected_run", "dataset", "motion"]
@@ -72,7 +72,7 @@ class Check:
     """One check.
 
     Attributes:
-        name: Its row in `demorec.tables.CHECKS`.
+        name: Its row in `demorec.core.tables.CHECKS`.
         group: What it is about.
         scope: What it looks at: a recording of a simulated or of a collected episode, a run (its folder), a dataset, or
             the motions of any of them whose robot is not one of our simulation (`demorec.check.motion`).

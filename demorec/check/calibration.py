@@ -22,11 +22,11 @@ from demorec.check.cells import ImageKind
 from demorec.check.drawn import PictureComparison, judge_lag
 from demorec.check.episode import CheckedEpisode, of_each_camera
 from demorec.check.rows import displacement, matrices
-from demorec.errors import RecordingError
-from demorec.geometry import Array
-from demorec.recording import channels
-from demorec.scene.camera_error import told_error
-from demorec.scene.scene import Camera
+from demorec.core.errors import RecordingError
+from demorec.core.geometry import Array
+from demorec.episode.camera_error import told_error
+from demorec.episode.scene import Camera
+from demorec.mcap import channels
 
 UNRELATED = 16.0
 """Root mean square difference of all pictures from the drawn ones, of 255, from which on they show something else."""

@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.errors import RecordingError
+from demorec.core.errors import RecordingError
 
 Cells = NDArray[np.float32]
 """(T, h, w, channels), 0..255."""

@@ -16,13 +16,13 @@ import numpy as np
 
 from demorec.check.base import Found, Measurement, NotMeasured, check, collected_check, worst_frame
 from demorec.check.file import complete
-from demorec.recording import CollectedRecording
-from demorec.recording.collected.streams import SUBTASK
-from demorec.recording.container import Container
-from demorec.recording.video import decode
+from demorec.episode.collected import COLLECTED_VERSION, NO_PICTURE
+from demorec.mcap import CollectedRecording
+from demorec.mcap.container import Container
+from demorec.mcap.external.streams import SUBTASK
+from demorec.mcap.video import decode
 from demorec.runs.collected import load_collected_run
 from demorec.runs.run_file import EPISODES, sha256_of
-from demorec.scene.collected import COLLECTED_VERSION, NO_PICTURE
 
 NOT_APPLICABLE = "not applicable: the episode was collected, and this needs the scene of a simulated one"
 _NANOSECONDS = 1_000_000_000

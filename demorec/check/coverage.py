@@ -10,11 +10,11 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from demorec.check.base import Found, Measurement, worst
-from demorec.errors import ConfigError
-from demorec.geometry import Array
-from demorec.safety.replacing import PICTURE, written_whole
-from demorec.scene.episode import EpisodeInfo
-from demorec.scene.scene import Scene, yaw_of
+from demorec.core.errors import ConfigError
+from demorec.core.geometry import Array
+from demorec.core.replacing import PICTURE, written_whole
+from demorec.episode.episode import EpisodeInfo
+from demorec.episode.scene import Scene, yaw_of
 
 MIN_EPISODES = 50
 """With fewer, gaps are chance: the largest of 80 good runs of 50 is 0.26 of a range, of runs of 30 it is 0.38."""

@@ -17,18 +17,17 @@ from demorec.check.cells import Cells
 from demorec.check.dataset_video import EpisodePictures, episode_pictures
 from demorec.check.drawn import NOT_DRAWABLE, PictureComparison, compare, draw, frames_to_draw
 from demorec.check.episode_drawn import drawable_scene
-from demorec.errors import ConfigError, ExportError, in_words
-from demorec.geometry import Array
-from demorec.lerobot.files import open_table, read_table
-from demorec.lerobot.language import COLUMNS, SpokenEpisode, spoken_episodes
-from demorec.lerobot.layout import AUTOMATIC_FEATURES, DatasetInfo
-from demorec.lerobot.paths import SIDECAR_DIR
-from demorec.lerobot.reader import EpisodePlace, RowReader, episode_places, read_tasks
-from demorec.lerobot.robots import DatasetRobot, read_robot
-from demorec.lerobot.sidecar import EPISODE_SCHEMA
-from demorec.render.recorded import RecordedWorld
-from demorec.scene.episode import EpisodeInfo
-from demorec.scene.features import (
+from demorec.core.errors import ConfigError, ExportError, in_words
+from demorec.core.geometry import Array
+from demorec.datasets.lerobot.files import open_table, read_table
+from demorec.datasets.lerobot.language import COLUMNS, SpokenEpisode, spoken_episodes
+from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetInfo
+from demorec.datasets.lerobot.paths import SIDECAR_DIR
+from demorec.datasets.lerobot.reader import EpisodePlace, RowReader, episode_places, read_tasks
+from demorec.datasets.lerobot.robots import DatasetRobot, read_robot
+from demorec.datasets.lerobot.sidecar import EPISODE_SCHEMA
+from demorec.episode.episode import EpisodeInfo
+from demorec.episode.features import (
     ACTION,
     IMAGE_PREFIX,
     STATE,
@@ -38,7 +37,8 @@ from demorec.scene.features import (
     action_names,
     state_names,
 )
-from demorec.scene.validity import read_episode_info
+from demorec.episode.validity import read_episode_info
+from demorec.render.recorded import RecordedWorld
 
 Rows = Mapping[str, NDArray[Any]]
 

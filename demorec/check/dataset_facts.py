@@ -8,11 +8,11 @@ import numpy as np
 
 from demorec.check.base import Measurement, dataset_check
 from demorec.check.dataset import Dataset
-from demorec.errors import ExportError, without_path
-from demorec.lerobot.facts import facts_of
-from demorec.lerobot.files import open_table, read_table
-from demorec.lerobot.progress import PROGRESS_PATH, STAGE_COLUMNS, progress_table, read_progress
-from demorec.lerobot.robots import read_robot
+from demorec.core.errors import ExportError, without_path
+from demorec.datasets.lerobot.facts import facts_of
+from demorec.datasets.lerobot.files import open_table, read_table
+from demorec.datasets.lerobot.progress import PROGRESS_PATH, STAGE_COLUMNS, progress_table, read_progress
+from demorec.datasets.lerobot.robots import read_robot
 
 
 @dataset_check(

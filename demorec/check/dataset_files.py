@@ -15,10 +15,10 @@ import numpy as np
 
 from demorec.check.base import Measurement, dataset_check
 from demorec.check.dataset import Dataset
-from demorec.errors import ExportError, MissingDependencyError, ResourceError
-from demorec.lerobot.inspect import dataset_problems, episode_digests
-from demorec.lerobot.reader import PacketReader
-from demorec.lerobot.verify import LEROBOT, lerobot_is_installed
+from demorec.core.errors import ExportError, MissingDependencyError, ResourceError
+from demorec.datasets.lerobot.inspect import dataset_problems, episode_digests
+from demorec.datasets.lerobot.reader import PacketReader
+from demorec.datasets.lerobot.verify import LEROBOT, lerobot_is_installed
 
 
 @dataset_check(

@@ -15,15 +15,15 @@ from typing import Any
 
 import numpy as np
 
+from demorec.annotate.kinds import STATES
+from demorec.annotate.questions import ANSWERS
+from demorec.annotate.referring import references
+from demorec.annotate.situation import COLOR_WORDS, Surroundings, place_of, situation
 from demorec.check.base import Found, Measurement, NotMeasured, dataset_check
 from demorec.check.dataset import Dataset
-from demorec.language.kinds import STATES
-from demorec.language.questions import ANSWERS
-from demorec.language.referring import references
-from demorec.language.situation import COLOR_WORDS, Surroundings, place_of, situation
-from demorec.lerobot.boxes import BOXES_DIR, read_boxes
-from demorec.lerobot.language import COLUMNS, SpokenEpisode
-from demorec.scene.episode import CORRECTED_PHASE, MISTAKEN_PHASE, EpisodeInfo
+from demorec.datasets.lerobot.boxes import BOXES_DIR, read_boxes
+from demorec.datasets.lerobot.language import COLUMNS, SpokenEpisode
+from demorec.episode.episode import CORRECTED_PHASE, MISTAKEN_PHASE, EpisodeInfo
 
 Row = dict[str, Any]
 _ABOUT_PICTURES = ("vqa", "trace")

@@ -13,11 +13,11 @@ from demorec.check.coverage import twins, worst_gap
 from demorec.check.dataset import Dataset, Rows
 from demorec.check.rows import LinkMatrices, displacement, matrices
 from demorec.check.run import motion_vector
-from demorec.geometry import Array
-from demorec.scene.assets import asset_path
-from demorec.scene.episode import EpisodeInfo
-from demorec.scene.features import ACTION, EE_POSE, STATE
-from demorec.scene.urdf import Urdf
+from demorec.core.geometry import Array
+from demorec.episode.episode import EpisodeInfo
+from demorec.episode.features import ACTION, EE_POSE, STATE
+from demorec.robots.assets import asset_path
+from demorec.robots.urdf import Urdf
 
 
 @dataset_check(

@@ -14,8 +14,8 @@ from demorec.check.dataset import Dataset
 from demorec.check.dataset_statistics import episode_column, numbers_of, read_statistics
 from demorec.check.drawn import judge_lag, judge_unlike
 from demorec.check.rows import longest_run
-from demorec.geometry import Array
-from demorec.scene.features import STATE
+from demorec.core.geometry import Array
+from demorec.episode.features import STATE
 
 
 @dataset_check(

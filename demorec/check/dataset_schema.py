@@ -11,13 +11,13 @@ import pyarrow as pa
 
 from demorec.check.base import Measurement, dataset_check
 from demorec.check.dataset import Dataset
-from demorec.errors import ExportError, in_words
-from demorec.lerobot.files import check_video, open_table, read_json
-from demorec.lerobot.layout import AUTOMATIC_FEATURES, VIDEO_PATH, Feature
-from demorec.lerobot.paths import INFO_PATH
-from demorec.scene.episode import EpisodeInfo
-from demorec.scene.features import ACTION, ENVIRONMENT_STATE, IMAGE_PREFIX, STATE, observation_names
-from demorec.tables import ROBOTS
+from demorec.core.errors import ExportError, in_words
+from demorec.core.tables import ROBOTS
+from demorec.datasets.lerobot.files import check_video, open_table, read_json
+from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, VIDEO_PATH, Feature
+from demorec.datasets.lerobot.paths import INFO_PATH
+from demorec.episode.episode import EpisodeInfo
+from demorec.episode.features import ACTION, ENVIRONMENT_STATE, IMAGE_PREFIX, STATE, observation_names
 
 _TYPES = {
     "float32": pa.float32(), "float64": pa.float64(), "int64": pa.int64(), "bool": pa.bool_(), "string": pa.string(),

@@ -11,11 +11,11 @@ import numpy as np
 
 from demorec.check.base import Found, Measurement, dataset_check, worst
 from demorec.check.dataset import Dataset, read_rows
-from demorec.errors import ExportError, in_words
-from demorec.geometry import Array
-from demorec.lerobot.files import read_json
-from demorec.lerobot.layout import STATS_PATH
-from demorec.lerobot.stats import NAMES, QUANTILES
+from demorec.core.errors import ExportError, in_words
+from demorec.core.geometry import Array
+from demorec.datasets.lerobot.files import read_json
+from demorec.datasets.lerobot.layout import STATS_PATH
+from demorec.datasets.lerobot.stats import NAMES, QUANTILES
 
 _NUMBERING = ("index", "episode_index", "task_index")
 _SMALLEST_DEVIATION = 1e-4

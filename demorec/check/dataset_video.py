@@ -11,11 +11,11 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.errors import ExportError, in_words
-from demorec.geometry import Array
-from demorec.lerobot.files import check_video
-from demorec.lerobot.layout import VIDEO_PATH, DatasetInfo
-from demorec.lerobot.reader import EpisodePlace
+from demorec.core.errors import ExportError, in_words
+from demorec.core.geometry import Array
+from demorec.datasets.lerobot.files import check_video
+from demorec.datasets.lerobot.layout import VIDEO_PATH, DatasetInfo
+from demorec.datasets.lerobot.reader import EpisodePlace
 
 _FLAT_LEVELS = 1.0
 """Standard deviation over a picture, of 255: less is a black, green or otherwise empty one."""

@@ -9,15 +9,15 @@ from typing import Any
 
 import numpy as np
 
+from demorec.annotate.situation import COLOR_WORDS
 from demorec.check.base import Found, Measurement, NotMeasured, alignment_check, outcome_check
 from demorec.check.episode import CheckedEpisode
-from demorec.errors import ConfigError
-from demorec.language.situation import COLOR_WORDS
-from demorec.plain import digest, from_plain
-from demorec.scene.episode import POLICY_PHASE
-from demorec.scene.scene import Scene
-from demorec.scene.variation import Ranges, resolve
-from demorec.tables import ROBOTS, camera_name, load_robot
+from demorec.core.errors import ConfigError
+from demorec.core.plain import digest, from_plain
+from demorec.core.tables import ROBOTS, camera_name, load_robot
+from demorec.episode.episode import POLICY_PHASE
+from demorec.episode.scene import Scene
+from demorec.episode.variation import Ranges, resolve
 
 _MARGIN = 1e-9
 """By how much a drawn number may be beyond its range: it was turned and scaled."""

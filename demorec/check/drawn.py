@@ -22,12 +22,12 @@ from numpy.typing import NDArray
 from demorec.check.base import Found, Measurement, NotMeasured
 from demorec.check.cells import CellGrid, Cells, ImageKind, cell_side
 from demorec.check.rows import finest_lag
-from demorec.errors import RenderError, SceneError
-from demorec.geometry import Array
+from demorec.core.errors import RenderError, SceneError
+from demorec.core.geometry import Array
+from demorec.episode.scene import Camera
 from demorec.render import Renderer
 from demorec.render.painter import Painter
 from demorec.render.recorded import RecordedWorld
-from demorec.scene.scene import Camera
 
 PIXELS_PER_CELL = 3
 """Pixels that are drawn along the side of a cell, at most. With 2 a check costs a tenth less, and pictures that are as

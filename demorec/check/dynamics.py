@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from demorec.check.base import Found, Measurement, NotMeasured, physics_check, worst
 from demorec.check.episode import CheckedEpisode
 from demorec.check.rows import longest_run
-from demorec.errors import SceneError, as_reason
-from demorec.geometry import Array
-from demorec.scene.assets import asset_path
-from demorec.scene.inertials import link_masses
+from demorec.core.errors import SceneError, as_reason
+from demorec.core.geometry import Array
+from demorec.robots.assets import asset_path
+from demorec.robots.inertials import link_masses
 
 MIN_LOAD = 3.0
 """N m: joints that bear less, root mean square, say nothing about efforts."""

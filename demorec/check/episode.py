@@ -18,14 +18,14 @@ from demorec.check.cells import CellGrid, Cells, ImageKind, PictureCells
 from demorec.check.drawn import NOT_DRAWABLE, PictureComparison, compare, strays
 from demorec.check.episode_drawn import DrawnEpisode, draw_episode
 from demorec.check.rows import LinkMatrices, matrices
-from demorec.errors import RecordingError
-from demorec.geometry import Array
-from demorec.recording import Recording, channels
-from demorec.recording.chunks import Block
-from demorec.recording.container import Container
-from demorec.scene.episode import EpisodeColumns, EpisodeInfo, Event, Outcome, frame_time_ns
-from demorec.scene.scene import Camera
-from demorec.scene.urdf import Urdf
+from demorec.core.errors import RecordingError
+from demorec.core.geometry import Array
+from demorec.episode.episode import EpisodeColumns, EpisodeInfo, Event, Outcome, frame_time_ns
+from demorec.episode.scene import Camera
+from demorec.mcap import Recording, channels
+from demorec.mcap.chunks import Block
+from demorec.mcap.container import Container
+from demorec.robots.urdf import Urdf
 
 _STAMP_FIRST = {
     "sensor_msgs/msg/JointState",

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from demorec.check.cells import Cells, ImageKind, cell_counts, cell_side
 from demorec.check.drawn import DrawnPictures, draw, fit, frames_to_draw
-from demorec.geometry import Array, Pose
+from demorec.core.geometry import Array, Pose
+from demorec.episode.camera_error import told_error, true_camera
+from demorec.episode.episode import EpisodeColumns, EpisodeInfo
+from demorec.episode.scene import Camera, Scene
 from demorec.render.recorded import RecordedWorld
-from demorec.scene.camera_error import told_error, true_camera
-from demorec.scene.episode import EpisodeColumns, EpisodeInfo
-from demorec.scene.scene import Camera, Scene
 
 _NUM_FITTED = 9
 """Frames that are drawn to find how far a camera is turned."""

@@ -6,9 +6,9 @@ from collections.abc import Iterator
 
 from demorec.check.base import Measurement, file_check
 from demorec.check.episode import CheckedEpisode
-from demorec.recording import CollectedRecording, channels, messages
-from demorec.recording.streams import frame_streams
-from demorec.scene.episode import FORMAT_VERSION
+from demorec.episode.episode import FORMAT_VERSION
+from demorec.mcap import CollectedRecording, channels, messages
+from demorec.mcap.streams import frame_streams
 
 
 @file_check(

@@ -10,9 +10,9 @@ import numpy as np
 
 from demorec.check.base import Found, Measurement, physics_check
 from demorec.check.episode import CheckedEpisode
-from demorec.geometry import Array
-from demorec.scene.scene import Shape
-from demorec.scene.urdf_shapes import UrdfShape, read_links
+from demorec.core.geometry import Array
+from demorec.episode.scene import Shape
+from demorec.robots.urdf_shapes import UrdfShape, read_links
 
 NEAR = 0.002
 """Gap between a finger and an object, metres, from which on there is something to measure."""

@@ -9,7 +9,7 @@ import numpy as np
 from demorec.check.base import Found, Measurement, NotMeasured, alignment_check, physics_check, worst_entry, worst_frame
 from demorec.check.episode import CheckedEpisode
 from demorec.check.objects import SOLID
-from demorec.scene.scene import Body
+from demorec.episode.scene import Body
 
 SETTLE_SECONDS = 0.6
 """After a new command the fingers need so long to arrive; they close at 0.2 m/s from an opening of 0.1 m."""

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from demorec.check.base import Found, Measurement, check
 
 if TYPE_CHECKING:
-    from demorec.ingest.import_file import ImportFile
+    from demorec.sources.import_file import ImportFile
 
 _TIMES = frozenset(
     ("clock_offset", "clock_jump", "clock_drift", "unstamped", "drops", "gap", "slow", "fps", "jitter", "order")
@@ -66,7 +66,7 @@ def import_dropped(folder: Path) -> Found:
 
 
 def _import(folder: Path) -> ImportFile | None:
-    from demorec.ingest.import_file import load_import_file
+    from demorec.sources.import_file import load_import_file
 
     return load_import_file(folder)
 

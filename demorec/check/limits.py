@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-from demorec.plain import from_plain
+from demorec.core.plain import from_plain
 
 TABLE = Path(__file__).with_name("limits.toml")
 

@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from demorec.check.base import Found, Measurement, NotMeasured, check, worst_entry
 from demorec.check.dataset import Dataset
 from demorec.check.rows import finest_lag
-from demorec.geometry import Array
-from demorec.lerobot.robots import ELEMENT_SUFFIX, recognised_robot
-from demorec.recording import CollectedRecording
-from demorec.scene.features import ACTION, STATE, VELOCITY
-from demorec.scene.urdf import Urdf
+from demorec.core.geometry import Array
+from demorec.datasets.lerobot.robots import ELEMENT_SUFFIX, recognised_robot
+from demorec.episode.features import ACTION, STATE, VELOCITY
+from demorec.mcap import CollectedRecording
+from demorec.robots.urdf import Urdf
 
 GRIPPER = "gripper.width"
 """The element that is the opening of a simulated gripper, metres."""

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from demorec.check.base import Found, Measurement, physics_check, worst_entry, worst_frame
 from demorec.check.episode import CheckedEpisode
 from demorec.check.rows import displacement, inverse, matrices
-from demorec.geometry import Array
-from demorec.scene.scene import Body, Shape
+from demorec.core.geometry import Array
+from demorec.episode.scene import Body, Shape
 
 COAST_SECONDS = 0.7
 """How long a thing may go on moving by itself after it was last touched."""

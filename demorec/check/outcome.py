@@ -10,8 +10,8 @@ import numpy as np
 from demorec.check.base import Found, Measurement, outcome_check
 from demorec.check.episode import CheckedEpisode
 from demorec.check.rows import matrices
-from demorec.scene.episode import SuccessCheck
-from demorec.tables import TASKS
+from demorec.core.tables import TASKS
+from demorec.episode.episode import SuccessCheck
 
 AT_LEAST = ("on_support", "on_table", "gripper_width")
 """Conditions of demorec's own tasks that hold from their limit up; all others hold up to it."""

@@ -21,8 +21,8 @@ from demorec.check.base import (
 from demorec.check.drawn import PictureComparison, judge_unlike
 from demorec.check.episode import CheckedEpisode, of_each_camera
 from demorec.check.rows import longest_run
-from demorec.geometry import Array
-from demorec.scene.scene import Camera
+from demorec.core.geometry import Array
+from demorec.episode.scene import Camera
 
 MIN_MOTION = 2.5
 """Root mean square change of the drawn cells from frame to frame, of 255, that a picture must show."""

@@ -12,20 +12,20 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
-from demorec.geometry import Pose
-from demorec.lerobot.language import COLUMNS
-from demorec.lerobot.layout import AUTOMATIC_FEATURES
-from demorec.lerobot.progress import PROGRESS_PATH
-from demorec.recording import channels
-from demorec.recording.collected.streams import SUBTASK
-from demorec.recording.metadata import COLLECTED, EPISODE, OUTCOME, RECOVERED, CameraStreams
-from demorec.recording.streams import frame_streams
-from demorec.recording.transforms import FrameTree
+from demorec.core.geometry import Pose
+from demorec.core.tables import CHECKS, load_robot
+from demorec.datasets.lerobot.language import COLUMNS
+from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES
+from demorec.datasets.lerobot.progress import PROGRESS_PATH
+from demorec.episode import features
+from demorec.episode.episode import EpisodeInfo, Outcome
+from demorec.episode.scene import Body, Camera, RobotPlacement, Scene, Shape
+from demorec.mcap import channels
+from demorec.mcap.external.streams import SUBTASK
+from demorec.mcap.metadata import COLLECTED, EPISODE, OUTCOME, RECOVERED, CameraStreams
+from demorec.mcap.streams import frame_streams
+from demorec.mcap.transforms import FrameTree
 from demorec.runs.run_file import IMPORT_NAME, RunFile
-from demorec.scene import features
-from demorec.scene.episode import EpisodeInfo, Outcome
-from demorec.scene.scene import Body, Camera, RobotPlacement, Scene, Shape
-from demorec.tables import CHECKS, load_robot
 
 SourceKind = Literal["topic", "field", "column"]
 

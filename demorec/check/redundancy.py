@@ -14,15 +14,15 @@ import numpy as np
 from demorec.check.base import PICTURE_TOPICS, Found, Measurement, NotMeasured, alignment_check, file_check, worst_frame
 from demorec.check.episode import CheckedEpisode
 from demorec.check.rows import displacement, matrices
-from demorec.errors import SceneError
-from demorec.recording import channels, messages, metadata
-from demorec.recording.container import damage_as_recording_error
-from demorec.recording.depth import FORMAT as DEPTH_FORMAT
-from demorec.recording.labels import FORMAT as LABELS_FORMAT
-from demorec.recording.streams import frame_streams, transforms_layout
-from demorec.recording.transforms import WORLD, FrameTree, camera_frame
-from demorec.scene.episode import Event
-from demorec.scene.scene import Camera
+from demorec.core.errors import SceneError
+from demorec.episode.episode import Event
+from demorec.episode.scene import Camera
+from demorec.mcap import channels, messages, metadata
+from demorec.mcap.container import damage_as_recording_error
+from demorec.mcap.depth import FORMAT as DEPTH_FORMAT
+from demorec.mcap.labels import FORMAT as LABELS_FORMAT
+from demorec.mcap.streams import frame_streams, transforms_layout
+from demorec.mcap.transforms import WORLD, FrameTree, camera_frame
 
 
 @file_check(

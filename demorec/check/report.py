@@ -13,17 +13,17 @@ from demorec.check.dataset import Dataset
 from demorec.check.episode import CheckedEpisode
 from demorec.check.motion import Motions
 from demorec.check.run import CheckedRun
-from demorec.errors import check_option, resource_error
-from demorec.processes import SPAWN
-from demorec.recording import CollectedRecording
-from demorec.recording.opening import is_collected
+from demorec.core.errors import check_option, resource_error
+from demorec.core.processes import SPAWN
+from demorec.core.tables import CHECKS
+from demorec.core.user_modules import is_allowed
+from demorec.episode.episode import EpisodeInfo
+from demorec.mcap import CollectedRecording
+from demorec.mcap.opening import is_collected
+from demorec.robots.assets import allow_models, modules_of_models
 from demorec.runs.collected import is_collected_run
 from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings, find
 from demorec.runs.run_file import DATASET
-from demorec.safety.user_modules import is_allowed
-from demorec.scene.assets import allow_models, modules_of_models
-from demorec.scene.episode import EpisodeInfo
-from demorec.tables import CHECKS
 
 _OF_THE_FILE: tuple[Group, ...] = ("file", "time")
 """Groups of the checks that look at the file itself, not at what was recorded."""

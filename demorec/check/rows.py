@@ -1,6 +1,6 @@
 """Rigid transforms over all frames at once: forward kinematics, distances and angles of (T, ...) arrays.
 
-Written apart from `demorec.scene.kinematics` on purpose: that code made the recorded poses, this one judges them.
+Written apart from `demorec.robots.kinematics` on purpose: that code made the recorded poses, this one judges them.
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.geometry import Array
-from demorec.scene.urdf import Urdf, UrdfJoint
+from demorec.core.geometry import Array
+from demorec.robots.urdf import Urdf, UrdfJoint
 
 
 def matrices(poses: Array) -> Array:

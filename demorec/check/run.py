@@ -13,14 +13,14 @@ import numpy as np
 
 from demorec.check.base import Found, Measurement, NotMeasured, run_check, worst
 from demorec.check.coverage import start_vector, twins, worst_gap
-from demorec.errors import ConfigError, RecordingError, in_words, resource_error
-from demorec.geometry import Array
-from demorec.lerobot.files import read_json
-from demorec.lerobot.paths import INFO_PATH
-from demorec.recording import Recording
+from demorec.core.errors import ConfigError, RecordingError, in_words, resource_error
+from demorec.core.files import open_regular, read_json_limited
+from demorec.core.geometry import Array
+from demorec.datasets.lerobot.files import read_json
+from demorec.datasets.lerobot.paths import INFO_PATH
+from demorec.episode.episode import EpisodeInfo, Outcome
+from demorec.mcap import Recording
 from demorec.runs.run_file import EPISODES, FAILED, RUN_NAME
-from demorec.safety.files import open_regular, read_json_limited
-from demorec.scene.episode import EpisodeInfo, Outcome
 
 _MAX_JSON_BYTES = 2 << 30
 _LINE = {"episode_index": int, "attempt": int, "seed": int, "success": bool, "file": str, "sha256": str}

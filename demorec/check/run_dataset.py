@@ -14,15 +14,15 @@ import numpy as np
 from demorec.check.base import Measurement, run_check
 from demorec.check.dataset import Dataset, Rows, read_rows
 from demorec.check.run import CheckedRun
-from demorec.errors import ConfigError, DemorecError, RecordingError, in_words, resource_error
-from demorec.export.exported import exported
-from demorec.lerobot.files import read_json
-from demorec.lerobot.options import ExportOptions
-from demorec.lerobot.paths import SIDECAR_DIR, is_dataset
-from demorec.lerobot.prepare import prepare_episode, reasons_to_transcode
-from demorec.lerobot.reader import PacketReader
-from demorec.lerobot.sidecar import EPISODE_SCHEMA, EXPORT_PATH
-from demorec.recording import Recording
+from demorec.core.errors import ConfigError, DemorecError, RecordingError, in_words, resource_error
+from demorec.datasets.exported import exported
+from demorec.datasets.lerobot.files import read_json
+from demorec.datasets.lerobot.options import ExportOptions
+from demorec.datasets.lerobot.paths import SIDECAR_DIR, is_dataset
+from demorec.datasets.lerobot.prepare import prepare_episode, reasons_to_transcode
+from demorec.datasets.lerobot.reader import PacketReader
+from demorec.datasets.lerobot.sidecar import EPISODE_SCHEMA, EXPORT_PATH
+from demorec.mcap import Recording
 
 _OF_THE_PLACE = ("episode_index", "source", "content_digest")
 """What the sidecar keeps that is not of the recording."""

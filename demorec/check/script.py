@@ -14,8 +14,8 @@ import numpy as np
 
 from demorec.check.base import Found, Measurement, NotMeasured, alignment_check, outcome_check
 from demorec.check.episode import CheckedEpisode
-from demorec.scene.episode import CORRECTED_PHASE, INTERJECTION_EVENT, MISTAKEN_PHASE, POLICY_PHASE
-from demorec.tables import TASKS
+from demorec.core.tables import TASKS
+from demorec.episode.episode import CORRECTED_PHASE, INTERJECTION_EVENT, MISTAKEN_PHASE, POLICY_PHASE
 
 OPEN_PHASES = {
     MISTAKEN_PHASE,

@@ -8,8 +8,8 @@ import numpy as np
 
 from demorec.check.base import COLOR_TOPICS, Found, Measurement, time_check, worst_frame
 from demorec.check.episode import CheckedEpisode
-from demorec.recording import channels
-from demorec.recording.streams import frame_streams
+from demorec.mcap import channels
+from demorec.mcap.streams import frame_streams
 
 
 @time_check(

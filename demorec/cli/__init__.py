@@ -18,8 +18,8 @@ from typing import Protocol
 
 from demorec.cli.shared.flags import parse, terminal_width
 from demorec.cli.shared.output import PrintableFormatter, say, tell
-from demorec.errors import DemorecError, OptionError, resource_error
-from demorec.registry import Registry, nearest_match
+from demorec.core.errors import DemorecError, OptionError, resource_error
+from demorec.core.registry import Registry, nearest_match
 
 
 class Command(Protocol):

@@ -16,15 +16,15 @@ from demorec.cli.shared.allow import Allow, allowed_modules
 from demorec.cli.shared.output import counted, say, say_json
 from demorec.cli.shared.paths import need_paths, places_read, refuse_inside, tell_unfinished
 from demorec.cli.shared.progress import ProgressBar
-from demorec.errors import ConfigError, OptionError
-from demorec.safety.replacing import PICTURE, check_replaceable
+from demorec.core.errors import ConfigError, OptionError
+from demorec.core.replacing import PICTURE, check_replaceable
 
 if TYPE_CHECKING:
     from demorec.check.base import Level, Result
     from demorec.check.report import CheckOptions, Subject, SubjectReport
+    from demorec.episode.episode import EpisodeInfo
     from demorec.replay import ReplayReport
     from demorec.replay.deep import DeepReport
-    from demorec.scene.episode import EpisodeInfo
 
 
 _SHOWN = 12
@@ -85,7 +85,7 @@ class Check:
             check_replaceable(picture, PICTURE, overwrite=self.overwrite, sources=places_read(self.paths))
             refuse_inside([picture])
         from demorec.check.report import CheckOptions, check_subjects, find_subjects, useful_workers
-        from demorec.processes import available_cores
+        from demorec.core.processes import available_cores
 
         allowed = allowed_modules(self.allow)
         subjects = find_subjects(self.paths)
@@ -155,7 +155,7 @@ def _split(subjects: Sequence[Subject]) -> tuple[list[Path], list[Path]]:
 def _infos(subjects: Sequence[Subject]) -> Iterator[EpisodeInfo]:
     """Of every successful episode of runs, every recording, and every episode of datasets."""
     from demorec.check.dataset import Dataset
-    from demorec.recording import Recording
+    from demorec.mcap import Recording
 
     _, datasets = _split(subjects)
     for subject in subjects:
@@ -243,7 +243,7 @@ def _summary(reports: Sequence[SubjectReport], failed: int, replays: int, diverg
 
 
 def _plain(report: SubjectReport) -> dict[str, Any]:
-    from demorec.plain import to_plain
+    from demorec.core.plain import to_plain
 
     results = [to_plain(result) for result in report.results]
     for result in results:
@@ -256,7 +256,7 @@ def _plain(report: SubjectReport) -> dict[str, Any]:
 
 
 def _plain_replay(report: ReplayReport, is_as_recorded: bool) -> dict[str, Any]:
-    from demorec.plain import to_plain
+    from demorec.core.plain import to_plain
 
     plain = to_plain(report)
     return {
@@ -309,7 +309,7 @@ def deep_summary(remade: Sequence[DeepReport], different: Sequence[DeepReport]) 
 
 def plain_deep(report: DeepReport) -> dict[str, Any]:
     """The same as plain data for JSON, with every frame that differs."""
-    from demorec.plain import to_plain
+    from demorec.core.plain import to_plain
 
     plain = to_plain(report)
     return {"path": str(report.path), "kind": "deep", "level": report.level, "results": [

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING
 
 from demorec.cli.shared.output import say
 from demorec.cli.shared.rollout_flags import RolloutFlags, Split
-from demorec.errors import ConfigError
-from demorec.evaluate.moments import TakeOver
+from demorec.core.errors import ConfigError
+from demorec.learn.evaluate.moments import TakeOver
 
 if TYPE_CHECKING:
-    from demorec.evaluate.rollouts import Evaluation
+    from demorec.learn.evaluate.rollouts import Evaluation
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,7 +49,7 @@ class Correct(RolloutFlags):
 
 
 def _told(evaluation: Evaluation, out: Path) -> Iterator[str]:
-    from demorec.evaluate.correction import read_takeover
+    from demorec.learn.evaluate.correction import read_takeover
 
     config = evaluation.settings.config
     found = [read_takeover(out / rollout.file) for rollout in evaluation.rollouts]

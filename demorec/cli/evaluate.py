@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 from demorec.cli.shared.output import say, say_json
 from demorec.cli.shared.rollout_flags import RolloutFlags, Split
-from demorec.errors import ConfigError
+from demorec.core.errors import ConfigError
 
 if TYPE_CHECKING:
-    from demorec.evaluate.rollouts import Evaluation
-    from demorec.evaluate.statistics import RateComparison
+    from demorec.learn.evaluate.rollouts import Evaluation
+    from demorec.learn.evaluate.statistics import RateComparison
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,8 +54,8 @@ class Evaluate(RolloutFlags):
         return 0
 
     def _compare(self, first: Path, second: Path) -> int:
-        from demorec.evaluate.rollouts import load_evaluation
-        from demorec.evaluate.statistics import compare
+        from demorec.learn.evaluate.rollouts import load_evaluation
+        from demorec.learn.evaluate.statistics import compare
 
         a, b = load_evaluation(first), load_evaluation(second)
         scenes_a, scenes_b = a.settings.config, b.settings.config
@@ -72,7 +72,7 @@ class Evaluate(RolloutFlags):
 
 
 def _told(evaluation: Evaluation, out: Path) -> Iterator[str]:
-    from demorec.evaluate.statistics import cells
+    from demorec.learn.evaluate.statistics import cells
 
     settings = evaluation.settings
     yield f"policy        {settings.policy_type} {settings.policy_digest}, action {settings.action}"
@@ -91,8 +91,8 @@ def _told(evaluation: Evaluation, out: Path) -> Iterator[str]:
 
 
 def _plain(evaluation: Evaluation) -> dict[str, Any]:
-    from demorec.evaluate.statistics import cells
-    from demorec.plain import to_plain
+    from demorec.core.plain import to_plain
+    from demorec.learn.evaluate.statistics import cells
 
     plain: dict[str, Any] = to_plain(evaluation)
     plain["success_rate"] = evaluation.rate.value

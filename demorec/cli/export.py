@@ -13,9 +13,9 @@ from tyro.constructors import MISSING_NONPROP
 from demorec.cli.shared.output import counted, say
 from demorec.cli.shared.paths import refuse_inside
 from demorec.cli.shared.progress import ProgressBar
-from demorec.errors import ConfigError
-from demorec.export.options import CommonOptions, ExportReport
-from demorec.tables import EXPORTERS
+from demorec.core.errors import ConfigError
+from demorec.core.tables import EXPORTERS
+from demorec.datasets.options import CommonOptions, ExportReport
 
 
 @dataclass(frozen=True, kw_only=True)

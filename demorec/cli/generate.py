@@ -13,11 +13,11 @@ from tyro.conf import arg
 
 from demorec.cli.shared.output import tell
 from demorec.cli.shared.paths import refuse_inside
-from demorec.config import GenerateConfig, read_toml
-from demorec.errors import ConfigError
+from demorec.core.config import GenerateConfig, read_toml
+from demorec.core.errors import ConfigError
+from demorec.core.plain import from_plain, to_plain
+from demorec.core.registry import nearest_match
 from demorec.generate.options import RunOptions, default_out, default_repo_id
-from demorec.plain import from_plain, to_plain
-from demorec.registry import nearest_match
 
 if TYPE_CHECKING:
     from demorec.runs.run_file import Attempt
@@ -113,7 +113,7 @@ class Generate:
 @contextmanager
 def _viewer(folder: Path) -> Iterator[Callable[[Attempt], None]]:
     """A window; what it gives hands finished attempts to it."""
-    from demorec.playback.live import LiveViewer
+    from demorec.view.live import LiveViewer
 
     with LiveViewer() as viewer:
         yield lambda attempt: viewer.add(folder / attempt.file) if attempt.file else None

@@ -12,11 +12,11 @@ from tyro.conf import Positional, arg
 from demorec.cli.shared.output import counted, say, tell
 from demorec.cli.shared.paths import refuse_inside
 from demorec.cli.shared.progress import ProgressBar
-from demorec.config import VideoConfig
-from demorec.errors import ConfigError, check_option
+from demorec.core.config import VideoConfig
+from demorec.core.errors import ConfigError, check_option
 
 if TYPE_CHECKING:
-    from demorec.ingest.frames_writer import FramesImport
+    from demorec.sources.frames_writer import FramesImport
 
 MAX_WORKERS = 1000
 _LEROBOT, _HDF5 = Path("lerobot"), Path("hdf5")
@@ -84,15 +84,15 @@ class Import:
                 "Name HDF5 files after the word hdf5: demorec import hdf5 demo.hdf5 --mapping demo.toml --out "
                 "runs/demo. A bag of that name is given with its folder."
             )
-        from demorec.ingest.bag import bags_in, open_bag
+        from demorec.sources.bag import bags_in, open_bag
 
         if self.suggest:
             if is_hdf5:
-                from demorec.ingest.hdf5_suggest import suggested_hdf5_mapping
+                from demorec.sources.hdf5_suggest import suggested_hdf5_mapping
 
                 say(*suggested_hdf5_mapping(files[0]))
             else:
-                from demorec.ingest.suggest import suggested_mapping
+                from demorec.sources.suggest import suggested_mapping
 
                 say(*suggested_mapping(bags_in(files[0])[0], tell))
             return 0
@@ -105,8 +105,8 @@ class Import:
         return (self._import_hdf5 if is_hdf5 else self._import_bags)(files, self.mapping, self.out)
 
     def _import_bags(self, bags: Sequence[Path], mapping: Path, out: Path) -> int:
-        from demorec.ingest.import_run import import_bags
-        from demorec.ingest.report import report_lines
+        from demorec.sources.import_run import import_bags
+        from demorec.sources.report import report_lines
 
         with ProgressBar("importing", unit="bag") as bar:
             result = import_bags(
@@ -147,7 +147,7 @@ class Import:
             )
         if self.suggest or self.mapping is not None:
             raise ConfigError("A LeRobot dataset names its features itself: leave --mapping and --suggest out.")
-        from demorec.ingest.dataset_import import import_lerobot
+        from demorec.sources.dataset_import import import_lerobot
 
         self.video.validate()
         result = import_lerobot(self.bags[1], self.out, video=self.video)
@@ -155,7 +155,7 @@ class Import:
         return 0
 
     def _import_hdf5(self, files: Sequence[Path], mapping: Path, out: Path) -> int:
-        from demorec.ingest.hdf5_import import import_hdf5
+        from demorec.sources.hdf5_import import import_hdf5
 
         result = import_hdf5(files, mapping, out, video=self.video)
         left_out = [f"{name} is left out: {reason}." for name, reason in result.left_out.items() if reason]

@@ -9,8 +9,8 @@ from tyro.conf import Positional
 
 from demorec.cli.shared.output import say, tell
 from demorec.cli.shared.paths import refuse_inside
-from demorec.errors import check_option
-from demorec.evaluate.moments import TakeOver
+from demorec.core.errors import check_option
+from demorec.learn.evaluate.moments import TakeOver
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,11 +66,11 @@ class Improve:
             check_option("workers", self.workers, 1, 1024)
         self.takeover.validate()
         refuse_inside([self.out])
-        from demorec.evaluate.improvement import Improvement, Plan
+        from demorec.core.processes import available_cores
+        from demorec.core.registry import check_choice
+        from demorec.episode.features import STATE_KINDS
+        from demorec.learn.evaluate.improvement import Improvement, Plan
         from demorec.loop.actions import ACTION_KINDS
-        from demorec.processes import available_cores
-        from demorec.registry import check_choice
-        from demorec.scene.features import STATE_KINDS
 
         plan = Plan(
             demonstrations=self.demonstrations,

@@ -12,14 +12,14 @@ from tyro.conf import Positional
 from demorec.cli.shared.output import counted, say, say_json
 from demorec.cli.shared.paths import need_paths
 from demorec.cli.shared.table import aligned, size_in_words
-from demorec.errors import ExportError, RecordingError, in_words, resource_error, without_path
-from demorec.lerobot.paths import INFO_PATH
+from demorec.core.errors import ExportError, RecordingError, in_words, resource_error, without_path
+from demorec.datasets.lerobot.paths import INFO_PATH
+from demorec.episode.features import IMAGE_PREFIX
 from demorec.runs.find import Found, expect
-from demorec.scene.features import IMAGE_PREFIX
 
 if TYPE_CHECKING:
-    from demorec.recording.collected.summary import CollectedCameraSummary, CollectedSummary, FeatureSummary
-    from demorec.recording.summary import RecordingSummary
+    from demorec.mcap.external.summary import CollectedCameraSummary, CollectedSummary, FeatureSummary
+    from demorec.mcap.summary import RecordingSummary
     from demorec.runs.collected import CollectedRun
     from demorec.runs.run_file import RunFile
 
@@ -68,12 +68,12 @@ def _describe(path: Path) -> tuple[dict[str, Any], list[str]]:
 
 
 def _recording(path: Path) -> tuple[dict[str, Any], list[str]]:
-    from demorec.plain import to_plain
-    from demorec.recording.opening import is_collected
-    from demorec.recording.summary import summarize
+    from demorec.core.plain import to_plain
+    from demorec.mcap.opening import is_collected
+    from demorec.mcap.summary import summarize
 
     if is_collected(path):
-        from demorec.recording.collected.summary import summarize_collected
+        from demorec.mcap.external.summary import summarize_collected
 
         collected = summarize_collected(path)
         return {"kind": "collected recording", **to_plain(collected)}, _collected_lines(collected)
@@ -170,7 +170,7 @@ def _outcome(summary: RecordingSummary) -> str:
 
 
 def _run(path: Path) -> tuple[dict[str, Any], list[str]]:
-    from demorec.plain import to_plain
+    from demorec.core.plain import to_plain
     from demorec.runs.collected import is_collected_run, load_collected_run
     from demorec.runs.run_file import load_run_file
 
@@ -254,7 +254,7 @@ def _collected_run_lines(path: Path, run: CollectedRun) -> list[str]:
 
 def _left_out(path: Path) -> list[dict[str, str]]:
     """What an import did not take into the run: episodes that it dropped and bags that it skipped, each with why."""
-    from demorec.ingest.import_file import load_import_file
+    from demorec.sources.import_file import load_import_file
 
     if (imported := load_import_file(path)) is None:
         return []
@@ -273,7 +273,7 @@ def _left_out_lines(left_out: list[dict[str, str]]) -> list[str]:
 
 
 def _dataset(path: Path) -> tuple[dict[str, Any], list[str]]:
-    from demorec.lerobot.files import read_json
+    from demorec.datasets.lerobot.files import read_json
 
     file = path / INFO_PATH
     try:
@@ -302,9 +302,9 @@ def _dataset(path: Path) -> tuple[dict[str, Any], list[str]]:
 
 def _dataset_content(path: Path) -> tuple[list[tuple[str, str]], list[str]]:
     """What the tables say beyond info.json, where demorec understands them, and what is wrong with the dataset."""
-    from demorec.lerobot import dataset_digest, dataset_info
-    from demorec.lerobot.inspect import dataset_problems, has_digest
-    from demorec.lerobot.layout import DatasetInfo
+    from demorec.datasets.lerobot import dataset_digest, dataset_info
+    from demorec.datasets.lerobot.inspect import dataset_problems, has_digest
+    from demorec.datasets.lerobot.layout import DatasetInfo
 
     facts: list[tuple[str, str]] = []
     problems: list[str] = []
@@ -334,8 +334,8 @@ def _names(names: object) -> str:
 
 
 def _folder(found: Found) -> tuple[dict[str, Any], list[str]]:
-    from demorec.recording import open_recording
-    from demorec.scene.collected import CollectedInfo
+    from demorec.episode.collected import CollectedInfo
+    from demorec.mcap import open_recording
 
     path, recordings = found.path, (*found.recordings, *found.failed)
     rows = [("file", "task", "seed", "episode", "outcome", "frames", "size")]

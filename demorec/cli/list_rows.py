@@ -11,10 +11,10 @@ from tyro.conf import Positional
 
 from demorec.cli.shared.output import say, say_json
 from demorec.cli.shared.table import aligned
-from demorec.errors import ConfigError
+from demorec.core.errors import ConfigError
 
 if TYPE_CHECKING:
-    from demorec.registry import Registry
+    from demorec.core.registry import Registry
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,7 +38,7 @@ class ListRows:
         """Print one line each."""
         if self.coverage:
             return self._print_coverage()
-        from demorec import tables
+        from demorec.core import tables
 
         registry: Registry[Any] = getattr(tables, self.what.upper())
         describe = _DESCRIBED.get(self.what, _own_summary)
@@ -53,7 +53,7 @@ class ListRows:
         if self.what != "checks":
             raise ConfigError(f"--coverage is of checks alone, found {self.what}: demorec list checks --coverage.")
         from demorec.check.reads import coverage
-        from demorec.plain import to_plain
+        from demorec.core.plain import to_plain
 
         rows = coverage()
         if self.json:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from demorec.cli.shared.output import say, tell
 from demorec.cli.shared.paths import refuse_inside
-from demorec.errors import check_option
+from demorec.core.errors import check_option
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,10 +45,10 @@ class Pretrain:
         check_option("learning_rate", self.learning_rate, 1e-7, 1.0)
         check_option("frame_cache_mb", self.frame_cache_mb, 0, 1 << 20)
         refuse_inside([self.out])
-        from demorec.training.command import training_config
+        from demorec.learn.training.command import training_config
 
         config = training_config(self.others)
-        from demorec.training.pretrain import Teaching, pretrain
+        from demorec.learn.training.pretrain import Teaching, pretrain
 
         teaching = Teaching(
             updates=self.num_updates,

@@ -34,7 +34,7 @@ class Recover:
 
     def run(self) -> int:
         """Recover and say how much was kept."""
-        from demorec.recording import is_whole, recover
+        from demorec.mcap import is_whole, recover
 
         found = expect(self.file, "recording", "unfinished")
         if found.kind == "recording" and self.out is None and is_whole(self.file):

@@ -14,11 +14,11 @@ from demorec.cli.shared.allow import Allow, allowed_modules
 from demorec.cli.shared.output import counted, say, tell
 from demorec.cli.shared.paths import refuse_sources
 from demorec.cli.shared.progress import ProgressBar
-from demorec.config import VideoConfig
-from demorec.errors import ConfigError, check_option
-from demorec.processes import available_cores, in_turn
+from demorec.core.config import VideoConfig
+from demorec.core.errors import ConfigError, check_option
+from demorec.core.processes import available_cores, in_turn
+from demorec.core.user_modules import modules_of
 from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings
-from demorec.safety.user_modules import modules_of
 
 if TYPE_CHECKING:
     from demorec.render.warm import WarmRenderer
@@ -116,9 +116,9 @@ class Render:
         return 1 if differing else 0
 
     def _options(self) -> RerenderOptions:
+        from demorec.core.tables import RENDERERS
         from demorec.replay.free_camera import read_cameras
         from demorec.replay.rerender import RerenderOptions
-        from demorec.tables import RENDERERS
 
         if self.renderer is not None:
             RENDERERS.check_name(self.renderer)

@@ -15,7 +15,7 @@ from demorec.cli.shared.allow import Allow, allowed_modules
 from demorec.cli.shared.output import say, say_json, tell
 from demorec.cli.shared.paths import need_paths, refuse_sources
 from demorec.cli.shared.progress import ProgressBar
-from demorec.errors import ConfigError, OptionError
+from demorec.core.errors import ConfigError, OptionError
 from demorec.runs.find import EPISODE_FOLDERS, Found, expect, expect_recordings
 
 if TYPE_CHECKING:
@@ -102,7 +102,7 @@ class Replay:
                 raise ConfigError(f"No episode has a number within {self.episodes!r}.")
             good = [is_as_recorded(r, tolerance=self.tolerance, bitwise=options.is_plain) for r in reports]
             if self.json:
-                from demorec.plain import to_plain
+                from demorec.core.plain import to_plain
 
                 say_json([to_plain(report) for report in reports])
             else:
@@ -128,9 +128,9 @@ def demonstrations(
     Tells, before each of them, in which versions what recorded it differs from what is here, and where modules of the
     user's own are not what they were.
     """
-    from demorec.config import deciding_versions
-    from demorec.safety.own_versions import changed_sources, version_differences
-    from demorec.scene.assets import allow_models
+    from demorec.core.config import deciding_versions
+    from demorec.core.own_versions import changed_sources, version_differences
+    from demorec.robots.assets import allow_models
 
     allow_models(options.allowed)
     noted: set[str] = set()
@@ -148,7 +148,7 @@ def demonstrations(
 def _found(
     paths: Sequence[Path], options: ReplayOptions, *, episodes: str, limit: int | None
 ) -> Iterator[Demonstration]:
-    from demorec.export.options import parse_episodes
+    from demorec.datasets.options import parse_episodes
     from demorec.replay import dataset_demonstrations, open_file
 
     wanted = parse_episodes(episodes)

@@ -11,9 +11,9 @@ from demorec.cli.shared.allow import Allow, allowed_modules
 from demorec.cli.shared.output import counted, say
 from demorec.cli.shared.paths import places_read, refuse_inside
 from demorec.cli.shared.progress import ProgressBar
-from demorec.errors import ConfigError, check_option
+from demorec.core.errors import ConfigError, check_option
+from demorec.core.replacing import REPORT, check_replaceable
 from demorec.runs.find import EPISODE_FOLDERS, expect
-from demorec.safety.replacing import REPORT, check_replaceable
 
 
 @dataclass(frozen=True, kw_only=True)

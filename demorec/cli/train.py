@@ -32,7 +32,7 @@ class Train:
 
     def run(self) -> int:
         """Train."""
-        from demorec.training.command import train
+        from demorec.learn.training.command import train
 
         replaced = "demorec train: FastDataset reads in place of LeRobotDataset; all else is lerobot-train."
         train(

@@ -13,13 +13,13 @@ from tyro.conf import Positional
 from demorec.cli.shared.allow import Allow, allowed_modules
 from demorec.cli.shared.output import say, tell
 from demorec.cli.shared.paths import places_read, refuse_inside, tell_unfinished
-from demorec.errors import ConfigError, check_option
+from demorec.core.errors import ConfigError, check_option
+from demorec.core.replacing import PICTURE, RERUN_FILE, check_replaceable
+from demorec.robots.assets import allow_models
 from demorec.runs.find import expect
-from demorec.safety.replacing import PICTURE, RERUN_FILE, check_replaceable
-from demorec.scene.assets import allow_models
 
 if TYPE_CHECKING:
-    from demorec.playback.sources import PlaybackSource
+    from demorec.view.sources import PlaybackSource
 
 _MOST = 50
 """How many episodes are shown unless --episodes asks for more."""
@@ -72,10 +72,10 @@ class View:
         allow_models(allowed_modules(self.allow))
         if any(path.suffix == ".rrd" for path in self.paths):
             return self._show_rrd()
-        from demorec.playback.glyphs import drawable_source
-        from demorec.playback.save import numbered, save, save_comparison, save_each
-        from demorec.playback.sources import find_episodes, select
-        from demorec.playback.viewer import need_screen
+        from demorec.view.glyphs import drawable_source
+        from demorec.view.save import numbered, save, save_comparison, save_each
+        from demorec.view.sources import find_episodes, select
+        from demorec.view.viewer import need_screen
 
         sources = select(find_episodes(self.paths, include_failures=self.include_failures), self.episodes)
         tell_unfinished(self.paths)
@@ -155,26 +155,26 @@ class View:
 
     def _show(self, files: Sequence[Path], sources: Sequence[PlaybackSource]) -> int:
         if self.screenshot is not None:
-            from demorec.playback.viewer import screenshot
+            from demorec.view.viewer import screenshot
 
             width, height = self.size
             screenshot(files, self.screenshot, seconds=self._second(sources), width=width, height=height)
             say(f"{width}x{height}: {self.screenshot}")
             return 0
         if self.web:
-            from demorec.playback.viewer import serve_web
+            from demorec.view.viewer import serve_web
 
             with serve_web(files, web_port=self.port or 0) as (address, wait):
                 say(f"Open this in a browser on this machine (Ctrl-C ends it): {address}")
                 return 1 if wait() else 0
-        from demorec.playback.viewer import show
+        from demorec.view.viewer import show
 
         show(files)
         return 0
 
     def _second(self, sources: Sequence[PlaybackSource]) -> float | None:
         """When the screenshot is taken; None leaves it to the viewer, which knows how long an .rrd file is."""
-        from demorec.playback.viewer import moment
+        from demorec.view.viewer import moment
 
         ends = []
         for source in sources[: 2 if self.compare else 1]:

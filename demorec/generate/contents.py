@@ -7,14 +7,14 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-from demorec.errors import ConfigError
+from demorec.core.errors import ConfigError
+from demorec.core.replacing import RECORDING, ReplaceableKind, files_below, json_object
+from demorec.datasets.lerobot.kind import DATASET, is_dataset_file
+from demorec.datasets.lerobot.paths import CARD_PATH
+from demorec.datasets.lerobot.sidecar import CONFIGS_PATH
 from demorec.generate.survey import recordings_of
-from demorec.lerobot.kind import DATASET, is_dataset_file
-from demorec.lerobot.paths import CARD_PATH
-from demorec.lerobot.sidecar import CONFIGS_PATH
 from demorec.runs.run_file import DATASET as DATASET_FOLDER
 from demorec.runs.run_file import EPISODES, FAILED, RUN_NAME, UNFINISHED, RunFile
-from demorec.safety.replacing import RECORDING, ReplaceableKind, files_below, json_object
 
 PARTS = (RUN_NAME, EPISODES, FAILED, UNFINISHED, DATASET_FOLDER)
 """All that a run writes; what else is in its folder is never touched."""

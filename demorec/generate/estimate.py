@@ -11,13 +11,13 @@ from functools import partial
 from itertools import chain
 from pathlib import Path
 
-from demorec.config import EpisodePlan, GenerateConfig
-from demorec.errors import GenerationError
+from demorec.core.config import EpisodePlan, GenerateConfig
+from demorec.core.errors import GenerationError
+from demorec.core.processes import available_cores
+from demorec.datasets.lerobot import ExportOptions, export_lerobot
 from demorec.generate.executor import MAKE_EPISODE, Lost, Made, Raised
 from demorec.generate.local import LocalExecutor
 from demorec.generate.options import RunOptions
-from demorec.lerobot import ExportOptions, export_lerobot
-from demorec.processes import available_cores
 from demorec.runs.run_file import EPISODES, FAILED, STARTING, UNFINISHED
 
 _MEASURED = 2

@@ -14,8 +14,8 @@ from typing import Protocol, Self
 
 import psutil
 
-from demorec.config import EpisodePlan
-from demorec.errors import ConfigError, DemorecError, GenerationError, error_chain
+from demorec.core.config import EpisodePlan
+from demorec.core.errors import ConfigError, DemorecError, GenerationError, error_chain
 from demorec.runs.run_file import Attempt
 
 Maker = Callable[[EpisodePlan, Path], Attempt]

@@ -8,13 +8,14 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from demorec.errors import DemorecError, resource_error
+from demorec.core.errors import DemorecError, resource_error
+from demorec.core.replacing import obstacle
+from demorec.datasets.lerobot import ExportOptions, ExportReport, dataset_digest, export_lerobot
+from demorec.datasets.lerobot.card import has_own_card
+from demorec.datasets.lerobot.inspect import check_tables
+from demorec.datasets.lerobot.kind import DATASET as DATASET_KIND
+from demorec.datasets.lerobot.paths import CARD_PATH
 from demorec.generate.contents import check_dataset_place, is_dataset_of_run
-from demorec.lerobot import ExportOptions, ExportReport, dataset_digest, export_lerobot
-from demorec.lerobot.card import has_own_card
-from demorec.lerobot.inspect import check_tables
-from demorec.lerobot.kind import DATASET as DATASET_KIND
-from demorec.lerobot.paths import CARD_PATH
 from demorec.runs.lock import run_lock
 from demorec.runs.run_file import (
     DATASET,
@@ -26,7 +27,6 @@ from demorec.runs.run_file import (
     save_run_file,
     sync_folder,
 )
-from demorec.safety.replacing import obstacle
 
 
 def export_run(

@@ -12,16 +12,27 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
-from demorec.config import GenerateConfig, deciding_versions
-from demorec.errors import ConfigError, DemorecError, GenerationError, resource_error
+from demorec.core.config import GenerateConfig, deciding_versions
+from demorec.core.errors import ConfigError, DemorecError, GenerationError, resource_error
+from demorec.core.files import make_folder
+from demorec.core.plain import from_plain, to_plain
+from demorec.core.processes import available_cores
+from demorec.core.replacing import (
+    check_replaceable,
+    check_unsettled_parts,
+    files_below,
+    has_unsettled_parts,
+    obstacle,
+    replaced_parts,
+    settle_parts,
+    shown,
+)
 from demorec.generate.contents import PARTS, RUN, check_dataset_place
 from demorec.generate.executor import peak_memory
 from demorec.generate.observer import RunObserver, RunResult
 from demorec.generate.options import RunOptions
 from demorec.generate.plan import differences
 from demorec.generate.survey import Inspector, recordings_of, survey
-from demorec.plain import from_plain, to_plain
-from demorec.processes import available_cores
 from demorec.runs.lock import LOCK_NAME, run_lock
 from demorec.runs.run_file import (
     EPISODES,
@@ -35,17 +46,6 @@ from demorec.runs.run_file import (
     free_name,
     load_run_file,
     save_run_file,
-)
-from demorec.safety.files import make_folder
-from demorec.safety.replacing import (
-    check_replaceable,
-    check_unsettled_parts,
-    files_below,
-    has_unsettled_parts,
-    obstacle,
-    replaced_parts,
-    settle_parts,
-    shown,
 )
 
 

@@ -18,9 +18,9 @@ from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from types import FrameType
 
-from demorec.config import EpisodePlan
+from demorec.core.config import EpisodePlan
+from demorec.core.processes import SPAWN
 from demorec.generate.executor import SINGLE_THREADED, Executor, Lost, Report, attempt_episode
-from demorec.processes import SPAWN
 
 _OF_THE_GROUP = frozenset({signal.SIGINT, signal.SIGTERM})
 _LEAVE = signal.SIGUSR1

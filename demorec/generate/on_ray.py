@@ -16,11 +16,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from demorec.config import EpisodePlan
-from demorec.errors import ConfigError, GenerationError, MissingDependencyError, in_words
+from demorec.core.config import EpisodePlan
+from demorec.core.errors import ConfigError, GenerationError, MissingDependencyError, in_words
+from demorec.core.processes import available_cores
 from demorec.generate.executor import SINGLE_THREADED, Executor, Lost, Report, attempt_episode
 from demorec.generate.options import RunOptions
-from demorec.processes import available_cores
 from demorec.runs.run_file import RUN_NAME
 
 try:

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from demorec.errors import ConfigError, check_option
-from demorec.lerobot.options import check_repo_id
+from demorec.core.errors import ConfigError, check_option
+from demorec.datasets.lerobot.options import check_repo_id
 from demorec.runs.run_file import MAX_EPISODES
 
 

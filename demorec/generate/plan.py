@@ -6,9 +6,9 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
-from demorec.config import EpisodePlan
+from demorec.core.config import EpisodePlan
+from demorec.core.own_versions import version_differences
 from demorec.runs.run_file import Attempt, RunFile
-from demorec.safety.own_versions import version_differences
 
 
 class Schedule:

@@ -12,25 +12,25 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from demorec.config import GenerateConfig, deciding_versions, parse_config
-from demorec.errors import ConfigError, DemorecError, RecordingError, in_words, resource_error
+from demorec.core.config import GenerateConfig, deciding_versions, parse_config
+from demorec.core.errors import ConfigError, DemorecError, RecordingError, in_words, resource_error
+from demorec.core.own_versions import version_differences
+from demorec.core.replacing import use_as_source
+from demorec.datasets.lerobot import ExportOptions, export_lerobot
+from demorec.datasets.lerobot.files import read_json, read_table
+from demorec.datasets.lerobot.inspect import episode_digests
+from demorec.datasets.lerobot.layout import DatasetInfo
+from demorec.datasets.lerobot.paths import SIDECAR_DIR
+from demorec.datasets.lerobot.sidecar import CONFIGS_PATH, EXPORT_PATH
+from demorec.episode.validity import read_episode_info
 from demorec.generate.contents import is_dataset_of_run
 from demorec.generate.folder import AnotherRunError
 from demorec.generate.observer import RunObserver, RunResult
 from demorec.generate.options import RunOptions
 from demorec.generate.run import generate
-from demorec.lerobot import ExportOptions, export_lerobot
-from demorec.lerobot.files import read_json, read_table
-from demorec.lerobot.inspect import episode_digests
-from demorec.lerobot.layout import DatasetInfo
-from demorec.lerobot.paths import SIDECAR_DIR
-from demorec.lerobot.sidecar import CONFIGS_PATH, EXPORT_PATH
-from demorec.recording import Recording
+from demorec.mcap import Recording
 from demorec.runs.find import expect
 from demorec.runs.run_file import DATASET, RUN_NAME, load_run_file
-from demorec.safety.own_versions import version_differences
-from demorec.safety.replacing import use_as_source
-from demorec.scene.validity import read_episode_info
 
 Key = tuple[int, int]
 """(episode of the run, attempt)."""

@@ -13,8 +13,10 @@ from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
-from demorec.config import EpisodePlan, GenerateConfig
-from demorec.errors import ConfigError, GenerationError
+from demorec.core.config import EpisodePlan, GenerateConfig
+from demorec.core.errors import ConfigError, GenerationError
+from demorec.core.processes import available_cores
+from demorec.core.tables import load_robot
 from demorec.generate.executor import MAKE_EPISODE, POLL_S, Executor, Lost, Made, Raised, Report
 from demorec.generate.folder import RunFolder, open_run
 from demorec.generate.interrupts import catch_interrupts
@@ -23,13 +25,11 @@ from demorec.generate.observer import RunObserver, RunResult
 from demorec.generate.options import RunOptions
 from demorec.generate.plan import Schedule
 from demorec.generate.survey import Inspector
-from demorec.processes import available_cores
 from demorec.render.warm import warm_up_renderer
+from demorec.robots.assets import allow_models
+from demorec.robots.inertials import check_masses
 from demorec.runs.recordings import inspect_recording
 from demorec.runs.run_file import UNFINISHED, RunFile
-from demorec.scene.assets import allow_models
-from demorec.scene.inertials import check_masses
-from demorec.tables import load_robot
 
 MAX_LOSSES = 5
 """How often one attempt may lose its worker before the run stops: chance takes few, too little memory takes all."""

@@ -6,9 +6,9 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from demorec.errors import DemorecError, in_words, resource_error, without_path
+from demorec.core.errors import DemorecError, in_words, resource_error, without_path
+from demorec.core.plain import to_plain
 from demorec.generate.plan import differences
-from demorec.plain import to_plain
 from demorec.runs.recordings import Inspected
 from demorec.runs.run_file import (
     EPISODES,

@@ -17,13 +17,13 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-from demorec.config import EpisodePlan
-from demorec.errors import ConfigError, SceneError
+from demorec.core.config import EpisodePlan
+from demorec.core.errors import ConfigError, SceneError
+from demorec.core.own_versions import version_differences
 from demorec.loop import ScriptAgent, Session, Workshop, prepare
-from demorec.recording import EpisodeWriter
+from demorec.mcap import EpisodeWriter
 from demorec.runs.recordings import inspect_recording
 from demorec.runs.run_file import EPISODES, FAILED, STARTING, UNFINISHED, Attempt, recording_name, sync_folder
-from demorec.safety.own_versions import version_differences
 
 SIMULATION, RENDERING, RECORDING = "simulation", "rendering", "recording"
 STAGES = (SIMULATION, RENDERING, RECORDING)

@@ -12,8 +12,8 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import freeze_after_episode_end
 from lerobot.utils.constants import ACTION, OBS_IMAGES
 
+from demorec.episode import features
 from demorec.gym_env import DemorecEnv, env_id
-from demorec.scene import features
 
 _AS_THEY_ARE = (
     "split", "variation", "fps", "renderer", "privileged", "state", "action", "episode_length", "render_mode",

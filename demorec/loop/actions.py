@@ -1,4 +1,4 @@
-"""From what a policy says to what the motors are told: the inverse of `demorec.scene.features.action_vectors`."""
+"""From what a policy says to what the motors are told: the inverse of `demorec.episode.features.action_vectors`."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from typing import get_args
 
 import numpy as np
 
-from demorec.geometry import Array, Pose, wrap_angle
-from demorec.scene import features
-from demorec.scene.episode import Action
-from demorec.scene.features import ActionKind
-from demorec.scene.robot import RobotSpec
+from demorec.core.geometry import Array, Pose, wrap_angle
+from demorec.episode import features
+from demorec.episode.episode import Action
+from demorec.episode.features import ActionKind
+from demorec.robots.robot import RobotSpec
 from demorec.sim.world import World
 
 ACTION_KINDS: tuple[ActionKind, ...] = get_args(ActionKind)
@@ -44,7 +44,7 @@ class ActionDecoder:
 
     Args:
         world: At the episode's start.
-        kind: What the actions mean (`demorec.scene.features.action_vectors`).
+        kind: What the actions mean (`demorec.episode.features.action_vectors`).
         is_limited: True for what a policy says: every command is held within the joint limits in position and velocity
             (from the last command) and the gripper within its opening, the elbow is pulled towards where the expert
             has it, and deltas go on from the last pose that was reached. False for recorded actions, which are sent as

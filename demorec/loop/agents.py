@@ -6,9 +6,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
+from demorec.episode.episode import Action, Event
 from demorec.loop.noise import ActionNoise
 from demorec.loop.prepare import Episode
-from demorec.scene.episode import Action, Event
 from demorec.sim.world import World
 from demorec.tasks.interjection import mistake
 from demorec.tasks.script import Step

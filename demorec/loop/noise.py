@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
-from demorec.geometry import Array
-from demorec.scene.episode import Action
-from demorec.scene.features import NOISE_DECAY
+from demorec.core.geometry import Array
+from demorec.episode.episode import Action
+from demorec.episode.features import NOISE_DECAY
 from demorec.sim.world import World
 from demorec.tasks.script import Step
 
@@ -18,7 +18,7 @@ class ActionNoise:
 
     The label stays clean, so that a policy learns how to come back (DART, Laskey et al. 2017,
     https://arxiv.org/abs/1703.09327). The noise lets go at the same rate whether more is added or not
-    (`demorec.scene.features.NOISE_DECAY`), so that there is one way back from it, which increments of the command can
+    (`demorec.episode.features.NOISE_DECAY`), so that there is one way back from it, which increments of the command can
     hold. Every command stays within the joint limits in position and velocity.
     """
 

@@ -8,21 +8,21 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from demorec.config import EpisodePlan, GenerateConfig, deciding_versions
-from demorec.errors import ConfigError
-from demorec.geometry import Pose
-from demorec.plain import digest, to_plain
+from demorec.core.config import EpisodePlan, GenerateConfig, deciding_versions
+from demorec.core.errors import ConfigError
+from demorec.core.geometry import Pose
+from demorec.core.plain import digest, to_plain
+from demorec.core.seeding import Purpose, generator
+from demorec.core.tables import CAMERAS, RENDERERS, TASKS, camera_name, load_robot
+from demorec.core.user_modules import modules_of
+from demorec.episode.camera_error import error_values
+from demorec.episode.episode import EpisodeInfo
+from demorec.episode.scene import CONTACT_BREAKING_THRESHOLD, FINGER_STIFFNESS, Camera, Scene
+from demorec.episode.variation import Ranges, resolve
 from demorec.render import Renderer
-from demorec.safety.user_modules import modules_of
-from demorec.scene.assets import allow_models, model_name
-from demorec.scene.camera_error import error_values
-from demorec.scene.episode import EpisodeInfo
-from demorec.scene.robot import RobotSpec
-from demorec.scene.scene import CONTACT_BREAKING_THRESHOLD, FINGER_STIFFNESS, Camera, Scene
-from demorec.scene.variation import Ranges, resolve
-from demorec.seeding import Purpose, generator
+from demorec.robots.assets import allow_models, model_name
+from demorec.robots.robot import RobotSpec
 from demorec.sim.world import World
-from demorec.tables import CAMERAS, RENDERERS, TASKS, camera_name, load_robot
 from demorec.tasks.base import Task
 from demorec.tasks.interjection import Interjection, draw_interjection
 from demorec.tasks.sampling import Sampler, stratified_point

@@ -6,13 +6,13 @@ import math
 from collections.abc import Iterator, Mapping
 from typing import Self
 
-from demorec.geometry import Array, Pose
+from demorec.core.geometry import Array, Pose
+from demorec.episode.episode import Action, CameraImages, Frame, Observation, Outcome, SuccessCheck, frame_time_ns
+from demorec.episode.scene import Scene
 from demorec.loop.agents import Agent, Decision
 from demorec.loop.prepare import Episode
 from demorec.render import Renderer
 from demorec.render.painter import Painter
-from demorec.scene.episode import Action, CameraImages, Frame, Observation, Outcome, SuccessCheck, frame_time_ns
-from demorec.scene.scene import Scene
 from demorec.sim.world import World
 from demorec.tasks.base import Task
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from demorec.episode.episode import EpisodeInfo
 from demorec.loop.prepare import make_world
 from demorec.render import Renderer
 from demorec.render.warm import WarmRenderer
-from demorec.scene.episode import EpisodeInfo
 from demorec.sim.world import World
 
 

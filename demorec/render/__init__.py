@@ -10,9 +10,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
-from demorec.geometry import Array, Pose
-from demorec.scene.episode import CameraImages
-from demorec.scene.scene import Camera, Light, Rgba, Texture
+from demorec.core.geometry import Array, Pose
+from demorec.episode.episode import CameraImages
+from demorec.episode.scene import Camera, Light, Rgba, Texture
 
 VisualKind = Literal["box", "sphere", "cylinder", "capsule", "mesh", "plane"]
 

@@ -1,4 +1,4 @@
-"""Camera presets: one constant and one row of `demorec.tables.CAMERAS` each."""
+"""Camera presets: one constant and one row of `demorec.core.tables.CAMERAS` each."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-from demorec.geometry import look_at
-from demorec.scene.robot import RobotSpec
-from demorec.scene.scene import Camera, Vector3
+from demorec.core.geometry import look_at
+from demorec.episode.scene import Camera, Vector3
+from demorec.robots.robot import RobotSpec
 
 
 @dataclass(frozen=True, kw_only=True)

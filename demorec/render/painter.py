@@ -9,10 +9,10 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Protocol
 
-from demorec.geometry import Array, Pose
+from demorec.core.geometry import Array, Pose
+from demorec.episode.episode import CameraImages
+from demorec.episode.scene import Camera, Scene
 from demorec.render import Mount, Renderer, RenderSetup, VisualBody
-from demorec.scene.episode import CameraImages
-from demorec.scene.scene import Camera, Scene
 
 
 class Drawable(Protocol):

@@ -11,14 +11,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from demorec.errors import SceneError, in_words
-from demorec.geometry import Array, Pose
+from demorec.core.errors import SceneError, in_words
+from demorec.core.geometry import Array, Pose
+from demorec.episode.scene import Body, Rgba, Scene
 from demorec.render import Mount, Visual, VisualBody
-from demorec.scene.assets import asset_path, mesh_path
-from demorec.scene.bullet_kinematics import BulletBody, as_told, origin_as_told, standing_as_told
-from demorec.scene.robot import RobotSpec
-from demorec.scene.scene import Body, Rgba, Scene
-from demorec.scene.urdf_shapes import read_links
+from demorec.robots.assets import asset_path, mesh_path
+from demorec.robots.bullet_kinematics import BulletBody, as_told, origin_as_told, standing_as_told
+from demorec.robots.robot import RobotSpec
+from demorec.robots.urdf_shapes import read_links
 
 _WHITE: Rgba = (1.0, 1.0, 1.0, 1.0)
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
-from demorec.errors import RenderError
-from demorec.geometry import Array, Pose
+from demorec.core.errors import RenderError
+from demorec.core.geometry import Array, Pose
+from demorec.episode.scene import Camera
 from demorec.render import RenderSetup, first_rows
-from demorec.scene.scene import Camera
 
 MAX_SAMPLES = 1 << 28
 """Of a picture; beyond, buffers would take several GB. (PyBullet ends the process on sizes that it cannot draw.)"""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Self
 
+from demorec.core.tables import RENDERERS
 from demorec.render import Renderer
-from demorec.tables import RENDERERS
 
 
 class WarmRenderer:

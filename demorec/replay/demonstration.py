@@ -11,13 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
-from demorec.errors import ConfigError, OptionError, RecordingError, check_option
-from demorec.geometry import Array
-from demorec.recording import Recording
-from demorec.recording.frames import frames_of
-from demorec.recording.streams import action_at
-from demorec.scene.episode import Action, EpisodeInfo, Frame, SuccessCheck
-from demorec.scene.features import ACTION, STATE, ActionKind
+from demorec.core.errors import ConfigError, OptionError, RecordingError, check_option
+from demorec.core.geometry import Array
+from demorec.episode.episode import Action, EpisodeInfo, Frame, SuccessCheck
+from demorec.episode.features import ACTION, STATE, ActionKind
+from demorec.mcap import Recording
+from demorec.mcap.frames import frames_of
+from demorec.mcap.streams import action_at
 
 
 @dataclass(frozen=True, kw_only=True)

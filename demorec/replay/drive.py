@@ -9,16 +9,16 @@ from itertools import chain, repeat
 
 import numpy as np
 
-from demorec.geometry import Array
+from demorec.core.geometry import Array
+from demorec.core.seeding import generator
+from demorec.core.tables import TASKS
+from demorec.episode.episode import Action, Frame, Outcome
 from demorec.loop import Decision, Session
 from demorec.loop.actions import ActionDecoder
-from demorec.recording.streams import pose_of
+from demorec.mcap.streams import pose_of
 from demorec.render.painter import Painter
 from demorec.replay.demonstration import Demonstration, ReplayOptions
-from demorec.scene.episode import Action, Frame, Outcome
-from demorec.seeding import generator
 from demorec.sim.world import World
-from demorec.tables import TASKS
 
 FrameSink = Callable[[Frame], None]
 

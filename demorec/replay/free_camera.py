@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from demorec.config import read_toml
-from demorec.errors import ConfigError, in_words
-from demorec.geometry import Pose, look_at
-from demorec.plain import from_plain
-from demorec.scene.scene import Camera
+from demorec.core.config import read_toml
+from demorec.core.errors import ConfigError, in_words
+from demorec.core.geometry import Pose, look_at
+from demorec.core.plain import from_plain
+from demorec.episode.scene import Camera
 
 
 @dataclass(frozen=True, kw_only=True)

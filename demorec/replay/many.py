@@ -7,17 +7,17 @@ from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
-from demorec.config import VideoConfig
-from demorec.errors import ConfigError
+from demorec.core.config import VideoConfig
+from demorec.core.errors import ConfigError
+from demorec.core.files import make_folder
+from demorec.core.plain import from_plain
+from demorec.core.tables import TASKS
 from demorec.loop import Workshop
-from demorec.plain import from_plain
-from demorec.recording import EpisodeWriter
+from demorec.mcap import EpisodeWriter
 from demorec.replay.demonstration import Demonstration, ReplayOptions
 from demorec.replay.drive import ReplayReport, replay
 from demorec.replay.rerender import recorded_view, view_behaviour, view_painter
-from demorec.safety.files import make_folder
-from demorec.scene.assets import allow_models
-from demorec.tables import TASKS
+from demorec.robots.assets import allow_models
 
 
 def replay_all(

@@ -12,28 +12,28 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from demorec.config import EpisodePlan, GenerateConfig, VideoConfig
-from demorec.errors import ConfigError, DemorecError, NotAllowedError, RecordingError
-from demorec.geometry import Pose
+from demorec.core.config import EpisodePlan, GenerateConfig, VideoConfig
+from demorec.core.errors import ConfigError, DemorecError, NotAllowedError, RecordingError
+from demorec.core.files import make_folder
+from demorec.core.geometry import Pose
+from demorec.core.plain import digest, from_plain, to_json
+from demorec.core.registry import nearest_match
+from demorec.core.seeding import generator
+from demorec.core.tables import CAMERAS, RENDERERS, camera_name
+from demorec.core.user_modules import split_name
+from demorec.episode.camera_error import told_error, true_camera
+from demorec.episode.episode import EpisodeColumns, EpisodeInfo, Outcome
+from demorec.episode.scene import Camera, Scene
+from demorec.episode.variation import Ranges, resolve
 from demorec.loop import prepare
-from demorec.plain import digest, from_plain, to_json
-from demorec.recording import EpisodeWriter, Recording
-from demorec.recording.frames import frames_of
-from demorec.registry import nearest_match
+from demorec.mcap import EpisodeWriter, Recording
+from demorec.mcap.frames import frames_of
 from demorec.render import Renderer
 from demorec.render.painter import Painter
 from demorec.render.recorded import RecordedWorld
 from demorec.render.warm import WarmRenderer
 from demorec.replay.free_camera import FreeCamera
-from demorec.safety.files import make_folder
-from demorec.safety.user_modules import split_name
-from demorec.scene.assets import allow_models
-from demorec.scene.camera_error import told_error, true_camera
-from demorec.scene.episode import EpisodeColumns, EpisodeInfo, Outcome
-from demorec.scene.scene import Camera, Scene
-from demorec.scene.variation import Ranges, resolve
-from demorec.seeding import generator
-from demorec.tables import CAMERAS, RENDERERS, camera_name
+from demorec.robots.assets import allow_models
 from demorec.tasks.vary import vary_looks
 
 

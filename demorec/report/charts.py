@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.check.coverage import ticks
-from demorec.geometry import Array
+from demorec.core.geometry import Array
+from demorec.episode.episode import EpisodeInfo
 from demorec.report.content import ReportedEpisode
 from demorec.report.histogram import Histogram
-from demorec.scene.episode import EpisodeInfo
 
 WIDTH, HEIGHT = 220, 70
 """Of a chart without its labels, in units of its SVG."""

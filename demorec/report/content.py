@@ -10,10 +10,10 @@ from typing import Any, Literal
 from numpy.typing import NDArray
 
 from demorec.check.base import Level, Result
-from demorec.evaluate.statistics import Rate
+from demorec.episode.episode import EpisodeInfo, Outcome
+from demorec.learn.evaluate.statistics import Rate
 from demorec.report.filmstrip import Filmstrip
 from demorec.report.histogram import Histogram
-from demorec.scene.episode import EpisodeInfo, Outcome
 
 LEVELS: tuple[Level, ...] = ("skip", "pass", "warn", "fail")
 State = Literal["unreadable", "failed", "flagged", "unknown", "succeeded"]

@@ -10,19 +10,19 @@ from typing import Any
 from numpy.typing import NDArray
 
 from demorec.check.report import CheckOptions, Subject, check_subject
-from demorec.errors import ConfigError, ExportError, in_words, without_path
-from demorec.lerobot.attempts import ATTEMPT_SCHEMA
-from demorec.lerobot.files import read_json, read_table
-from demorec.lerobot.layout import DatasetInfo
-from demorec.lerobot.paths import SIDECAR_DIR
-from demorec.lerobot.reader import EpisodePlace, RowReader, episode_places
-from demorec.lerobot.sidecar import CONFIGS_PATH, EPISODE_SCHEMA
-from demorec.lerobot.stills import pictures_at
+from demorec.core.errors import ConfigError, ExportError, in_words, without_path
+from demorec.datasets.lerobot.attempts import ATTEMPT_SCHEMA
+from demorec.datasets.lerobot.files import read_json, read_table
+from demorec.datasets.lerobot.layout import DatasetInfo
+from demorec.datasets.lerobot.paths import SIDECAR_DIR
+from demorec.datasets.lerobot.reader import EpisodePlace, RowReader, episode_places
+from demorec.datasets.lerobot.sidecar import CONFIGS_PATH, EPISODE_SCHEMA
+from demorec.datasets.lerobot.stills import pictures_at
+from demorec.episode.episode import Outcome, SuccessCheck
+from demorec.episode.features import ACTION, IMAGE_PREFIX, STATE
+from demorec.episode.validity import read_episode_info
 from demorec.report.content import CheckSummaries, Components, Report, ReportedEpisode, common_facts, count
 from demorec.report.filmstrip import MAX_SHOWN, Filmstrip, filmstrip, strip_budget
-from demorec.scene.episode import Outcome, SuccessCheck
-from demorec.scene.features import ACTION, IMAGE_PREFIX, STATE
-from demorec.scene.validity import read_episode_info
 
 _SUCCESS = "next.success"
 _NUMBERS = ("float32", "float64", "int64", "bool")

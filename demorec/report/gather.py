@@ -9,10 +9,13 @@ from itertools import pairwise
 from pathlib import Path
 
 from demorec.check.report import CheckOptions, Subject, SubjectReport, check_subject, find_subjects
-from demorec.errors import ConfigError, RecordingError, without_path
-from demorec.plain import to_plain
-from demorec.processes import in_turn
-from demorec.recording import Recording
+from demorec.core.errors import ConfigError, RecordingError, without_path
+from demorec.core.plain import to_plain
+from demorec.core.processes import in_turn
+from demorec.episode.episode import EpisodeInfo, Outcome
+from demorec.episode.features import ACTION, STATE, action_names, action_vectors, observation_names, observation_vectors
+from demorec.episode.sensed import ObservationRows
+from demorec.mcap import Recording
 from demorec.report.content import (
     CheckSummaries,
     Components,
@@ -27,9 +30,6 @@ from demorec.report.dataset import dataset_report
 from demorec.report.filmstrip import MAX_SHOWN, filmstrip, strip_budget
 from demorec.runs.find import EPISODE_FOLDERS, Found, PathKind, expect, expect_recordings
 from demorec.runs.run_file import FAILED, RUN_NAME, Attempt, DamagedRunFileError, RunFile, load_run_file
-from demorec.scene.episode import EpisodeInfo, Outcome
-from demorec.scene.features import ACTION, STATE, action_names, action_vectors, observation_names, observation_vectors
-from demorec.scene.sensed import ObservationRows
 
 _KINDS: Mapping[PathKind, str] = {
     "recording": "recording",

@@ -22,17 +22,17 @@ from markupsafe import Markup
 
 from demorec.check.base import Result
 from demorec.check.coverage import MIN_VALUES, drawn_columns, randomised, with_unit
-from demorec.errors import ConfigError
-from demorec.playback.style import phase_colors
+from demorec.core.errors import ConfigError
+from demorec.core.replacing import REPORT, REPORT_MARK, written_whole
+from demorec.core.text import printable
+from demorec.episode.episode import EpisodeInfo
+from demorec.episode.features import ACTION, STATE
 from demorec.report import charts
 from demorec.report.charts import Chart, css_color
 from demorec.report.content import LEVELS, Report, ReportedEpisode, State, success_rate
 from demorec.report.filmstrip import MAX_SHOWN
 from demorec.report.histogram import Histogram
-from demorec.safety.replacing import REPORT, REPORT_MARK, written_whole
-from demorec.safety.text import printable
-from demorec.scene.episode import EpisodeInfo
-from demorec.scene.features import ACTION, STATE
+from demorec.view.style import phase_colors
 
 _STATES: dict[State, str] = {
     "unreadable": "unreadable",
@@ -206,7 +206,7 @@ def _distributions(report: Report) -> Iterator[Chart]:
 
 
 def _unit(name: str) -> str:
-    """Of a component, by its name in `demorec.scene.features`."""
+    """Of a component, by its name in `demorec.episode.features`."""
     part = name.rpartition(".")[2]
     if part in ("pos", "delta", "rx", "ry", "rz"):
         return "rad"

@@ -14,9 +14,12 @@ from datetime import UTC, datetime
 from hashlib import sha256
 from pathlib import Path
 
-from demorec.errors import ConfigError, RecordingError, in_words, resource_error
-from demorec.plain import from_plain, to_plain
-from demorec.recording import CollectedRecording, recover
+from demorec.core.errors import ConfigError, RecordingError, in_words, resource_error
+from demorec.core.files import make_folder, read_json_limited
+from demorec.core.plain import from_plain, to_plain
+from demorec.core.replacing import shown
+from demorec.episode.collected import CollectedInfo
+from demorec.mcap import CollectedRecording, recover
 from demorec.runs.lock import LOCK_NAME, run_lock
 from demorec.runs.run_file import (
     COLLECTED,
@@ -32,9 +35,6 @@ from demorec.runs.run_file import (
     replace_run_file,
     sha256_of,
 )
-from demorec.safety.files import make_folder, read_json_limited
-from demorec.safety.replacing import shown
-from demorec.scene.collected import CollectedInfo
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,11 +14,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from demorec.errors import ConfigError, resource_error
-from demorec.lerobot.paths import INFO_PATH
+from demorec.core.errors import ConfigError, resource_error
+from demorec.core.files import HDF5_MAGIC, MCAP_MAGIC, RERUN_MAGICS, irregular_kind, open_regular
+from demorec.core.replacing import shown
+from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.runs.run_file import EPISODES, FAILED, RUN_NAME, UNFINISHED
-from demorec.safety.files import HDF5_MAGIC, MCAP_MAGIC, RERUN_MAGICS, irregular_kind, open_regular
-from demorec.safety.replacing import shown
 
 PathKind = Literal[
     "recording",

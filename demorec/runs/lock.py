@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from demorec.errors import ConfigError, resource_error
+from demorec.core.errors import ConfigError, resource_error
 
 LOCK_NAME = ".lock"
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from demorec.errors import RecordingError
-from demorec.recording import Recording
+from demorec.core.errors import RecordingError
+from demorec.mcap import Recording
 from demorec.runs.run_file import Attempt, sha256_of
 
 

@@ -14,10 +14,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from demorec.config import GenerateConfig
-from demorec.errors import ConfigError, DemorecError, in_words, resource_error
-from demorec.plain import digest, from_plain, to_plain
-from demorec.safety.files import open_regular, read_json_limited, replace_text
+from demorec.core.config import GenerateConfig
+from demorec.core.errors import ConfigError, DemorecError, in_words, resource_error
+from demorec.core.files import open_regular, read_json_limited, replace_text
+from demorec.core.plain import digest, from_plain, to_plain
 
 RUN_NAME = "run.json"
 RUN_FORMAT = 1
@@ -26,7 +26,7 @@ EPISODES, FAILED, UNFINISHED, DATASET = "episodes", "failed", "unfinished", "dat
 COLLECTED = "collected"
 """The "kind" that run.json has where the run's episodes were collected; see `demorec.runs.collected`."""
 IMPORT_NAME = "import.json"
-"""Beside run.json: what `demorec import` read, and what it found in it (`demorec.ingest.import_file`)."""
+"""Beside run.json: what `demorec import` read, and what it found in it (`demorec.sources.import_file`)."""
 STARTING = "starting"
 """What a worker does before its first frame, once: it compiles, or loads, and fills caches that later episodes find."""
 
@@ -45,7 +45,7 @@ class Attempt:
 
     Attributes:
         episode_index, attempt: Which.
-        seed: Root seed; with index and attempt it gives every random number (demorec.seeding).
+        seed: Root seed; with index and attempt it gives every random number (demorec.core.seeding).
         success: Whether every check of the task passed.
         file: Recording, relative to the run's folder; "" when no scene could be laid out, so that nothing was
             recorded.

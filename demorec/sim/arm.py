@@ -6,14 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from demorec.errors import SceneError
-from demorec.geometry import Array, Pose
-from demorec.scene.assets import asset_path
-from demorec.scene.episode import Action
-from demorec.scene.kinematics import ArmKinematics
-from demorec.scene.robot import RobotSpec
-from demorec.scene.scene import POSITION_GAIN, RobotPlacement
-from demorec.scene.urdf import Urdf
+from demorec.core.errors import SceneError
+from demorec.core.geometry import Array, Pose
+from demorec.episode.episode import Action
+from demorec.episode.scene import POSITION_GAIN, RobotPlacement
+from demorec.robots.assets import asset_path
+from demorec.robots.kinematics import ArmKinematics
+from demorec.robots.robot import RobotSpec
+from demorec.robots.urdf import Urdf
 from demorec.sim.urdf_file import load_urdf
 
 FINGER_DAMPING = 1_000.0

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from demorec.errors import SceneError
-from demorec.scene.assets import asset_path
-from demorec.scene.scene import Body
+from demorec.core.errors import SceneError
+from demorec.episode.scene import Body
+from demorec.robots.assets import asset_path
 from demorec.sim.client import silence
 from demorec.sim.urdf_file import load_urdf
 

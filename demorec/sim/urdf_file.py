@@ -11,10 +11,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from demorec.errors import DemorecError, SceneError
-from demorec.geometry import Pose
-from demorec.scene.assets import asset_path, mesh_path
-from demorec.scene.inertials import check_masses, with_massless_frames
+from demorec.core.errors import DemorecError, SceneError
+from demorec.core.geometry import Pose
+from demorec.robots.assets import asset_path, mesh_path
+from demorec.robots.inertials import check_masses, with_massless_frames
 from demorec.sim.client import silence
 
 
@@ -25,7 +25,7 @@ def load_urdf(
 
     Args:
         client: The PyBullet client.
-        name: As in `demorec.scene.assets.asset_path`.
+        name: As in `demorec.robots.assets.asset_path`.
         pose: Of its base.
         scale: Uniform scale.
         is_fixed: Whether physics cannot move its base.
@@ -53,7 +53,7 @@ def urdf_file(name: str, *, has_frames: bool = False) -> Iterator[str]:
     """A file that PyBullet can load while the context lasts.
 
     Args:
-        name: As in `demorec.scene.assets.asset_path`.
+        name: As in `demorec.robots.assets.asset_path`.
         has_frames: Whether links without `<inertial>` are frames of no mass.
 
     Raises:

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from demorec.errors import RenderError
-from demorec.geometry import Array, Pose
+from demorec.core.errors import RenderError
+from demorec.core.geometry import Array, Pose
+from demorec.episode.scene import Texture
 from demorec.render import Visual, VisualBody, VisualKind
-from demorec.scene.assets import asset_path
-from demorec.scene.scene import Texture
+from demorec.robots.assets import asset_path
 
 ShapeRows = tuple[tuple[Any, ...], ...]
 """Of every visual shape what PyBullet tells: body, link, kind, dimensions, file, position, orientation, colour."""

@@ -12,12 +12,12 @@ from typing import Any, Self
 
 import numpy as np
 
-from demorec.errors import ConfigError, SceneError
-from demorec.geometry import Array, Pose
+from demorec.core.errors import ConfigError, SceneError
+from demorec.core.geometry import Array, Pose
+from demorec.episode.episode import Action, JointSample, Observation, frame_time_ns
+from demorec.episode.scene import Body, Physics, Scene
 from demorec.render import Mount, VisualBody
-from demorec.scene.episode import Action, JointSample, Observation, frame_time_ns
-from demorec.scene.robot import RobotSpec
-from demorec.scene.scene import Body, Physics, Scene
+from demorec.robots.robot import RobotSpec
 from demorec.sim.arm import Arm
 from demorec.sim.bodies import add_body
 from demorec.sim.client import connect

@@ -8,10 +8,10 @@ from typing import ClassVar
 
 import numpy as np
 
+from demorec.episode.episode import SuccessCheck
+from demorec.episode.scene import Scene
 from demorec.render.cameras import CameraPreset
-from demorec.scene.episode import SuccessCheck
-from demorec.scene.robot import RobotSpec
-from demorec.scene.scene import Scene
+from demorec.robots.robot import RobotSpec
 from demorec.sim.world import World
 from demorec.tasks.recovery import begin_again, is_served
 from demorec.tasks.sampling import Sampler

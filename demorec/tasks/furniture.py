@@ -6,9 +6,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from demorec.geometry import Pose
-from demorec.scene.robot import RobotSpec
-from demorec.scene.scene import Body, Rgba, RobotPlacement, Shape, Vector3
+from demorec.core.geometry import Pose
+from demorec.episode.scene import Body, Rgba, RobotPlacement, Shape, Vector3
+from demorec.robots.robot import RobotSpec
 from demorec.tasks.sampling import Sampler
 
 TABLE_HEIGHT = 0.62

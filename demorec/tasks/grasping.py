@@ -7,9 +7,9 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from demorec.geometry import Array, Pose, wrap_angle
-from demorec.scene.robot import RobotSpec
-from demorec.scene.scene import Body
+from demorec.core.geometry import Array, Pose, wrap_angle
+from demorec.episode.scene import Body
+from demorec.robots.robot import RobotSpec
 
 # Of the open hand, metres, from the TCP along its x and y axes; the larger of the Panda's and the iiwa's.
 _FINGERS = (0.012, 0.07)

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from demorec.geometry import Array
-from demorec.scene.episode import CORRECTED_PHASE, INTERJECTION_EVENT, MISTAKEN_PHASE
-from demorec.scene.scene import Scene
+from demorec.core.geometry import Array
+from demorec.episode.episode import CORRECTED_PHASE, INTERJECTION_EVENT, MISTAKEN_PHASE
+from demorec.episode.scene import Scene
 from demorec.tasks.grasping import hand_down, hand_yaw
 from demorec.tasks.script import Step
 from demorec.tasks.skills import FREE_SPEED, Expert, GaveUp

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from demorec.scene.episode import SuccessCheck
+from demorec.episode.episode import SuccessCheck
 from demorec.sim.world import World
 from demorec.tasks.furniture import mark
 from demorec.tasks.placing import Layout, TableTask, on_table, random_cube

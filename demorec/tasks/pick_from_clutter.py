@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from demorec.scene.scene import Body
+from demorec.episode.scene import Body
 from demorec.tasks.furniture import COLORS, mark
 from demorec.tasks.placing import Layout, TableTask, on_table
 from demorec.tasks.sampling import WORKSPACE, Region, Sampler

@@ -9,10 +9,10 @@ from typing import ClassVar
 
 import numpy as np
 
-from demorec.geometry import Pose
-from demorec.scene.episode import SuccessCheck
-from demorec.scene.robot import RobotSpec
-from demorec.scene.scene import Body, Goal, Rgba, Scene, Shape
+from demorec.core.geometry import Pose
+from demorec.episode.episode import SuccessCheck
+from demorec.episode.scene import Body, Goal, Rgba, Scene, Shape
+from demorec.robots.robot import RobotSpec
 from demorec.sim.world import World
 from demorec.tasks.base import Task
 from demorec.tasks.furniture import COLORS, cube, robot_at_origin, table_and_floor

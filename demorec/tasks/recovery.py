@@ -12,9 +12,9 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from demorec.scene.episode import HALT_PHASE
-from demorec.scene.motion import PEAK_VELOCITY, quintic, slowdown
-from demorec.scene.scene import Goal
+from demorec.episode.episode import HALT_PHASE
+from demorec.episode.scene import Goal
+from demorec.robots.motion import PEAK_VELOCITY, quintic, slowdown
 from demorec.sim.world import World
 from demorec.tasks.grasping import hand_down, hand_yaw, nearest_first, symmetric_yaws
 from demorec.tasks.script import Step

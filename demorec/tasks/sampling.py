@@ -10,10 +10,10 @@ from typing import Literal
 
 import numpy as np
 
-from demorec.errors import SceneError
-from demorec.geometry import Array
-from demorec.scene.variation import PRESETS, Ranges
-from demorec.seeding import generator
+from demorec.core.errors import SceneError
+from demorec.core.geometry import Array
+from demorec.core.seeding import generator
+from demorec.episode.variation import PRESETS, Ranges
 
 MAX_TRIES = 1000
 STRATIFIED_NUMBERS = 12

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 
-from demorec.scene.episode import Action, Event
+from demorec.episode.episode import Action, Event
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,10 +13,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from demorec.geometry import Array, Pose, wrap_angle
-from demorec.scene.episode import Event
-from demorec.scene.motion import MotionLimits, plan_straight
-from demorec.scene.scene import Goal, yaw_of
+from demorec.core.geometry import Array, Pose, wrap_angle
+from demorec.episode.episode import Event
+from demorec.episode.scene import Goal, yaw_of
+from demorec.robots.motion import MotionLimits, plan_straight
 from demorec.sim.world import World
 from demorec.tasks.grasping import (
     grasp_yaws,

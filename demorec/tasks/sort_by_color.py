@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from demorec.geometry import Pose
-from demorec.scene.scene import Body, Goal
+from demorec.core.geometry import Pose
+from demorec.episode.scene import Body, Goal
 from demorec.tasks.placing import TRAY_FLOOR, Layout, TableTask, random_cube, tray
 from demorec.tasks.sampling import Region, Sampler
 

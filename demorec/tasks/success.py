@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
-from demorec.geometry import Pose
-from demorec.scene.episode import SuccessCheck
-from demorec.scene.scene import Body, Goal
+from demorec.core.geometry import Pose
+from demorec.episode.episode import SuccessCheck
+from demorec.episode.scene import Body, Goal
 from demorec.sim.world import World
 
 MAX_DISTANCE = 0.02

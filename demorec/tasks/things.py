@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from demorec.geometry import Pose
-from demorec.scene.scene import Body, Role, Shape
+from demorec.core.geometry import Pose
+from demorec.episode.scene import Body, Role, Shape
 from demorec.tasks.furniture import COLORS
 from demorec.tasks.sampling import Sampler
 

@@ -1,4 +1,4 @@
-"""Applies the ranges of `demorec.scene.variation` to a task's scene, whatever the task."""
+"""Applies the ranges of `demorec.episode.variation` to a task's scene, whatever the task."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from demorec.geometry import Pose
-from demorec.scene.scene import Body, Camera, Light, Rgba, Scene, Shape, Texture, Vector3
-from demorec.scene.variation import Ranges
+from demorec.core.geometry import Pose
+from demorec.episode.scene import Body, Camera, Light, Rgba, Scene, Shape, Texture, Vector3
+from demorec.episode.variation import Ranges
 from demorec.tasks.sampling import WORKSPACE, Region, Sampler
 from demorec.tasks.script import Behaviour
 

@@ -7,14 +7,14 @@ from typing import ClassVar
 
 import numpy as np
 
+from demorec.core.plain import from_json, to_json
+from demorec.core.tables import load_robot
+from demorec.core.user_modules import modules_of
 from demorec.loop import Episode, make_world, prepare
-from demorec.plain import from_json, to_json
-from demorec.safety.user_modules import modules_of
-from demorec.scene.assets import allow_models, asset_path
-from demorec.scene.robot import RobotSpec
-from demorec.scene.urdf import Urdf
+from demorec.robots.assets import allow_models, asset_path
+from demorec.robots.robot import RobotSpec
+from demorec.robots.urdf import Urdf
 from demorec.sim.arm import arm_kinematics
-from demorec.tables import load_robot
 from demorec.tasks.grasping import hand_down
 from demorec.testing.task_contract import plan_of, run_expert
 

@@ -12,14 +12,14 @@ from typing import ClassVar
 import numpy as np
 
 from demorec.check.report import CheckOptions, Subject, check_subject
-from demorec.config import EpisodePlan, GenerateConfig
+from demorec.core.config import EpisodePlan, GenerateConfig
+from demorec.core.plain import to_json
+from demorec.core.user_modules import modules_of
+from demorec.episode.episode import EpisodeInfo, Frame, Outcome
+from demorec.episode.validity import read_episode_info
 from demorec.loop import Episode, ScriptAgent, Session, make_world, prepare
-from demorec.plain import to_json
-from demorec.recording import EpisodeWriter
+from demorec.mcap import EpisodeWriter
 from demorec.replay import ReplayOptions, open_file, replay_all
-from demorec.safety.user_modules import modules_of
-from demorec.scene.episode import EpisodeInfo, Frame, Outcome
-from demorec.scene.validity import read_episode_info
 from demorec.sim.arm import arm_kinematics
 from demorec.tasks.grasping import hand_down, symmetric_yaws
 

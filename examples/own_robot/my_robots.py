@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 
 from demorec.render.cameras import CameraPreset
-from demorec.scene.robot import ParallelGripper, RobotSpec
+from demorec.robots.robot import ParallelGripper, RobotSpec
 
 TURN = 2 * math.pi
 

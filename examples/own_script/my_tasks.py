@@ -11,9 +11,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from demorec.scene import Scene
-from demorec.scene.episode import SuccessCheck
-from demorec.scene.robot import RobotSpec
+from demorec.episode.episode import SuccessCheck
+from demorec.episode.scene import Scene
+from demorec.robots.robot import RobotSpec
 from demorec.sim.world import World
 from demorec.tasks.base import Task
 from demorec.tasks.furniture import mark, robot_at_origin, table_and_floor

@@ -16,7 +16,7 @@ import pybullet_data
 from numpy.typing import NDArray
 
 from demorec import Recorder
-from demorec.scene.collected import CollectedCamera
+from demorec.episode.collected import CollectedCamera
 
 URDF = Path(pybullet_data.getDataPath()) / "kuka_iiwa" / "model.urdf"
 FPS, PHYSICS_HZ = 30, 240

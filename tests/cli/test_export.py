@@ -9,7 +9,7 @@ import pytest
 from support.commands import exit_code
 from support.export import episode_rows, files_of, make_run
 
-from demorec.lerobot import ExportOptions, dataset_digest, export_lerobot
+from demorec.datasets.lerobot import ExportOptions, dataset_digest, export_lerobot
 
 
 @pytest.fixture(scope="module")

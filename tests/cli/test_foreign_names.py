@@ -14,10 +14,10 @@ import pytest
 from support.check import Spoilt
 from support.commands import exit_code
 
-from demorec.config import GenerateConfig
-from demorec.errors import ConfigError, NotAllowedError
-from demorec.lerobot import ExportOptions, export_lerobot
-from demorec.plain import to_plain
+from demorec.core.config import GenerateConfig
+from demorec.core.errors import ConfigError, NotAllowedError
+from demorec.core.plain import to_plain
+from demorec.datasets.lerobot import ExportOptions, export_lerobot
 from demorec.runs.recordings import inspect_recording
 from demorec.runs.run_file import RUN_NAME, RunFile, save_run_file
 
@@ -32,7 +32,7 @@ Path(__file__).with_name("marker").touch()
 class Mine(PickPlace):
     """A task like another."""
 '''
-HARMFUL = ["os:abort", "builtins:exit", "demorec.errors:DemorecError", "no colon", "a:b:c", ""]
+HARMFUL = ["os:abort", "builtins:exit", "demorec.core.errors:DemorecError", "no colon", "a:b:c", ""]
 
 
 @pytest.fixture
@@ -186,7 +186,7 @@ def test_what_can_be_no_module_is_refused(name: str, tmp_path: Path, capsys: pyt
 
 
 def test_a_policy_sees_cameras_that_the_user_names(tmp_path: Path) -> None:
-    from demorec.evaluate.rollouts import settings_for
+    from demorec.learn.evaluate.rollouts import settings_for
 
     shape = {"type": "VISUAL", "shape": [3, 48, 64]}
     inputs = {f"observation.images.{name}": shape for name in ("front", "corner")}
@@ -199,7 +199,7 @@ def test_a_policy_sees_cameras_that_the_user_names(tmp_path: Path) -> None:
 
 
 def test_a_policy_cannot_name_the_code_of_its_steps_nor_its_cameras(tmp_path: Path, marker: Path) -> None:
-    from demorec.evaluate.rollouts import settings_for
+    from demorec.learn.evaluate.rollouts import settings_for
 
     policy = tmp_path / "policy"
     policy.mkdir()
@@ -222,8 +222,8 @@ def test_a_policy_cannot_name_the_code_of_its_steps_nor_its_cameras(tmp_path: Pa
     "file", ["/etc/hostname", "../../secret.urdf", "demorec:../robots/panda.py", "stranger:abort.urdf"]
 )
 def test_models_that_a_file_names_lie_in_known_folders(file: str) -> None:
-    from demorec.errors import DemorecError
-    from demorec.scene.assets import asset_path
+    from demorec.core.errors import DemorecError
+    from demorec.robots.assets import asset_path
 
     with pytest.raises(DemorecError, match=r"lies outside of|add --allow stranger\."):
         asset_path(file)

@@ -18,7 +18,7 @@ from support.mcap import rewritten
 from support.recording import write_episode
 
 from demorec.cli import COMMANDS, main, run_command
-from demorec.recording import Recording
+from demorec.mcap import Recording
 from demorec.runs.recordings import inspect_recording
 from demorec.runs.run_file import RunFile, save_run_file
 
@@ -90,7 +90,7 @@ def hostile(tmp_path_factory: pytest.TempPathFactory) -> Path:
     shutil.copy(good, run / "episodes" / "episode_000000.mcap")
     from dataclasses import replace
 
-    from demorec.config import GenerateConfig
+    from demorec.core.config import GenerateConfig
 
     attempt = replace(inspect_recording(good).attempt, file="episodes/episode_000000.mcap")
     config = GenerateConfig(cameras=())

@@ -194,7 +194,7 @@ def test_help_has_examples_and_every_option(capsys: pytest.CaptureFixture[str]) 
     ],
 )
 def test_list_tells_every_row_in_one_line(capsys: pytest.CaptureFixture[str], what: str, names: str) -> None:
-    from demorec import tables
+    from demorec.core import tables
 
     with pytest.raises(SystemExit) as ended:
         main(["list", what])

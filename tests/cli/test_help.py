@@ -8,7 +8,7 @@ import unicodedata
 import pytest
 
 from demorec.cli import COMMANDS, generate_dataset_main, main
-from demorec.tables import EXPORTERS
+from demorec.core.tables import EXPORTERS
 
 PROGRAMS = (
     "demorec",

@@ -15,8 +15,8 @@ from rosbags.rosbag2 import StoragePlugin
 from support import bag_mappings, bags
 
 from demorec.cli import main
-from demorec.lerobot.paths import INFO_PATH
-from demorec.recording import CollectedRecording
+from demorec.datasets.lerobot.paths import INFO_PATH
+from demorec.mcap import CollectedRecording
 from demorec.runs.collected import load_collected_run
 
 
@@ -269,7 +269,7 @@ def test_a_full_disk_leaves_nothing_half_written(
 def test_interrupting_leaves_nothing_half_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from demorec.ingest.episode_writer import ImportedEpisodeWriter
+    from demorec.sources.episode_writer import ImportedEpisodeWriter
 
     bag = bags.write_mcap(bags.in_order(bags.so101(0.5)), tmp_path / "bag.mcap")
     mapping = bag_mappings.write_mapping(bag_mappings.SO101, tmp_path / "robot.toml")

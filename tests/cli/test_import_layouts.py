@@ -13,7 +13,7 @@ from support.layout_topics import Layout, Part
 from support.layouts import LAYOUTS, UR
 
 from demorec.cli import main
-from demorec.recording import CollectedRecording
+from demorec.mcap import CollectedRecording
 
 
 def _run(*words: str | Path) -> int:

@@ -13,7 +13,7 @@ from support.export import export, files_of
 from support.recording import make_episode, write_episode
 
 from demorec.cli import COMMANDS, main, run_command
-from demorec.recording import EpisodeWriter, Recording
+from demorec.mcap import EpisodeWriter, Recording
 from demorec.runs.find import find
 
 

@@ -20,15 +20,9 @@ from support.generate import run_fake
 from support.recording import write_episode
 
 from demorec.cli.shared.paths import refuse_inside
-from demorec.config import GenerateConfig
-from demorec.errors import ConfigError, DemorecError
-from demorec.evaluate.rollouts import Settings, _open
-from demorec.generate import reproduce as reproducing
-from demorec.generate.observer import RunObserver
-from demorec.generate.options import RunOptions
-from demorec.lerobot import ExportOptions
-from demorec.runs.find import EVALUATION_NAME
-from demorec.safety.replacing import (
+from demorec.core.config import GenerateConfig
+from demorec.core.errors import ConfigError, DemorecError
+from demorec.core.replacing import (
     PICTURE,
     RECORDING,
     REPORT_MARK,
@@ -37,6 +31,12 @@ from demorec.safety.replacing import (
     settle_parts,
     written_whole,
 )
+from demorec.datasets.lerobot import ExportOptions
+from demorec.generate import reproduce as reproducing
+from demorec.generate.observer import RunObserver
+from demorec.generate.options import RunOptions
+from demorec.learn.evaluate.rollouts import Settings, _open
+from demorec.runs.find import EVALUATION_NAME
 
 
 @pytest.fixture(scope="module")
@@ -147,7 +147,7 @@ def test_a_workshop_of_somebody_else_is_left_alone(place: Path, capsys: pytest.C
 
 
 def test_files_put_into_the_target_meanwhile_are_kept(place: Path) -> None:
-    from demorec.lerobot import ExportOptions, export_lerobot
+    from demorec.datasets.lerobot import ExportOptions, export_lerobot
 
     def note(done: int, total: int) -> None:
         (place / "dataset" / "notes.txt").write_text("years of work")
@@ -405,7 +405,7 @@ def test_a_recording_replaces_recordings_only(place: Path, capsys: pytest.Captur
     """What render, replay and evaluate write with."""
     from support.recording import make_episode
 
-    from demorec.recording import EpisodeWriter
+    from demorec.mcap import EpisodeWriter
 
     info, _, _ = make_episode(num_frames=1, cameras=())
     before = files_of(place.parent)

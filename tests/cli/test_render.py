@@ -13,8 +13,8 @@ import pytest
 from support.commands import exit_code
 from support.export import files_of, make_run
 
-from demorec.recording import EpisodeWriter
-from demorec.scene.episode import Outcome
+from demorec.episode.episode import Outcome
+from demorec.mcap import EpisodeWriter
 
 INTERRUPTIBLE = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
 """Whoever runs the tests in the background of a shell has switched it off."""

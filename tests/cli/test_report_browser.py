@@ -13,7 +13,7 @@ from support.export import make_run
 from support.mcap import rewritten
 from support.viewer import Chromium, chromium, need_chromium, num_colors, pixels
 
-from demorec.recording import Recording
+from demorec.mcap import Recording
 
 HOSTILE = "<script>document.title = 'taken'</script><img src=x onerror=\"document.title = 'taken'\">"
 

@@ -49,7 +49,7 @@ def test_flags_go_on_and_the_reader_is_replaced_meanwhile(
 ) -> None:
     from lerobot.datasets import LeRobotDataset, factory
 
-    from demorec.training import FastDataset
+    from demorec.learn.training import FastDataset
 
     seen: dict[str, Any] = {}
 

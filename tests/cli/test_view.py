@@ -14,13 +14,13 @@ from support.viewer import chromium, need_chromium, need_vulkan, num_colors, pix
 
 from demorec.cli import run_command
 from demorec.cli.view import View
-from demorec.config import VideoConfig
-from demorec.playback import live as live_module
-from demorec.playback.live import LiveViewer
-from demorec.playback.save import save, save_each
-from demorec.playback.sources import find_episodes
-from demorec.playback.viewer import HeadlessViewer, serve_web
-from demorec.recording import EpisodeWriter
+from demorec.core.config import VideoConfig
+from demorec.mcap import EpisodeWriter
+from demorec.view import live as live_module
+from demorec.view.live import LiveViewer
+from demorec.view.save import save, save_each
+from demorec.view.sources import find_episodes
+from demorec.view.viewer import HeadlessViewer, serve_web
 
 
 def view(*args: object) -> int:

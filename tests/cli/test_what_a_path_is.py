@@ -14,8 +14,8 @@ from support.commands import exit_code
 from support.recording import write_episode
 
 from demorec.cli import main
-from demorec.errors import ConfigError
-from demorec.lerobot.paths import INFO_PATH
+from demorec.core.errors import ConfigError
+from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.runs.find import PathKind, expect, find
 
 

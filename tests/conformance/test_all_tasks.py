@@ -10,8 +10,8 @@ import pytest
 from support.check import checked, simulate_run
 
 from demorec.cli import main
-from demorec.recording import Recording
-from demorec.tables import TASKS
+from demorec.core.tables import TASKS
+from demorec.mcap import Recording
 
 
 @pytest.mark.slow

@@ -16,8 +16,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from support.collected import TOP, URDF, make_collected, write_collected
 from support.export import export
 
-from demorec.recording.ros2 import DEFINITIONS
-from demorec.scene.urdf import Urdf
+from demorec.mcap.ros2 import DEFINITIONS
+from demorec.robots.urdf import Urdf
 
 EPISODE = make_collected()
 

@@ -11,14 +11,14 @@ import pytest
 from support.export import without_verification
 
 from demorec.cli import generate_dataset_main, main
-from demorec.config import EpisodePlan, GenerateConfig, deciding_versions
+from demorec.core.config import EpisodePlan, GenerateConfig, deciding_versions
+from demorec.datasets.lerobot import ExportOptions, dataset_digest, export_lerobot
+from demorec.datasets.lerobot.verify import Verifier
 from demorec.generate.export_step import export_run
 from demorec.generate.observer import RunObserver, RunResult
 from demorec.generate.options import RunOptions
 from demorec.generate.run import generate
-from demorec.lerobot import ExportOptions, dataset_digest, export_lerobot
-from demorec.lerobot.verify import Verifier
-from demorec.recording import Recording
+from demorec.mcap import Recording
 from demorec.runs.run_file import load_run_file
 
 CONFIG = GenerateConfig(seed=11, width=48, height=32)
@@ -104,8 +104,8 @@ def test_reproduce_makes_runs_and_datasets_again_and_sees_a_difference(
 
 @pytest.mark.usefixtures("unverified")
 def test_a_dataset_of_few_features_is_made_again_and_can_be_shown(tmp_path: Path, reference: RunResult) -> None:
-    from demorec.playback.episode import PlayedEpisode
-    from demorec.playback.from_dataset import open_dataset_episode
+    from demorec.view.episode import PlayedEpisode
+    from demorec.view.from_dataset import open_dataset_episode
 
     few = ExportOptions(features=("observation.images.wrist",), action="ee_delta", verify=False)
     export_lerobot([reference.folder], tmp_path / "few", few)

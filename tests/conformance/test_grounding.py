@@ -13,15 +13,15 @@ from support.check import simulate_run
 from support.export import export, files_of, make_run
 from support.language import NOUNS, language_of, meant, phrases
 
-from demorec.errors import ConfigError
-from demorec.export.exported import exported
-from demorec.geometry import rotation_from_quat
-from demorec.language.masks import outline_area, run_lengths
-from demorec.lerobot import ExportOptions, dataset_digest
-from demorec.lerobot.boxes import coco_string
-from demorec.lerobot.prepare import prepare_episode
-from demorec.recording import Recording
-from demorec.scene.scene import Camera, Shape
+from demorec.annotate.masks import outline_area, run_lengths
+from demorec.core.errors import ConfigError
+from demorec.core.geometry import rotation_from_quat
+from demorec.datasets.exported import exported
+from demorec.datasets.lerobot import ExportOptions, dataset_digest
+from demorec.datasets.lerobot.boxes import coco_string
+from demorec.datasets.lerobot.prepare import prepare_episode
+from demorec.episode.scene import Camera, Shape
+from demorec.mcap import Recording
 
 PREFIX = "observation.images."
 Row = dict[str, Any]
@@ -74,7 +74,7 @@ class Truth:
         """The one body that a phrase means at that moment."""
         from dataclasses import replace
 
-        from demorec.geometry import Pose
+        from demorec.core.geometry import Pose
 
         moved = [
             replace(body, world_from_body=Pose(position=self.position(frame, body.name))) for body in self.scene.bodies
@@ -263,7 +263,7 @@ def test_pycocotools_reads_them(dataset: Path) -> None:
 @pytest.mark.parametrize("shape", [Shape(kind="box", size=(0.2, 0.1, 0.3)), Shape(kind="cylinder", size=(0.1, 0.3))])
 def test_outlines_of_what_faces_the_camera(shape: Shape) -> None:
     """From far above, the outline is the face that is seen, in pixels."""
-    from demorec.geometry import look_at
+    from demorec.core.geometry import look_at
 
     eye = look_at((0.0, 0.0, 100.15), (0.0, 0.0, 0.0), up=(0.0, 1.0, 0.0))
     camera = Camera(name="c", width=100, height=100, fov_y=0.02, mount="world", mount_from_camera=eye, far=200.0)
@@ -301,10 +301,10 @@ def test_without_segmentation_there_are_traces_and_no_questions(tmp_path: Path) 
 def test_playback_has_the_words_and_the_boxes(dataset: Path, tmp_path: Path) -> None:
     from rerun.chunk import RrdReader
 
-    from demorec.playback.episode import PlayedEpisode
-    from demorec.playback.from_dataset import open_dataset_episode
-    from demorec.playback.save import save
-    from demorec.playback.sources import find_episodes
+    from demorec.view.episode import PlayedEpisode
+    from demorec.view.from_dataset import open_dataset_episode
+    from demorec.view.save import save
+    from demorec.view.sources import find_episodes
 
     (frames,) = language_of(dataset)
     subtasks = {row["timestamp"]: row["content"] for row in frames[0][0] if row["style"] == "subtask"}

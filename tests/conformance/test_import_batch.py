@@ -21,17 +21,17 @@ from rosbags.rosbag2 import StoragePlugin
 from support import bag_mappings, bags
 
 from demorec.cli import main
-from demorec.errors import ConfigError, DemorecError
-from demorec.ingest import import_run
-from demorec.ingest.bag import Bag
-from demorec.ingest.channel import BagError
-from demorec.ingest.import_run import import_bags
-from demorec.ingest.mapping import BagMapping
-from demorec.ingest.report import BagReport
-from demorec.ingest.streams import BagStreams, read_streams
-from demorec.recording import CollectedRecording
+from demorec.core.errors import ConfigError, DemorecError
+from demorec.core.tables import CHECKS
+from demorec.mcap import CollectedRecording
 from demorec.runs.collected import load_collected_run
-from demorec.tables import CHECKS
+from demorec.sources import import_run
+from demorec.sources.bag import Bag
+from demorec.sources.channel import BagError
+from demorec.sources.import_run import import_bags
+from demorec.sources.mapping import BagMapping
+from demorec.sources.report import BagReport
+from demorec.sources.streams import BagStreams, read_streams
 
 FRONT = "/follower/cam_front/image_raw/compressed"
 DROPPING = bag_mappings.SO101.replace("fps = 30", 'fps = 30\nwhen_old = "drop_episode"')

@@ -12,7 +12,7 @@ import pytest
 from support import bag_mappings, bags
 
 from demorec.cli import main
-from demorec.recording import CollectedRecording
+from demorec.mcap import CollectedRecording
 
 STATE, ACTION, FRONT = "/joint_states", "/joint_command", "/front/rgb"
 GRIPPER = "/gripper/state"

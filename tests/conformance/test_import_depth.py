@@ -19,13 +19,13 @@ from support.commands import exit_code
 from support.export import export
 
 from demorec.check.report import CheckOptions, Subject, check_subject
-from demorec.errors import ConfigError
-from demorec.lerobot.depth import quantised
-from demorec.playback.episode import PlayedCollected
-from demorec.playback.from_dataset import open_dataset_episode
-from demorec.playback.sources import find_episodes
-from demorec.recording import CollectedRecording
-from demorec.recording.depth import encode_millimetres
+from demorec.core.errors import ConfigError
+from demorec.datasets.lerobot.depth import quantised
+from demorec.mcap import CollectedRecording
+from demorec.mcap.depth import encode_millimetres
+from demorec.view.episode import PlayedCollected
+from demorec.view.from_dataset import open_dataset_episode
+from demorec.view.sources import find_episodes
 
 COLOR = "/camera/wrist/color/image_raw"
 DEPTH = "/camera/wrist/aligned_depth_to_color/image_raw"

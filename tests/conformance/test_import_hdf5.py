@@ -27,17 +27,17 @@ from support.hdf5 import (
     write_robomimic,
 )
 
-from demorec.errors import ConfigError
-from demorec.hdf5.foreign import ForeignFile, Hdf5Error, StoredArray
-from demorec.ingest.frames_writer import FramesImport, Picture
-from demorec.ingest.hdf5_episodes import episode_places
-from demorec.ingest.hdf5_features import Hdf5FitError, StoredFeature
-from demorec.ingest.hdf5_import import import_hdf5
-from demorec.ingest.hdf5_mapping import DatasetPart, Hdf5Episodes
-from demorec.ingest.hdf5_pictures import StoredCamera
-from demorec.ingest.hdf5_suggest import suggested_hdf5_mapping
-from demorec.recording import CollectedRecording, Recording
+from demorec.core.errors import ConfigError
+from demorec.datasets.hdf5.foreign import ForeignFile, Hdf5Error, StoredArray
+from demorec.mcap import CollectedRecording, Recording
 from demorec.runs.collected import load_collected_run
+from demorec.sources.frames_writer import FramesImport, Picture
+from demorec.sources.hdf5_episodes import episode_places
+from demorec.sources.hdf5_features import Hdf5FitError, StoredFeature
+from demorec.sources.hdf5_import import import_hdf5
+from demorec.sources.hdf5_mapping import DatasetPart, Hdf5Episodes
+from demorec.sources.hdf5_pictures import StoredCamera
+from demorec.sources.hdf5_suggest import suggested_hdf5_mapping
 
 DEMOS = ("demo_0", "demo_1", "demo_10")
 Vectors = dict[str, NDArray[np.generic]]
@@ -299,7 +299,7 @@ def test_pictures_are_read_by_whole_chunks(tmp_path: Path, monkeypatch: pytest.M
         return read(self, begin, end)
 
     monkeypatch.setattr(StoredArray, "read", noted)
-    monkeypatch.setattr("demorec.hdf5.foreign._BLOCK_BYTES", 9 * given[0].nbytes)
+    monkeypatch.setattr("demorec.datasets.hdf5.foreign._BLOCK_BYTES", 9 * given[0].nbytes)
     with ForeignFile(tmp_path / "a.hdf5") as opened:
         np.testing.assert_array_equal(np.array(list(opened.array("images").rows())), given)
     assert asked == [(0, 8), (8, 16), (16, 23)]
@@ -345,7 +345,7 @@ def test_rows_that_share_their_bytes_are_bounded(
     assert count * len(data) > 1 << 20
     mapping = suggested(file)
     monkeypatch.setenv("DEMOREC_UNPACKED_MB", "1")
-    monkeypatch.setattr("demorec.recording.limits._RATIO", 0)
+    monkeypatch.setattr("demorec.mcap.limits._RATIO", 0)
     assert exit_code("import", "hdf5", file, "--mapping", mapping, "--out", tmp_path / "run") == 1
     assert "would unpack to" in capsys.readouterr().err
 
@@ -693,7 +693,7 @@ def test_other_models_are_refused_at_once_and_the_same_is_kept_once(
         planned.extend(plans)
         return 0
 
-    monkeypatch.setattr("demorec.ingest.hdf5_import._write", noted)
+    monkeypatch.setattr("demorec.sources.hdf5_import._write", noted)
     import_hdf5([first, same], mapping, tmp_path / "run")
     assert len(planned) == 2
     assert planned[0].info.urdf is planned[1].info.urdf

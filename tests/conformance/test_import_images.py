@@ -16,8 +16,8 @@ import pytest
 from support import bag_mappings, bags
 
 from demorec.cli import main
-from demorec.recording import CollectedRecording
-from demorec.tables import CHECKS
+from demorec.core.tables import CHECKS
+from demorec.mcap import CollectedRecording
 
 FRONT, SIDE = "/front/image_raw/compressed", "/side/image_raw/compressed"
 STATE, ACTION = "/follower/joint_states", "/leader/joint_states"

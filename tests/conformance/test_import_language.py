@@ -17,9 +17,9 @@ from support.commands import exit_code
 from support.export import export
 
 from demorec.check.report import CheckOptions, Subject, check_subject
-from demorec.errors import ConfigError
-from demorec.lerobot import dataset_digest
-from demorec.recording import CollectedRecording, CollectedWriter, recover
+from demorec.core.errors import ConfigError
+from demorec.datasets.lerobot import dataset_digest
+from demorec.mcap import CollectedRecording, CollectedWriter, recover
 
 pytestmark = pytest.mark.usefixtures("hf_datasets_cache")
 ARM = [note for note in bags.so101(3.0) if "joint_states" in note.topic]

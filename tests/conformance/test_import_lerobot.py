@@ -19,12 +19,12 @@ from support.training import CAMERA, DEPTH, write_by_lerobot
 
 from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.cli import main
-from demorec.errors import ConfigError, DemorecError
-from demorec.ingest.dataset_import import import_lerobot
-from demorec.lerobot import dataset_digest
-from demorec.playback.sources import find_episodes
-from demorec.recording import CollectedRecording
+from demorec.core.errors import ConfigError, DemorecError
+from demorec.datasets.lerobot import dataset_digest
+from demorec.mcap import CollectedRecording
 from demorec.runs.collected import load_collected_run
+from demorec.sources.dataset_import import import_lerobot
+from demorec.view.sources import find_episodes
 
 pytestmark = pytest.mark.usefixtures("hf_datasets_cache")
 LENGTHS = (14, 9, 11)

@@ -9,8 +9,8 @@ import pytest
 from support import bag_mappings, bags
 
 from demorec.cli import main
-from demorec.recording import CollectedRecording
-from demorec.tables import CHECKS
+from demorec.core.tables import CHECKS
+from demorec.mcap import CollectedRecording
 
 TOPIC = "/episode"
 TAKES = [(0.2, "start"), (0.9, "stop"), (1.1, "start"), (1.8, "stop"), (2.0, "start"), (2.7, "success")]

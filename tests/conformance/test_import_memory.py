@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from support import bags
 
-from demorec.ingest.bag import open_bag
-from demorec.ingest.import_run import import_bags
-from demorec.ingest.mapping import read_mapping
-from demorec.ingest.streams import read_streams
+from demorec.sources.bag import open_bag
+from demorec.sources.import_run import import_bags
+from demorec.sources.mapping import read_mapping
+from demorec.sources.streams import read_streams
 
 MAPPING = """
 [robot]

@@ -17,10 +17,10 @@ from rosbags.rosbag2 import StoragePlugin
 from support import bag_mappings, bags
 
 from demorec.cli import main
-from demorec.errors import ConfigError
-from demorec.ingest.channel import BagError
-from demorec.ingest.import_run import import_bags
-from demorec.recording import CollectedRecording
+from demorec.core.errors import ConfigError
+from demorec.mcap import CollectedRecording
+from demorec.sources.channel import BagError
+from demorec.sources.import_run import import_bags
 
 SECONDS = 1.5
 
@@ -204,7 +204,7 @@ def test_an_episode_that_lacks_something_is_dropped_where_the_mapping_says_so(tm
 
 @pytest.mark.parametrize("encoding", ["bgr8", "mono8", "bgra8", "bayer_rggb8"])
 def test_raw_pictures_of_other_encodings(encoding: str, tmp_path: Path) -> None:
-    from demorec.ingest.raw_pictures import raw_picture
+    from demorec.sources.raw_pictures import raw_picture
 
     image = bags.picture(bags.EPOCH_NS, 1)
     smooth = np.broadcast_to(np.linspace(0, 255, bags.WIDTH).astype(np.uint8)[:, None], (bags.HEIGHT, bags.WIDTH, 3))
@@ -227,7 +227,7 @@ def test_raw_pictures_of_other_encodings(encoding: str, tmp_path: Path) -> None:
 
 
 def test_h265_and_av1_stay_as_they_are(tmp_path: Path) -> None:
-    from demorec.ingest.picture_messages import picture_head
+    from demorec.sources.picture_messages import picture_head
 
     for codec, name in (("libx265", "h265"), ("libsvtav1", "av1")):
         packets = bags.video([bags.picture(bags.EPOCH_NS + k * 33_000_000, 0) for k in range(12)], gop=5, codec=codec)

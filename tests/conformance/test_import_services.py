@@ -12,11 +12,11 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from support import bag_mappings, bags
 from support.commands import exit_code
 
-from demorec.ingest.fields import FieldError
-from demorec.ingest.ros_types import Budgets, ros_decoder
-from demorec.ingest.service_calls import CallReader
-from demorec.recording import CollectedRecording
+from demorec.mcap import CollectedRecording
 from demorec.runs.collected import load_collected_run
+from demorec.sources.fields import FieldError
+from demorec.sources.ros_types import Budgets, ros_decoder
+from demorec.sources.service_calls import CallReader
 
 SEPARATOR = "=" * 80 + "\n"
 DEFINITIONS = {

@@ -18,7 +18,7 @@ import pytest
 from numpy.typing import NDArray
 from support.commands import exit_code
 
-from demorec.recording import CollectedRecording
+from demorec.mcap import CollectedRecording
 
 CAMERA = "observation.images.top"
 LENGTHS = (6, 5)

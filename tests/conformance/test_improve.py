@@ -18,7 +18,7 @@ from support.export import data_table, info
 from support.training import SMALL_ACT
 
 from demorec.cli import generate_dataset_main, main
-from demorec.evaluate import improvement
+from demorec.learn.evaluate import improvement
 
 SETTINGS: dict[str, Any] = {
     "policy": SMALL_ACT,

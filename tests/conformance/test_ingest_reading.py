@@ -14,11 +14,11 @@ from mcap.writer import Writer as McapWriter
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 from support import bags
 
-from demorec.ingest.bag import Bag, open_bag
-from demorec.ingest.channel import BagChannel, BagError
-from demorec.ingest.decoding import UnknownEncodingError, decoder_of
-from demorec.ingest.fields import stamp_of
-from demorec.ingest.streams import BagDecoder
+from demorec.sources.bag import Bag, open_bag
+from demorec.sources.channel import BagChannel, BagError
+from demorec.sources.decoding import UnknownEncodingError, decoder_of
+from demorec.sources.fields import stamp_of
+from demorec.sources.streams import BagDecoder
 
 
 def _read(bag: Bag) -> tuple[list[tuple[str, int, dict[str, Any]]], list[str]]:

@@ -11,11 +11,11 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin
 from support import bag_mappings, bags
 
-from demorec.ingest.bag import open_bag
-from demorec.ingest.episodes import windows
-from demorec.ingest.mapping import BagMapping, read_mapping
-from demorec.ingest.rows import EpisodeRows, NoRowsError, Timelines
-from demorec.ingest.streams import read_streams
+from demorec.sources.bag import open_bag
+from demorec.sources.episodes import windows
+from demorec.sources.mapping import BagMapping, read_mapping
+from demorec.sources.rows import EpisodeRows, NoRowsError, Timelines
+from demorec.sources.streams import read_streams
 
 Write = Callable[[bags.Notes, Path], Path]
 LAYOUTS: dict[str, tuple[bags.Notes, Write, str]] = {

@@ -16,11 +16,11 @@ from support.check import checked, level_of, simulate_run
 from support.export import export
 from support.language import active, language_of, meant, phrases
 
-from demorec.config import GenerateConfig
-from demorec.lerobot import dataset_digest
-from demorec.plain import from_plain, to_plain
-from demorec.recording import Recording
-from demorec.seeding import PURPOSES
+from demorec.core.config import GenerateConfig
+from demorec.core.plain import from_plain, to_plain
+from demorec.core.seeding import PURPOSES
+from demorec.datasets.lerobot import dataset_digest
+from demorec.mcap import Recording
 
 Row = dict[str, Any]
 

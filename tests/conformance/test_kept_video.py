@@ -20,15 +20,15 @@ from support import bag_mappings, bags
 from support.check import level_of
 from support.export import episode_rows, export
 
-from demorec.ingest.dataset_import import import_lerobot
-from demorec.ingest.import_run import import_bags
-from demorec.lerobot import dataset_digest
-from demorec.lerobot.layout import DatasetInfo
-from demorec.lerobot.packets import episode_packets
-from demorec.lerobot.reader import episode_places
-from demorec.lerobot.stills import pictures_at
-from demorec.playback.from_dataset import open_dataset_episode
-from demorec.recording import CollectedRecording
+from demorec.datasets.lerobot import dataset_digest
+from demorec.datasets.lerobot.layout import DatasetInfo
+from demorec.datasets.lerobot.packets import episode_packets
+from demorec.datasets.lerobot.reader import episode_places
+from demorec.datasets.lerobot.stills import pictures_at
+from demorec.mcap import CollectedRecording
+from demorec.sources.dataset_import import import_lerobot
+from demorec.sources.import_run import import_bags
+from demorec.view.from_dataset import open_dataset_episode
 
 TOPIC, KEY = "/cameras/cam_high/image", "observation.images.high"
 GOP = 20

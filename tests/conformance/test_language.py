@@ -15,17 +15,17 @@ from support.check import simulate_run
 from support.export import data_table, episode_rows, export, files_of
 from support.language import active, language_of, meant, phrases
 
-from demorec.errors import ConfigError
-from demorec.geometry import Pose
-from demorec.language.kinds import STATES
-from demorec.language.situation import nouns_of, place_of
-from demorec.lerobot import dataset_digest
-from demorec.lerobot.inspect import episode_digests
-from demorec.lerobot.layout import DatasetInfo
-from demorec.recording import Recording
-from demorec.scene.scene import Body, Shape
-from demorec.scene.variation import Ranges
-from demorec.tables import TASKS
+from demorec.annotate.kinds import STATES
+from demorec.annotate.situation import nouns_of, place_of
+from demorec.core.errors import ConfigError
+from demorec.core.geometry import Pose
+from demorec.core.tables import TASKS
+from demorec.datasets.lerobot import dataset_digest
+from demorec.datasets.lerobot.inspect import episode_digests
+from demorec.datasets.lerobot.layout import DatasetInfo
+from demorec.episode.scene import Body, Shape
+from demorec.episode.variation import Ranges
+from demorec.mcap import Recording
 from demorec.tasks.things import THINGS
 
 RECIPE = Path(__file__).parents[2] / "examples" / "language_recipe.yaml"

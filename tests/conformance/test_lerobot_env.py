@@ -13,14 +13,14 @@ import pytest
 from support.sim import episode
 
 from demorec.cli import main
-from demorec.config import GenerateConfig
-from demorec.errors import ConfigError
-from demorec.evaluate.policy import find_checkpoint, trained_action
-from demorec.evaluate.rollouts import evaluate, load_evaluation, settings_for
-from demorec.lerobot.export import export_lerobot
-from demorec.lerobot.options import ExportOptions
+from demorec.core.config import GenerateConfig
+from demorec.core.errors import ConfigError
+from demorec.datasets.lerobot.export import export_lerobot
+from demorec.datasets.lerobot.options import ExportOptions
+from demorec.learn.evaluate.policy import find_checkpoint, trained_action
+from demorec.learn.evaluate.rollouts import evaluate, load_evaluation, settings_for
 from demorec.loop import ScriptAgent, Session, make_world
-from demorec.recording import EpisodeWriter, Recording
+from demorec.mcap import EpisodeWriter, Recording
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]  # each command of LeRobot takes 15 s of CPU to start
 

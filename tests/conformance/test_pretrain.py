@@ -108,7 +108,7 @@ def test_lerobot_loads_the_policy_and_its_encoder_sees_as_taught(settings: Path,
     import torch
     from lerobot.policies.act.modeling_act import ACTPolicy
 
-    from demorec.training.encoder import KeyframeEncoder
+    from demorec.learn.training.encoder import KeyframeEncoder
 
     policy = ACTPolicy.from_pretrained(taught)
     network = KeyframeEncoder(policy.config, num_cameras=2, state_dim=15, num_targets=5)
@@ -128,7 +128,8 @@ def test_lerobot_loads_the_policy_and_its_encoder_sees_as_taught(settings: Path,
 def test_a_killed_call_goes_on_to_the_same_weights(settings: Path, taught: Path, tmp_path: Path) -> None:
     out = tmp_path / "killed"
     program = (
-        "import sys; from demorec.training import pretrain as p; from demorec.training.command import training_config; "
+        "import sys; from demorec.learn.training import pretrain as p; "
+        "from demorec.learn.training.command import training_config; "
         "from pathlib import Path; "
         "p.pretrain(training_config([sys.argv[1]]), p.Teaching(updates=6, batch_size=4, seed=1000), Path(sys.argv[2]), "
         "frame_cache_bytes=1 << 28, on_progress=lambda done, loss: print(done, flush=True), save_every=2)"

@@ -22,10 +22,10 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from support.present import present
 from support.recording import Codec, frame_number, make_episode, write_episode
 
-from demorec.config import VideoConfig
-from demorec.recording.ros2 import DEFINITIONS
-from demorec.scene.assets import asset_path
-from demorec.scene.episode import EpisodeInfo, Frame, Outcome
+from demorec.core.config import VideoConfig
+from demorec.episode.episode import EpisodeInfo, Frame, Outcome
+from demorec.mcap.ros2 import DEFINITIONS
+from demorec.robots.assets import asset_path
 
 NUM_FRAMES = 40
 
@@ -333,7 +333,7 @@ def world_from(frame: str, tree: dict[str, tuple[str, np.ndarray[Any, Any]]]) ->
 
 def test_segment_names_are_pybullets_links() -> None:
     pybullet = pytest.importorskip("pybullet")
-    from demorec.recording.labels import segment_names
+    from demorec.mcap.labels import segment_names
 
     info, _, _ = make_episode(num_frames=1)
     names = dict(segment_names(info))

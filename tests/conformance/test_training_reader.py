@@ -19,7 +19,7 @@ from support.training import CAMERA, assert_same_item, write_by_lerobot
 if TYPE_CHECKING:
     import torch
 
-    from demorec.training import FastDataset
+    from demorec.learn.training import FastDataset
 
 LENGTHS = (7, 11, 5, 9)
 KINDS = ("ours", "lerobot", "lerobot_images", "lerobot_long_gops")
@@ -71,7 +71,7 @@ def pair(root: Path, **arguments: Any) -> tuple[FastDataset, Any]:
     """Both readers with the same arguments."""
     from lerobot.datasets import LeRobotDataset
 
-    from demorec.training import FastDataset
+    from demorec.learn.training import FastDataset
 
     arguments = {"root": root, "video_backend": "pyav", "return_uint8": True, **arguments}
     return FastDataset("local/test", **arguments), LeRobotDataset("local/test", **arguments)
@@ -249,7 +249,7 @@ def test_a_pickled_dataset_carries_no_arrays_and_no_files(roots: dict[str, Path]
 
 
 def test_a_dataset_being_written_is_refused_and_then_read(tmp_path: Path) -> None:
-    from demorec.training import FastDataset
+    from demorec.learn.training import FastDataset
 
     features = {"action": {"dtype": "float32", "shape": (2,), "names": None}}
     dataset = FastDataset.create("local/test", 30, features, root=tmp_path / "d")

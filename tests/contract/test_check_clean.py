@@ -11,8 +11,8 @@ from support.check import checked, simulate
 from support.tasks import tasks_with_slow_ones
 
 from demorec.cli import main
-from demorec.config import VideoConfig
-from demorec.tables import CHECKS, ROBOTS, TASKS
+from demorec.core.config import VideoConfig
+from demorec.core.tables import CHECKS, ROBOTS, TASKS
 
 
 @pytest.mark.parametrize("task", tasks_with_slow_ones())
@@ -109,7 +109,7 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
 @pytest.fixture(scope="module")
 def cut_short(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """What recover makes of a good recording of which a third, a half, two thirds are left."""
-    from demorec.recording import recover
+    from demorec.mcap import recover
 
     folder = tmp_path_factory.mktemp("cut")
     data = simulate(folder / "e.mcap", seed=21).read_bytes()

@@ -16,12 +16,12 @@ from support.check import checked, copy, edit_column, edit_json, level_of, simul
 from support.collected import make_collected, write_collected
 
 from demorec.check.coverage import draw_coverage, largest_gap
-from demorec.config import EpisodePlan, GenerateConfig
-from demorec.lerobot.export import export_lerobot
-from demorec.lerobot.options import ExportOptions
+from demorec.core.config import EpisodePlan, GenerateConfig
+from demorec.core.tables import TASKS
+from demorec.datasets.lerobot.export import export_lerobot
+from demorec.datasets.lerobot.options import ExportOptions
+from demorec.episode.episode import EpisodeInfo
 from demorec.loop import prepare
-from demorec.scene.episode import EpisodeInfo
-from demorec.tables import TASKS
 
 
 @pytest.fixture(scope="session")

@@ -16,8 +16,8 @@ from support.check import Message, Spoilt, checked, flip_bits, level_of, rewrite
 from support.present import present
 
 from demorec.check.rows import matrices
-from demorec.recording import channels, messages
-from demorec.scene.episode import SuccessCheck
+from demorec.episode.episode import SuccessCheck
+from demorec.mcap import channels, messages
 
 Fault = Callable[[Spoilt], None]
 
@@ -385,7 +385,7 @@ def test_other_joint_names(good: Path, tmp_path: Path) -> None:
 
 
 def test_a_recovered_recording_is_a_warning(good: Path, tmp_path: Path) -> None:
-    from demorec.recording import recover
+    from demorec.mcap import recover
 
     part = tmp_path / "cut.mcap.part"
     part.write_bytes(good.read_bytes()[: int(good.stat().st_size * 0.7)])

@@ -13,8 +13,8 @@ from support.check import Message, level_of, rewrite_messages, simulate
 from support.faults import Rows
 from support.mcap import sealed
 
-from demorec.recording import channels, messages
-from demorec.scene.episode import Event
+from demorec.episode.episode import Event
+from demorec.mcap import channels, messages
 
 Edit = Callable[[Message], list[Message]]
 INFO = channels.camera_topic("front", "camera_info")
@@ -194,8 +194,8 @@ def test_the_good_one_passes(good: Path) -> None:
 @pytest.mark.parametrize(("topic", "slot"), [(channels.GRIPPER, 1), (channels.ACTION, 9), (channels.COMMAND, 23)])
 @pytest.mark.parametrize("at", [None, 2 * SECOND])
 def test_values_that_become_no_column(topic: str, slot: int, at: int | None, good: Path, tmp_path: Path) -> None:
-    from demorec.recording import Recording
-    from demorec.recording.streams import frame_streams
+    from demorec.mcap import Recording
+    from demorec.mcap.streams import frame_streams
 
     with Recording(good) as recording:
         layout = next(stream.layout for stream in frame_streams(recording.info) if stream.topic == topic)

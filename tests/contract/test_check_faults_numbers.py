@@ -17,14 +17,14 @@ from support.faults import Changed, Rows, frozen, halved, inverted, judged, late
 
 from demorec.check.base import Found, Measurement
 from demorec.check.described import drawn_within_ranges
-from demorec.config import EpisodePlan, GenerateConfig
-from demorec.geometry import Pose
+from demorec.core.config import EpisodePlan, GenerateConfig
+from demorec.core.geometry import Pose
+from demorec.core.tables import CHECKS, ROBOTS, TASKS
+from demorec.episode.camera_error import error_values
+from demorec.episode.episode import SuccessCheck
+from demorec.episode.variation import PRESET_NAMES, Preset
 from demorec.loop import prepare
-from demorec.scene.camera_error import error_values
-from demorec.scene.episode import SuccessCheck
-from demorec.scene.variation import PRESET_NAMES, Preset
-from demorec.sim.robots.panda import PANDA
-from demorec.tables import CHECKS, ROBOTS, TASKS
+from demorec.robots.panda import PANDA
 
 Fault = Callable[[Changed], Changed]
 

@@ -17,9 +17,9 @@ from demorec.check.cells import ImageKind
 from demorec.check.drawn import DrawnPictures, PictureComparison, fill_between, frames_to_draw
 from demorec.check.episode import CheckedEpisode
 from demorec.check.episode_drawn import DrawnEpisode
-from demorec.geometry import Array
+from demorec.core.geometry import Array
+from demorec.core.tables import CHECKS
 from demorec.render.recorded import RecordedWorld
-from demorec.tables import CHECKS
 
 Fault = Callable[[Rows], Rows]
 ONE = 100

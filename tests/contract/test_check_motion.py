@@ -12,9 +12,9 @@ import pytest
 from numpy.typing import NDArray
 from support.check import checked, copy, edit_column, edit_json, simulate_run
 
-from demorec.lerobot.export import export_lerobot
-from demorec.lerobot.options import ExportOptions
-from demorec.recording import Recording
+from demorec.datasets.lerobot.export import export_lerobot
+from demorec.datasets.lerobot.options import ExportOptions
+from demorec.mcap import Recording
 
 STATE, ACTION, VELOCITY, FRONT = "observation.state", "action", "observation.velocity", "observation.images.front"
 Rows = NDArray[Any]

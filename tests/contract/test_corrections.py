@@ -14,26 +14,26 @@ from support.export import data_table, export, info
 from support.recording import write_episode
 
 from demorec.check.report import CheckOptions, Subject, check_subject
-from demorec.config import EpisodePlan, GenerateConfig
-from demorec.errors import ConfigError
-from demorec.evaluate import rollouts
-from demorec.evaluate.correction import read_takeover
-from demorec.evaluate.moments import TakeOver
-from demorec.evaluate.rollouts import Evaluation, Settings, make_rollout
-from demorec.evaluate.turns import Turns
-from demorec.evaluate.watch import Watch
+from demorec.core.config import EpisodePlan, GenerateConfig
+from demorec.core.errors import ConfigError
+from demorec.core.geometry import Array, Pose
+from demorec.core.plain import to_plain
+from demorec.episode.episode import POLICY_PHASE, Action, Frame, Observation, interventions
+from demorec.episode.features import ActionKind
 from demorec.generate.options import RunOptions
 from demorec.generate.run import generate
-from demorec.geometry import Array, Pose
 from demorec.gym_env import DemorecEnv, Situation
+from demorec.learn.evaluate import rollouts
+from demorec.learn.evaluate.correction import read_takeover
+from demorec.learn.evaluate.moments import TakeOver
+from demorec.learn.evaluate.rollouts import Evaluation, Settings, make_rollout
+from demorec.learn.evaluate.turns import Turns
+from demorec.learn.evaluate.watch import Watch
 from demorec.loop import ScriptAgent, Session, make_world, prepare
-from demorec.plain import to_plain
-from demorec.recording import Recording
+from demorec.mcap import Recording
 from demorec.replay import ReplayOptions, open_file, replay_all
 from demorec.runs.find import EVALUATION_NAME
 from demorec.runs.run_file import Attempt
-from demorec.scene.episode import POLICY_PHASE, Action, Frame, Observation, interventions
-from demorec.scene.features import ActionKind
 
 FPS = 30
 UNSEEN = Action(joint_target=np.zeros(7), gripper_target=0.0, base_from_tcp_target=Pose())

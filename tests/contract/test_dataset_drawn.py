@@ -13,8 +13,8 @@ from support.export import rewrite_video
 
 from demorec.check.base import Level
 from demorec.check.dataset import Dataset
-from demorec.lerobot.export import export_lerobot
-from demorec.lerobot.options import ExportOptions
+from demorec.datasets.lerobot.export import export_lerobot
+from demorec.datasets.lerobot.options import ExportOptions
 
 FRONT, WRIST = "observation.images.front", "observation.images.wrist"
 CHECKS = ("dataset_pictures_as_drawn", "dataset_picture_lag")

@@ -16,10 +16,10 @@ from support.export import rewrite_video
 from support.mcap import rewritten
 
 from demorec.cli import main
-from demorec.errors import ExportError
-from demorec.lerobot.export import export_lerobot
-from demorec.lerobot.options import ExportOptions
-from demorec.recording import Recording, channels
+from demorec.core.errors import ExportError
+from demorec.datasets.lerobot.export import export_lerobot
+from demorec.datasets.lerobot.options import ExportOptions
+from demorec.mcap import Recording, channels
 
 CAMERA = "observation.images.front"
 Fault = Callable[[Path], None]
@@ -234,8 +234,8 @@ def test_a_dataset_of_another_run(run: Path, tmp_path: Path) -> None:
 
 def test_an_episode_that_was_edited_with_its_digest(run: Path, tmp_path: Path) -> None:
     """As an exporter with a fault would leave it: only the recording knows better."""
-    from demorec.lerobot.inspect import episode_digests
-    from demorec.lerobot.layout import DatasetInfo
+    from demorec.datasets.lerobot.inspect import episode_digests
+    from demorec.datasets.lerobot.layout import DatasetInfo
 
     spoilt = tmp_path / "run"
     shutil.copytree(run, spoilt)

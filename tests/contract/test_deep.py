@@ -19,12 +19,12 @@ from support.mcap import rewritten
 
 from demorec.cli import main
 from demorec.cli.generate_report import check_run
+from demorec.core.plain import to_plain
 from demorec.generate.observer import RunResult
 from demorec.loop import Workshop
-from demorec.plain import to_plain
-from demorec.recording import Recording, recover
-from demorec.recording.metadata import EPISODE, OUTCOME
-from demorec.recording.ros2 import DEFINITIONS
+from demorec.mcap import Recording, recover
+from demorec.mcap.metadata import EPISODE, OUTCOME
+from demorec.mcap.ros2 import DEFINITIONS
 from demorec.replay.deep import DeepReport, deep_check, deep_checks
 from demorec.replay.deep.contents import CODED, Contents, content_differences
 from demorec.replay.rerender import RerenderOptions, rerender

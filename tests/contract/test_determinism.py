@@ -7,11 +7,11 @@ import itertools
 import pytest
 from support.sim import episode, run
 
+from demorec.core.plain import from_json, to_json
+from demorec.core.tables import ROBOTS, TASKS
+from demorec.episode.episode import EpisodeInfo
+from demorec.episode.variation import PRESET_NAMES
 from demorec.loop import make_world
-from demorec.plain import from_json, to_json
-from demorec.scene.episode import EpisodeInfo
-from demorec.scene.variation import PRESET_NAMES
-from demorec.tables import ROBOTS, TASKS
 
 CASES = list(itertools.product(TASKS.names(), ROBOTS.names(), PRESET_NAMES))
 FAST = [case for case in CASES if case[0] == "pick_place" and case[2] == "full"]

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from demorec.config import EpisodePlan, GenerateConfig
-from demorec.evaluate import rollouts
-from demorec.evaluate.rollouts import Evaluation, Settings, make_rollout
-from demorec.plain import to_plain
-from demorec.recording import Recording
+from demorec.core.config import EpisodePlan, GenerateConfig
+from demorec.core.plain import to_plain
+from demorec.learn.evaluate import rollouts
+from demorec.learn.evaluate.rollouts import Evaluation, Settings, make_rollout
+from demorec.mcap import Recording
 from demorec.replay import ReplayOptions, open_file, replay_all
 from demorec.runs.find import EVALUATION_NAME
 

@@ -13,13 +13,13 @@ import pytest
 from support.export import data_table, export, files_of, make_run
 from support.recording import make_episode
 
-from demorec.config import VideoConfig
-from demorec.errors import ConfigError, DemorecError, RecordingError
-from demorec.export.options import CommonOptions
-from demorec.recording import EpisodeWriter, Recording
-from demorec.recording.recover import recover
-from demorec.scene.sensed import SENSED
-from demorec.tables import EXPORTERS
+from demorec.core.config import VideoConfig
+from demorec.core.errors import ConfigError, DemorecError, RecordingError
+from demorec.core.tables import EXPORTERS
+from demorec.datasets.options import CommonOptions
+from demorec.episode.sensed import SENSED
+from demorec.mcap import EpisodeWriter, Recording
+from demorec.mcap.recover import recover
 
 pytestmark = pytest.mark.parametrize("exporter", EXPORTERS.names())
 

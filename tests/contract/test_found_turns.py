@@ -12,10 +12,10 @@ from support.check import simulate
 from demorec.check.cells import ImageKind
 from demorec.check.episode import CheckedEpisode
 from demorec.check.episode_drawn import draw_episode
-from demorec.config import EpisodePlan, GenerateConfig
+from demorec.core.config import EpisodePlan, GenerateConfig
+from demorec.core.plain import from_plain
+from demorec.episode.episode import EpisodeInfo
 from demorec.loop import prepare
-from demorec.plain import from_plain
-from demorec.scene.episode import EpisodeInfo
 
 
 def older(info: EpisodeInfo) -> EpisodeInfo:

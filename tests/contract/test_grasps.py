@@ -7,9 +7,9 @@ from dataclasses import replace
 import pytest
 from support.sim import episode
 
+from demorec.core.tables import ROBOTS
+from demorec.episode.scene import Shape
 from demorec.loop import Episode, ScriptAgent, Session, make_world
-from demorec.scene.scene import Shape
-from demorec.tables import ROBOTS
 
 SINKING = 1e-3
 """Of each finger, metres, that is too much."""

@@ -18,15 +18,15 @@ from support.sim import episode
 from support.tasks import tasks_with_slow_ones
 
 import demorec.gym_env
-from demorec.errors import ConfigError, SceneError
+from demorec.core.errors import ConfigError, SceneError
+from demorec.core.tables import TASKS
+from demorec.episode import features
+from demorec.episode.episode import EpisodeColumns, EpisodeInfo
+from demorec.episode.sensed import ObservationRows
 from demorec.gym_env import DemorecEnv, env_id
 from demorec.loop import ScriptAgent, Session, make_renderer, make_world
 from demorec.loop.actions import ACTION_KINDS
-from demorec.recording import Recording
-from demorec.scene import features
-from demorec.scene.episode import EpisodeColumns, EpisodeInfo
-from demorec.scene.sensed import ObservationRows
-from demorec.tables import TASKS
+from demorec.mcap import Recording
 
 FRAMES = 45
 VARYING = ("sort_by_color", "pick_from_clutter", "pick_shapes")

@@ -10,14 +10,14 @@ import pytest
 from support import bag_mappings, bags
 from support.bag_faults import ACTION, FAULTS, FRONT, hurt
 
-from demorec.ingest.bag import open_bag
-from demorec.ingest.channel import BagError
-from demorec.ingest.findings import all_findings
-from demorec.ingest.import_run import import_bags
-from demorec.ingest.mapping import read_mapping
-from demorec.ingest.rows import Timelines
-from demorec.ingest.streams import read_streams
-from demorec.tables import CHECKS
+from demorec.core.tables import CHECKS
+from demorec.sources.bag import open_bag
+from demorec.sources.channel import BagError
+from demorec.sources.findings import all_findings
+from demorec.sources.import_run import import_bags
+from demorec.sources.mapping import read_mapping
+from demorec.sources.rows import Timelines
+from demorec.sources.streams import read_streams
 
 MAPPING = bag_mappings.SO101.replace('field = "position"', 'field = "position"\nunit = "rad"', 1)
 

@@ -11,7 +11,7 @@ from support.export import export, without_verification
 
 from demorec.check import dataset_files
 from demorec.cli import main
-from demorec.ingest.import_run import import_bags
+from demorec.sources.import_run import import_bags
 
 COLLECTED = "collected from another robot or program"
 ROWS: dict[str, tuple[int, str]] = {

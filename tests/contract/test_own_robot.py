@@ -15,16 +15,16 @@ from support.commands import exit_code
 from support.generate import inspect
 
 from demorec.cli import generate_dataset_main
-from demorec.config import EpisodePlan, GenerateConfig, deciding_versions
-from demorec.errors import ConfigError, SceneError
+from demorec.core.config import EpisodePlan, GenerateConfig, deciding_versions
+from demorec.core.errors import ConfigError, SceneError
+from demorec.core.own_versions import changed_sources, own_versions, source_digest
 from demorec.generate.options import RunOptions
 from demorec.generate.run import generate
 from demorec.generate.worker import make_episode
-from demorec.recording import Recording
+from demorec.mcap import Recording
 from demorec.replay import ReplayOptions, open_file, replay_all
+from demorec.robots.assets import asset_path, modules_of_models
 from demorec.runs.run_file import load_run_file
-from demorec.safety.own_versions import changed_sources, own_versions, source_digest
-from demorec.scene.assets import asset_path, modules_of_models
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "own_robot"
@@ -45,7 +45,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     monkeypatch.chdir(folder)
     before = list(sys.path)
     sys.path[:] = [entry for entry in sys.path if entry not in ("", str(folder))]
-    monkeypatch.setattr("demorec.scene.assets._modules_with_models", set())
+    monkeypatch.setattr("demorec.robots.assets._modules_with_models", set())
     forget("my_robots")
     yield folder
     sys.path[:] = before
@@ -72,7 +72,7 @@ def test_the_example_makes_checks_and_replays_a_dataset(
     # Elsewhere, without the module: the recording is enough to look and to check, and says what replaying needs.
     (folder / "xarm6.urdf").rename(tmp_path / "xarm6.urdf")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("demorec.scene.assets._modules_with_models", set())
+    monkeypatch.setattr("demorec.robots.assets._modules_with_models", set())
     assert exit_code("check", recording, "--no-pictures") == 0
     assert exit_code("view", recording, "--save", tmp_path / "view.rrd") == 0
     capsys.readouterr()
@@ -111,7 +111,7 @@ def test_check_says_what_it_skips_for_lack_of_the_model_and_names_the_flag(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     recording = simulate(tmp_path / "e.mcap", robot=XARM6)
-    monkeypatch.setattr("demorec.scene.assets._modules_with_models", set())
+    monkeypatch.setattr("demorec.robots.assets._modules_with_models", set())
     forget("my_robots")
 
     assert exit_code("check", recording) == 0
@@ -234,7 +234,7 @@ def test_the_source_counts_with_what_it_imports_from_beside_it(folder: Path) -> 
 
 @pytest.mark.parametrize("has_init", [True, False])
 def test_modules_in_packages_name_models_of_their_package(has_init: bool, folder: Path) -> None:
-    from demorec.scene.assets import allow_models, model_name
+    from demorec.robots.assets import allow_models, model_name
 
     package = folder / "my_lab"
     (package / "arms").mkdir(parents=True)
@@ -258,7 +258,7 @@ def test_modules_in_packages_name_models_of_their_package(has_init: bool, folder
 
 @pytest.mark.parametrize("where", ["absolute", "pybullet_data", "absolute in pybullet_data"])
 def test_models_are_found_wherever_they_may_lie(where: str, folder: Path) -> None:
-    from demorec.scene.assets import data_folder, model_name
+    from demorec.robots.assets import data_folder, model_name
 
     name, wanted = {
         "absolute": (str(folder / "xarm6.urdf"), "my_robots:xarm6.urdf"),
@@ -269,7 +269,7 @@ def test_models_are_found_wherever_they_may_lie(where: str, folder: Path) -> Non
 
 
 def test_a_model_from_elsewhere_cannot_be_recorded(folder: Path, tmp_path: Path) -> None:
-    from demorec.scene.assets import allow_models, model_name
+    from demorec.robots.assets import allow_models, model_name
 
     shutil.copy(folder / "xarm6.urdf", tmp_path / "xarm6.urdf")
     with pytest.raises(ConfigError, match="put it beside the module, found "):

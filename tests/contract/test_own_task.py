@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 from support.check import checked, simulate
 
-from demorec.config import EpisodePlan, GenerateConfig
+from demorec.core.config import EpisodePlan, GenerateConfig
+from demorec.core.own_versions import source_digest
+from demorec.core.tables import ROBOTS
 from demorec.loop import ScriptAgent, Session, make_world, prepare
-from demorec.recording import Recording
+from demorec.mcap import Recording
 from demorec.replay import ReplayOptions, open_file, replay_all
-from demorec.safety.own_versions import source_digest
-from demorec.tables import ROBOTS
 
 EXAMPLE = Path(__file__).parents[2] / "docs" / "tasks.md"
 

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from support.sim import episode
 
-from demorec.errors import SceneError
-from demorec.geometry import Pose
+from demorec.core.errors import SceneError
+from demorec.core.geometry import Pose
+from demorec.core.tables import ROBOTS, TASKS
+from demorec.episode.episode import Action
+from demorec.episode.scene import Body, Scene, Shape, Texture
 from demorec.loop import make_world
 from demorec.render.recorded import RecordedWorld
-from demorec.scene.episode import Action
-from demorec.scene.robot import RobotSpec
-from demorec.scene.scene import Body, Scene, Shape, Texture
+from demorec.robots.robot import RobotSpec
 from demorec.sim.world import World
-from demorec.tables import ROBOTS, TASKS
 
 
 def recorded(world: World, robot: RobotSpec) -> RecordedWorld:

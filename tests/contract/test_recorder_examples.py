@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from demorec.recording import CollectedRecording
+from demorec.mcap import CollectedRecording
 from demorec.runs.collected import load_collected_run
 
 pytestmark = pytest.mark.slow  # loops in real time, and three programs that load PyBullet and gymnasium

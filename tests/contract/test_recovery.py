@@ -9,9 +9,9 @@ import pytest
 from support.sim import episode
 from support.tasks import tasks_with_slow_ones
 
-from demorec.geometry import Array, Pose, quat_multiply
+from demorec.core.geometry import Array, Pose, quat_multiply
+from demorec.episode.episode import HALT_PHASE
 from demorec.loop import Episode, ScriptAgent, Session, make_world
-from demorec.scene.episode import HALT_PHASE
 from demorec.sim.world import World
 from demorec.tasks.grasping import hand_down, raised
 from demorec.tasks.recovery import TAKE_OVER, is_served

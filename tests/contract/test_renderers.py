@@ -16,12 +16,12 @@ import pytest
 from support import render as scenes
 from support.present import present
 
-from demorec.errors import RenderError
-from demorec.geometry import Pose, quat_from_rotation, rotation_from_quat
+from demorec.core.errors import RenderError
+from demorec.core.geometry import Pose, quat_from_rotation, rotation_from_quat
+from demorec.core.tables import RENDERERS
+from demorec.episode.scene import Light
 from demorec.render import Renderer
-from demorec.scene.scene import Light
 from demorec.sim.renderers.client_renderer import TinyRenderer
-from demorec.tables import RENDERERS
 
 
 @dataclass(frozen=True, kw_only=True)

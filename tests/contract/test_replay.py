@@ -15,10 +15,10 @@ from support.commands import exit_code
 from support.recording import make_episode
 from support.tasks import tasks_with_slow_ones
 
-from demorec.errors import ConfigError
-from demorec.lerobot.export import export_lerobot
-from demorec.lerobot.options import ExportOptions
-from demorec.recording import EpisodeWriter, Recording
+from demorec.core.errors import ConfigError
+from demorec.datasets.lerobot.export import export_lerobot
+from demorec.datasets.lerobot.options import ExportOptions
+from demorec.mcap import EpisodeWriter, Recording
 from demorec.replay import ReplayOptions, ReplayReport, open_file, replay_all
 
 

@@ -11,10 +11,10 @@ from support.check import edit_json, simulate_run
 from support.mcap import rewritten
 
 from demorec.cli import main
+from demorec.core.plain import to_plain
 from demorec.generate.reproduce import read_original
-from demorec.plain import to_plain
-from demorec.recording import Recording
-from demorec.recording.metadata import EPISODE
+from demorec.mcap import Recording
+from demorec.mcap.metadata import EPISODE
 
 
 @pytest.fixture(scope="module")

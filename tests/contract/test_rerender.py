@@ -13,9 +13,9 @@ import pytest
 from support.check import checked, simulate
 from support.commands import exit_code
 
-from demorec.errors import ConfigError
-from demorec.geometry import Pose
-from demorec.recording import Recording
+from demorec.core.errors import ConfigError
+from demorec.core.geometry import Pose
+from demorec.mcap import Recording
 from demorec.render.warm import WarmRenderer
 from demorec.replay.free_camera import read_cameras
 from demorec.replay.rerender import RerenderOptions, SceneView, rerender, view_behaviour

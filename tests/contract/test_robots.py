@@ -13,14 +13,14 @@ import pytest
 from support.present import present
 from support.sim import episode, run
 
-from demorec.errors import SceneError
+from demorec.core.errors import SceneError
+from demorec.core.tables import ROBOTS
+from demorec.episode.episode import Action
 from demorec.loop import make_world
-from demorec.scene.assets import asset_path, mesh_path
-from demorec.scene.episode import Action
-from demorec.scene.robot import RobotSpec
+from demorec.robots.assets import asset_path, mesh_path
+from demorec.robots.robot import RobotSpec
 from demorec.sim.arm import arm_kinematics
 from demorec.sim.world import World
-from demorec.tables import ROBOTS
 from demorec.tasks import grasping
 from demorec.tasks.grasping import hand_down
 from demorec.testing import RobotContract

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from demorec.recording import Recording
-from demorec.scene.episode import FORMAT_VERSION
+from demorec.episode.episode import FORMAT_VERSION
+from demorec.mcap import Recording
 
 FOLDER = Path(__file__).parents[2] / "recordings" / "sample"
 # Never change a row: the file of a version that is out in the world stays what it is.

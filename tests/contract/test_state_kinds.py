@@ -13,19 +13,19 @@ from support.collected import make_collected, write_collected
 from support.commands import exit_code
 from support.export import data_table, info
 
-from demorec.config import GenerateConfig
-from demorec.errors import ConfigError
-from demorec.evaluate.policy import CONFIG_NAME
-from demorec.evaluate.rollouts import settings_for
+from demorec.core.config import GenerateConfig
+from demorec.core.errors import ConfigError
+from demorec.datasets.lerobot.export import export_lerobot
+from demorec.datasets.lerobot.options import ExportOptions
+from demorec.episode.features import Vectors
 from demorec.generate.reproduce import read_original
 from demorec.gym_env import DemorecEnv
-from demorec.lerobot.export import export_lerobot
-from demorec.lerobot.options import ExportOptions
-from demorec.playback.episode import PlayedEpisode
-from demorec.playback.from_dataset import open_dataset_episode
-from demorec.recording import Recording
+from demorec.learn.evaluate.policy import CONFIG_NAME
+from demorec.learn.evaluate.rollouts import settings_for
+from demorec.mcap import Recording
 from demorec.replay.demonstration import ReplayOptions
-from demorec.scene.features import Vectors
+from demorec.view.episode import PlayedEpisode
+from demorec.view.from_dataset import open_dataset_episode
 
 STATE = "observation.state"
 SMALL = ExportOptions(verify=False, action="ee_delta", state="joint_ee", features=(STATE,))

@@ -9,10 +9,10 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from demorec.config import EpisodePlan, GenerateConfig
-from demorec.errors import ConfigError
+from demorec.core.config import EpisodePlan, GenerateConfig
+from demorec.core.errors import ConfigError
+from demorec.core.tables import TASKS
 from demorec.loop import prepare
-from demorec.tables import TASKS
 from demorec.testing import TaskContract
 
 

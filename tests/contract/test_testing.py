@@ -11,9 +11,9 @@ from typing import Any
 
 import pytest
 
-from demorec.errors import DemorecError
-from demorec.scene.robot import RobotSpec
-from demorec.tables import ROBOTS
+from demorec.core.errors import DemorecError
+from demorec.core.tables import ROBOTS
+from demorec.robots.robot import RobotSpec
 from demorec.testing import RobotContract, TaskContract
 
 ROOT = Path(__file__).parents[2]

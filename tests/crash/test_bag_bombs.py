@@ -30,7 +30,7 @@ _SEPARATOR = "=" * 80 + "\n"
 
 @pytest.fixture(scope="module")
 def commands() -> Iterator[LimitedCommands]:
-    with LimitedCommands(("demorec.ingest.suggest", "demorec.ingest.import_run")) as process:
+    with LimitedCommands(("demorec.sources.suggest", "demorec.sources.import_run")) as process:
         yield process
 
 
@@ -259,7 +259,7 @@ def test_a_small_bag_never_becomes_large(
 def test_too_little_memory_is_no_fault_of_a_definition(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from demorec.ingest import ros_types
+    from demorec.sources import ros_types
 
     def lack(_: object) -> None:
         raise MemoryError
@@ -325,7 +325,7 @@ def test_rows_follow_the_size_of_the_bag(commands: LimitedCommands, tmp_path: Pa
 
 def test_ten_million_rows_of_a_long_bag_are_no_claim() -> None:
     """Three hours at 1 kHz, of a bag of 1 GB: 10.8 million rows of 14 joints."""
-    from demorec.ingest.clock import grid
+    from demorec.sources.clock import grid
 
     rows = grid(bags.EPOCH_NS, bags.EPOCH_NS + 10_800 * bags.NS, 1000)
     assert len(rows) == 10_800_001

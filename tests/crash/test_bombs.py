@@ -20,10 +20,10 @@ from support.export import export
 from support.mcap import chunk_record, message_record, record, rewritten
 from support.recording import write_episode
 
-from demorec.errors import ConfigError, ExportError, RecordingError
-from demorec.lerobot.files import check_video
-from demorec.recording import Recording, recover
-from demorec.scene.urdf import check_primitives
+from demorec.core.errors import ConfigError, ExportError, RecordingError
+from demorec.datasets.lerobot.files import check_video
+from demorec.mcap import Recording, recover
+from demorec.robots.urdf import check_primitives
 
 
 @pytest.fixture(scope="module")
@@ -114,9 +114,9 @@ def test_pictures_that_compress_well_are_no_bomb(tmp_path: Path) -> None:
 
     from support.recording import make_episode
 
-    from demorec.config import VideoConfig
-    from demorec.recording import EpisodeWriter
-    from demorec.scene.episode import frame_time_ns
+    from demorec.core.config import VideoConfig
+    from demorec.episode.episode import frame_time_ns
+    from demorec.mcap import EpisodeWriter
 
     info, frames, outcome = make_episode(num_frames=1, cameras=("front", "wrist"), width=640, height=480)
     black = {

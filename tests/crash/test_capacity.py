@@ -11,8 +11,8 @@ from typing import Literal
 import pytest
 from support.generate import Remembers, expected_attempts, inspect, run_fake
 
-from demorec.config import EpisodePlan, GenerateConfig
-from demorec.errors import GenerationError
+from demorec.core.config import EpisodePlan, GenerateConfig
+from demorec.core.errors import GenerationError
 from demorec.generate import executor as executing
 from demorec.generate import run as running
 from demorec.generate.executor import Executor, Lost, Report, attempt_episode

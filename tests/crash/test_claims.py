@@ -19,12 +19,17 @@ import pytest
 from support.foreign_dataset import DATA, EPISODES, TASKS, write_foreign
 from support.fuzz import LimitedCommands, problem_of
 
-from demorec.errors import ExportError
-from demorec.hdf5.foreign import ForeignFile
-from demorec.lerobot.files import check_video, read_table
-from demorec.lerobot.pages import longest_row, pages_of
+from demorec.core.errors import ExportError
+from demorec.datasets.hdf5.foreign import ForeignFile
+from demorec.datasets.lerobot.files import check_video, read_table
+from demorec.datasets.lerobot.pages import longest_row, pages_of
 
-_MODULES = ("demorec.check.run", "demorec.ingest.dataset_import", "demorec.ingest.hdf5_import", "demorec.report.gather")
+_MODULES = (
+    "demorec.check.run",
+    "demorec.sources.dataset_import",
+    "demorec.sources.hdf5_import",
+    "demorec.report.gather",
+)
 
 
 @pytest.fixture(scope="module")

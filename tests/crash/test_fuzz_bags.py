@@ -6,7 +6,7 @@ import pytest
 from support.fuzz import problems_within_limits, results_here
 from support.fuzz_bags import FuzzedBags
 
-_MODULES = ("demorec.ingest.suggest", "demorec.ingest.import_run", "ruamel.yaml", "google.protobuf.descriptor_pool")
+_MODULES = ("demorec.sources.suggest", "demorec.sources.import_run", "ruamel.yaml", "google.protobuf.descriptor_pool")
 
 
 @pytest.fixture(scope="module")

@@ -7,9 +7,9 @@ from support.fuzz import problems_within_limits, results_here
 from support.fuzz_data import FuzzedData
 
 _MODULES = (
-    "demorec.check.run", "demorec.ingest.dataset_import", "demorec.ingest.hdf5_import", "demorec.ingest.hdf5_suggest",
-    "demorec.lerobot.inspect", "demorec.lerobot.export", "demorec.hdf5.export", "demorec.report.gather",
-    "demorec.evaluate.rollouts",
+    "demorec.check.run", "demorec.sources.dataset_import", "demorec.sources.hdf5_import",
+    "demorec.sources.hdf5_suggest", "demorec.datasets.lerobot.inspect", "demorec.datasets.lerobot.export",
+    "demorec.datasets.hdf5.export", "demorec.report.gather", "demorec.learn.evaluate.rollouts",
 )  # fmt: skip
 
 

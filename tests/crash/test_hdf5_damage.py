@@ -17,8 +17,8 @@ import pytest
 from support.commands import exit_code
 from support.hdf5 import write_robomimic
 
-from demorec.errors import ResourceError
-from demorec.hdf5 import trial
+from demorec.core.errors import ResourceError
+from demorec.datasets.hdf5 import trial
 
 _SIZE_OF_FIRST = 24
 """Where a collection says how long its first object is: after its own head (16), number, references and reserved."""

@@ -14,8 +14,8 @@ import pytest
 from support.odd import Odd
 
 from demorec.cli import COMMANDS, parse_command
-from demorec.errors import DemorecError
-from demorec.safety.text import printable
+from demorec.core.errors import DemorecError
+from demorec.core.text import printable
 
 
 @pytest.fixture(scope="module")

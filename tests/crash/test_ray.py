@@ -16,8 +16,8 @@ import psutil
 import pytest
 from support.generate import Remembers, expected_attempts, inspect, num_finished, run_fake
 
-from demorec.config import GenerateConfig
-from demorec.errors import ConfigError, GenerationError
+from demorec.core.config import GenerateConfig
+from demorec.core.errors import ConfigError, GenerationError
 from demorec.generate import on_ray
 from demorec.generate.observer import RunObserver, RunResult
 from demorec.generate.options import RunOptions

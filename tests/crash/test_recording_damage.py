@@ -18,9 +18,9 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from support.recording import write_episode
 
-from demorec.config import VideoConfig
-from demorec.errors import RecordingError
-from demorec.recording import Recording, recover
+from demorec.core.config import VideoConfig
+from demorec.core.errors import RecordingError
+from demorec.mcap import Recording, recover
 
 Damage = Callable[[bytes, random.Random], bytes]
 
@@ -288,7 +288,7 @@ def test_a_newer_format_is_refused_by_its_number(tmp_path: Path) -> None:
 
     from support.recording import make_episode
 
-    from demorec.recording import EpisodeWriter
+    from demorec.mcap import EpisodeWriter
 
     info, frames, outcome = make_episode(num_frames=2, cameras=())
     with EpisodeWriter(tmp_path / "a.mcap", replace(info, format_version=99)) as writer:

@@ -19,10 +19,10 @@ from pathlib import Path
 import pytest
 from support.recording import Codec, frame_number, make_episode, write_episode
 
-from demorec.config import VideoConfig
-from demorec.errors import RecordingError
-from demorec.recording import EpisodeWriter, Recording, recover
-from demorec.scene.episode import EpisodeInfo, Frame
+from demorec.core.config import VideoConfig
+from demorec.core.errors import RecordingError
+from demorec.episode.episode import EpisodeInfo, Frame
+from demorec.mcap import EpisodeWriter, Recording, recover
 
 FPS = 30
 MOST_FRAMES = 300

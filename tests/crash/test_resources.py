@@ -9,8 +9,8 @@ import pytest
 import zstandard
 from support.recording import write_episode
 
-from demorec.errors import RecordingError, ResourceError
-from demorec.recording import container
+from demorec.core.errors import RecordingError, ResourceError
+from demorec.mcap import container
 from demorec.runs.recordings import inspect_recording
 
 

@@ -16,8 +16,8 @@ from support import generate as generating
 from support.generate import Remembers, attempts_of, expected_attempts, run_fake
 
 from demorec.cli import main
-from demorec.config import GenerateConfig
-from demorec.errors import ConfigError, GenerationError, MissingDependencyError, ResourceError
+from demorec.core.config import GenerateConfig
+from demorec.core.errors import ConfigError, GenerationError, MissingDependencyError, ResourceError
 from demorec.generate import survey
 from demorec.generate.observer import RunResult
 from demorec.generate.options import RunOptions

@@ -15,7 +15,7 @@ from PIL import Image
 from support.recording import write_episode
 
 from demorec.cli import main
-from demorec.playback.programs import viewer_program
+from demorec.view.programs import viewer_program
 
 PROGRAM = """
 import os, signal, sys

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from demorec.geometry import Pose, quat_from_rotation
+from demorec.core.geometry import Pose, quat_from_rotation
 
 coordinates = st.floats(-10, 10, allow_nan=False)
 components = st.tuples(*[st.floats(-1, 1, allow_nan=False)] * 4).filter(lambda q: sum(v * v for v in q) > 1e-3)

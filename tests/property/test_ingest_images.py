@@ -12,14 +12,14 @@ import numpy as np
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from demorec.ingest.episodes import Window
-from demorec.ingest.fields import layout_of
-from demorec.ingest.findings import all_findings
-from demorec.ingest.import_run import row_findings
-from demorec.ingest.mapping import BagMapping, CameraSource, Clock, Robot, Source, TaskText
-from demorec.ingest.picture_messages import PictureHead, PictureHeads
-from demorec.ingest.rows import EpisodeRows, Timelines
-from demorec.ingest.streams import BagStreams, Stream
+from demorec.sources.episodes import Window
+from demorec.sources.fields import layout_of
+from demorec.sources.findings import all_findings
+from demorec.sources.import_run import row_findings
+from demorec.sources.mapping import BagMapping, CameraSource, Clock, Robot, Source, TaskText
+from demorec.sources.picture_messages import PictureHead, PictureHeads
+from demorec.sources.rows import EpisodeRows, Timelines
+from demorec.sources.streams import BagStreams, Stream
 
 NS = 1_000_000_000
 COUNT = 60

@@ -18,7 +18,7 @@ from support import bags
 from support.bags import EPOCH_NS, Note
 
 from demorec.cli import main
-from demorec.ingest.words import quoted
+from demorec.sources.words import quoted
 
 TEXTS = st.text(min_size=1, max_size=12)
 ODD = [

@@ -8,9 +8,9 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from demorec.scene.motion import MotionLimits, plan_straight, quintic, slowdown
+from demorec.robots.motion import MotionLimits, plan_straight, quintic, slowdown
+from demorec.robots.panda import PANDA
 from demorec.sim.arm import arm_kinematics
-from demorec.sim.robots.panda import PANDA
 from demorec.tasks.grasping import hand_down
 
 ARM = arm_kinematics(PANDA)

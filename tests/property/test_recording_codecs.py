@@ -18,17 +18,17 @@ from hypothesis.extra import numpy as hnp
 from mcap_ros2._dynamic import generate_dynamic
 from support.present import present
 
-from demorec.errors import RecordingError
-from demorec.geometry import Pose
-from demorec.recording.cdr import CdrReader, Slot, layout
-from demorec.recording.depth import decode_depth, encode_depth
-from demorec.recording.description import body_description, robot_description
-from demorec.recording.labels import LabelDecoder, decode_labels, encode_labels
-from demorec.recording.messages import JOINT_STATE
-from demorec.recording.ros2 import DEFINITIONS
-from demorec.recording.shapes import Primitive, fit_primitives
-from demorec.scene.assets import asset_path
-from demorec.scene.scene import Body, Shape
+from demorec.core.errors import RecordingError
+from demorec.core.geometry import Pose
+from demorec.episode.scene import Body, Shape
+from demorec.mcap.cdr import CdrReader, Slot, layout
+from demorec.mcap.depth import decode_depth, encode_depth
+from demorec.mcap.description import body_description, robot_description
+from demorec.mcap.labels import LabelDecoder, decode_labels, encode_labels
+from demorec.mcap.messages import JOINT_STATE
+from demorec.mcap.ros2 import DEFINITIONS
+from demorec.mcap.shapes import Primitive, fit_primitives
+from demorec.robots.assets import asset_path
 
 pictures = hnp.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=24)
 

@@ -10,8 +10,8 @@ from huggingface_hub.utils._validators import validate_repo_id
 from hypothesis import given
 from hypothesis import strategies as st
 
-from demorec.errors import ConfigError
-from demorec.lerobot.options import check_repo_id
+from demorec.core.errors import ConfigError
+from demorec.datasets.lerobot.options import check_repo_id
 
 words = st.text(st.sampled_from("aZ09_-.é "), min_size=0, max_size=6)
 

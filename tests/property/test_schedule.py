@@ -7,7 +7,7 @@ import random
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from demorec.config import EpisodePlan, GenerateConfig
+from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.generate.plan import Schedule, plain_differences
 from demorec.runs.run_file import Attempt, RunFile
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from demorec.scene.urdf import Urdf
+from demorec.robots.urdf import Urdf
 
 links = st.integers(0, 6).map("link{}".format)
 

@@ -18,16 +18,16 @@ import pyarrow.parquet as pq
 import pytest
 
 from demorec.check.report import CheckOptions, Subject, SubjectReport, check_subject
-from demorec.config import EpisodePlan, GenerateConfig
+from demorec.core.config import EpisodePlan, GenerateConfig
+from demorec.episode.episode import CameraImages, EpisodeColumns, EpisodeInfo, Frame, Outcome
 from demorec.loop import ScriptAgent, Session, make_renderer, make_world, prepare
-from demorec.recording import EpisodeWriter, Recording
-from demorec.recording.container import Container
-from demorec.recording.frame_check import FrameCheck
-from demorec.recording.frames import decoded_images, frames_of
-from demorec.recording.part_file import PartFile
+from demorec.mcap import EpisodeWriter, Recording
+from demorec.mcap.container import Container
+from demorec.mcap.frame_check import FrameCheck
+from demorec.mcap.frames import decoded_images, frames_of
+from demorec.mcap.part_file import PartFile
 from demorec.runs.recordings import inspect_recording
 from demorec.runs.run_file import RunFile, save_run_file
-from demorec.scene.episode import CameraImages, EpisodeColumns, EpisodeInfo, Frame, Outcome
 from support.mcap import metadata_of
 
 Pictures = list[dict[str, CameraImages]]
@@ -139,8 +139,8 @@ class Spoilt:
         return path
 
     def _frame(self, frame: Frame, number: int, index: int) -> Frame:
-        from demorec.recording.streams import pose_of
-        from demorec.scene.episode import frame_time_ns
+        from demorec.episode.episode import frame_time_ns
+        from demorec.mcap.streams import pose_of
 
         images = {
             name: replace(image, world_from_camera=pose_of(self.columns.world_from_camera[name][index]))

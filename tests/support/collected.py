@@ -11,9 +11,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.config import VideoConfig
-from demorec.recording import CollectedWriter
-from demorec.scene.collected import (
+from demorec.core.config import VideoConfig
+from demorec.episode.collected import (
     CollectedCamera,
     CollectedFeature,
     CollectedFrame,
@@ -21,6 +20,7 @@ from demorec.scene.collected import (
     CollectedOutcome,
     Sample,
 )
+from demorec.mcap import CollectedWriter
 
 URDF = """<robot name="two_joints">
  <link name="base"><visual><geometry><box size="0.1 0.1 0.1"/></geometry></visual></link>

@@ -16,11 +16,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from demorec.config import VideoConfig
-from demorec.errors import ExportError
-from demorec.lerobot import ExportReport
-from demorec.lerobot import export as lerobot_export
-from demorec.tables import EXPORTERS
+from demorec.core.config import VideoConfig
+from demorec.core.errors import ExportError
+from demorec.core.tables import EXPORTERS
+from demorec.datasets.lerobot import ExportReport
+from demorec.datasets.lerobot import export as lerobot_export
 from support.recording import write_episode
 
 

@@ -14,9 +14,9 @@ from demorec.check.base import Result
 from demorec.check.cells import CellGrid, ImageKind
 from demorec.check.drawn import PictureComparison
 from demorec.check.episode import CheckedEpisode, PictureSummary
-from demorec.scene.episode import EpisodeColumns, EpisodeInfo, Outcome
-from demorec.scene.scene import Camera
-from demorec.tables import CHECKS
+from demorec.core.tables import CHECKS
+from demorec.episode.episode import EpisodeColumns, EpisodeInfo, Outcome
+from demorec.episode.scene import Camera
 
 Rows = NDArray[Any]
 

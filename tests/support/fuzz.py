@@ -25,7 +25,7 @@ from types import TracebackType
 from typing import Protocol, Self
 
 from demorec.cli import COMMANDS, main, parse_command
-from demorec.errors import DemorecError
+from demorec.core.errors import DemorecError
 
 if __name__ != "__main__":
     from support.commands import MOST_BYTES, Told

@@ -15,11 +15,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from demorec.config import GenerateConfig
-from demorec.evaluate.rollouts import Evaluation, Settings
-from demorec.plain import to_plain
-from demorec.recording import Recording
-from demorec.tables import CHECKS
+from demorec.core.config import GenerateConfig
+from demorec.core.plain import to_plain
+from demorec.core.tables import CHECKS
+from demorec.learn.evaluate.rollouts import Evaluation, Settings
+from demorec.mcap import Recording
 from support import hdf5
 from support.collected import write_collected
 from support.export import export, make_run

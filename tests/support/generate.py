@@ -9,14 +9,14 @@ import json
 import sys
 from pathlib import Path
 
-from demorec.config import GenerateConfig
-from demorec.errors import DemorecError
+from demorec.core.config import GenerateConfig
+from demorec.core.errors import DemorecError
+from demorec.core.files import read_text_limited
 from demorec.generate import run as running
 from demorec.generate.observer import RunObserver, RunResult
 from demorec.generate.options import RunOptions
 from demorec.generate.run import generate
 from demorec.runs.recordings import Inspected
-from demorec.safety.files import read_text_limited
 from support.makers import line_of, succeeds
 
 

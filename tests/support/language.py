@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from demorec.scene.scene import Body, Scene
+from demorec.episode.scene import Body, Scene
 from support.export import data_table
 
 Row = dict[str, Any]

@@ -14,9 +14,9 @@ import signal
 import time
 from pathlib import Path
 
-from demorec.config import EpisodePlan, deciding_versions
-from demorec.errors import RenderError
-from demorec.plain import digest, to_plain
+from demorec.core.config import EpisodePlan, deciding_versions
+from demorec.core.errors import RenderError
+from demorec.core.plain import digest, to_plain
 from demorec.runs.run_file import Attempt, recording_name, sha256_of
 
 

@@ -17,8 +17,8 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from demorec.config import GenerateConfig
-from demorec.recording import Recording
+from demorec.core.config import GenerateConfig
+from demorec.mcap import Recording
 from demorec.runs.recordings import inspect_recording
 from demorec.runs.run_file import RunFile, save_run_file
 from support.export import export

@@ -8,9 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from demorec.geometry import Pose
-from demorec.scene.robot import RobotSpec
-from demorec.scene.scene import Scene
+from demorec.core.geometry import Pose
+from demorec.episode.scene import Scene
+from demorec.robots.robot import RobotSpec
 from demorec.tasks.grasping import raised
 from demorec.tasks.pick_place import PickPlace
 from demorec.tasks.sampling import Sampler

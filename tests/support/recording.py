@@ -13,10 +13,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.config import VideoConfig
-from demorec.geometry import Pose, look_at
-from demorec.recording import EpisodeWriter
-from demorec.scene.episode import (
+from demorec.core.config import VideoConfig
+from demorec.core.geometry import Pose, look_at
+from demorec.episode.episode import (
     Action,
     CameraImages,
     EpisodeInfo,
@@ -28,8 +27,9 @@ from demorec.scene.episode import (
     SuccessCheck,
     frame_time_ns,
 )
-from demorec.scene.robot import ParallelGripper, RobotSpec
-from demorec.scene.scene import Body, Camera, Goal, RobotPlacement, Scene, Shape
+from demorec.episode.scene import Body, Camera, Goal, RobotPlacement, Scene, Shape
+from demorec.mcap import EpisodeWriter
+from demorec.robots.robot import ParallelGripper, RobotSpec
 
 Codec = Literal["h264", "av1", "jpeg"]
 PHASES = ("approach", "descend", "grasp", "lift", "transport", "place", "retreat")
@@ -148,7 +148,7 @@ def _camera(name: str, width: int, height: int) -> Camera:
 
 
 def _scene(cameras: tuple[Camera, ...], physics_hz: int) -> Scene:
-    from demorec.scene.scene import Physics
+    from demorec.episode.scene import Physics
 
     return Scene(
         robot=RobotPlacement(name="panda", world_from_base=Pose(), joint_position=HOME, gripper_width=0.08),

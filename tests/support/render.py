@@ -12,10 +12,10 @@ import pybullet_data
 from numpy.typing import NDArray
 from pybullet_utils.bullet_client import BulletClient
 
-from demorec.geometry import Pose, look_at
+from demorec.core.geometry import Pose, look_at
+from demorec.episode.episode import CameraImages
+from demorec.episode.scene import Camera, RobotPlacement, Scene, Texture
 from demorec.render import Mount, Renderer, RenderSetup, VisualBody
-from demorec.scene.episode import CameraImages
-from demorec.scene.scene import Camera, RobotPlacement, Scene, Texture
 from demorec.sim.renderers.client_renderer import view_matrix
 from demorec.sim.visuals import body_poses, shape_rows, visual_bodies
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from demorec.config import EpisodePlan, GenerateConfig
+from demorec.core.config import EpisodePlan, GenerateConfig
+from demorec.episode.episode import Frame, Outcome
 from demorec.loop import Episode, ScriptAgent, Session, make_renderer, make_world, prepare
-from demorec.scene.episode import Frame, Outcome
 from demorec.sim.world import World
 
 

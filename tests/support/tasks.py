@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from demorec.tables import TASKS
+from demorec.core.tables import TASKS
 
 QUICK_TASKS = ("pick_from_clutter", "tutorial")
 """Many bodies, an own script. Most other tests take one cube (`pick_place`); `tests/contract/test_tasks.py` runs every

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.recording.video import ordinary_scheduling
+from demorec.mcap.video import ordinary_scheduling
 
 CAMERA, DEPTH = "observation.images.top", "observation.images.top_depth"
 SMALL_ACT: dict[str, Any] = {

@@ -8,7 +8,7 @@ import time
 from multiprocessing.connection import Connection
 from typing import Any
 
-from demorec.errors import resource_error
+from demorec.core.errors import resource_error
 
 
 def never_end(pipe: Connection[Any, Any], cache: str) -> None:

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from support.sim import episode
 
+from demorec.episode.features import ActionKind
 from demorec.loop import make_world
 from demorec.loop.actions import ActionDecoder
-from demorec.scene.features import ActionKind
 from demorec.sim.world import World
 
 

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from demorec.geometry import Pose
-from demorec.scene.camera_error import error_values, told_error
+from demorec.core.geometry import Pose
+from demorec.episode.camera_error import error_values, told_error
 
 small = st.floats(-0.3, 0.3)
 

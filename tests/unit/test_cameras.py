@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from support.sim import episode
 
-from demorec.geometry import Pose
+from demorec.core.geometry import Pose
+from demorec.core.tables import CAMERAS, ROBOTS
+from demorec.episode.scene import Camera
 from demorec.loop import make_world
-from demorec.scene.scene import Camera
 from demorec.sim.world import World
-from demorec.tables import CAMERAS, ROBOTS
 from demorec.tasks.sampling import WORKSPACE
 
 

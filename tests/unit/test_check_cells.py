@@ -15,10 +15,10 @@ from support.recording import write_episode
 from demorec.check.cells import DEPTH_RANGE, CellGrid, Cells, cell_counts, cell_side
 from demorec.check.drawn import compare, frames_to_draw, small_camera
 from demorec.check.episode_drawn import draw_episode
-from demorec.errors import RecordingError
-from demorec.geometry import Array, Pose
-from demorec.recording import Recording
-from demorec.scene.scene import Camera
+from demorec.core.errors import RecordingError
+from demorec.core.geometry import Array, Pose
+from demorec.episode.scene import Camera
+from demorec.mcap import Recording
 
 
 def parts(picture: NDArray[Any], width: int, height: int) -> list[list[NDArray[Any]]]:

@@ -12,7 +12,7 @@ from support.recording import write_episode
 
 from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.cli import main
-from demorec.recording.container import Container
+from demorec.mcap.container import Container
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from support.export import make_run
 from demorec.check.report import CheckOptions, SubjectReport, check_subjects, find_subjects
 from demorec.cli import main
 from demorec.cli.generate_report import check_run
-from demorec.config import GenerateConfig
+from demorec.core.config import GenerateConfig
 from demorec.generate.observer import RunResult
 from demorec.runs.recordings import inspect_recording
 from demorec.runs.run_file import RunFile, RunSession, save_run_file

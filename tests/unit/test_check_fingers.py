@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from demorec.check.fingers import Convex, depth_in
-from demorec.geometry import Array, Pose
-from demorec.scene.scene import Shape, ShapeKind
+from demorec.core.geometry import Array, Pose
+from demorec.episode.scene import Shape, ShapeKind
 from demorec.sim.client import connect
 
 BOX = Shape(kind="box", size=(0.04, 0.05, 0.06))

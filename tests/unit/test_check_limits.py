@@ -10,7 +10,7 @@ from support.check import checked
 from support.export import export
 from support.recording import PANDA, make_episode
 
-from demorec.recording import EpisodeWriter
+from demorec.mcap import EpisodeWriter
 
 
 @pytest.mark.parametrize(("width", "beyond"), [(0.104, 0.0), (0.120, 0.016)])

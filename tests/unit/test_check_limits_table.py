@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from demorec.check.limits import limit_table
-from demorec.tables import CHECKS
+from demorec.core.tables import CHECKS
 
 TABLE = limit_table()
 

@@ -10,10 +10,10 @@ import pytest
 
 from demorec.check import reads
 from demorec.cli import main
-from demorec.recording import Recording, channels
-from demorec.recording.streams import frame_streams
-from demorec.scene.episode import EpisodeInfo
-from demorec.tables import CHECKS
+from demorec.core.tables import CHECKS
+from demorec.episode.episode import EpisodeInfo
+from demorec.mcap import Recording, channels
+from demorec.mcap.streams import frame_streams
 
 SAMPLES = Path(__file__).parents[2] / "recordings" / "sample"
 

@@ -12,7 +12,7 @@ import pytest
 
 from demorec.cli import generate_report
 from demorec.cli.generate_report import next_commands
-from demorec.config import GenerateConfig
+from demorec.core.config import GenerateConfig
 from demorec.generate.contents import set_aside
 from demorec.generate.observer import RunResult
 from demorec.runs.run_file import ExportRecord, RunFile, RunSession

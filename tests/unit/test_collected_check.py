@@ -14,9 +14,9 @@ from support.collected import FORCE, TOP, Episode, make_collected, write_collect
 
 from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.cli import main
-from demorec.recording import recover
+from demorec.episode.collected import CollectedFrame, Sample
+from demorec.mcap import recover
 from demorec.runs.collected import open_collected_run
-from demorec.scene.collected import CollectedFrame, Sample
 
 CAMERAS = (TOP, replace(TOP, name="side"))
 

@@ -17,8 +17,8 @@ from support.collected import TOP, Episode, make_collected, write_collected
 from support.export import data_table, export
 from support.recording import write_episode
 
-from demorec.errors import ConfigError, ExportError
-from demorec.recording import CollectedRecording
+from demorec.core.errors import ConfigError, ExportError
+from demorec.mcap import CollectedRecording
 
 
 def run_of(folder: Path, *episodes: Episode) -> Path:
@@ -160,7 +160,7 @@ def test_a_dataset_can_be_appended_to(tmp_path: Path) -> None:
 def test_kept_h265_becomes_hevc(tmp_path: Path) -> None:
     from typing import cast
 
-    from demorec.recording import CollectedWriter
+    from demorec.mcap import CollectedWriter
 
     context = cast(av.VideoCodecContext, av.CodecContext.create("libx265", "w"))
     context.width, context.height, context.pix_fmt, context.time_base = 64, 48, "yuv420p", Fraction(1, 30)

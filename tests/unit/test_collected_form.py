@@ -22,12 +22,9 @@ from support.collected import (
     write_pictures_and_frames,
 )
 
-from demorec.config import VideoConfig
-from demorec.errors import ConfigError, DemorecError, RecordingError
-from demorec.recording import CollectedRecording, CollectedWriter, Recording, recover
-from demorec.recording.collected.transforms import JointPositions
-from demorec.recording.collected.validity import what_is_wrong
-from demorec.scene.collected import (
+from demorec.core.config import VideoConfig
+from demorec.core.errors import ConfigError, DemorecError, RecordingError
+from demorec.episode.collected import (
     NO_PICTURE,
     CollectedCamera,
     CollectedFrame,
@@ -37,6 +34,9 @@ from demorec.scene.collected import (
     Sample,
     SourceFile,
 )
+from demorec.mcap import CollectedRecording, CollectedWriter, Recording, recover
+from demorec.mcap.external.transforms import JointPositions
+from demorec.mcap.external.validity import what_is_wrong
 
 
 @pytest.mark.parametrize("num_frames", [0, 1, 45, 100])

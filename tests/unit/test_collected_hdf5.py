@@ -12,8 +12,8 @@ import pytest
 from support.collected import FORCE, STATE, TOP, URDF, make_collected, write_collected
 from support.export import export
 
-from demorec.errors import ConfigError, ExportError
-from demorec.recording import CollectedRecording
+from demorec.core.errors import ConfigError, ExportError
+from demorec.mcap import CollectedRecording
 
 
 def run_of(folder: Path, *outcomes: bool | None) -> Path:

@@ -9,10 +9,10 @@ import pytest
 from rerun.chunk import RrdReader
 from support.collected import TOP, WRIST, make_collected, write_collected
 
-from demorec.errors import ConfigError
-from demorec.playback.episode import PlayedCollected
-from demorec.playback.save import save, save_comparison
-from demorec.playback.sources import find_episodes
+from demorec.core.errors import ConfigError
+from demorec.view.episode import PlayedCollected
+from demorec.view.save import save, save_comparison
+from demorec.view.sources import find_episodes
 
 
 def opened(path: Path) -> PlayedCollected:

@@ -8,9 +8,16 @@ from typing import Any
 
 import pytest
 
-from demorec.config import GenerateConfig, VideoConfig, _deciding_versions, deciding_versions, parse_config, read_toml
-from demorec.errors import ConfigError
-from demorec.scene.episode import frame_time_ns
+from demorec.core.config import (
+    GenerateConfig,
+    VideoConfig,
+    _deciding_versions,
+    deciding_versions,
+    parse_config,
+    read_toml,
+)
+from demorec.core.errors import ConfigError
+from demorec.episode.episode import frame_time_ns
 
 
 @pytest.mark.parametrize(
@@ -92,8 +99,8 @@ def test_the_fork_in_pybullets_place_is_named(monkeypatch: pytest.MonkeyPatch) -
             raise PackageNotFoundError(name)
         return "3.2.8"
 
-    monkeypatch.setattr("demorec.config.version", version)
-    monkeypatch.setattr("demorec.config._deciding_versions", _deciding_versions.__wrapped__)
+    monkeypatch.setattr("demorec.core.config.version", version)
+    monkeypatch.setattr("demorec.core.config._deciding_versions", _deciding_versions.__wrapped__)
     assert deciding_versions()["pybullet"] == "3.2.8 (pybullet-arm64)"
 
 

@@ -14,7 +14,7 @@ from PIL import Image, ImageDraw
 from support.recording import make_episode
 
 from demorec.check.coverage import draw_coverage, ticks
-from demorec.geometry import Pose
+from demorec.core.geometry import Pose
 
 
 @given(st.floats(-5, 5), st.floats(1e-3, 10))

@@ -19,15 +19,15 @@ from support.check import level_of
 from support.collected import TOP, URDF, Episode, make_collected, write_collected
 from support.export import data_table, export
 
-from demorec.errors import ExportError, MissingDependencyError
-from demorec.lerobot.robots import RobotRecord, portable_urdf, read_robot
-from demorec.plain import digest, from_json, to_json
-from demorec.playback import robot as played_robot
-from demorec.playback.episode import PlayedCollected, PlayedEpisode
-from demorec.playback.from_dataset import open_dataset_episode
-from demorec.playback.save import save
-from demorec.playback.sources import find_episodes
-from demorec.recording import Recording
+from demorec.core.errors import ExportError, MissingDependencyError
+from demorec.core.plain import digest, from_json, to_json
+from demorec.datasets.lerobot.robots import RobotRecord, portable_urdf, read_robot
+from demorec.mcap import Recording
+from demorec.view import robot as played_robot
+from demorec.view.episode import PlayedCollected, PlayedEpisode
+from demorec.view.from_dataset import open_dataset_episode
+from demorec.view.save import save
+from demorec.view.sources import find_episodes
 
 SAMPLE = Path(__file__).parents[2] / "recordings" / "sample" / "format_1.mcap"
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from demorec.check.episode_drawn import drawable_scene
-from demorec.config import EpisodePlan, GenerateConfig
+from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.loop import prepare
-from demorec.scene.motion import angle_between
+from demorec.robots.motion import angle_between
 
 
 @pytest.mark.parametrize("index", range(3))

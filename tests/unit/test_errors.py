@@ -12,7 +12,7 @@ import av
 import pytest
 from support.present import present
 
-from demorec.errors import RecordingError, ResourceError, in_words, resource_error
+from demorec.core.errors import RecordingError, ResourceError, in_words, resource_error
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from support.export import export, make_run
 
-from demorec.config import EpisodePlan, GenerateConfig
+from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.generate import estimate as estimating
 from demorec.generate.executor import Made
 from demorec.generate.options import RunOptions

@@ -18,11 +18,11 @@ from support.recording import frame_number, write_episode
 from demorec.cli.export import Export
 from demorec.cli.generate import Generate
 from demorec.cli.shared.flags import parse
-from demorec.config import GenerateConfig, VideoConfig
-from demorec.lerobot.commands import flags
-from demorec.lerobot.options import ExportOptions
-from demorec.recording import Recording
-from demorec.scene.variation import Ranges
+from demorec.core.config import GenerateConfig, VideoConfig
+from demorec.datasets.lerobot.commands import flags
+from demorec.datasets.lerobot.options import ExportOptions
+from demorec.episode.variation import Ranges
+from demorec.mcap import Recording
 
 
 def commands_of(dataset: Path) -> list[str]:

@@ -16,12 +16,12 @@ from mcap.reader import make_reader
 from support.export import data_table, episode_rows, export, files_of, info, make_run
 from support.recording import make_episode, write_episode
 
-import demorec.lerobot.writer
-from demorec.config import VideoConfig
-from demorec.errors import ConfigError, ExportError, RecordingError
-from demorec.export.options import parse_episodes
-from demorec.lerobot import ExportOptions, dataset_digest, dataset_info, is_dataset
-from demorec.recording import Recording
+import demorec.datasets.lerobot.writer
+from demorec.core.config import VideoConfig
+from demorec.core.errors import ConfigError, ExportError, RecordingError
+from demorec.datasets.lerobot import ExportOptions, dataset_digest, dataset_info, is_dataset
+from demorec.datasets.options import parse_episodes
+from demorec.mcap import Recording
 
 
 @pytest.fixture(scope="module")
@@ -107,7 +107,7 @@ def test_the_digest_depends_on_the_content_alone(run: Path, tmp_path: Path) -> N
 
 
 def test_every_kind_of_file_rolls_over_by_itself(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(demorec.lerobot.writer, "_EPISODES_PER_TABLE", 1)
+    monkeypatch.setattr(demorec.datasets.lerobot.writer, "_EPISODES_PER_TABLE", 1)
     out = tmp_path / "d"
     export(run, out, video_files_mb=0.006, data_files_mb=0.001, files_per_chunk=2)
     rows = episode_rows(out)

@@ -12,8 +12,8 @@ import pytest
 from support.export import export, make_run
 
 from demorec.cli import main
-from demorec.errors import ConfigError
-from demorec.recording import Recording
+from demorec.core.errors import ConfigError
+from demorec.mcap import Recording
 
 
 @pytest.fixture(scope="module")

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from support.present import present
 
-from demorec.config import VideoConfig
-from demorec.errors import ExportError
-from demorec.lerobot.bitstream import parameter_sets
-from demorec.lerobot.depth import code_values, depth_video, quantised
-from demorec.lerobot.mp4 import CodedVideo, Mp4Writer
-from demorec.recording import VideoPacket, VideoSettings
-from demorec.recording.video import decode, is_keyframe, make_encoder
+from demorec.core.config import VideoConfig
+from demorec.core.errors import ExportError
+from demorec.datasets.lerobot.bitstream import parameter_sets
+from demorec.datasets.lerobot.depth import code_values, depth_video, quantised
+from demorec.datasets.lerobot.mp4 import CodedVideo, Mp4Writer
+from demorec.mcap import VideoPacket, VideoSettings
+from demorec.mcap.video import decode, is_keyframe, make_encoder
 
 WIDTH, HEIGHT = 64, 48
 

@@ -10,10 +10,10 @@ import pyarrow.parquet as pq
 import pytest
 from numpy.typing import NDArray
 
-from demorec.lerobot.data_stats import data_statistics
-from demorec.lerobot.layout import Feature, data_schema
-from demorec.lerobot.stats import QUANTILES, PixelHistogram, Statistics, colour_levels, vector_statistics
-from demorec.lerobot.writer import merge_statistics
+from demorec.datasets.lerobot.data_stats import data_statistics
+from demorec.datasets.lerobot.layout import Feature, data_schema
+from demorec.datasets.lerobot.stats import QUANTILES, PixelHistogram, Statistics, colour_levels, vector_statistics
+from demorec.datasets.lerobot.writer import merge_statistics
 
 
 def check(found: Statistics, column: NDArray[np.generic]) -> None:

@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 from support.export import export, files_of, make_run, without_verification
 
-from demorec.config import GenerateConfig, deciding_versions
-from demorec.errors import ConfigError
+from demorec.core.config import GenerateConfig, deciding_versions
+from demorec.core.errors import ConfigError
+from demorec.datasets.lerobot import dataset_digest
 from demorec.generate.export_step import export_run
-from demorec.lerobot import dataset_digest
 from demorec.runs.run_file import RunFile, load_run_file, save_run_file
 
 

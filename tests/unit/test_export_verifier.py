@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 from support.verifier import die, lack_memory, never_end, never_listen
 
-from demorec.errors import ExportError, ResourceError
-from demorec.lerobot import ExportOptions, verify
-from demorec.lerobot.verify import Verifier
+from demorec.core.errors import ExportError, ResourceError
+from demorec.datasets.lerobot import ExportOptions, verify
+from demorec.datasets.lerobot.verify import Verifier
 
 
 def test_an_export_that_fails_does_not_wait_for_it(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,9 +11,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.recording import HOME, PANDA, make_episode
 
-from demorec.geometry import Pose
-from demorec.scene.episode import EpisodeColumns, frame_time_ns
-from demorec.scene.features import (
+from demorec.core.geometry import Pose
+from demorec.episode.episode import EpisodeColumns, frame_time_ns
+from demorec.episode.features import (
     ACTION,
     EE_POSE,
     ENVIRONMENT_STATE,
@@ -26,8 +26,8 @@ from demorec.scene.features import (
     observation_vectors,
     pose_from_delta,
 )
-from demorec.scene.scene import Body, Goal, RobotPlacement, Scene, Shape
-from demorec.scene.sensed import ObservationRows
+from demorec.episode.scene import Body, Goal, RobotPlacement, Scene, Shape
+from demorec.episode.sensed import ObservationRows
 
 
 def random_pose(rng: np.random.Generator) -> Pose:

@@ -10,9 +10,9 @@ import pytest
 from support.export import export, info, make_run
 
 from demorec.check.report import CheckOptions, check_subjects, find_subjects
-from demorec.config import GenerateConfig
+from demorec.core.config import GenerateConfig
+from demorec.datasets.lerobot import ExportOptions
 from demorec.generate import export_step
-from demorec.lerobot import ExportOptions
 from demorec.runs.recordings import inspect_recording
 from demorec.runs.run_file import RunFile, save_run_file
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from demorec.safety.files import open_regular, read_json_limited, read_text_limited
+from demorec.core.files import open_regular, read_json_limited, read_text_limited
 
 
 def test_regular_files_and_links_to_them_are_read(tmp_path: Path) -> None:

@@ -44,7 +44,7 @@ def batch(*index: int) -> dict[str, Any]:
 
 
 def frozen(limit_bytes: int) -> Policy:
-    from demorec.training.frozen import freeze_encoder
+    from demorec.learn.training.frozen import freeze_encoder
 
     policy = Policy()
     names = list(policy.state_dict())
@@ -98,8 +98,8 @@ def test_pictures_of_no_dataset_go_through() -> None:
 
 @pytest.mark.parametrize("policy", [Policy("diffusion"), Policy(cameras=())])
 def test_only_act_with_pictures_has_such_an_encoder(policy: Policy) -> None:
-    from demorec.errors import ConfigError
-    from demorec.training.frozen import freeze_encoder
+    from demorec.core.errors import ConfigError
+    from demorec.learn.training.frozen import freeze_encoder
 
     with pytest.raises(ConfigError, match="--freeze-encoder is for ACT policies with pictures"):
         freeze_encoder(policy, num_frames=1, limit_bytes=0)

@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from demorec.errors import ConfigError
+from demorec.core.errors import ConfigError
+from demorec.core.processes import available_cores
 from demorec.generate.options import RunOptions, default_out, default_repo_id
-from demorec.processes import available_cores
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from demorec.geometry import Pose, intrinsic_matrix, look_at, quat_from_rotation, rotation_from_quat, wrap_angle
+from demorec.core.geometry import Pose, intrinsic_matrix, look_at, quat_from_rotation, rotation_from_quat, wrap_angle
 
 
 def test_look_at_puts_the_target_on_the_optical_axis_upright() -> None:

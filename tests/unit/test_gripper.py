@@ -17,15 +17,15 @@ from support.sim import episode
 
 from demorec.check.base import Measurement
 from demorec.check.physics import gripper_width
-from demorec.geometry import Array
-from demorec.plain import from_json, from_plain, to_json, to_plain
-from demorec.recording.streams import FrameValues, frame_streams
-from demorec.scene.episode import Action, EpisodeInfo
-from demorec.scene.features import VELOCITY, observation_vectors
-from demorec.scene.robot import ParallelGripper, RobotSpec
-from demorec.scene.sensed import ObservationRows
+from demorec.core.geometry import Array
+from demorec.core.plain import from_json, from_plain, to_json, to_plain
+from demorec.core.tables import ROBOTS
+from demorec.episode.episode import Action, EpisodeInfo
+from demorec.episode.features import VELOCITY, observation_vectors
+from demorec.episode.sensed import ObservationRows
+from demorec.mcap.streams import FrameValues, frame_streams
+from demorec.robots.robot import ParallelGripper, RobotSpec
 from demorec.sim.world import World
-from demorec.tables import ROBOTS
 
 SAMPLES = Path(__file__).parents[2] / "recordings" / "sample"
 GRIPPER = PANDA.gripper

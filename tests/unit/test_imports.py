@@ -20,14 +20,14 @@ PROJECT = Path(__file__).parents[2] / "pyproject.toml"
 HOMES = {
     "pybullet": "demorec.sim",
     "pybullet_data": "demorec.sim",
-    "mcap": "demorec.recording",
-    "foxglove": "demorec.recording",
-    "rerun": "demorec.playback",
+    "mcap": "demorec.mcap",
+    "foxglove": "demorec.mcap",
+    "rerun": "demorec.view",
     "tyro": "demorec.cli",
     "tqdm": "demorec.cli",
-    "h5py": "demorec.hdf5",
-    "rosbags": "demorec.ingest",
-    "ruamel": "demorec.ingest",
+    "h5py": "demorec.datasets.hdf5",
+    "rosbags": "demorec.sources",
+    "ruamel": "demorec.sources",
     "ray": "demorec.generate.on_ray",
 }
 """Heavy library -> the folder or module of demorec that alone imports it (CONTRIBUTING.md)."""
@@ -108,9 +108,9 @@ def test_no_modules_import_each_other() -> None:
 
 def test_a_circle_would_be_found() -> None:
     graph = deepcopy(_graph(with_type_checking=True))
-    graph.add_import(importer="demorec.scene.robot", imported="demorec.sim.arm")
+    graph.add_import(importer="demorec.robots.robot", imported="demorec.sim.arm")
     (circle,) = _circles(graph)
-    assert {"demorec.scene.robot", "demorec.sim.arm"} <= set(circle)
+    assert {"demorec.robots.robot", "demorec.sim.arm"} <= set(circle)
 
 
 @pytest.mark.parametrize("library", HOMES)

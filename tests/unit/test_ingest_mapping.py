@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from support import bag_mappings, bags
 
-from demorec.errors import ConfigError
-from demorec.ingest.bag import open_bag
-from demorec.ingest.channel import BagError
-from demorec.ingest.fields import (
+from demorec.core.errors import ConfigError
+from demorec.sources.bag import open_bag
+from demorec.sources.channel import BagError
+from demorec.sources.fields import (
     FieldError,
     OtherPublisherError,
     SourceReader,
@@ -20,8 +20,8 @@ from demorec.ingest.fields import (
     layout_of,
     parse_path,
 )
-from demorec.ingest.mapping import Source, read_mapping
-from demorec.ingest.streams import read_streams
+from demorec.sources.mapping import Source, read_mapping
+from demorec.sources.streams import read_streams
 
 WRONG = [
     ('fps = 30', 'fpss = 30', r"unknown key 'fpss' in clock. Did you mean 'fps'\?"),

@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from demorec.ingest.words import task_in_name, unique_name
+from demorec.sources.words import task_in_name, unique_name
 
 
 @pytest.mark.parametrize(
@@ -27,7 +27,7 @@ def test_a_name_tells_its_task(name: str, task: str) -> None:
 
 def test_long_numbers_do_not_hold_it_up() -> None:
     name = "1" * 200 + "a"
-    program = f"from demorec.ingest.words import task_in_name; print(task_in_name({name!r}))"
+    program = f"from demorec.sources.words import task_in_name; print(task_in_name({name!r}))"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True)
     assert done.stdout.strip() == name
 

@@ -11,16 +11,16 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from demorec.geometry import Pose
-from demorec.scene.assets import asset_path
-from demorec.scene.kinematics import ArmKinematics
-from demorec.scene.kinematics_kernels import forward
-from demorec.scene.robot import RobotSpec
-from demorec.scene.urdf import Urdf, quat_from_rpy
+from demorec.core.geometry import Pose
+from demorec.core.tables import ROBOTS
+from demorec.robots.assets import asset_path
+from demorec.robots.kinematics import ArmKinematics
+from demorec.robots.kinematics_kernels import forward
+from demorec.robots.robot import RobotSpec
+from demorec.robots.urdf import Urdf, quat_from_rpy
 from demorec.sim.arm import arm_kinematics
 from demorec.sim.client import connect
 from demorec.sim.urdf_file import urdf_file
-from demorec.tables import ROBOTS
 
 SimulatedRobot = tuple[RobotSpec, Any, int, dict[str, int], dict[str, int]]
 """Specification, client, body, indices of links and of joints by name."""

@@ -11,16 +11,16 @@ import pyarrow.parquet as pq
 import pytest
 from support.recording import make_episode
 
-from demorec.errors import ExportError
-from demorec.geometry import Pose
-from demorec.language.narration import narrate
-from demorec.language.referring import phrase_for, phrases_for, references, resolve
-from demorec.language.situation import Surroundings, situation
-from demorec.lerobot import files
-from demorec.lerobot.language import EpisodeLanguage, LanguageRow, language_arrays
-from demorec.recording import EpisodeWriter, Recording
-from demorec.scene.episode import Event
-from demorec.scene.scene import Body, RobotPlacement, Scene, Shape
+from demorec.annotate.narration import narrate
+from demorec.annotate.referring import phrase_for, phrases_for, references, resolve
+from demorec.annotate.situation import Surroundings, situation
+from demorec.core.errors import ExportError
+from demorec.core.geometry import Pose
+from demorec.datasets.lerobot import files
+from demorec.datasets.lerobot.language import EpisodeLanguage, LanguageRow, language_arrays
+from demorec.episode.episode import Event
+from demorec.episode.scene import Body, RobotPlacement, Scene, Shape
+from demorec.mcap import EpisodeWriter, Recording
 
 
 def scene(*cubes: tuple[str, float, float, float], yaw: float = 0.0) -> Scene:

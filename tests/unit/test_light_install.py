@@ -12,13 +12,13 @@ from support.export import make_run
 
 from demorec.check.dataset import Dataset
 from demorec.cli import COMMANDS, main
-from demorec.errors import ExportError, MissingDependencyError
-from demorec.evaluate.policy import Policy
-from demorec.lerobot import ExportOptions, export_lerobot
-from demorec.lerobot.export import push_to_hub
-from demorec.lerobot.verify import LEROBOT
-from demorec.tables import CHECKS
-from demorec.training.command import train
+from demorec.core.errors import ExportError, MissingDependencyError
+from demorec.core.tables import CHECKS
+from demorec.datasets.lerobot import ExportOptions, export_lerobot
+from demorec.datasets.lerobot.export import push_to_hub
+from demorec.datasets.lerobot.verify import LEROBOT
+from demorec.learn.evaluate.policy import Policy
+from demorec.learn.training.command import train
 
 ROOT = Path(__file__).parents[2]
 ABSENT = ("lerobot", "torch", "torchvision", "torchcodec", "datasets", "pandas", "huggingface_hub", "accelerate")
@@ -90,7 +90,7 @@ import importlib, pkgutil, sys
 sys.modules.update(dict.fromkeys({ABSENT!r}))
 import demorec
 for module in pkgutil.walk_packages(demorec.__path__, "demorec."):
-    plug_ins = ("demorec.lerobot_env", "demorec.training.")
+    plug_ins = ("demorec.lerobot_env", "demorec.learn.training.")
     if not module.name.startswith(plug_ins) and module.name != "demorec.generate.on_ray":
         importlib.import_module(module.name)
 """

@@ -15,11 +15,11 @@ import pytest
 from support.sim import episode, run
 
 import demorec.loop
-from demorec.config import EpisodePlan, GenerateConfig
+from demorec.core.config import EpisodePlan, GenerateConfig
+from demorec.core.plain import from_json, to_json
+from demorec.episode.episode import EpisodeInfo, Frame, Outcome
+from demorec.episode.features import NOISE_DECAY
 from demorec.loop import Episode, ScriptAgent, Session, make_world, prepare
-from demorec.plain import from_json, to_json
-from demorec.scene.episode import EpisodeInfo, Frame, Outcome
-from demorec.scene.features import NOISE_DECAY
 
 
 @pytest.fixture(scope="module")
@@ -159,7 +159,7 @@ def test_pictures_do_not_disturb_the_physics() -> None:
 PRINT_DIGEST = """
 import json, sys
 from support.sim import episode, run
-from demorec.plain import to_json
+from demorec.core.plain import to_json
 prepared = episode(4)
 frames, outcome = run(prepared)
 print(json.dumps([outcome.final_state_digest, to_json(prepared.info)]))

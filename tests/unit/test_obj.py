@@ -9,9 +9,9 @@ import pybullet_data
 import pytest
 import trimesh
 
-from demorec.errors import SceneError
-from demorec.recording.description import _mesh_primitives
-from demorec.scene.obj import read_obj
+from demorec.core.errors import SceneError
+from demorec.mcap.description import _mesh_primitives
+from demorec.robots.obj import read_obj
 
 SQUARE = "v 0 0 0\nv 2 0 0\nv 2 3 0\nv 0 3 0\n"
 

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from demorec.geometry import Array, Pose
+from demorec.core.geometry import Array, Pose
+from demorec.episode.episode import CameraImages
+from demorec.episode.scene import Camera, Light, RobotPlacement, Scene
 from demorec.render import Mount, RenderSetup, Visual, VisualBody, first_rows
 from demorec.render.painter import Painter
 from demorec.render.setup_checks import world_from_camera
-from demorec.scene.episode import CameraImages
-from demorec.scene.scene import Camera, Light, RobotPlacement, Scene
 
 HALF_TURN = Pose(position=np.array([0.0, 0.0, 0.5]), quat_xyzw=np.array([0.0, 0.0, 1.0, 0.0]))
 

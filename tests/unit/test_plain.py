@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from demorec.config import GenerateConfig
-from demorec.geometry import Pose, look_at
-from demorec.plain import digest, from_json, from_plain, to_json, to_plain
-from demorec.scene.scene import (
+from demorec.core.config import GenerateConfig
+from demorec.core.geometry import Pose, look_at
+from demorec.core.plain import digest, from_json, from_plain, to_json, to_plain
+from demorec.episode.scene import (
     CONTACT_BREAKING_THRESHOLD,
     FINGER_STIFFNESS,
     Body,

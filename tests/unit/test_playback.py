@@ -13,24 +13,24 @@ from rerun.chunk import RrdReader
 from scipy.spatial.transform import Rotation
 from support.recording import make_episode, write_episode
 
-from demorec.config import VideoConfig
-from demorec.errors import ConfigError
-from demorec.geometry import Pose
-from demorec.playback import bodies
-from demorec.playback.compare import differences
-from demorec.playback.episode import PlayedEpisode
-from demorec.playback.meshes import MAX_TRIANGLES, urdf_meshes
-from demorec.playback.programs import viewer_environment
-from demorec.playback.robot import joint_columns, robot_model
-from demorec.playback.save import save, save_comparison
-from demorec.playback.sources import find_episodes, select
-from demorec.playback.style import segment_colors
-from demorec.playback.summary import entry, summary
-from demorec.recording import EpisodeWriter, Recording
-from demorec.scene import assets
-from demorec.scene.assets import asset_path
-from demorec.scene.scene import Body, Shape
-from demorec.scene.urdf import Urdf
+from demorec.core.config import VideoConfig
+from demorec.core.errors import ConfigError
+from demorec.core.geometry import Pose
+from demorec.episode.scene import Body, Shape
+from demorec.mcap import EpisodeWriter, Recording
+from demorec.robots import assets
+from demorec.robots.assets import asset_path
+from demorec.robots.urdf import Urdf
+from demorec.view import bodies
+from demorec.view.compare import differences
+from demorec.view.episode import PlayedEpisode
+from demorec.view.meshes import MAX_TRIANGLES, urdf_meshes
+from demorec.view.programs import viewer_environment
+from demorec.view.robot import joint_columns, robot_model
+from demorec.view.save import save, save_comparison
+from demorec.view.sources import find_episodes, select
+from demorec.view.style import segment_colors
+from demorec.view.summary import entry, summary
 
 
 @pytest.fixture(scope="module")

@@ -14,14 +14,14 @@ from rerun.chunk import RrdReader
 from support.export import export, make_run
 from support.recording import write_episode
 
-from demorec.errors import ExportError, RecordingError
-from demorec.geometry import Array
-from demorec.playback.episode import PlayedEpisode
-from demorec.playback.from_dataset import open_dataset_episode
-from demorec.playback.held_objects import held
-from demorec.playback.save import save
-from demorec.playback.sources import find_episodes
-from demorec.recording import Recording
+from demorec.core.errors import ExportError, RecordingError
+from demorec.core.geometry import Array
+from demorec.mcap import Recording
+from demorec.view.episode import PlayedEpisode
+from demorec.view.from_dataset import open_dataset_episode
+from demorec.view.held_objects import held
+from demorec.view.save import save
+from demorec.view.sources import find_episodes
 
 SAMPLE = Path(__file__).parents[2] / "recordings" / "sample" / "format_1.mcap"
 """A simulated episode: the cube is lifted, carried 26 cm and put down."""

@@ -12,16 +12,16 @@ from support.viewer import need_vulkan
 
 from demorec.cli import run_command
 from demorec.cli.view import View
-from demorec.errors import DemorecError, RecordingError
-from demorec.playback.episode import PlayedCollected, PlayedEpisode
-from demorec.playback.glyphs import DRAWABLE, drawable, drawable_source
-from demorec.playback.layout import episode_layout
-from demorec.playback.scene import log_episode, new_recording
-from demorec.playback.sources import find_episodes
-from demorec.playback.summary import summary
-from demorec.playback.viewer import HeadlessViewer, why_it_ended
-from demorec.recording import EpisodeWriter
-from demorec.scene.urdf import Urdf
+from demorec.core.errors import DemorecError, RecordingError
+from demorec.mcap import EpisodeWriter
+from demorec.robots.urdf import Urdf
+from demorec.view.episode import PlayedCollected, PlayedEpisode
+from demorec.view.glyphs import DRAWABLE, drawable, drawable_source
+from demorec.view.layout import episode_layout
+from demorec.view.scene import log_episode, new_recording
+from demorec.view.sources import find_episodes
+from demorec.view.summary import summary
+from demorec.view.viewer import HeadlessViewer, why_it_ended
 
 INSTRUCTION = "把红色方块放到绿色托盘里"
 

@@ -9,14 +9,14 @@ from pathlib import Path
 
 import psutil
 
-from demorec.processes import start_program
+from demorec.core.processes import start_program
 
 SCRIPT = """
 import sys
 from concurrent.futures import ProcessPoolExecutor
 from math import sqrt
 
-from demorec.processes import SPAWN
+from demorec.core.processes import SPAWN
 
 print("script")
 with ProcessPoolExecutor(max_workers=2, mp_context=SPAWN) as pool:
@@ -46,7 +46,7 @@ def test_a_script_needs_no_main_guard(tmp_path: Path) -> None:
 def test_python_itself_would_run_the_script_again(tmp_path: Path) -> None:
     """Else the test above would prove nothing."""
     plain = "from multiprocessing import get_context; SPAWN = get_context('spawn')"
-    (tmp_path / "script.py").write_text(SCRIPT.replace("from demorec.processes import SPAWN", plain))
+    (tmp_path / "script.py").write_text(SCRIPT.replace("from demorec.core.processes import SPAWN", plain))
     done = subprocess.run([sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode != 0
     assert "bootstrapping phase" in done.stderr
@@ -73,7 +73,7 @@ def work():
 """
 STARTS_IT = """
 from work import work
-from demorec.processes import SPAWN
+from demorec.core.processes import SPAWN
 
 process = SPAWN.Process(target=work)
 process.start()
@@ -94,7 +94,7 @@ PARENT = """
 import time
 from concurrent.futures import ProcessPoolExecutor
 
-from demorec.processes import SPAWN
+from demorec.core.processes import SPAWN
 
 with ProcessPoolExecutor(max_workers=2, mp_context=SPAWN) as pool:
     busy = [pool.submit(time.sleep, 600), pool.submit(time.sleep, 0)]
@@ -120,7 +120,7 @@ def test_workers_of_a_pool_end_with_their_parent_busy_or_idle(tmp_path: Path) ->
 
 STARTS = """
 import sys
-from demorec.processes import start_program
+from demorec.core.processes import start_program
 
 process = start_program([sys.executable, "-c", "import time; print('ready', flush=True); time.sleep(600)"])
 process.wait()

@@ -10,12 +10,12 @@ import pytest
 from support import render as scenes
 from support.present import present
 
-from demorec.errors import RenderError
-from demorec.geometry import Pose, look_at
+from demorec.core.errors import RenderError
+from demorec.core.geometry import Pose, look_at
+from demorec.episode.scene import Light, Texture
 from demorec.render.painter import Painter
 from demorec.render.raster import RasterRenderer, renderer
 from demorec.render.raster.kernels import antialias, records, shade, still, triangles, vertices
-from demorec.scene.scene import Light, Texture
 
 
 @pytest.fixture
@@ -123,7 +123,7 @@ def test_what_stood_still_and_was_moved_is_noticed(client: Any) -> None:
 
 
 def test_procedural_textures_are_drawn(client: Any) -> None:
-    from demorec.scene.textures import texture_pixels
+    from demorec.render.procedural import texture_pixels
 
     texture = Texture(pattern="checker", colors=((1.0, 1.0, 1.0), (0.0, 0.0, 0.0)), scale=2.0)
     body = scenes.add(client, "box", (0.4, 0.4, 0.4), rgbaColor=[1, 1, 1, 1])

@@ -9,7 +9,7 @@ import pytest
 import trimesh
 from support import render as scenes
 
-from demorec.errors import RenderError
+from demorec.core.errors import RenderError
 from demorec.render.raster import RasterRenderer
 from demorec.render.raster.decimate import decimate
 from demorec.render.raster.mesh_cache import cached_mesh

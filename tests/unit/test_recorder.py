@@ -20,14 +20,14 @@ from support.collected import URDF
 from support.export import export
 
 from demorec import Recorder
-from demorec.config import VideoConfig
-from demorec.errors import ConfigError, DemorecError, RecordingError
-from demorec.recorder.coder import Coder
-from demorec.recording import CollectedRecording
-from demorec.recording.collected.writer import CollectedWriter
+from demorec.core.config import VideoConfig
+from demorec.core.errors import ConfigError, DemorecError, RecordingError
+from demorec.episode.collected import NO_PICTURE, CollectedCamera, CollectedFeature
+from demorec.mcap import CollectedRecording
+from demorec.mcap.external.writer import CollectedWriter
+from demorec.mcap.recorder.coder import Coder
+from demorec.robots.panda import PANDA
 from demorec.runs.collected import load_collected_run
-from demorec.scene.collected import NO_PICTURE, CollectedCamera, CollectedFeature
-from demorec.sim.robots.panda import PANDA
 
 TOP = {"top": (48, 64)}
 PIXELS = np.zeros((48, 64, 3), dtype=np.uint8)
@@ -267,7 +267,7 @@ def test_file_and_encoders_are_open_before_the_first_frame(
             raise AssertionError("opened by the first frame")
 
         with monkeypatch.context() as patched:
-            patched.setattr("demorec.recording.video.av.CodecContext", SimpleNamespace(create=opens))
+            patched.setattr("demorec.mcap.video.av.CodecContext", SimpleNamespace(create=opens))
             patched.setattr(foxglove, "open_mcap", opens)
             for index in range(3):
                 episode.write([float(index)], images={"top": PIXELS})

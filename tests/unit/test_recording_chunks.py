@@ -13,12 +13,12 @@ from mcap.records import ChunkIndex
 from mcap.stream_reader import StreamReader
 from support.recording import write_episode
 
-from demorec.config import VideoConfig
-from demorec.recording import Recording
-from demorec.recording.chunks import ChunkPlace, blocks_of
-from demorec.recording.container import Container
-from demorec.recording.limits import Limits
-from demorec.recording.messages import PictureMessages, coded_pictures
+from demorec.core.config import VideoConfig
+from demorec.mcap import Recording
+from demorec.mcap.chunks import ChunkPlace, blocks_of
+from demorec.mcap.container import Container
+from demorec.mcap.limits import Limits
+from demorec.mcap.messages import PictureMessages, coded_pictures
 
 
 @pytest.fixture(scope="module")

@@ -12,10 +12,10 @@ import pytest
 from support.present import present
 from support.recording import make_episode
 
-from demorec.errors import RecordingError
-from demorec.geometry import Pose
-from demorec.recording import EpisodeWriter
-from demorec.scene.episode import EpisodeInfo, Frame
+from demorec.core.errors import RecordingError
+from demorec.core.geometry import Pose
+from demorec.episode.episode import EpisodeInfo, Frame
+from demorec.mcap import EpisodeWriter
 
 NAN = float("nan")
 

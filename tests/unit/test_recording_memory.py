@@ -14,8 +14,8 @@ import pytest
 from support.collected import TOP, make_collected
 from support.recording import make_episode
 
-from demorec.recording import CollectedRecording, CollectedWriter, EpisodeWriter, Recording
-from demorec.scene.episode import frame_time_ns
+from demorec.episode.episode import frame_time_ns
+from demorec.mcap import CollectedRecording, CollectedWriter, EpisodeWriter, Recording
 
 READERS: dict[str, Callable[[Recording], Iterable[object]]] = {
     "packets": lambda recording: recording.packets("front"),

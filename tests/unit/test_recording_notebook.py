@@ -17,11 +17,11 @@ from support.docs import run_examples
 from support.present import present
 from support.recording import Codec, frame_number, make_episode, write_episode
 
-from demorec.config import VideoConfig
-from demorec.errors import MissingDependencyError, RecordingError
-from demorec.recording import Recording, episode_file, video
-from demorec.recording.video import VideoPacket, VideoSettings
-from demorec.scene.episode import Frame
+from demorec.core.config import VideoConfig
+from demorec.core.errors import MissingDependencyError, RecordingError
+from demorec.episode.episode import Frame
+from demorec.mcap import Recording, episode_file, video
+from demorec.mcap.video import VideoPacket, VideoSettings
 
 NUM_FRAMES = 47
 
@@ -198,5 +198,5 @@ def test_the_examples_of_the_documents_run(capsys: pytest.CaptureFixture[str], d
     """On a recording of the demo's task, since the examples name what lies on its table."""
     sample = Path(__file__).parents[2] / "recordings/sample/format_2.mcap"
     recording = {"recordings/demo/episodes/episode_000000.mcap": sample}
-    assert run_examples(document, "from demorec.recording import Recording", recording) == number
+    assert run_examples(document, "from demorec.mcap import Recording", recording) == number
     assert capsys.readouterr().out

@@ -12,11 +12,11 @@ import pytest
 from support.present import present
 from support.recording import frame_number, make_episode, write_episode
 
-from demorec.config import VideoConfig
-from demorec.errors import RecordingError
-from demorec.recording import EpisodeWriter, Recording
-from demorec.recording.container import Container
-from demorec.scene.episode import FORMAT_VERSION, EpisodeInfo, Event, Frame, Outcome
+from demorec.core.config import VideoConfig
+from demorec.core.errors import RecordingError
+from demorec.episode.episode import FORMAT_VERSION, EpisodeInfo, Event, Frame, Outcome
+from demorec.mcap import EpisodeWriter, Recording
+from demorec.mcap.container import Container
 
 CODECS = [VideoConfig(), VideoConfig(codec="av1"), VideoConfig(codec="jpeg"), VideoConfig(gop=30, crf=30)]
 
@@ -168,7 +168,7 @@ def test_labels_that_were_read_with_the_coded_pictures_are_not_unpacked_again(
     with Recording(path) as recording:
         expected = list(recording.segmentation_at(cameras, chosen))
         recording.coded_pictures(cameras)
-        monkeypatch.setattr("demorec.recording.container.chunk_content", lambda *_: pytest.fail("a chunk was unpacked"))
+        monkeypatch.setattr("demorec.mcap.container.chunk_content", lambda *_: pytest.fail("a chunk was unpacked"))
         found = list(recording.segmentation_at(cameras, chosen))
     for camera in cameras:
         pictures, again = ([row for row in rows if row[0] == camera] for rows in (expected, found))

@@ -13,12 +13,12 @@ from support.check import checked, level_of, rewrite_messages
 from support.present import present
 from support.recording import make_episode, write_episode
 
-from demorec.errors import RecordingError
-from demorec.recording import EpisodeWriter, Recording, recover
-from demorec.recording.frames import frames_of
-from demorec.recording.ros2 import DEFINITIONS
-from demorec.recording.streams import FrameValues, frame_streams, merged_columns
-from demorec.scene.episode import FORMAT_VERSION, EpisodeColumns, EpisodeInfo, Frame, Outcome
+from demorec.core.errors import RecordingError
+from demorec.episode.episode import FORMAT_VERSION, EpisodeColumns, EpisodeInfo, Frame, Outcome
+from demorec.mcap import EpisodeWriter, Recording, recover
+from demorec.mcap.frames import frames_of
+from demorec.mcap.ros2 import DEFINITIONS
+from demorec.mcap.streams import FrameValues, frame_streams, merged_columns
 
 LATER = {stream.topic for stream in frame_streams(make_episode(num_frames=1)[0]) if stream.since > 1}
 """Topics that the first version did not have."""
@@ -125,7 +125,7 @@ def test_stamps_of_the_wrench_are_checked(tmp_path: Path) -> None:
 
 
 def test_a_description_of_another_version_than_its_record_is_refused(tmp_path: Path) -> None:
-    from demorec.recording import metadata
+    from demorec.mcap import metadata
 
     info, frames, outcome = make_episode(num_frames=2, cameras=())
     record(tmp_path / "a.mcap", info, frames, outcome)

@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 from support.recording import Codec, make_episode
 
-from demorec.config import VideoConfig
-from demorec.errors import RecordingError
-from demorec.recording.video import VideoPacket, decode, is_keyframe, make_encoder, ordinary_scheduling
+from demorec.core.config import VideoConfig
+from demorec.core.errors import RecordingError
+from demorec.mcap.video import VideoPacket, decode, is_keyframe, make_encoder, ordinary_scheduling
 
 ENCODE = """
 import hashlib, sys
 from support.recording import make_episode
-from demorec.config import VideoConfig
-from demorec.recording.video import make_encoder
+from demorec.core.config import VideoConfig
+from demorec.mcap.video import make_encoder
 _, frames, _ = make_episode(num_frames=40, width=224, height=224, cameras=("front",))
 for codec in ("h264", "av1", "jpeg"):
     for gop in (2, 30):

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from support.recording import make_episode, write_episode
 
-from demorec.config import VideoConfig
-from demorec.errors import ConfigError, RecordingError
-from demorec.recording import EpisodeWriter, Recording, part_file, recover
-from demorec.scene.episode import Event, Frame, Outcome
+from demorec.core.config import VideoConfig
+from demorec.core.errors import ConfigError, RecordingError
+from demorec.episode.episode import Event, Frame, Outcome
+from demorec.mcap import EpisodeWriter, Recording, part_file, recover
 
 
 def names(folder: Path) -> list[str]:

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from demorec.errors import ConfigError, MissingDependencyError, NotAllowedError
-from demorec.registry import Registry
+from demorec.core.errors import ConfigError, MissingDependencyError, NotAllowedError
+from demorec.core.registry import Registry
 
 SHAPES: Registry[type] = Registry(
     kind="shape",
@@ -64,7 +64,7 @@ def test_whatever_a_module_raises_is_one_sentence(
         SHAPES.load("breaks_on_import:Mine", ["breaks_on_import"])
 
 
-@pytest.mark.parametrize("name", ["os:abort", "builtins:exit", "demorec.errors:DemorecError", "fractions:math"])
+@pytest.mark.parametrize("name", ["os:abort", "builtins:exit", "demorec.core.errors:DemorecError", "fractions:math"])
 def test_things_of_another_kind_are_refused_and_not_called(name: str) -> None:
     with pytest.raises(ConfigError, match=r"is no shape: it must be a subclass of numbers\.Number"):
         SHAPES.load(name, [name.partition(":")[0]])
@@ -77,7 +77,7 @@ def test_a_class_is_no_instance_of_itself() -> None:
 
 
 def test_an_unfinished_class_is_refused() -> None:
-    from demorec.tables import TASKS
+    from demorec.core.tables import TASKS
 
     with pytest.raises(ConfigError, match="is not complete: it lacks evaluate, instruction, sample_scene, script"):
         TASKS.load("demorec.tasks.base:Task", ["demorec"])

@@ -21,12 +21,12 @@ from support.mcap import rewritten
 from support.recording import frame_number, write_episode
 
 from demorec.check.report import CheckOptions
-from demorec.playback.style import phase_colors
-from demorec.recording import Recording
+from demorec.mcap import Recording
 from demorec.report.content import Report
 from demorec.report.filmstrip import MAX_SHOWN, Filmstrip, filmstrip, strip_budget
 from demorec.report.gather import gather
 from demorec.report.page import page
+from demorec.view.style import phase_colors
 
 HOSTILE = "</p><script>document.title = 'taken'</script><img src=x onerror=alert(1)>\"'&\u202e"
 MOST_BYTES = 30_000_000

@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 from support.generate import expected_attempts
 
-from demorec.config import GenerateConfig
-from demorec.errors import ConfigError, ResourceError
+from demorec.core.config import GenerateConfig
+from demorec.core.errors import ConfigError, ResourceError
 from demorec.runs.run_file import (
     Attempt,
     DamagedRunFileError,

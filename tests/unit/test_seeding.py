@@ -6,7 +6,7 @@ import itertools
 
 import numpy as np
 
-from demorec.seeding import PURPOSES, generator
+from demorec.core.seeding import PURPOSES, generator
 
 
 def test_the_first_purposes_keep_their_place() -> None:

@@ -12,10 +12,10 @@ import pytest
 from support.export import export
 from support.recording import make_episode
 
-from demorec.errors import ConfigError
-from demorec.export import episode
-from demorec.recording import EpisodeWriter
-from demorec.training.stretches import INTERVENTION, Stretches
+from demorec.core.errors import ConfigError
+from demorec.datasets import episode
+from demorec.learn.training.stretches import INTERVENTION, Stretches
+from demorec.mcap import EpisodeWriter
 
 
 def stretches() -> Stretches:
@@ -49,7 +49,7 @@ def write(path: Path, episode_index: int, phases: Sequence[str]) -> None:
 
 @pytest.mark.usefixtures("hf_datasets_cache")
 def test_a_dataset_shows_the_expert_alone(tmp_path: Path) -> None:
-    from demorec.training import FastDataset
+    from demorec.learn.training import FastDataset
 
     policy = ["policy"] * 3
     (tmp_path / "run").mkdir()

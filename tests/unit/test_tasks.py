@@ -13,14 +13,14 @@ import pytest
 from numpy.typing import NDArray
 from support.sim import body_index, episode, run
 
-from demorec.errors import SceneError
-from demorec.geometry import Pose, wrap_angle
+from demorec.core.errors import SceneError
+from demorec.core.geometry import Pose, wrap_angle
+from demorec.core.tables import TASKS
+from demorec.episode.episode import Frame
+from demorec.episode.scene import Body, Shape, ShapeKind
 from demorec.loop import Episode, make_world
-from demorec.scene.episode import Frame
-from demorec.scene.scene import Body, Shape, ShapeKind
-from demorec.sim.robots.panda import PANDA
+from demorec.robots.panda import PANDA
 from demorec.sim.world import World
-from demorec.tables import TASKS
 from demorec.tasks import skills
 from demorec.tasks.grasping import grasp_yaws, grasps_beside, hand_down, hand_yaw, raised, symmetric_yaws
 from demorec.tasks.sampling import WORKSPACE, Region, Sampler

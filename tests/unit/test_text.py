@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from demorec.cli.shared.output import OutputError, PrintableFormatter, say, tell
 from demorec.cli.shared.table import aligned
-from demorec.safety.text import display_width, printable
+from demorec.core.text import display_width, printable
 
 
 @given(st.text())

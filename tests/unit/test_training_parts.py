@@ -20,8 +20,8 @@ from numpy.typing import NDArray
     joined=st.booleans(),
 )
 def test_rows_are_taken_from_any_chunks(lengths: list[int], rows: list[int], joined: bool) -> None:
-    from demorec.training import columns
-    from demorec.training.columns import Column
+    from demorec.learn.training import columns
+    from demorec.learn.training.columns import Column
 
     values = np.arange(3 * sum(lengths), dtype=np.float32).reshape(-1, 3)
     chunks = np.split(values, np.cumsum(lengths)[:-1])
@@ -50,7 +50,7 @@ def test_rows_are_taken_from_any_chunks(lengths: list[int], rows: list[int], joi
 def test_numbers_get_the_types_that_torch_gives_them(kind: pa.DataType, rows: list[object]) -> None:
     import torch
 
-    from demorec.training.columns import numbers
+    from demorec.learn.training.columns import numbers
 
     column = numbers(pa.chunked_array([pa.array(rows[:1], kind), pa.array([], kind), pa.array(rows[1:], kind)]))
     assert column is not None
@@ -75,13 +75,13 @@ def test_numbers_get_the_types_that_torch_gives_them(kind: pa.DataType, rows: li
     ],
 )
 def test_what_is_no_array_of_numbers_is_left_to_lerobot(array: pa.Array) -> None:
-    from demorec.training.columns import numbers
+    from demorec.learn.training.columns import numbers
 
     assert numbers(pa.chunked_array([array])) is None
 
 
 def test_lists_that_differ_between_chunks_are_left_to_lerobot() -> None:
-    from demorec.training.columns import numbers
+    from demorec.learn.training.columns import numbers
 
     kind = pa.list_(pa.float32())
     assert numbers(pa.chunked_array([pa.array([[1.0]], kind), pa.array([[1.0, 2.0]], kind)])) is None
@@ -92,8 +92,8 @@ def test_lists_that_differ_between_chunks_are_left_to_lerobot() -> None:
 def test_the_cache_stays_within_its_limit_and_keeps_the_latest(sizes: list[int], limit: int) -> None:
     import torch
 
-    from demorec.training.pictures import FrameCache
-    from demorec.training.video_file import DecodedFrame
+    from demorec.learn.training.pictures import FrameCache
+    from demorec.learn.training.video_file import DecodedFrame
 
     cache = FrameCache(limit)
     for number, size in enumerate(sizes):
@@ -108,8 +108,8 @@ def test_the_cache_stays_within_its_limit_and_keeps_the_latest(sizes: list[int],
 def test_what_was_wanted_lately_is_kept() -> None:
     import torch
 
-    from demorec.training.pictures import FrameCache
-    from demorec.training.video_file import DecodedFrame
+    from demorec.learn.training.pictures import FrameCache
+    from demorec.learn.training.video_file import DecodedFrame
 
     cache = FrameCache(20)
     for number in (0, 1):
@@ -137,7 +137,7 @@ def write_video(path: Path, count: int, **options: str) -> list[NDArray[np.uint8
 
 @pytest.mark.parametrize("options", [{"g": "2", "bf": "0"}, {"g": "9", "bf": "3"}, {"g": "100"}], ids=str)
 def test_any_frames_in_any_order_are_those_of_a_straight_decoding(options: dict[str, str], tmp_path: Path) -> None:
-    from demorec.training.video_file import VideoFile
+    from demorec.learn.training.video_file import VideoFile
 
     pictures = write_video(tmp_path / "v.mp4", 40, **options)
     with av.open(str(tmp_path / "v.mp4")) as container:
@@ -154,7 +154,7 @@ def test_any_frames_in_any_order_are_those_of_a_straight_decoding(options: dict[
 
 
 def test_frames_of_a_batch_are_decoded_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from demorec.training.video_file import VideoFile
+    from demorec.learn.training.video_file import VideoFile
 
     write_video(tmp_path / "v.mp4", 40, g="10", bf="0")
     file = VideoFile(str(tmp_path / "v.mp4"), "rgb24")
@@ -176,7 +176,7 @@ def test_frames_of_a_batch_are_decoded_once(tmp_path: Path, monkeypatch: pytest.
 def test_a_video_without_frames_is_refused(tmp_path: Path) -> None:
     from lerobot.datasets.video_utils import FrameTimestampError
 
-    from demorec.training.video_file import VideoFile
+    from demorec.learn.training.video_file import VideoFile
 
     path = tmp_path / "v.mp4"
     with av.open(str(path), "w") as container:

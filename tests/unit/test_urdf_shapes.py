@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from demorec.scene.urdf import Urdf
-from demorec.scene.urdf_shapes import read_links
+from demorec.robots.urdf import Urdf
+from demorec.robots.urdf_shapes import read_links
 
 TEXT = """
 <robot name="thing">

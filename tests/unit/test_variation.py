@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from scipy.stats import qmc
 from support.sim import episode, first_frame, run
 
-from demorec.config import GenerateConfig
-from demorec.errors import ConfigError, SceneError
-from demorec.geometry import Pose
-from demorec.scene.scene import Texture
-from demorec.scene.textures import texture_pixels
-from demorec.scene.variation import PRESETS, Ranges, resolve
-from demorec.tables import TASKS
+from demorec.core.config import GenerateConfig
+from demorec.core.errors import ConfigError, SceneError
+from demorec.core.geometry import Pose
+from demorec.core.tables import TASKS
+from demorec.episode.scene import Texture
+from demorec.episode.variation import PRESETS, Ranges, resolve
+from demorec.render.procedural import texture_pixels
 from demorec.tasks.sampling import WORKSPACE, stratified_point
 
 

@@ -6,12 +6,12 @@ from typing import ClassVar
 
 import pytest
 
-from demorec.errors import ConfigError
-from demorec.geometry import Array
-from demorec.registry import Registry
+from demorec.core.errors import ConfigError
+from demorec.core.geometry import Array
+from demorec.core.registry import Registry
+from demorec.episode.episode import CameraImages
 from demorec.render import Renderer, RenderSetup, warm
 from demorec.render.warm import WarmRenderer
-from demorec.scene.episode import CameraImages
 
 
 class Counted:

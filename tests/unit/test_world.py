@@ -13,13 +13,13 @@ import pytest
 from support.present import present
 from support.sim import body_index, episode, run
 
-from demorec.errors import ConfigError, SceneError
-from demorec.geometry import Pose
-from demorec.plain import from_json, to_json
-from demorec.scene.episode import Action
-from demorec.scene.scene import Body, Scene, Shape, Texture
+from demorec.core.errors import ConfigError, SceneError
+from demorec.core.geometry import Pose
+from demorec.core.plain import from_json, to_json
+from demorec.episode.episode import Action
+from demorec.episode.scene import Body, Scene, Shape, Texture
+from demorec.robots.panda import PANDA
 from demorec.sim.client import connect
-from demorec.sim.robots.panda import PANDA
 from demorec.sim.world import World
 
 
@@ -266,7 +266,7 @@ def test_a_world_that_nobody_closed_is_silent_at_the_end() -> None:
     """The later a module is cleared away, the longer it keeps what it holds: this one longer than PyBullet."""
     program = """
 import os
-from demorec.sim.robots.panda import PANDA
+from demorec.robots.panda import PANDA
 from demorec.sim.world import World
 os.kept = World(PANDA)
 """

@@ -10,7 +10,7 @@ from pathlib import Path
 import rerun as rr
 import rerun.blueprint as rrb
 
-from demorec.recording import Recording
+from demorec.mcap import Recording
 
 GREEN, RED = (80, 220, 120), (240, 80, 80)
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import rerun as rr
 
-from demorec.recording import Recording
+from demorec.mcap import Recording
 
 
 def main(recording_path: Path, target: Path) -> None:

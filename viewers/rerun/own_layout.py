@@ -9,9 +9,9 @@ from pathlib import Path
 
 import rerun.blueprint as rrb
 
-from demorec.playback.paths import Paths
-from demorec.playback.scene import log_episode, new_recording
-from demorec.playback.sources import find_episodes
+from demorec.view.paths import Paths
+from demorec.view.scene import log_episode, new_recording
+from demorec.view.sources import find_episodes
 
 
 def main(path: Path, target: Path, camera: str = "wrist") -> None:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from tyro.conf import UseAppendAction, arg
 
-from demorec.safety.user_modules import check_allowed
+from demorec.core.user_modules import check_allowed
 
 Allow = Annotated[tuple[str, ...], UseAppendAction, arg(metavar="MODULE", help_behavior_hint="(may be given again)")]
 """One module or package each time, since paths may follow."""

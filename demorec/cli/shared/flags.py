@@ -30,7 +30,7 @@ from tyro.constructors import (
 )
 
 from demorec.cli.shared.output import say, tell
-from demorec.safety.text import printable
+from demorec.core.text import printable
 
 FLAG_TYPES = ConstructorRegistry()
 

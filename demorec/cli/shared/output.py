@@ -15,8 +15,8 @@ from typing import TextIO
 
 from tqdm import tqdm
 
-from demorec.errors import DemorecError
-from demorec.safety.text import printable
+from demorec.core.errors import DemorecError
+from demorec.core.text import printable
 
 
 class OutputError(DemorecError):

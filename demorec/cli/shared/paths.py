@@ -6,11 +6,11 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from demorec.cli.shared.output import tell
-from demorec.errors import ConfigError
-from demorec.lerobot.kind import DATASET as DATASET_KIND
+from demorec.core.errors import ConfigError
+from demorec.core.replacing import use_as_source
+from demorec.datasets.lerobot.kind import DATASET as DATASET_KIND
 from demorec.runs.find import EPISODE_FOLDERS, EVALUATION_NAME, find
 from demorec.runs.run_file import DATASET, EPISODES, FAILED, RUN_NAME, UNFINISHED
-from demorec.safety.replacing import use_as_source
 
 _PARTS = (EPISODES, FAILED, UNFINISHED)
 

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any, Literal
 from demorec.cli.shared.allow import Allow, allowed_modules
 from demorec.cli.shared.paths import refuse_inside
 from demorec.cli.shared.progress import ProgressBar
-from demorec.config import GenerateConfig, VideoConfig
-from demorec.errors import check_option
+from demorec.core.config import GenerateConfig, VideoConfig
+from demorec.core.errors import check_option
 
 if TYPE_CHECKING:
-    from demorec.evaluate.moments import TakeOver
-    from demorec.evaluate.rollouts import Evaluation
+    from demorec.learn.evaluate.moments import TakeOver
+    from demorec.learn.evaluate.rollouts import Evaluation
 
 Split = Literal["all", "train", "eval"]
 
@@ -66,10 +66,10 @@ class RolloutFlags:
         if self.workers is not None:
             check_option("workers", self.workers, 1, 1024)
         refuse_inside([out])
-        from demorec.evaluate.rollouts import evaluate, settings_for
+        from demorec.core.processes import available_cores
+        from demorec.core.registry import check_choice
+        from demorec.learn.evaluate.rollouts import evaluate, settings_for
         from demorec.loop.actions import ACTION_KINDS
-        from demorec.processes import available_cores
-        from demorec.registry import check_choice
 
         settings = settings_for(
             policy,

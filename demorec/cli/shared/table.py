@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from demorec.safety.text import display_width, printable
+from demorec.core.text import display_width, printable
 
 
 def aligned(rows: Iterable[Sequence[str]]) -> list[str]:

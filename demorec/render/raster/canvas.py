@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from demorec.episode.scene import Camera, Light
 from demorec.render.raster.batch import Batch, Floats32
 from demorec.render.raster.kernels import layout
 from demorec.render.raster.kernels.antialias import STILL, centre_of_mixed, resolve, shade_edges
@@ -17,7 +18,6 @@ from demorec.render.raster.kernels.triangles import draw_instances
 from demorec.render.raster.kernels.vertices import aim_camera, project_instances, transform_vertices
 from demorec.render.raster.mesh import Floats
 from demorec.render.raster.stage import Stage
-from demorec.scene.scene import Camera, Light
 
 SHADOW_OFFSET = 0.006
 """How far a point is at least lifted off its surface before it is looked up in the shadow map, metres: the map holds

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.errors import RenderError, in_words
+from demorec.core.errors import RenderError, in_words
 from demorec.render.raster.mesh import Floats, RasterMesh, make_mesh
-from demorec.scene.obj import Material, read_obj
+from demorec.robots.obj import Material, read_obj
 
 FORMATS = (".obj", ".stl", ".dae")
 

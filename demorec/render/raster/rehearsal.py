@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from demorec.geometry import Pose, look_at
+from demorec.core.geometry import Pose, look_at
+from demorec.episode.scene import Camera, Light, Texture
 from demorec.render import Visual, VisualBody, VisualKind
 from demorec.render.raster.batch import make_batch
 from demorec.render.raster.canvas import Canvas
 from demorec.render.raster.shapes import ModelStore, make_instances
 from demorec.render.raster.stage import Stage
 from demorec.render.raster.view import CameraView
-from demorec.scene.scene import Camera, Light, Texture
 
 
 def _body(kind: VisualKind, *size: float, is_fixed: bool, texture: Texture | None = None) -> VisualBody:

@@ -7,7 +7,9 @@ import logging
 import math
 from typing import Self
 
-from demorec.geometry import Array
+from demorec.core.geometry import Array
+from demorec.episode.episode import CameraImages
+from demorec.episode.scene import Camera
 from demorec.render import RenderSetup
 from demorec.render.raster.batch import Batch, make_batch
 from demorec.render.raster.cache import folder_lock
@@ -17,8 +19,6 @@ from demorec.render.raster.shapes import Instance, ModelStore, make_instances
 from demorec.render.raster.stage import Stage
 from demorec.render.raster.view import CameraView
 from demorec.render.setup_checks import check_setup, world_from_camera
-from demorec.scene.episode import CameraImages
-from demorec.scene.scene import Camera
 
 log = logging.getLogger(__name__)
 

@@ -12,8 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.errors import DemorecError, RenderError
+from demorec.core.errors import DemorecError, RenderError
+from demorec.episode.scene import Texture
 from demorec.render import Visual, VisualBody, first_rows
+from demorec.render.procedural import texture_pixels
 from demorec.render.raster import primitives
 from demorec.render.raster.decimate import decimated
 from demorec.render.raster.kernels import layout
@@ -21,8 +23,6 @@ from demorec.render.raster.mesh import Floats, RasterMesh, unit, weld
 from demorec.render.raster.mesh_cache import cached_mesh
 from demorec.render.raster.mesh_files import load_mesh
 from demorec.render.raster.textures import Picture, load_picture, palette_colors
-from demorec.scene.scene import Texture
-from demorec.scene.textures import texture_pixels
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -8,14 +8,14 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.errors import RenderError
+from demorec.core.errors import RenderError
+from demorec.episode.scene import Light
 from demorec.render.raster.batch import caster_geometry
 from demorec.render.raster.kernels import layout
 from demorec.render.raster.kernels.triangles import draw_casters
 from demorec.render.raster.kernels.vertices import place_instances, transform_casters
 from demorec.render.raster.mesh import Floats
 from demorec.render.raster.shapes import Instance
-from demorec.scene.scene import Light
 
 REACH = 0.9
 """How far a robot's shadow is expected around its base, metres."""

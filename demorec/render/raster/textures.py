@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
-from demorec.errors import RenderError, in_words
+from demorec.core.errors import RenderError, in_words
 from demorec.render.raster.kernels.layout import MIP_LEVELS
 from demorec.render.raster.mesh import Floats, RasterMesh, face_normals
 

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.geometry import Pose
+from demorec.core.geometry import Pose
+from demorec.episode.episode import CameraImages
 from demorec.render.raster.batch import Floats32
 from demorec.render.raster.canvas import Canvas, Images, Int32s
 from demorec.render.raster.kernels import layout
@@ -15,7 +16,6 @@ from demorec.render.raster.kernels.antialias import STILL, halve_extents
 from demorec.render.raster.kernels.still import clear_queued, gather_still, list_tiles, restore_samples, shade_still
 from demorec.render.raster.mesh import Floats
 from demorec.render.raster.stage import Stage
-from demorec.scene.episode import CameraImages
 
 
 @dataclass(eq=False)

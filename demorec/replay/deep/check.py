@@ -10,19 +10,19 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
-from demorec.config import deciding_versions
-from demorec.errors import DemorecError, resource_error
+from demorec.core.config import deciding_versions
+from demorec.core.errors import DemorecError, resource_error
+from demorec.core.own_versions import version_differences
+from demorec.core.processes import in_turn
+from demorec.episode.episode import EpisodeInfo
 from demorec.loop import Workshop
-from demorec.processes import in_turn
-from demorec.recording import Recording
+from demorec.mcap import Recording
 from demorec.replay.deep.contents import Contents, coded_topics, content_differences
 from demorec.replay.deep.difference import Difference
 from demorec.replay.deep.pictures import picture_differences
 from demorec.replay.deep.remake import recorded_config, recorded_painter, remake
 from demorec.replay.demonstration import ReplayOptions, open_demonstration
 from demorec.replay.drive import replay
-from demorec.safety.own_versions import version_differences
-from demorec.scene.episode import EpisodeInfo
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,13 +14,13 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
-from demorec.plain import parse_json
-from demorec.recording.channels import camera_topic
-from demorec.recording.container import Container
-from demorec.recording.fields import Value, message_fields
-from demorec.recording.metadata import EPISODE
+from demorec.core.plain import parse_json
+from demorec.episode.episode import EpisodeInfo
+from demorec.mcap.channels import camera_topic
+from demorec.mcap.container import Container
+from demorec.mcap.fields import Value, message_fields
+from demorec.mcap.metadata import EPISODE
 from demorec.replay.deep.difference import Difference, Differences
-from demorec.scene.episode import EpisodeInfo
 
 CODED = ("h264", "video", "image/compressed", "depth", "segmentation")
 """Streams of a camera whose messages hold a coded picture in the field `data`."""

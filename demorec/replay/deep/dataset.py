@@ -9,14 +9,14 @@ from pathlib import Path
 
 from demorec.check.dataset import Dataset
 from demorec.check.run_dataset import DatasetEpisode, dataset_episodes, episode_differences, export_options
-from demorec.errors import ConfigError, DemorecError, resource_error
-from demorec.lerobot.options import ExportOptions
+from demorec.core.errors import ConfigError, DemorecError, resource_error
+from demorec.core.own_versions import version_differences
+from demorec.datasets.lerobot.options import ExportOptions
+from demorec.episode.episode import EpisodeInfo
 from demorec.loop import Workshop
 from demorec.replay.deep.check import DeepReport, versions_here
 from demorec.replay.deep.difference import Difference
 from demorec.replay.deep.remake import generate_again
-from demorec.safety.own_versions import version_differences
-from demorec.scene.episode import EpisodeInfo
 
 
 def deep_dataset_checks(path: Path, *, allowed: Sequence[str] = ()) -> Iterator[DeepReport]:

@@ -16,13 +16,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.errors import RecordingError
-from demorec.geometry import Array
-from demorec.recording import Recording
-from demorec.recording.depth import decode_depth
-from demorec.recording.fields import message_fields
-from demorec.recording.labels import decode_labels
-from demorec.recording.video import Rgb, VideoPacket, VideoSettings, decode, is_keyframe
+from demorec.core.errors import RecordingError
+from demorec.core.geometry import Array
+from demorec.mcap import Recording
+from demorec.mcap.depth import decode_depth
+from demorec.mcap.fields import message_fields
+from demorec.mcap.labels import decode_labels
+from demorec.mcap.video import Rgb, VideoPacket, VideoSettings, decode, is_keyframe
 from demorec.render.painter import Painter
 from demorec.render.recorded import RecordedWorld
 from demorec.replay.deep.contents import Contents

@@ -6,19 +6,19 @@ from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from demorec.config import EpisodePlan, GenerateConfig, VideoConfig
-from demorec.errors import ConfigError
+from demorec.core.config import EpisodePlan, GenerateConfig, VideoConfig
+from demorec.core.errors import ConfigError
+from demorec.core.plain import digest, from_plain
+from demorec.core.tables import RENDERERS
+from demorec.episode.episode import EpisodeInfo
 from demorec.loop import ScriptAgent, Session, Workshop, prepare
-from demorec.plain import digest, from_plain
-from demorec.recording import EpisodeWriter, Recording
+from demorec.mcap import EpisodeWriter, Recording
 from demorec.render import Renderer
 from demorec.render.painter import Painter
 from demorec.replay.demonstration import ReplayOptions, open_demonstration
 from demorec.replay.drive import replay
 from demorec.replay.rerender import recorded_view, view_painter
-from demorec.scene.assets import allow_models
-from demorec.scene.episode import EpisodeInfo
-from demorec.tables import RENDERERS
+from demorec.robots.assets import allow_models
 
 
 def recorded_config(info: EpisodeInfo, allowed: Collection[str]) -> GenerateConfig:

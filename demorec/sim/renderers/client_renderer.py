@@ -7,11 +7,11 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.geometry import Array, Pose
+from demorec.core.geometry import Array, Pose
+from demorec.episode.episode import CameraImages
+from demorec.episode.scene import Camera
 from demorec.render import RenderSetup
 from demorec.render.setup_checks import check_setup, world_from_camera
-from demorec.scene.episode import CameraImages
-from demorec.scene.scene import Camera
 from demorec.sim.client import connect
 from demorec.sim.renderers.mirror import SceneMirror
 

@@ -8,9 +8,9 @@ import subprocess
 import sys
 from typing import Any
 
-from demorec.errors import RenderError
-from demorec.geometry import Array
-from demorec.scene.episode import CameraImages
+from demorec.core.errors import RenderError
+from demorec.core.geometry import Array
+from demorec.episode.episode import CameraImages
 from demorec.sim.renderers.client_renderer import ClientRenderer
 
 _PROBE = """

@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from demorec.errors import RenderError
-from demorec.geometry import Array, Pose
+from demorec.core.errors import RenderError
+from demorec.core.geometry import Array, Pose
+from demorec.episode.scene import Texture
 from demorec.render import RenderSetup, Visual, first_rows
-from demorec.scene.scene import Texture
-from demorec.scene.textures import texture_pixels
+from demorec.render.procedural import texture_pixels
 from demorec.sim.bodies import shape_arguments
 
 

@@ -1,0 +1,170 @@
+"""Phrases that refer to things ("the smaller red cube"), and the resolver that says what such a phrase refers to.
+
+The resolver reads words alone and looks at the scene; it knows nothing of who made a phrase and why. What cannot be
+told apart by a clear margin refers to nothing, so that no phrase leans on a millimetre. Left and right are the
+robot's: it looks along the x axis of its base frame, left is +y.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterator, Sequence
+from functools import lru_cache
+
+from demorec.annotate.situation import COLOR_WORDS, NamedThing, Surroundings
+
+MIN_GAP = 0.04
+"""By how much, metres, one thing must be farther to a side, or nearer, than the next one to be called so."""
+MIN_SIZE_RATIO = 1.15
+"""By what factor one thing must be larger than the next one to be called so."""
+
+_IN_FRONT = ("left", "right", "leftmost", "rightmost", "middle", "smaller", "larger", "smallest", "largest")
+_BEHIND = ("nearest to the robot", "farthest from the robot")
+
+
+def resolve(phrase: str, situation: Surroundings) -> frozenset[str]:
+    """Names of the things that a phrase refers to: one for "the ...", all that fit for "every ...".
+
+    Nothing when the phrase is none of this grammar, or when it could mean several things: ARTICLE [ORDER] [COLOUR]
+    NOUN [nearest to the robot | farthest from the robot], where ARTICLE is "the" or "every".
+    """
+    match = _grammar(situation.nouns).fullmatch(phrase.strip().lower())
+    return frozenset() if match is None else _resolved(match, situation)
+
+
+def references(text: str, situation: Surroundings) -> Iterator[tuple[str, frozenset[str]]]:
+    """Each phrase of a text that refers to something, and what it refers to; nothing where that is unclear."""
+    for match in _grammar(situation.nouns).finditer(text.lower()):
+        yield match[0], _resolved(match, situation)
+
+
+def each_phrase(name: str, situation: Surroundings) -> Iterator[str]:
+    """Every phrase of the grammar that refers to this thing and nothing else; the plainest with a colour come first."""
+    thing = situation.thing(name)
+    for noun in thing.nouns:
+        for colored in ([f"{thing.color} {noun}"] if thing.color else []) + [noun]:
+            plain = f"the {colored}"
+            if resolve(plain, situation) == {name}:  # where the plain words suffice, nobody says more
+                yield plain
+                continue
+            candidates = [f"the {order} {colored}" for order in _IN_FRONT]
+            candidates += [f"the {colored} {order}" for order in _BEHIND]
+            for candidate in candidates:
+                if resolve(candidate, situation) == {name}:
+                    yield candidate
+
+
+def phrases_for(name: str, situation: Surroundings) -> list[str]:
+    """As `each_phrase`, all of them."""
+    return list(each_phrase(name, situation))
+
+
+def phrase_for(name: str, situation: Surroundings) -> str:
+    """The plainest phrase for a thing; "a red cube" where none tells it from the others."""
+    for found in each_phrase(name, situation):
+        return found
+    thing = situation.thing(name)
+    words = f"{thing.color} {thing.noun}".strip()
+    return f"{'an' if words[0] in 'aeiou' else 'a'} {words}"
+
+
+@lru_cache(maxsize=64)
+def _grammar(known: frozenset[str]) -> re.Pattern[str]:
+    nouns = "|".join(sorted((re.escape(noun) for noun in known), key=len)[::-1])
+    return re.compile(
+        rf"\b(?P<article>the|every) (?:(?P<order>{'|'.join(_IN_FRONT)}) )?(?:(?P<color>{'|'.join(COLOR_WORDS)}) )?"
+        rf"(?P<noun>{nouns})\b(?: (?P<behind>{'|'.join(_BEHIND)})\b)?"
+    )
+
+
+def _resolved(match: re.Match[str], situation: Surroundings) -> frozenset[str]:
+    fitting = [
+        thing
+        for thing in situation.things
+        if match["noun"] in thing.nouns and (match["color"] is None or thing.color == match["color"])
+    ]
+    if match["article"] == "every":
+        return frozenset(thing.name for thing in fitting)
+    for order in (match["order"], match["behind"]):
+        if order is not None:
+            fitting = _ORDERS[order](fitting)
+    return frozenset({fitting[0].name} if len(fitting) == 1 else ())
+
+
+def _first(things: Sequence[NamedThing], value: Callable[[NamedThing], float], margin: float) -> list[NamedThing]:
+    """The one of the smallest value, or none when the next one is not larger by the margin; none of a single one."""
+    ordered = sorted(things, key=value)
+    if len(ordered) < 2 or value(ordered[1]) - value(ordered[0]) < margin:
+        return []
+    return ordered[:1]
+
+
+def _of_two(
+    choose: Callable[[Sequence[NamedThing]], list[NamedThing]],
+) -> Callable[[Sequence[NamedThing]], list[NamedThing]]:
+    return lambda things: choose(things) if len(things) == 2 else []
+
+
+def _of_more(
+    choose: Callable[[Sequence[NamedThing]], list[NamedThing]],
+) -> Callable[[Sequence[NamedThing]], list[NamedThing]]:
+    return lambda things: choose(things) if len(things) > 2 else []
+
+
+def _distance(thing: NamedThing) -> float:
+    return math.hypot(float(thing.position[0]), float(thing.position[1]))
+
+
+def _leftmost(things: Sequence[NamedThing]) -> list[NamedThing]:
+    return _first(things, lambda thing: -float(thing.position[1]), MIN_GAP)
+
+
+def _rightmost(things: Sequence[NamedThing]) -> list[NamedThing]:
+    return _first(things, lambda thing: float(thing.position[1]), MIN_GAP)
+
+
+def _smallest(things: Sequence[NamedThing]) -> list[NamedThing]:
+    return _first(things, lambda thing: math.log(thing.size), math.log(MIN_SIZE_RATIO))
+
+
+def _largest(things: Sequence[NamedThing]) -> list[NamedThing]:
+    return _first(things, lambda thing: -math.log(thing.size), math.log(MIN_SIZE_RATIO))
+
+
+def _nearest(things: Sequence[NamedThing]) -> list[NamedThing]:
+    return _first(things, _distance, MIN_GAP)
+
+
+def _farthest(things: Sequence[NamedThing]) -> list[NamedThing]:
+    return _first(things, lambda thing: -_distance(thing), MIN_GAP)
+
+
+def _middle(things: Sequence[NamedThing]) -> list[NamedThing]:
+    """Of three in a row: the one between the others."""
+    if len(things) != 3:
+        return []
+
+    def detour(thing: NamedThing) -> float:
+        """How much longer the way between the other two is by way of this one, metres."""
+        a, b = (other.position[:2].tolist() for other in things if other is not thing)
+        here = thing.position[:2].tolist()
+        return math.dist(a, here) + math.dist(here, b) - math.dist(a, b)
+
+    chosen = _first(things, detour, MIN_GAP)
+    return chosen if chosen and detour(chosen[0]) < MIN_GAP else []
+
+
+_ORDERS: dict[str, Callable[[Sequence[NamedThing]], list[NamedThing]]] = {
+    "left": _of_two(_leftmost),
+    "right": _of_two(_rightmost),
+    "leftmost": _of_more(_leftmost),
+    "rightmost": _of_more(_rightmost),
+    "middle": _middle,
+    "smaller": _of_two(_smallest),
+    "larger": _of_two(_largest),
+    "smallest": _of_more(_smallest),
+    "largest": _of_more(_largest),
+    "nearest to the robot": _nearest,
+    "farthest from the robot": _farthest,
+}

@@ -1,0 +1,148 @@
+"""The things of a scene as people speak of them: what they are called, how large they are and where they are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from demorec.core.geometry import Array, Pose
+from demorec.episode.scene import Body, Goal, Scene
+
+COLOR_WORDS = ("red", "green", "blue", "yellow", "orange", "purple", "black", "white", "grey")
+"""Words for colours in instructions and names."""
+_NOUNS = {"jenga": "wooden plank", "lego": "toy brick"}
+"""Words for things whose names say less."""
+_SYNONYMS = {
+    "target": ("target", "mark", "square"),
+    "mark": ("mark", "target", "square"),
+    "tray": ("tray",),
+}
+_AT_THE_PLACE = 0.01
+"""How far, metres, the middle of a mark may be from a goal that is meant to be on it."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class NamedThing:
+    """One body of the scene.
+
+    Attributes:
+        name: Of the body.
+        nouns: What it may be called, the usual word first.
+        color: The word for its colour, or "".
+        size: Its largest extent, metres.
+        position: (3,) of its middle in the robot's base frame (x forward, y to the left, z up), metres.
+        height: Of its bounding box, metres.
+        can_be_held: Whether it is movable.
+    """
+
+    name: str
+    nouns: tuple[str, ...]
+    color: str
+    size: float
+    position: Array
+    height: float
+    can_be_held: bool
+
+    @property
+    def noun(self) -> str:
+        """The usual word."""
+        return self.nouns[0]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Surroundings:
+    """All things at one moment, the floor and what else only carries the scene left out."""
+
+    things: tuple[NamedThing, ...]
+
+    @cached_property
+    def nouns(self) -> frozenset[str]:
+        """What any of them may be called."""
+        return frozenset(noun for thing in self.things for noun in thing.nouns)
+
+    def thing(self, name: str) -> NamedThing:
+        """The thing of that name; KeyError when there is none."""
+        for thing in self.things:
+            if thing.name == name:
+                return thing
+        raise KeyError(name)
+
+
+class Situations:
+    """The things of a scene at any moment; what stays the same about them is found out once.
+
+    Args:
+        scene: At the episode's start.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self._base_from_world = scene.robot.world_from_base.inverse()
+        self._bodies = [body for body in scene.bodies if body.role != "fixture"]
+        self._traits: list[dict[str, Any]] = [
+            {
+                "name": body.name,
+                "nouns": nouns_of(body),
+                "color": body.color_name,
+                "size": max(body.shape.extents),
+                "height": body.shape.extents[2],
+                "can_be_held": body.movable,
+            }
+            for body in self._bodies
+        ]
+
+    def at(self, world_from_object: Mapping[str, Array] | None = None) -> Surroundings:
+        """The things where they are.
+
+        Args:
+            world_from_object: Body -> (7,) pose (xyz, quaternion xyzw) at the moment; the scene's own where left out.
+        """
+        return self.at_each({name: pose[np.newaxis] for name, pose in (world_from_object or {}).items()}, 1)[0]
+
+    def at_each(self, world_from_object: Mapping[str, Array], moments: int) -> list[Surroundings]:
+        """The same of T moments at once: body -> (T, 7) poses."""
+        places = np.empty((moments, len(self._bodies), 3))
+        for index, body in enumerate(self._bodies):
+            moved = world_from_object.get(body.name)
+            places[:, index] = body.world_from_body.position if moved is None else moved[:, :3]
+        return [
+            Surroundings(
+                things=tuple(
+                    NamedThing(position=place, **traits) for place, traits in zip(there, self._traits, strict=True)
+                )
+            )
+            for there in self._base_from_world.apply(places)
+        ]
+
+
+def situation(scene: Scene, world_from_object: Mapping[str, Array] | None = None) -> Surroundings:
+    """The things of a scene at one moment; arguments as of `Situations`."""
+    return Situations(scene).at(world_from_object)
+
+
+def nouns_of(body: Body) -> tuple[str, ...]:
+    """What a body may be called: by its name, less colour and number, and by its shape."""
+    words = [word for word in body.name.split("_") if not word.isdigit() and word not in (*COLOR_WORDS, "other")]
+    noun = " ".join(_NOUNS.get(word, word) for word in words) or "object"
+    nouns = _SYNONYMS.get(noun, (noun,))
+    x, y, z = body.shape.extents
+    if body.movable and body.shape.kind == "box":
+        nouns += ("cube",) if max(x, y, z) < 1.05 * min(x, y, z) else ("block",)
+    elif body.movable and body.shape.kind in ("cylinder", "sphere", "capsule"):
+        nouns += (body.shape.kind,)
+    return tuple(dict.fromkeys(nouns))
+
+
+def place_of(scene: Scene, goal: Goal) -> str:
+    """Name of the body that a goal puts its object onto or into, a mark at its place, or ""."""
+    if goal.onto:
+        return goal.onto
+    wanted: Pose = scene.world_from_goal(goal)
+    for body in scene.bodies:
+        offset = np.abs(body.world_from_body.position[:2] - wanted.position[:2])
+        if body.role == "target" and bool((offset < _AT_THE_PLACE).all()):
+            return body.name
+    return ""

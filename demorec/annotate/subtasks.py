@@ -1,0 +1,204 @@
+"""Sentences for stretches and goals: subtask, plan, memory, motion."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from demorec.annotate.referring import phrase_for
+from demorec.annotate.situation import Surroundings, nouns_of, place_of
+from demorec.annotate.tries import Story, Stretch, Try
+from demorec.core.geometry import Array
+from demorec.episode.episode import CORRECTED_PHASE, MISTAKEN_PHASE
+from demorec.episode.scene import Scene
+
+_SENTENCES = {
+    MISTAKEN_PHASE: "move above {object}",
+    CORRECTED_PHASE: "stop and listen",
+    "open": "open the gripper",
+    "approach": "move above {object}",
+    "above_cube": "move above {object}",
+    "descend": "lower the open gripper around {object}",
+    "close": "grasp {object}",
+    "lift": "lift {object}",
+    "hold": "lift {object}",
+    "transport": "carry {object} to {place}",
+    "carry": "carry {object} over {place}",
+    "lower": "lower {object} {into} {place}",
+    "release": "let go of {object}",
+    "retreat": "move away from {object}",
+}
+_MISSING = {
+    "approach": "move beside {object}, to miss it on purpose",
+    "descend": "lower the open gripper beside {object}, to miss it on purpose",
+    "close": "close the gripper beside {object}, missing it on purpose",
+    "lift": "lift the empty gripper, having missed {object} on purpose",
+}
+_AGAIN = ("approach", "descend", "close")
+"""Phases of a later try in which the subtask says that it is one."""
+_RECOVERY = {
+    "missed": "open the gripper and rise after missing {object}",
+    "dropped": "open the gripper and rise after dropping {object}",
+}
+_SMALLEST_MOVE, _SMALLEST_OPENING = 0.005, 0.0025
+"""Metres below which a motion is not worth a word: half of the last digit that is told, or a change of the opening."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GoalWords:
+    """How the things of one goal are called during a try.
+
+    Attributes:
+        object: "the red cube".
+        place: "the blue tray", or "its place" where the scene has nothing there.
+        into: "into", "onto" or "to": what goes before the place.
+        inside: "in", "on" or "at": where the object is in the end.
+    """
+
+    object: str
+    place: str
+    into: str
+    inside: str
+
+
+def goal_words(scene: Scene, goal_index: int | None, now: Surroundings) -> GoalWords:
+    """Words that tell object and place of a goal from all other things as they are now."""
+    if goal_index is None:
+        return GoalWords(object="the object", place="its place", into="to", inside="at")
+    goal = scene.goals[goal_index]
+    name = place_of(scene, goal)
+    into, inside = prepositions(scene, name)
+    return GoalWords(
+        object=phrase_for(goal.object, now),
+        place=phrase_for(name, now) if name else "its place",
+        into=into,
+        inside=inside,
+    )
+
+
+def prepositions(scene: Scene, place: str) -> tuple[str, str]:
+    """("into", "in") for a tray, ("to", "at") for a place without a thing, ("onto", "on") for everything else."""
+    if not place:
+        return "to", "at"
+    return ("into", "in") if "tray" in nouns_of(scene.body(place)) else ("onto", "on")
+
+
+def subtask(stretch: Stretch, words: GoalWords, instruction: str, *, is_dropped: bool) -> str:
+    """What is to be done in a stretch, as an imperative; the instruction where the recording knows no phase."""
+    phase, attempt = stretch.phase, stretch.attempt
+    if phase == "recover":
+        text = _RECOVERY.get(attempt.end, "open the gripper and rise")
+        if attempt.is_deliberate_miss:
+            text += " on purpose"
+    elif stretch.is_deliberate_miss and phase in _MISSING:
+        text = _MISSING[phase]
+    elif phase == "release" and is_dropped:
+        text = "drop {object} {into} {place}"
+    else:
+        text = _SENTENCES.get(phase, phase.replace("_", " ") or instruction)
+        if attempt.number > 0 and phase in _AGAIN:
+            text = f"try again: {text}"
+    for field in ("object", "place", "into"):
+        text = text.replace(f"{{{field}}}", getattr(words, field))
+    return text
+
+
+def plan(goals: Sequence[GoalWords], *, is_dropped: bool, is_retry: bool) -> str:
+    """A numbered list of what remains to be done."""
+    lines = []
+    for index, words in enumerate(goals):
+        again = " again" if is_retry and index == 0 else ""
+        lines.append(f"pick up {words.object}{again}")
+        verb = "drop" if is_dropped else "put"
+        lines.append(f"{verb} it {words.into} {words.place}" if words.into != "to" else "put it in its place")
+    return "\n".join(f"{number}. {line}" for number, line in enumerate(lines, start=1))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recollection:
+    """What is remembered from a frame on."""
+
+    frame: int
+    text: str
+
+
+def memories(story: Story, words: dict[int, GoalWords], *, is_dropped: bool) -> list[Recollection]:
+    """What was done so far, in the first person, each from the frame on at which it is done.
+
+    Args:
+        story: Of the episode.
+        words: First frame of a try -> how its things are called.
+        is_dropped: Whether objects are let fall.
+    """
+    found: list[Recollection] = []
+    done: list[str] = []
+    for before, stretch in zip((None, *story.stretches), story.stretches, strict=False):
+        attempt = stretch.attempt
+        spoken = words[attempt.first]
+        present = ""
+        if before is not None and before.attempt is attempt:
+            if before.phase in ("lift", "hold") and stretch.phase != "recover":
+                present = f"I picked up {spoken.object}."
+            elif before.phase == "release" and attempt.end == "placed":
+                done.append(_placed(spoken, is_dropped=is_dropped))
+            elif before.phase == "release" and attempt.end == "misplaced":
+                present = f"I put {spoken.object} down in the wrong place."
+            elif stretch.phase == "recover":
+                present = _trouble(attempt, spoken)
+            else:
+                continue
+            found.append(Recollection(frame=stretch.first, text=" ".join([*done, *([present] if present else [])])))
+    return found
+
+
+def _placed(words: GoalWords, *, is_dropped: bool) -> str:
+    if words.into == "to":
+        return f"I put {words.object} in its place."
+    verb, where = ("dropped", words.into) if is_dropped else ("put", words.inside)
+    return f"I {verb} {words.object} {where} {words.place}."
+
+
+def _trouble(attempt: Try, words: GoalWords) -> str:
+    verb = "dropped" if attempt.end == "dropped" else "missed"
+    return f"I {verb} {words.object}{' on purpose' if attempt.is_deliberate_miss else ''}."
+
+
+def motion(before: Array, after: Array, opening_before: float, opening_after: float) -> str:
+    """A displacement of the TCP in the robot's base frame and what the gripper does, to whole centimetres.
+
+    Args:
+        before, after: (3,) positions in the base frame (x forward, y left, z up), metres.
+        opening_before, opening_after: Of the gripper, metres.
+    """
+    parts = []
+    for change, positive, negative in zip(
+        (after - before).tolist(), ("forward", "left", "up"), ("backward", "right", "down"), strict=True
+    ):
+        centimetres = round(abs(change) * 100)
+        if abs(change) >= _SMALLEST_MOVE and centimetres:
+            parts.append((centimetres, positive if change > 0 else negative))
+    parts.sort(key=lambda part: -part[0])
+    said = [f"{centimetres} cm {direction}" for centimetres, direction in parts]
+    sentences = [f"move {joined(said)}"] if said else []
+    change = opening_after - opening_before
+    if abs(change) >= _SMALLEST_OPENING:
+        verb = "open" if change > 0 else "close"
+        sentences.append(f"{verb} the gripper by {max(0.5, round(abs(change) * 200) / 2):g} cm")
+    return ", ".join(sentences) or "hold still"
+
+
+def joined(parts: Sequence[str]) -> str:
+    """ "a", "a and b", "a, b and c"."""
+    return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
+
+
+def tcp_motion(base_from_tcp: Array, opening: Array, first: int, last: int) -> str:
+    """`motion` between two frames of (T, 7) TCP poses and (T,) openings of the gripper."""
+    return motion(
+        np.asarray(base_from_tcp[first, :3]),
+        np.asarray(base_from_tcp[last, :3]),
+        float(opening[first]),
+        float(opening[last]),
+    )

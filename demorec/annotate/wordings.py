@@ -1,0 +1,178 @@
+"""Many wordings of one task, each of which says the same and can mean nothing else in its scene.
+
+A wording is a template with phrases in it. What each phrase refers to is proved by the resolver
+(`demorec.annotate.referring`), which reads the finished text and knows nothing of the template.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from demorec.annotate.referring import phrases_for, references, resolve
+from demorec.annotate.situation import Surroundings, place_of, situation
+from demorec.annotate.subtasks import joined, prepositions
+from demorec.episode.scene import Goal, Scene
+
+WORDINGS = 24
+"""How many wordings an episode gets; every task has so many."""
+_ON = 0.01
+"""Metres of air below a thing that still stands on another."""
+
+_PUT = (
+    "put {o} {p}",
+    "place {o} {p}",
+    "set {o} {p}",
+    "set {o} down {p}",
+    "pick up {o} and put it {p}",
+    "pick up {o} and place it {p}",
+    "pick {o} up and set it down {p}",
+    "grasp {o} and put it {p}",
+    "take {o} and place it {p}",
+    "get {o} and set it {p}",
+)
+_INTO = ("move {o} {i}", "bring {o} {i}", "carry {o} {i}", "transfer {o} {i}")
+_OFF = (
+    "take {o} off {b} and put it {p}",
+    "lift {o} off {b} and place it {p}",
+    "remove {o} from {b} and put it {p}",
+    "unstack {o} from {b} and set it {p}",
+)
+_DROP = (
+    "drop {o} {i}",
+    "let {o} fall {i}",
+    "pick up {o} and drop it {i}",
+    "pick {o} up and let it fall {i}",
+    "grasp {o} and drop it {i}",
+    "take {o} and let it drop {i}",
+)
+_CLASS_VERBS = ("move", "bring", "sort", "carry")
+_POLITE = ("{s}", "please {s}", "could you {s}?", "can you {s}?", "would you {s}, please?", "I want you to {s}")
+_THEN = ("{a}, then {b}", "first {a}, then {b}", "{a}, and then {b}", "{a}; after that, {b}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Clause:
+    """What one goal is about: names of its object, its place and what the object stands on, "" for nothing."""
+
+    object: str
+    place: str
+    base: str
+
+
+def task_wordings(scene: Scene, instruction: str, rng: np.random.Generator, *, is_dropped: bool) -> list[str]:
+    """Up to `WORDINGS` different wordings, the recorded instruction first; each is proved to be unambiguous.
+
+    Args:
+        scene: At the episode's start.
+        instruction: As recorded.
+        rng: Chooses among all wordings that are possible.
+        is_dropped: Whether objects are let fall rather than set down.
+    """
+    start = situation(scene)
+    clauses = [
+        _Clause(object=goal.object, place=place_of(scene, goal), base=_base_of(goal, start)) for goal in scene.goals
+    ]
+    sentences = list(
+        dict.fromkeys([*_by_class(scene, clauses, start), *_one_by_one(scene, clauses, start, is_dropped, rng)])
+    )
+    order = rng.permutation(len(sentences))
+    wanted = WORDINGS - 1
+    chosen = [sentences[index] for index in order[:wanted]]
+    # The politeness of the first round differs from sentence to sentence; short of sentences, it multiplies them.
+    forms = rng.permutation(len(_POLITE))
+    found = [instruction]
+    for turn, (round_, index) in enumerate(product(range(len(_POLITE)), range(len(chosen)))):
+        if len(found) >= WORDINGS:
+            break
+        form = _POLITE[forms[(turn + round_) % len(_POLITE)]]
+        text = form.replace("{s}", chosen[index])
+        if text not in found and _is_proved(text, clauses, start):
+            found.append(text)
+    return found
+
+
+def _is_proved(text: str, clauses: Sequence[_Clause], start: Surroundings) -> bool:
+    """Whether each phrase of a wording refers to something definite, and all together to the things of the goals."""
+    found = [names for _, names in references(text, start)]
+    wanted = {name for clause in clauses for name in (clause.object, clause.place) if name}
+    allowed = wanted | {clause.base for clause in clauses}
+    return all(found) and wanted <= set().union(*found) <= allowed
+
+
+def _base_of(goal: Goal, start: Surroundings) -> str:
+    """Name of the movable thing that a goal's object stands on, or ""."""
+    upper = start.thing(goal.object)
+    for thing in start.things:
+        offset = upper.position - thing.position
+        air = float(offset[2]) - (upper.height + thing.height) / 2
+        if (
+            thing is not upper
+            and thing.can_be_held
+            and abs(air) < _ON
+            and bool((abs(offset[:2]) < thing.size / 2).all())
+        ):
+            return thing.name
+    return ""
+
+
+def _one_by_one(
+    scene: Scene, clauses: Sequence[_Clause], start: Surroundings, is_dropped: bool, rng: np.random.Generator
+) -> Iterator[str]:
+    """Sentences that name each goal."""
+    per_goal = [list(_sentences(scene, clause, start, is_dropped)) for clause in clauses]
+    if not all(per_goal):
+        return
+    if len(per_goal) == 1:
+        yield from per_goal[0]
+        return
+    for number in range(4 * WORDINGS):
+        parts = [options[int(rng.integers(len(options)))] for options in per_goal]
+        form = _THEN[number % len(_THEN)]
+        text = parts[0]
+        for part in parts[1:-1]:
+            text += f", then {part}"
+        yield form.replace("{a}", text).replace("{b}", parts[-1])
+
+
+def _sentences(scene: Scene, clause: _Clause, start: Surroundings, is_dropped: bool) -> Iterator[str]:
+    objects = phrases_for(clause.object, start)
+    places = phrases_for(clause.place, start) if clause.place else []
+    bases = phrases_for(clause.base, start)[:1] if clause.base else []
+    into, inside = prepositions(scene, clause.place)
+    is_on_cube = bool(clause.place) and start.thing(clause.place).can_be_held
+    templates = _DROP if is_dropped else (*_PUT, *_INTO)
+    if bases and not is_dropped:
+        templates = (*templates, *_OFF)
+    for template, object_, place in product(templates, objects, places):
+        text = template.replace("{o}", object_).replace("{i}", f"{into} {place}").replace("{p}", f"{inside} {place}")
+        yield text.replace("{b}", bases[0]) if bases else text
+        if is_on_cube and "{p}" in template:
+            yield template.replace("{o}", object_).replace("{p}", f"on top of {place}")
+    if is_on_cube:
+        for object_, place in product(objects, places):
+            yield f"stack {object_} on {place}"
+
+
+def _by_class(scene: Scene, clauses: Sequence[_Clause], start: Surroundings) -> Iterator[str]:
+    """Sentences that speak of all things of a kind at once, where several goals share a place: "every red cube"."""
+    places = list(dict.fromkeys(clause.place for clause in clauses))
+    if len(places) == len(clauses) or not all(places):
+        return
+    parts: list[list[str]] = []
+    for place in places:
+        members = frozenset(clause.object for clause in clauses if clause.place == place)
+        thing = start.thing(next(iter(members)))
+        into, inside = prepositions(scene, place)
+        words = f"every {thing.color} {thing.noun}"
+        if resolve(words, start) != members or not (names := phrases_for(place, start)):
+            return
+        options = [*((verb, inside) for verb in ("put", "place", "set")), *((verb, into) for verb in _CLASS_VERBS)]
+        parts.append([f"{verb} {words} {where} {name}" for name in names for verb, where in options])
+    for choice in product(*parts):
+        yield joined(choice)
+        if len(choice) == 2:
+            yield f"{choice[0]}, then {choice[1]}"

@@ -1,0 +1,135 @@
+"""Files of unknown origin, opened without waiting and read within bounds.
+
+A folder may hold anything under the name that is looked for: opening a FIFO waits for its other end for ever, reading
+a device never ends, and a file of some gigabytes fills the memory before anybody has looked at its first byte.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import stat
+from io import BufferedReader
+from pathlib import Path
+from typing import Any
+
+from demorec.core.errors import ConfigError
+from demorec.core.plain import parse_json
+
+MCAP_MAGIC = b"\x89MCAP0\r\n"
+RERUN_MAGICS = (b"RRF", b"RRIO")
+HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
+"""First bytes by which files are known."""
+
+_KINDS = {
+    stat.S_IFIFO: "a FIFO",
+    stat.S_IFSOCK: "a socket",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+    stat.S_IFDIR: "a folder",
+}
+
+
+def open_regular(path: Path) -> BufferedReader:
+    """Open a regular file (or a link to one) for reading, without ever waiting.
+
+    Raises:
+        OSError: There is none, it cannot be opened, or it is a folder, FIFO, socket or device; `strerror` says which.
+    """
+    if "\0" in str(path):
+        raise OSError(errno.EINVAL, "its name holds a zero byte", str(path))
+    _refuse_irregular(path, path.stat().st_mode)
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    try:
+        _refuse_irregular(path, os.fstat(descriptor).st_mode)  # it may have been exchanged in between
+        return os.fdopen(descriptor, "rb")
+    except BaseException:
+        os.close(descriptor)
+        raise
+
+
+def read_text_limited(path: Path, limit: int) -> str:
+    """The text of a regular UTF-8 file of at most `limit` bytes.
+
+    Raises:
+        OSError: As `open_regular`, or the file is larger.
+        UnicodeDecodeError: It is no UTF-8.
+    """
+    with open_regular(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        if size > limit:
+            raise OSError(errno.EFBIG, f"it is larger than {limit:,} bytes", str(path))
+        data = file.read(size)
+    return data.decode()
+
+
+def read_json_limited(path: Path, limit: int) -> Any:
+    """The content of a regular JSON file of at most `limit` bytes.
+
+    Raises:
+        OSError: As `read_text_limited`.
+        ValueError: It is no UTF-8, no JSON, or nested too deeply to be read.
+    """
+    try:
+        return json.loads(read_text_limited(path, limit))
+    except RecursionError:
+        raise ValueError("its values are nested too deeply") from None
+
+
+MAX_SETTINGS_BYTES = 16 << 20
+"""Of a JSON file of settings or results; ours, and LeRobot's, have some kilobytes."""
+
+
+def read_json_object(path: Path) -> dict[str, Any]:
+    """The JSON object in a regular file of settings or results, nested no deeper than code can walk.
+
+    Raises:
+        OSError: As `read_text_limited`.
+        ValueError: It is no UTF-8, no JSON, no object, or nested too deeply.
+    """
+    found = parse_json(read_text_limited(path, MAX_SETTINGS_BYTES), allow_nan=True)
+    if not isinstance(found, dict):
+        raise ValueError("it is no JSON object")
+    return found
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder for results, and those above it; one that is there is fine.
+
+    Raises:
+        ConfigError: It cannot be made.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(
+            f"The output folder cannot be made ({error.strerror}): choose another --out: {path}"
+        ) from error
+
+
+def replace_text(path: Path, text: str) -> None:
+    """Write a file anew, in one step: what is there stays until all of the text is on the disk.
+
+    It is written beside its place first, to a new file: what else has that name is never written through.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    part = path.with_name(f"{path.name}.part")
+    part.unlink(missing_ok=True)
+    with part.open("x") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+    part.replace(path)
+
+
+def irregular_kind(mode: int) -> str:
+    """What something that is no regular file is, by its `st_mode`: "a FIFO"."""
+    return _KINDS.get(stat.S_IFMT(mode), "something else")
+
+
+def _refuse_irregular(path: Path, mode: int) -> None:
+    if not stat.S_ISREG(mode):
+        raise OSError(errno.EINVAL, f"it is {irregular_kind(mode)}, not a regular file", str(path))

@@ -1,0 +1,302 @@
+"""What may be replaced or deleted, and how: the one rule of every command.
+
+Only what a command recognises, by its content, as the kind of thing that it makes is replaced, and only when the user
+asks for it. Never a source of the same command, never a folder that a person lives or works in, never a folder with
+anything foreign in it. What is replaced stays whole until what takes its place is whole: a file is renamed over, a
+folder is moved aside first and deleted last.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import shutil
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from demorec.core.errors import ConfigError
+from demorec.core.files import MCAP_MAGIC, RERUN_MAGICS, read_json_limited
+
+_SHOWN = 5
+"""How many foreign files a refusal names."""
+_ASIDE = ".demorec-replaced"
+_MARK = "what-this-is.txt"
+_MARK_TEXT = "What --overwrite replaces. demorec removes this folder when the new is in place, or puts it back.\n"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplaceableKind:
+    """A kind of file or folder that a command makes, and may therefore replace.
+
+    Attributes:
+        name: In a sentence: "a recording".
+        is_folder: Whether it is a folder.
+        recognises: Whether a file or folder is of this kind, by its content.
+        strangers: Names, relative to such a folder or within such a file, of what in it is not part of it and would be
+            deleted with it.
+        advice: What to do where one is there already.
+    """
+
+    name: str
+    recognises: Callable[[Path], bool]
+    is_folder: bool = False
+    strangers: Callable[[Path], Sequence[str]] = lambda path: ()
+    advice: str = "choose another name, or --overwrite to replace it"
+
+
+def _begins_with(*magics: bytes) -> Callable[[Path], bool]:
+    def recognises(path: Path) -> bool:
+        with path.open("rb") as file:
+            return file.read(max(map(len, magics))).startswith(magics)
+
+    return recognises
+
+
+RECORDING = ReplaceableKind(name="a recording (MCAP)", recognises=_begins_with(MCAP_MAGIC))
+RERUN_FILE = ReplaceableKind(name="a Rerun file (.rrd)", recognises=_begins_with(*RERUN_MAGICS))
+PICTURE = ReplaceableKind(name="a picture (PNG)", recognises=_begins_with(b"\x89PNG\r\n\x1a\n"))
+REPORT_MARK = "<!doctype html>\n<!-- A report by demorec. -->\n"
+REPORT = ReplaceableKind(name="a report (HTML)", recognises=_begins_with(REPORT_MARK.encode()))
+
+
+def check_replaceable(
+    target: Path,
+    kind: ReplaceableKind,
+    *,
+    overwrite: bool,
+    sources: Iterable[Path] = (),
+) -> None:
+    """Raise unless `target` is free, or may be replaced by something of its kind and the user asks for that.
+
+    An empty folder counts as free; an empty file does not, since somebody's lock or mark may be one.
+
+    Args:
+        target: Where something new shall be.
+        kind: What is made there.
+        overwrite: Whether the user asks for replacing.
+        sources: What the command reads; neither it nor what holds it is replaced, nor anything in it.
+
+    Raises:
+        ConfigError: Something is there, and the user does not ask for replacing it, or it must never be replaced.
+    """
+    reason = obstacle(target, kind, sources)
+    if not reason and (not os.path.lexists(target) or _is_empty(target)):
+        return
+    if not overwrite:
+        if reason:
+            raise ConfigError(f"Something is there already, and not to be replaced, since {reason}: {target}")
+        raise ConfigError(f"{kind.name[0].upper()}{kind.name[1:]} is there already: {kind.advice}: {target}")
+    if reason:
+        raise ConfigError(f"This is never replaced, since {reason}: choose another name: {target}")
+
+
+def obstacle(target: Path, kind: ReplaceableKind, sources: Iterable[Path] = ()) -> str:
+    """Why `target` must not be replaced, as `check_replaceable` tells it; "" when it may be, or nothing is there."""
+    try:
+        if not os.path.lexists(target):
+            return ""
+        if not target.exists():
+            return "it is a link to something that is not there"
+        if reason := use_as_source(target.resolve(), sources):
+            return reason
+        if kind.is_folder and not target.is_dir():
+            return f"it is a file, not {kind.name}"
+        if not kind.is_folder and not target.is_file():
+            return f"it is {'a folder' if target.is_dir() else 'no regular file'}, not {kind.name}"
+        reason = protection(target) if kind.is_folder else ""
+        if reason or _is_empty(target):
+            return reason
+        if not kind.recognises(target):
+            return f"it is not {kind.name}"
+        foreign = kind.strangers(target)
+        return f"it holds what is not part of {kind.name} ({shown(foreign)})" if foreign else ""
+    except OSError as error:
+        return f"it cannot be read ({error.strerror})"
+
+
+def use_as_source(target: Path, sources: Iterable[Path]) -> str:
+    """How a command that reads these sources uses `target`, a resolved path; "" when it does not."""
+    for source in sources:
+        resolved = source.resolve()
+        if resolved == target:
+            return "this command reads it"
+        if resolved.is_relative_to(target):
+            return f"this command reads something in it ({source})"
+        if target.is_relative_to(resolved):
+            return f"it lies in what this command reads ({source})"
+    return ""
+
+
+def protection(folder: Path) -> str:
+    """Why a folder is never replaced whatever it holds: a person lives or works there; "" for any other one."""
+    resolved = folder.resolve()
+    if resolved == resolved.parent:
+        return "it is the root of the file system"
+    for what, place in (("home folder", Path.home()), ("current folder", Path.cwd())):
+        if place.resolve() == resolved:
+            return f"it is the {what}"
+        if place.resolve().is_relative_to(resolved):
+            return f"the {what} lies in it"
+    return "it is a repository (.git)" if os.path.lexists(resolved / ".git") else ""
+
+
+def _is_empty(path: Path) -> bool:
+    return path.is_dir() and not any(path.iterdir())
+
+
+def shown(names: Sequence[str]) -> str:
+    """The first few of some names, for a sentence."""
+    return ", ".join(names[:_SHOWN]) + (", ..." if len(names) > _SHOWN else "")
+
+
+def files_below(folder: Path) -> Iterator[str]:
+    """Every entry of a folder that is no folder itself, relative to it, links to folders included; in order."""
+    for place, folders, files in os.walk(folder):
+        links = [name for name in folders if (Path(place) / name).is_symlink()]
+        folders.sort()
+        for name in sorted((*files, *links)):
+            yield (Path(place) / name).relative_to(folder).as_posix()
+
+
+def json_object(path: Path) -> dict[str, Any]:
+    """The JSON object in a regular file; {} when there is none."""
+    try:
+        found = read_json_limited(path, sys.maxsize)
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+@contextmanager
+def replaced_parts(folder: Path, names: Sequence[str]) -> Iterator[None]:
+    """Move parts of a folder aside while what takes their place is made; delete them at the end.
+
+    An error puts them back. A crash leaves them in a folder of its own, for `settle_parts`.
+
+    Args:
+        folder: Where they are.
+        names: Of files and folders, whether there or not. The first is the one whose presence means that what takes
+            their place has been made: it goes first and comes back last.
+    """
+    aside = folder / _ASIDE
+    aside.mkdir()
+    (aside / _MARK).write_text(_MARK_TEXT)
+    try:
+        for name in names:
+            if os.path.lexists(folder / name):
+                (folder / name).rename(aside / name)
+        yield
+    except BaseException:
+        _put_back(folder, names)
+        raise
+    _drop(aside, names)
+
+
+def has_unsettled_parts(folder: Path) -> bool:
+    """Whether a crash within `replaced_parts` has left something for `settle_parts`: what has its mark."""
+    return (folder / _ASIDE / _MARK).is_file()
+
+
+def check_unsettled_parts(folder: Path, names: Sequence[str]) -> None:
+    """Raise ConfigError where what is there by the name of such leftovers is not ours."""
+    aside = folder / _ASIDE
+    if not os.path.lexists(aside):
+        return
+    found = {path.name for path in aside.iterdir()} if aside.is_dir() and not aside.is_symlink() else {"no folder"}
+    if not found <= {_MARK, *names} or (found and not (aside / _MARK).is_file()):
+        raise ConfigError(f"This was not made by demorec and is in the way, move it elsewhere: {aside}")
+
+
+def settle_parts(folder: Path, names: Sequence[str]) -> None:
+    """Finish what a crash within `replaced_parts` left: put the old back, or delete it where the new is there.
+
+    Raises:
+        ConfigError: A folder of that name is there and is not ours.
+    """
+    aside = folder / _ASIDE
+    check_unsettled_parts(folder, names)
+    if not os.path.lexists(aside):
+        return
+    if os.path.lexists(folder / names[0]):
+        _drop(aside, names)
+    else:
+        _put_back(folder, names)
+
+
+def _drop(aside: Path, names: Sequence[str]) -> None:
+    for name in names:
+        if (aside / name).is_dir() and not (aside / name).is_symlink():
+            shutil.rmtree(aside / name)
+        else:
+            (aside / name).unlink(missing_ok=True)
+    (aside / _MARK).unlink(missing_ok=True)  # last: it tells whose the folder is
+    aside.rmdir()
+
+
+def _put_back(folder: Path, names: Sequence[str]) -> None:
+    aside = folder / _ASIDE
+    for name in reversed(names):
+        if os.path.lexists(aside / name):
+            if _is_empty(folder / name):
+                (folder / name).rmdir()
+            (aside / name).rename(folder / name)
+    (aside / _MARK).unlink(missing_ok=True)
+    aside.rmdir()
+
+
+def lock_part(part: Path, kind: ReplaceableKind) -> int:
+    """Open an unfinished file for writing, locked until the descriptor is closed or the process dies.
+
+    What a dead process left there stays as it is; the caller decides about it.
+
+    Raises:
+        ConfigError: Another process is writing it, or it is none of ours.
+        OSError: It cannot be written.
+    """
+    while True:
+        if os.path.lexists(part) and (part.is_symlink() or not part.is_file()):
+            raise ConfigError(f"This is no unfinished file and is in the way, move it elsewhere: {part}")
+        handle = os.open(part, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        try:
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise ConfigError(f"Another process is writing this file, wait until it is done: {part}") from error
+            # The owner before us may have given the file its final name between the two calls.
+            if not part.exists() or not os.path.samestat(os.fstat(handle), part.stat()):
+                os.close(handle)
+                continue
+            if os.fstat(handle).st_size and not kind.recognises(part):
+                raise ConfigError(f"This is not the unfinished beginning of {kind.name}, move it elsewhere: {part}")
+            return handle
+        except BaseException:
+            os.close(handle)
+            raise
+
+
+@contextmanager
+def written_whole(target: Path, kind: ReplaceableKind) -> Iterator[Path]:
+    """Give the name of a file beside `target`, which takes its place in one step when the block ends without an error.
+
+    A leftover of a killed process is written over; an error removes the unfinished file.
+
+    Raises:
+        ConfigError: Another process is writing it.
+        OSError: The file cannot be written.
+    """
+    part = target.with_name(f".{target.name}.demorec-part")
+    handle = lock_part(part, kind)
+    try:
+        os.ftruncate(handle, 0)
+        yield part
+        os.fsync(handle)
+        part.replace(target)
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise
+    finally:
+        os.close(handle)

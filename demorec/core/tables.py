@@ -1,0 +1,150 @@
+"""The tables of everything that a user can name, but for commands (`COMMANDS` in demorec/cli).
+
+A row here and one file make a new one (CONTRIBUTING.md).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from demorec.core.registry import Registry
+from demorec.core.user_modules import modules_of, split_name
+from demorec.robots.assets import model_name
+
+if TYPE_CHECKING:
+    from demorec.check.base import Check
+    from demorec.datasets.exporter import Exporter
+    from demorec.render import Renderer
+    from demorec.render.cameras import CameraPreset
+    from demorec.robots.robot import RobotSpec
+    from demorec.tasks.base import Task
+
+
+def _named_alike(package: str, *modules: tuple[str, ...]) -> dict[str, str]:
+    """The rows of objects that are called as their rows are: a module of the package, then what it has, in order."""
+    return {name: f"{package}.{module}:{name}" for module, *names in modules for name in names}
+
+
+TASKS: Registry[type[Task]] = Registry(
+    kind="task",
+    rows={
+        "pick_place": "demorec.tasks.pick_place:PickPlace",
+        "place_in_tray": "demorec.tasks.place_in_tray:PlaceInTray",
+        "stack": "demorec.tasks.stack:Stack",
+        "stack_three": "demorec.tasks.stack:StackThree",
+        "unstack": "demorec.tasks.stack:Unstack",
+        "sort_by_color": "demorec.tasks.sort_by_color:SortByColor",
+        "line_up": "demorec.tasks.line_up:LineUp",
+        "pick_from_clutter": "demorec.tasks.pick_from_clutter:PickFromClutter",
+        "pick_shapes": "demorec.tasks.pick_shapes:PickShapes",
+        "tutorial": "demorec.tasks.tutorial:Tutorial",
+    },
+    subclass_of="demorec.tasks.base:Task",
+)
+
+ROBOTS: Registry[RobotSpec] = Registry(
+    kind="robot",
+    rows={"panda": "demorec.robots.panda:PANDA", "iiwa": "demorec.robots.iiwa:IIWA"},
+    instance_of="demorec.robots.robot:RobotSpec",
+)
+
+CAMERAS: Registry[CameraPreset] = Registry(
+    kind="camera",
+    rows={
+        "front": "demorec.render.cameras:FRONT",
+        "wrist": "demorec.render.cameras:WRIST",
+        "top": "demorec.render.cameras:TOP",
+        "workspace": "demorec.render.cameras:WORKSPACE",
+    },
+    instance_of="demorec.render.cameras:CameraPreset",
+)
+
+RENDERERS: Registry[type[Renderer]] = Registry(
+    kind="renderer",
+    rows={
+        "raster": "demorec.render.raster:RasterRenderer",
+        "tiny": "demorec.sim.renderers.client_renderer:TinyRenderer",
+        "egl": "demorec.sim.renderers.egl:EglRenderer",
+    },
+)
+
+EXPORTERS: Registry[Exporter[Any]] = Registry(
+    kind="format",
+    rows={"lerobot": "demorec.datasets.lerobot.options:LEROBOT", "hdf5": "demorec.datasets.hdf5.options:HDF5"},
+)
+
+CHECKS: Registry[Check] = Registry(
+    kind="check",
+    rows=_named_alike(
+        "demorec.check",
+        ("file", "opens", "checksums", "topics", "readable", "complete"),
+        ("redundancy", "latched_messages", "metadata_agrees", "phase_events", "picture_messages"),
+        ("timing", "frame_times", "joint_sample_times", "stamps", "video_frames"),
+        ("outcome", "outcome_consistent", "end_values"),
+        ("script", "story", "deliberate_misses"),
+        ("described", "config_agrees", "drawn_within_ranges", "robot_as_known", "instruction_fits_scene"),
+        ("outcome", "final_state", "at_rest_in_the_end"),
+        ("physics", "finite_numbers", "joint_position", "joint_velocity", "action_acceleration", "joint_acceleration"),
+        ("physics", "velocity_matches_position", "forward_kinematics", "unit_quaternions", "gripper_width"),
+        ("physics", "command_tracking", "action_matches_command"),
+        ("dynamics", "effort_bears_the_arm", "wrench_bears_the_hand", "stuck_sensors"),
+        ("gripper", "joint_effort", "gripper_label", "gripper_follows", "grip_force", "touches_nothing"),
+        ("physics", "idle_frames"),
+        ("objects", "object_motion", "teleports", "starts_as_scene_says", "penetration", "carried_by_gripper"),
+        ("fingers", "finger_depth"),
+        ("physics", "wrench_holds_the_hand"),
+        ("redundancy", "moving_frames", "derived_values"),
+        ("alignment", "command_lag"),
+        ("script", "phases_match_motion"),
+        ("described", "noise_as_said"),
+        ("alignment", "action_lag", "gripper_lag"),
+        ("calibration", "intrinsics", "extrinsics", "projection", "projected_size", "depth_matches_scene"),
+        ("calibration", "segmentation_matches_scene", "picture_lag"),
+        ("pictures", "pictures_decode", "pictures_exposed", "exposure", "pictures_as_drawn", "odd_pictures", "frozen"),
+        ("pictures", "repeated_pictures", "distinct_cameras", "pixel_statistics"),
+        ("collected", "collected_opens", "collected_checksums", "collected_readable", "collected_complete"),
+        ("collected", "collected_drops", "collected_rate", "collected_gaps", "collected_sample_age"),
+        ("collected", "collected_picture_age", "collected_missing_pictures"),
+        ("collected", "collected_stuck", "collected_pictures", "collected_distinct_cameras", "collected_run_files"),
+        ("imported", "import_times", "import_numbers", "import_pictures", "import_dropped"),
+        ("run", "run_files", "run_agrees", "run_duplicates", "run_coverage", "run_dataset"),
+        ("run_dataset", "run_dataset_content"),
+        ("dataset_files", "dataset_readable", "dataset_counts", "dataset_videos"),
+        ("dataset_schema", "dataset_schema", "dataset_description"),
+        ("dataset_statistics", "dataset_statistics", "dataset_episode_statistics"),
+        ("dataset_pictures", "dataset_pictures", "dataset_picture_statistics", "dataset_pictures_as_drawn"),
+        ("dataset_pictures", "dataset_picture_lag", "dataset_frozen"),
+        ("motion", "joint_limits", "joint_speed", "state_matches_velocity", "state_follows_action"),
+        ("motion", "actions_in_order", "state_reaches_action", "elements_alive"),
+        ("dataset_motion", "dataset_duplicates", "dataset_coverage"),
+        ("dataset_motion", "dataset_forward_kinematics", "dataset_action_lag"),
+        ("dataset_files", "dataset_sidecar"),
+        ("dataset_facts", "dataset_robots", "dataset_facts", "dataset_progress"),
+        ("dataset_language", "dataset_language", "dataset_language_truth"),
+        ("dataset_files", "dataset_opens"),
+    ),
+)
+
+
+def load_robot(name: str, allowed: Collection[str] = ()) -> RobotSpec:
+    """`ROBOTS.load`, with the model of a robot of the user's own named as recordings name it.
+
+    Raises:
+        ConfigError: As `Registry.load`, or the model lies where a recording cannot name it.
+    """
+    robot = ROBOTS.load(name, allowed)
+    module, *_ = modules_of([name]) or ("",)
+    return replace(robot, urdf=model_name(robot.urdf, module)) if module else robot
+
+
+def environment_name(task: str) -> str:
+    """Gymnasium's name of a task's environment: "demorec/PickPlace-v0", or "demorec/Mine-v0" for "my_package:Mine"."""
+    name = "".join(word.capitalize() for word in task.split("_")) if task in TASKS.rows else task.rpartition(":")[2]
+    return f"demorec/{name}-v0"
+
+
+def camera_name(name: str) -> str:
+    """What a camera is called in recordings and datasets: the row's name, or "top" for "my_cameras:TOP"."""
+    return name if split_name(name) is None else name.rpartition(":")[2].lower()

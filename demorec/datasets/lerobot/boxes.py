@@ -1,0 +1,173 @@
+"""COCO annotations of a dataset's pictures, one JSON file for each camera, written as the episodes come."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO
+
+from demorec.annotate.masks import SeenObject
+from demorec.core.errors import ExportError, in_words
+from demorec.core.files import open_regular
+from demorec.core.plain import parse_json
+from demorec.datasets.lerobot.paths import SIDECAR_DIR
+from demorec.datasets.staging import sync_file
+
+BOXES_DIR = f"{SIDECAR_DIR}/boxes"
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodeBoxes:
+    """What one camera sees in one episode.
+
+    Attributes:
+        width, height: Of the pictures, px.
+        num_frames: How many there are.
+        objects: What is seen, row by row.
+    """
+
+    width: int
+    height: int
+    num_frames: int
+    objects: tuple[SeenObject, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReadBox:
+    """One line of a file of boxes: `index` of the row in the dataset, name of the body, (x, y, width, height) px."""
+
+    index: int
+    object: str
+    box: tuple[float, float, float, float]
+
+
+def read_boxes(path: Path) -> Iterator[ReadBox]:
+    """What is in a file of ours, line by line, so that it may be as large as it likes.
+
+    Raises:
+        ExportError: It is missing, or no such file.
+    """
+    try:
+        with open_regular(path) as file:
+            for raw in file:
+                line = raw.decode().strip().rstrip(",")
+                if line == "]":
+                    return
+                if line.startswith('{"id"'):
+                    item = parse_json(line)
+                    x, y, width, height = (float(number) for number in item["bbox"])
+                    yield ReadBox(index=int(item["image_id"]), object=str(item["object"]), box=(x, y, width, height))
+        raise ValueError("its end is missing")
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise ExportError(f"The boxes cannot be read ({in_words(error)}): {path}") from error
+
+
+class BoxWriter:
+    """Context manager; `finish` completes the files.
+
+    Args:
+        root: Folder of the dataset.
+        fps: Of the dataset.
+    """
+
+    def __init__(self, root: Path, *, fps: int) -> None:
+        self._root, self._fps = root, fps
+        self._cameras: dict[str, _CameraFile] = {}
+        self._num_frames = 0
+
+    def __enter__(self) -> BoxWriter:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        for camera in self._cameras.values():
+            camera.close()
+
+    def add(self, episode_index: int, boxes: Mapping[str, EpisodeBoxes], num_frames: int) -> None:
+        """What the cameras (features) see in the next episode."""
+        for key, seen in boxes.items():
+            if key not in self._cameras:
+                self._cameras[key] = _CameraFile(self._root / BOXES_DIR / f"{key}.json", key, self._fps)
+            self._cameras[key].add(episode_index, seen, self._num_frames)
+        self._num_frames += num_frames
+
+    def finish(self) -> None:
+        """Complete all files, durably."""
+        for camera in self._cameras.values():
+            camera.finish()
+
+
+class _CameraFile:
+    """One COCO file; the pictures' descriptions wait in a file beside it, since they come at the same time."""
+
+    def __init__(self, path: Path, key: str, fps: int) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._path, self._key, self._fps = path, key, fps
+        self._annotations: IO[str] = path.open("w")
+        self._images: IO[str] = path.with_suffix(".images").open("w+")
+        self._annotations.write('{"info": {"description": "boxes and masks from the simulator"},\n"annotations": [\n')
+        self._categories: dict[str, int] = {}
+        self._num_annotations = 0
+        self._num_images = 0
+
+    def add(self, episode_index: int, seen: EpisodeBoxes, first_index: int) -> None:
+        for row in range(seen.num_frames):
+            image = {
+                "id": first_index + row,
+                "width": seen.width,
+                "height": seen.height,
+                "file_name": f"{self._key}/episode_{episode_index:06d}/frame_{row:06d}.png",
+                "episode_index": episode_index,
+                "frame_index": row,
+                "timestamp": row / self._fps,
+            }
+            self._images.write((",\n" if self._num_images else "") + json.dumps(image))
+            self._num_images += 1
+        for item in seen.objects:
+            category = self._categories.setdefault(item.noun, len(self._categories) + 1)
+            self._num_annotations += 1
+            annotation = {
+                "id": self._num_annotations,
+                "image_id": first_index + item.row,
+                "category_id": category,
+                "bbox": list(item.box),
+                "area": item.area,
+                "iscrowd": 0,
+                "segmentation": {"size": [seen.height, seen.width], "counts": coco_string(item.counts)},
+                "object": item.name,
+                "color": item.color,
+                "visible_fraction": item.visible_fraction,
+            }
+            self._annotations.write((",\n" if self._num_annotations > 1 else "") + json.dumps(annotation))
+
+    def finish(self) -> None:
+        self._annotations.write('\n],\n"images": [\n')
+        self._images.seek(0)
+        shutil.copyfileobj(self._images, self._annotations)
+        categories = [{"id": number, "name": noun} for noun, number in self._categories.items()]
+        self._annotations.write(f'\n],\n"categories": {json.dumps(categories)}}}\n')
+        self.close()
+        self._path.with_suffix(".images").unlink()
+        sync_file(self._path)
+
+    def close(self) -> None:
+        self._annotations.close()
+        self._images.close()
+
+
+def coco_string(counts: Sequence[int]) -> str:
+    """Run lengths in COCO's compressed form: differences to the one before the last (from the fourth on), in 5 bits."""
+    return "".join(_characters(counts))
+
+
+def _characters(counts: Sequence[int]) -> Iterator[str]:
+    for index, count in enumerate(counts):
+        value = count - counts[index - 2] if index > 2 else count
+        while True:
+            bits, value = value & 0x1F, value >> 5
+            more = value != (-1 if bits & 0x10 else 0)
+            yield chr(48 + bits + (0x20 if more else 0))
+            if not more:
+                break

@@ -1,0 +1,344 @@
+"""The dataset card: README.md, as the Hugging Face Hub shows it.
+
+Everything in it is read back from the finished dataset, so it is right after an append too.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from demorec.core.text import markdown, printable
+from demorec.datasets.lerobot.attempts import ATTEMPT_SCHEMA
+from demorec.datasets.lerobot.commands import making_commands
+from demorec.datasets.lerobot.files import read_table
+from demorec.datasets.lerobot.language import EVENTS, PERSISTENT
+from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetInfo, Feature
+from demorec.datasets.lerobot.options import ExportOptions
+from demorec.datasets.lerobot.paths import CARD_PATH, SIDECAR_DIR
+from demorec.datasets.lerobot.reader import episode_places, read_tasks
+from demorec.datasets.lerobot.robots import ROBOTS_DIR
+from demorec.datasets.lerobot.stills import pictures_at
+from demorec.datasets.lerobot.writer import write_text
+from demorec.datasets.staging import sync_file
+from demorec.episode.features import (
+    ACTION,
+    COMMAND,
+    EE_POSE,
+    ENVIRONMENT_STATE,
+    IMAGE_PREFIX,
+    STATE,
+    VELOCITY,
+    ActionKind,
+)
+from demorec.episode.sensed import SENSED
+
+SECOND_CARD_PATH = f"{SIDECAR_DIR}/README.md"
+"""Where the card goes if the dataset has a README.md that demorec did not write."""
+
+
+_MARK = "<!-- written by demorec, which renews it at every export unless it was edited ({digest}) -->\n"
+"""The last line of a card: with it a card that was edited is known from one that was not."""
+_CELLS = 4
+_MEANING = {
+    STATE: "joint positions (rad), gripper opening (m)",
+    VELOCITY: "joint velocities (rad/s), speed of the gripper's opening (m/s)",
+    EE_POSE: "tool centre point in the base frame: position (m), quaternion xyzw with x >= 0",
+    ENVIRONMENT_STATE: "privileged: TCP, objects and goals, symmetric and relative quantities first, raw poses last "
+    "(m, rad; base frame)",
+    COMMAND: "what the motors were sent: joint targets (rad), gripper opening (m)",
+    "next.reward": "1 at the last frame of a success, else 0",
+    "next.done": "true at the last frame",
+    "next.success": "true at the last frame of a success",
+    "intervention": "true where the expert acts in an episode that a policy began; its other frames are the policy's",
+    "timestamp": "seconds since the episode's start",
+    PERSISTENT: "what is said of the episode, each entry from its `timestamp` on until the next one of its style; all "
+    "of it in every row",
+    EVENTS: "what is said at this row alone: questions about its pictures with their answers, and the like",
+}
+_ACTION_MEANING: Mapping[ActionKind, str] = {
+    "joint": "absolute joint targets (rad), gripper opening (m)",
+    "joint_increment": "joint target minus that of the frame before (rad), the first minus the initial positions, plus "
+    "the way back from exploration noise (demorec.episode.features); gripper opening (m), absolute",
+    "ee": "absolute pose of the tool centre point in the base frame: position (m), quaternion xyzw with x >= 0; "
+    "gripper opening (m)",
+    "ee_delta": "change of the tool centre point's pose since the frame before, the first since the observed one: "
+    "translation (m) and rotation vector (rad) in base axes, applied from the left; gripper opening (m), absolute",
+}
+_EXTERNAL_ROWS = (
+    "Row t holds what was recorded at frame t, as it came. LeRobot's timestamps are multiples of the nominal "
+    "period; the frames' own stamps, and how old each sample was, are in the recordings."
+)
+_SIMULATED_ROWS = (
+    "Row t holds the observation at time t, taken before the action of row t is applied; the action is what the "
+    "expert wanted to be reached at the next frame. Where exploration noise was added to what the motors got, the "
+    "action is derived from the clean target. Frame times are multiples of the simulation's frame period, not of a "
+    "wall clock."
+)
+_BESIDE_EXTERNAL = (
+    f"`{SIDECAR_DIR}/episodes/` says where each episode comes from, how it ended and what its cameras were."
+)
+_BESIDE_SIMULATED = (
+    f"`{SIDECAR_DIR}/` holds what LeRobot has no column for: `episodes/` (seed, outcome with every check, phases, "
+    "camera intrinsics and extrinsics, poses, the complete scene of every episode), `camera_poses/` (of moving "
+    "cameras, per frame, world_from_camera, OpenCV axes), `attempts/` (failed ones too), `configs.json`."
+)
+THUMBNAILS_PATH = f"{SIDECAR_DIR}/thumbnails.jpg"
+_EPISODES, _MOMENTS, _SIDE, _LABEL, _GAP = 4, 5, 160, 18, 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class CardFacts:
+    """What the card tells that is not in the dataset's tables.
+
+    Attributes:
+        options: Of the export.
+        configs: Config digest -> configuration of the runs.
+        is_transcoded: Whether any pictures were coded anew.
+        is_simulated: Whether demorec simulated the episodes.
+    """
+
+    options: ExportOptions
+    configs: Mapping[str, Any]
+    is_transcoded: bool
+    is_simulated: bool
+
+
+def write_card(root: Path, info: DatasetInfo, about: CardFacts) -> None:
+    """Write the card and the thumbnails of a finished dataset folder."""
+    has_sheet = write_thumbnails(root, info)
+    there = root / CARD_PATH
+    path = root / SECOND_CARD_PATH if has_own_card(root) else there
+    path.unlink(missing_ok=True)
+    write_text(path, _marked("\n".join(_card(root, info, about, has_sheet)) + "\n"))
+
+
+def has_own_card(root: Path) -> bool:
+    """Whether a dataset's card is the user's own: one that `write_card` did not write, or that was edited since."""
+    path = root / CARD_PATH
+    if not os.path.lexists(path):
+        return False
+    if not path.is_file():
+        return True
+    text = path.read_bytes().decode(errors="replace")
+    return text != _marked(text.rpartition("<!--")[0])
+
+
+def _marked(text: str) -> str:
+    return text + _MARK.format(digest=hashlib.sha256(text.encode()).hexdigest()[:16])
+
+
+def _card(root: Path, info: DatasetInfo, about: CardFacts, has_sheet: bool) -> Iterable[str]:
+    options = about.options
+    tasks = read_tasks(root)
+    minutes = info.total_frames / info.fps / 60
+    pictures = (
+        "some pictures were coded anew" if about.is_transcoded else "every video packet is the one that was recorded"
+    )
+    yield from ("---", f"license: {options.license}", "task_categories:", "- robotics")
+    yield from ("tags:", "- LeRobot", "- demorec", *(["- simulation"] if about.is_simulated else []))
+    yield from ("configs:", "- config_name: default", "  data_files: data/*/*.parquet", "---", "")
+    yield from (f"# {options.repo_id}", "")
+    robot = markdown(str(info.robot_type))
+    plural = "" if info.total_episodes == 1 else "s"
+    whose = (
+        f"scripted demonstration{plural} by a simulated {robot} arm in PyBullet"
+        if about.is_simulated
+        else f"demonstration{plural} of {robot}"
+    )
+    yield (
+        f"{info.total_episodes} {whose}, "
+        f"{info.total_frames} frames at {info.fps} Hz ({minutes:.1f} minutes), in the LeRobot v3.0 format. Recorded "
+        f"and exported by demorec; {pictures}."
+    )
+    yield from ("", "## Task", "", *(f"- {markdown(task)}" for task in tasks[:20]))
+    if len(tasks) > 20:
+        yield f"- and {len(tasks) - 20} more"
+    if has_sheet:
+        yield from ("", f"![First to last picture of some episodes]({THUMBNAILS_PATH})")
+    yield from ("", "## Use", "", "```python", "from lerobot.datasets import LeRobotDataset", "")
+    yield '# or with root="path/of/this/folder"; LeRobot\'s default backend, torchcodec, needs FFmpeg installed'
+    yield from (f'dataset = LeRobotDataset("{options.repo_id}", video_backend="pyav")', "```", "")
+    yield from ("## Features", "", "| feature | type | shape | meaning |", "|---|---|---|---|")
+    for key, item in info.features.items():
+        name = f"`{key}`" if markdown(key) == key else markdown(key)
+        yield f"| {name} | {markdown(item.dtype)} | {list(item.shape)} | {_meaning(key, item, about)} |"
+    yield from ("", "Names of all components are in `meta/info.json`.", "", "## Contract", "")
+    yield from (_SIMULATED_ROWS if about.is_simulated else _EXTERNAL_ROWS, "")
+    yield from _success_section(_read_attempts(root))
+    yield from ("## What stands beside", "", _BESIDE_SIMULATED if about.is_simulated else _BESIDE_EXTERNAL)
+    yield from _robot_section(root)
+    yield ""
+    if about.is_simulated:
+        yield from _origin_section(root, about)
+
+
+def _robot_section(root: Path) -> Iterable[str]:
+    """What draws the arm, of a dataset that holds it."""
+    urdfs = sorted((root / ROBOTS_DIR).glob("*.urdf"))
+    if urdfs:
+        names = ", ".join(f"`{path.relative_to(root).as_posix()}`" for path in urdfs)
+        yield ""
+        yield (
+            f"The robot as a URDF: {names}. The JSON file beside it says which element of which feature moves which of "
+            "its joints (`joints`), and, of a simulated robot, its TCP link, limits and gripper (`spec`)."
+        )
+
+
+def _meaning(key: str, item: Feature, about: CardFacts) -> str:
+    if (
+        not about.is_simulated
+        and not key.startswith(IMAGE_PREFIX)
+        and key not in AUTOMATIC_FEATURES
+        and key != "next.done"
+    ):
+        return "as it was recorded"
+    if key == ACTION:
+        return _ACTION_MEANING[about.options.action]
+    if key == STATE and about.options.state == "joint_ee":
+        return f"{_MEANING[STATE]}, {_MEANING[EE_POSE]}"
+    if item.is_depth:
+        return "distance along the optical axis, 12-bit logarithmic codes of 0.01 to 10 m; 0.01 m: nothing was hit"
+    if key.startswith(IMAGE_PREFIX):
+        return f"camera {markdown(key.removeprefix(IMAGE_PREFIX))}, RGB"
+    if key in SENSED:
+        return SENSED[key].meaning
+    return _MEANING.get(key, "filled in by LeRobot's rules")
+
+
+def _origin_section(root: Path, about: CardFacts) -> Iterable[str]:
+    yield "## Origin"
+    yield ""
+    for digest, config in about.configs.items():
+        chosen = ", ".join(f"{key} {config[key]}" for key in ("task", "robot", "renderer", "seed") if key in config)
+        yield f"- configuration `{markdown(digest) or 'unknown'}`: {markdown(chosen) or 'not recorded'}"
+    yield ""
+    commands = making_commands(root, about.configs, about.options)
+    if commands:
+        yield from ("Made by these commands:", "", "```sh", *map(printable, commands), "```", "")
+        yield "This makes it again, from what this folder says about itself, and compares every episode to the bit:"
+        yield from ("", "```sh", "demorec reproduce path/of/this/folder --out copy", "```", "")
+
+
+# ------------------------------------------------------------------------------------------------------ success rates
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Attempts:
+    success: NDArray[np.bool_]  # (N,)
+    reasons: list[str]
+    num_unknown: int
+    positions: Mapping[str, NDArray[np.float64]]  # what -> (N, 2), nan where unknown
+
+
+def _read_attempts(root: Path) -> _Attempts:
+    columns = ["success", "failure_phase", "failure_reason", "object_x", "object_y", "goal_x", "goal_y"]
+    files = sorted((root / SIDECAR_DIR / "attempts").glob("*/*.parquet"))
+    table = pa.concat_tables([read_table(file, columns, schema=ATTEMPT_SCHEMA) for file in files])
+    is_known = pc.is_valid(table.column("success"))
+    num_unknown = len(table) - int(pc.sum(is_known).as_py() or 0)
+    table = table.filter(is_known)
+    coordinates = {name: table.column(name).to_numpy().astype(np.float64) for name in columns[3:]}
+    reasons = [
+        f"{reason} in phase {phase}" if phase else reason
+        for phase, reason in zip(
+            table.column("failure_phase").to_pylist(), table.column("failure_reason").to_pylist(), strict=True
+        )
+    ]
+    return _Attempts(
+        success=table.column("success").to_numpy().astype(np.bool_),
+        reasons=reasons,
+        num_unknown=num_unknown,
+        positions={
+            "object": np.stack([coordinates["object_x"], coordinates["object_y"]], axis=1),
+            "goal": np.stack([coordinates["goal_x"], coordinates["goal_y"]], axis=1),
+        },
+    )
+
+
+def _success_section(attempts: _Attempts) -> Iterable[str]:
+    total, good = len(attempts.success), int(attempts.success.sum())
+    yield "## Success"
+    yield ""
+    if attempts.num_unknown:
+        yield f"Of {attempts.num_unknown} episodes nobody said whether they succeeded."
+        yield ""
+    if not total:
+        return
+    yield f"{good} of {total} attempts that were made for this dataset succeeded ({100 * good / total:.1f} %)."
+    counts: dict[str, int] = {}
+    for reason, success in zip(attempts.reasons, attempts.success, strict=True):
+        if not success:
+            counts[reason] = counts.get(reason, 0) + 1
+    for reason, count in sorted(counts.items(), key=lambda item: (-item[1], item[0])):
+        yield f"- {count} failed: {markdown(reason) or 'no reason recorded'}"
+    yield ""
+    for what, positions in attempts.positions.items():
+        if total >= 2 and np.isfinite(positions).all():
+            yield f"By the start position of the {what} (successes / attempts, world frame):"
+            yield ""
+            yield from success_table(positions, attempts.success)
+            yield ""
+
+
+def success_table(positions: NDArray[np.float64], success: NDArray[np.bool_]) -> Iterable[str]:
+    """Markdown table of successes / attempts over a grid of positions (N, 2), x downwards and y to the right."""
+    low, high = positions.min(axis=0), positions.max(axis=0)
+    cells = np.where(high - low > 1e-6, _CELLS, 1)
+    width = np.where(high > low, high - low, 1.0)
+    index = np.clip(((positions - low) / width * cells).astype(np.int64), 0, cells - 1)
+
+    def span(axis: int, cell: int) -> str:
+        step = (high[axis] - low[axis]) / cells[axis]
+        return f"{low[axis] + cell * step:.3f} to {low[axis] + (cell + 1) * step:.3f} m"
+
+    yield "| x \\ y | " + " | ".join(span(1, column) for column in range(cells[1])) + " |"
+    yield "|---" * (cells[1] + 1) + "|"
+    for row in range(cells[0]):
+        texts = []
+        for column in range(cells[1]):
+            here = (index[:, 0] == row) & (index[:, 1] == column)
+            texts.append(f"{int(success[here].sum())} / {int(here.sum())}" if here.any() else "")
+        yield f"| {span(0, row)} | " + " | ".join(texts) + " |"
+
+
+def write_thumbnails(root: Path, info: DatasetInfo) -> bool:
+    """A labelled row per episode, from its first to its last picture; False for a dataset without cameras."""
+    key = next((name for name, item in info.features.items() if item.is_video and not item.is_depth), None)
+    if key is None:
+        return False
+    wanted = set(np.linspace(0, info.total_episodes - 1, _EPISODES).round().astype(int).tolist())
+    places = [place for place in episode_places(root, info) if place.episode_index in wanted]
+    height, width, _ = info.features[key].shape
+    scale = _SIDE / max(height, width)
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    sheet = Image.new("RGB", ((size[0] + _GAP) * _MOMENTS - _GAP, (size[1] + _LABEL) * len(places)), "white")
+    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(size=12)
+    for row, place in enumerate(places):
+        top = row * (size[1] + _LABEL)
+        label = f"episode {place.episode_index}, camera {key.removeprefix(IMAGE_PREFIX)}: {', '.join(place.tasks)}"
+        draw.text((4, top + 1), printable(label), fill="black", font=font)
+        moments = np.linspace(0, place.length - 1, _MOMENTS).round().astype(int).tolist()
+        for column, picture in enumerate(pictures_at(root, info, key, place, moments)):
+            corner = column * (size[0] + _GAP), top + _LABEL
+            sheet.paste(Image.fromarray(picture).resize(size, reducing_gap=1.0), corner)
+            time = f"{moments[column] / info.fps:.1f} s"
+            left, above, right, below = draw.textbbox((corner[0] + 4, corner[1] + 1), time, font=font)
+            draw.rectangle((left - 3, above - 2, right + 2, below + 2), fill="black")
+            draw.text((corner[0] + 4, corner[1] + 1), time, fill="white", font=font)
+    path = root / THUMBNAILS_PATH
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.unlink(missing_ok=True)
+    sheet.save(path, quality=85)
+    sync_file(path)
+    return True

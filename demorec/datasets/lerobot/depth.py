@@ -1,0 +1,155 @@
+"""Depth pictures as LeRobot 0.6 keeps them: 12-bit logarithmic codes in lossless HEVC.
+
+The code of a distance z (metres) is rint(4095 (ln(z + s) - ln(a + s)) / (ln(b + s) - ln(a + s))) with a = 0.01 m,
+b = 10 m and s = 3.5 m: steps of 0.8 mm near the camera, 3 mm at the far end. Where nothing was hit the code is 0,
+which reads as 0.01 m, closer than any camera sees.
+"""
+
+from __future__ import annotations
+
+import math
+import reprlib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from typing import Any, cast
+
+import av
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.core.errors import ExportError, in_words
+from demorec.core.geometry import Array
+from demorec.datasets.lerobot.mp4 import CodedVideo
+from demorec.datasets.lerobot.stats import PixelHistogram
+
+_NEAREST, _FARTHEST, _SHIFT = 0.01, 10.0, 3.5
+_LARGEST_CODE = 4095
+_GOP, _CRF = 2, 30
+_PARAMETERS = "lossless=1"
+
+
+def quantised(depth: NDArray[np.float32]) -> NDArray[np.uint16]:
+    """(H, W) codes of distances in metres; in float32 arithmetic, to the code as LeRobot's `quantize_depth`.
+
+    What is not finite, or behind the camera, was not measured, and has code 0.
+    """
+    shift = np.float32(_SHIFT)
+    low = math.log(float(np.float32(_NEAREST) + shift))
+    high = math.log(float(np.float32(_FARTHEST) + shift))
+    metres = np.maximum(np.nan_to_num(depth, nan=0.0, posinf=0.0, neginf=0.0), np.float32(0))
+    scaled = (np.log(metres + shift) - low) / (high - low)
+    return np.asarray(np.rint(scaled * _LARGEST_CODE).clip(0, _LARGEST_CODE), dtype=np.uint16)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DepthScale:
+    """What codes stand for, by the metadata of a depth feature: metres, and whether steps grow with the distance."""
+
+    nearest: float = _NEAREST
+    farthest: float = _FARTHEST
+    shift: float = _SHIFT
+    use_log: bool = True
+
+    @classmethod
+    def of(cls, info: Mapping[str, Any]) -> DepthScale:
+        """From the `info` of a feature, whoever wrote it; ValueError for what is no scale."""
+        numbers = [info.get(f"video.{name}") for name in ("depth_min", "depth_max", "shift")]
+        use_log = info.get("video.use_log")
+        if not isinstance(use_log, bool) or not all(_is_number(number) for number in numbers):
+            raise ValueError(f"its scale of depth is {reprlib.repr([*numbers, use_log])}")
+        nearest, farthest, shift = (float(number) for number in numbers if number is not None)
+        if not nearest < farthest or (use_log and not nearest + shift > 0):
+            raise ValueError(f"its depth is from {nearest} to {farthest} m, shifted by {shift}")
+        return cls(nearest=nearest, farthest=farthest, shift=shift, use_log=use_log)
+
+    def values(self) -> Array:
+        """(4096,) distance in metres that each code stands for."""
+        codes = np.arange(_LARGEST_CODE + 1)
+        if not self.use_log:
+            return np.asarray(self.nearest + codes * ((self.farthest - self.nearest) / _LARGEST_CODE))
+        low, high = math.log(self.nearest + self.shift), math.log(self.farthest + self.shift)
+        return np.asarray(np.exp(low + codes * ((high - low) / _LARGEST_CODE)) - self.shift)
+
+    def shown(self) -> NDArray[np.float32]:
+        """(4096,) the same for people's eyes: 0, nothing measured, for the lowest code."""
+        return np.concatenate([[0], self.values()[1:]]).astype(np.float32)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e6
+
+
+def code_values() -> Array:
+    """(4096,) distance in metres that each code of ours stands for."""
+    return DepthScale().values()
+
+
+def depth_video(pictures: Iterable[NDArray[np.float32]], *, fps: int) -> tuple[CodedVideo, PixelHistogram]:
+    """Code depth pictures (H, W) in metres; also count their codes for the statistics."""
+    context: av.VideoCodecContext | None = None
+    packets: list[av.Packet] = []
+    counts = np.zeros(_LARGEST_CODE + 1, dtype=np.int64)
+    number = 0
+    height = width = 0
+    for number, picture in enumerate(pictures, start=1):
+        codes = quantised(picture)
+        height, width = codes.shape
+        counts += np.bincount(codes.ravel(), minlength=_LARGEST_CODE + 1)
+        if context is None:
+            context = _encoder(width, height, fps)
+        frame = av.VideoFrame.from_ndarray(codes, format="gray12le")
+        frame.pts, frame.time_base = number - 1, context.time_base
+        packets += context.encode(frame)
+    if context is None:
+        raise ExportError("There are no depth pictures to code.")
+    packets += context.encode(None)
+    data = [bytes(packet) for packet in packets]
+    video = CodedVideo.of_access_units("hevc", width, height, b"".join(data), [len(unit) for unit in data])
+    video = replace(video, is_keyframe=np.array([packet.is_keyframe for packet in packets], dtype=np.bool_))
+    histogram = PixelHistogram(counts=counts[np.newaxis], level_values=code_values(), num_pictures=number)
+    return video, histogram
+
+
+def _encoder(width: int, height: int, fps: int) -> av.VideoCodecContext:
+    try:
+        context = cast(av.VideoCodecContext, av.CodecContext.create("libx265", "w"))
+        context.width, context.height, context.pix_fmt = width, height, "gray12le"
+        context.time_base, context.framerate = Fraction(1, fps), Fraction(fps, 1)
+        # No reordering and nothing said on the terminal; keyframes that stand alone.
+        context.options = {
+            "g": str(_GOP),
+            "crf": str(_CRF),
+            "x265-params": f"{_PARAMETERS}:bframes=0:repeat-headers=1:open-gop=0:log-level=none",
+        }
+        context.open()
+    except (av.FFmpegError, ValueError) as error:
+        raise ExportError(
+            f"Depth video cannot be coded, this build of PyAV has no 12-bit HEVC ({in_words(error)})."
+        ) from error
+    return context
+
+
+def depth_info(*, width: int, height: int, fps: int) -> dict[str, Any]:
+    """The `info` of a depth feature, from which LeRobot turns codes back into distances."""
+    return {
+        "video.height": height,
+        "video.width": width,
+        "video.codec": "hevc",
+        "video.pix_fmt": "gray12le",
+        "video.fps": fps,
+        "video.channels": 1,
+        "has_audio": False,
+        "video.g": _GOP,
+        "video.crf": _CRF,
+        "video.preset": None,
+        "video.fast_decode": 0,
+        "video.video_backend": "pyav",
+        "video.extra_options": {"x265-params": _PARAMETERS},
+        "video.depth_min": _NEAREST,
+        "video.depth_max": _FARTHEST,
+        "video.shift": _SHIFT,
+        "video.use_log": True,
+        "is_depth_map": True,
+        "depth_unit": "m",
+    }

@@ -1,0 +1,197 @@
+"""Going on in a dataset that is there already, whoever wrote it: what must fit, and where to continue.
+
+Files that are there are never opened for writing; new episodes get new files, as with LeRobot's own `resume`.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from demorec.core.errors import ConfigError, ExportError, in_words
+from demorec.datasets.lerobot.facts import facts_of
+from demorec.datasets.lerobot.files import open_table, read_json, read_table
+from demorec.datasets.lerobot.layout import (
+    AUTOMATIC_FEATURES,
+    STATS_PATH,
+    TASKS_PATH,
+    DatasetInfo,
+    Feature,
+    FilePosition,
+)
+from demorec.datasets.lerobot.paths import INFO_PATH, SIDECAR_DIR
+from demorec.datasets.lerobot.progress import PROGRESS_PATH, PROPORTIONS_PATH
+from demorec.datasets.lerobot.reader import read_tasks
+from demorec.datasets.lerobot.sidecar import CONFIGS_PATH, SidecarStart
+from demorec.datasets.lerobot.stats import Statistics
+from demorec.datasets.lerobot.writer import WriterStart
+
+_CODING = (
+    "video.codec",
+    "video.pix_fmt",
+    "is_depth_map",
+    "depth_unit",
+    "video.depth_min",
+    "video.depth_max",
+    "video.shift",
+    "video.use_log",
+)
+"""What a reader of the dataset takes as true of all its videos."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Existing:
+    """A dataset to be continued.
+
+    Attributes:
+        root: Its folder.
+        info: What meta/info.json says.
+        writer, sidecar: Where to go on.
+        facts: Which columns of facts its table of episodes has.
+    """
+
+    root: Path
+    info: DatasetInfo
+    writer: WriterStart
+    sidecar: SidecarStart
+    facts: tuple[str, ...] = ()
+
+
+def open_existing(root: Path) -> Existing:
+    """Read what a writer needs to go on.
+
+    Raises:
+        ExportError: No LeRobot dataset of this format, or one that is not whole.
+    """
+    info = DatasetInfo.load(root)
+    tables = sorted((root / "meta" / "episodes").glob("*/*.parquet"))
+    episodes = frames = 0
+    try:
+        for path in tables:
+            table = read_table(path, ["length"])
+            episodes += table.num_rows
+            frames += sum(table.column("length").to_pylist())
+        rows = sum(open_table(path).metadata.num_rows for path in (root / "data").glob("*/*.parquet"))
+        tasks = tuple(read_tasks(root)) if info.total_tasks else ()
+        found = read_json(root / STATS_PATH) if (root / STATS_PATH).exists() else {}
+        facts = facts_of(root)
+        configs = read_json(root / CONFIGS_PATH) if (root / CONFIGS_PATH).exists() else {}
+        statistics = {key: part for key in info.video_keys if (part := _statistics(found, key, info)) is not None}
+        if not isinstance(configs, dict) or not all(isinstance(config, dict) for config in configs.values()):
+            raise ValueError(f"{CONFIGS_PATH} holds no configurations")
+    except (OSError, ValueError, TypeError, AttributeError) as error:
+        raise ExportError(f"The dataset cannot be read ({in_words(error)}): {root}") from error
+    if (episodes, frames, rows) != (info.total_episodes, info.total_frames, info.total_frames):
+        raise ExportError(
+            f"The dataset is not whole: {INFO_PATH} counts {info.total_episodes} episodes of {info.total_frames} "
+            f"frames, its tables have {episodes} of {frames} and {rows} data rows: {root}"
+        )
+    writer = WriterStart(
+        num_episodes=episodes,
+        num_frames=frames,
+        tasks=tasks,
+        data=_after(root / "data", ".parquet", info.chunks_size),
+        episodes=_after(root / "meta" / "episodes", ".parquet", info.chunks_size),
+        videos={key: _after(root / "videos" / key, ".mp4", info.chunks_size) for key in info.video_keys},
+        statistics=statistics,
+    )
+    side = root / SIDECAR_DIR
+    sidecar = SidecarStart(
+        episodes=_after(side / "episodes", ".parquet", info.chunks_size),
+        attempts=_after(side / "attempts", ".parquet", info.chunks_size),
+        camera_poses=_after(side / "camera_poses", ".parquet", info.chunks_size),
+        configs=configs,
+    )
+    return Existing(root=root, info=info, writer=writer, sidecar=sidecar, facts=facts)
+
+
+def _statistics(found: dict[str, Any], key: str, info: DatasetInfo) -> Statistics | None:
+    """Of a camera, as stats.json has them; ValueError and the like when it has something else."""
+    part = Statistics.from_json(found.get(key, {}))
+    if part is None:
+        return None
+    if any(value.shape != info.features[key].shape[-1:] for value in part.values.values()) or part.count < 0:
+        raise ValueError(f"the statistics of {key} are none of its pictures")
+    # LeRobot's streaming writer counts pixels; as a weight beside ours a frame must count as one.
+    return Statistics(values=part.values, count=min(part.count, info.total_frames), is_camera=True)
+
+
+def _after(folder: Path, suffix: str, chunks_size: int) -> FilePosition:
+    """The first number that no file of a folder (chunk-CCC/file-FFF) has, counting from the last one."""
+    last: FilePosition | None = None
+    for path in folder.glob(f"chunk-*/file-*{suffix}"):
+        chunk, file = path.parent.name.removeprefix("chunk-"), path.stem.removeprefix("file-")
+        if chunk.isdigit() and file.isdigit():
+            position = FilePosition(chunk=int(chunk), file=int(file))
+            if last is None or (position.chunk, position.file) > (last.chunk, last.file):
+                last = position
+    return FilePosition() if last is None else last.next(chunks_size)
+
+
+def features_to_append(existing: Existing, offered: dict[str, Feature], *, fps: int, robot: str) -> tuple[str, ...]:
+    """Check that the recordings can give every feature of the dataset; return those that it does not have.
+
+    Raises:
+        ConfigError: All differences in one message.
+    """
+    info = existing.info
+    wrong = []
+    if info.fps != fps:
+        wrong.append(f"fps is {info.fps}, the recordings give {fps}")
+    if info.robot_type not in (None, robot):
+        wrong.append(f"robot_type is {info.robot_type!r}, the recordings have {robot!r}")
+    for name, feature in info.features.items():
+        if name in AUTOMATIC_FEATURES:
+            continue
+        if name not in offered:
+            wrong.append(f"it has {name!r}, which the recordings and these options do not give")
+        else:
+            wrong += [f"{name}: {difference}" for difference in _feature_differences(feature, offered[name])]
+    if wrong:
+        raise ConfigError(
+            f"These recordings cannot be appended, since the dataset differs: {'; '.join(wrong)}. "
+            f"Export into a new folder, or with other options: {existing.root}"
+        )
+    return tuple(name for name in offered if name not in info.features)
+
+
+def _feature_differences(there: Feature, ours: Feature) -> Iterable[str]:
+    for what in ("dtype", "shape"):
+        if getattr(there, what) != getattr(ours, what):
+            yield f"{what} is {getattr(there, what)}, not {getattr(ours, what)}"
+    if not there.is_video and there.names is not None and there.names != ours.names:
+        yield f"components are {', '.join(there.names)}, not {', '.join(ours.names or ())}"
+    if there.is_video and ours.is_video:
+        mine, theirs = ours.info or {}, there.info or {}
+        for key in _CODING:
+            if key in theirs and theirs[key] != mine.get(key):
+                yield f"{key} is {theirs[key]}, not {mine.get(key)}"
+
+
+def link_files(source: Path, target: Path) -> None:
+    """Let the finished tables and videos of a dataset appear in another folder, without copying where possible.
+
+    Only files that are never changed in place are linked; what the writer will write anew is left out.
+    """
+    renewed = {INFO_PATH, STATS_PATH, TASKS_PATH, PROGRESS_PATH}
+    renewed |= {PROPORTIONS_PATH.format(head=head) for head in ("sparse", "dense")}
+    for folder, _, names in os.walk(source):
+        for name in names:
+            path = Path(folder) / name
+            relative = path.relative_to(source)
+            is_table_or_video = path.suffix in (".parquet", ".mp4")
+            if relative.as_posix() in renewed:
+                continue
+            copy = target / relative
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            if is_table_or_video and not path.is_symlink():
+                try:
+                    os.link(path, copy)
+                    continue
+                except OSError:
+                    pass  # another file system, or one without links
+            shutil.copy2(path, copy)

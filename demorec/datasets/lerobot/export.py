@@ -1,0 +1,288 @@
+"""Recordings to a LeRobot v3.0 dataset: `export_lerobot`, from the first recording to the finished folder."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import nullcontext
+from dataclasses import replace
+from importlib.metadata import version
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from demorec.core.errors import ConfigError, ExportError, MissingDependencyError, in_words
+from demorec.core.replacing import shown
+from demorec.datasets.lerobot.boxes import BoxWriter
+from demorec.datasets.lerobot.card import CardFacts, has_own_card, write_card
+from demorec.datasets.lerobot.digest import combined_digest
+from demorec.datasets.lerobot.existing import Existing, features_to_append, link_files, open_existing
+from demorec.datasets.lerobot.inspect import episode_digests
+from demorec.datasets.lerobot.kind import DATASET, GROWING_DATASET
+from demorec.datasets.lerobot.layout import CODEBASE_VERSION, DatasetInfo
+from demorec.datasets.lerobot.options import ExportOptions
+from demorec.datasets.lerobot.paths import CARD_PATH
+from demorec.datasets.lerobot.progress import STAGE_COLUMNS, EpisodeProgress, read_progress, write_progress
+from demorec.datasets.lerobot.readings import Reading, readings
+from demorec.datasets.lerobot.sidecar import SidecarStart, SidecarWriter
+from demorec.datasets.lerobot.verify import LEROBOT, MAX_EPISODES, VerifiedEpisode, Verifier, lerobot_is_installed
+from demorec.datasets.lerobot.writer import DatasetWriter, WriterStart
+from demorec.datasets.options import ExportReport, ProgressCallback
+from demorec.datasets.sources import ExportSource, Intake, find_recordings, places_of
+from demorec.datasets.staging import CODED, staged_folder
+
+
+def export_lerobot(
+    sources: Sequence[Path], out: Path, options: ExportOptions, progress: ProgressCallback | None = None
+) -> ExportReport:
+    """Write the recordings into the dataset folder `out`: whole, or not at all.
+
+    Args:
+        sources: Recordings, runs, or folders of recordings.
+        out: Folder of the dataset.
+        options: How.
+        progress: Called after every recording.
+
+    Raises:
+        ConfigError: Options that contradict each other or ask for what was not recorded, nothing to export, recordings
+            that differ, something in the way at `out`, or episodes to be appended that the dataset has already.
+        ExportError: A full disk, a failed verification. What was at `out` is still there
+            then.
+        RecordingError: A recording is damaged.
+    """
+    options.validate()
+    found = find_recordings(sources, include_failures=options.include_failures)
+    existing = open_existing(out) if options.append and out.exists() else None
+    verifies = options.verify and lerobot_is_installed()
+    kind, replace_it = (DATASET, options.overwrite) if existing is None else (GROWING_DATASET, True)
+    with (
+        staged_folder(out, kind, replace=replace_it, sources=places_of(found)) as folder,
+        Verifier() if verifies else nullcontext() as verifier,
+    ):
+        if existing is not None:
+            link_files(existing.root, folder)
+        elif options.overwrite and has_own_card(out) and (out / CARD_PATH).is_file():
+            shutil.copy2(out / CARD_PATH, folder / CARD_PATH)  # what somebody wrote outlives the dataset it was about
+        export = _Export(folder, found, options, existing)
+        report = export.run(progress)
+        if verifier is not None:
+            report = replace(report, verified_frames=verifier.verify(folder, export.samples(), options))
+    why = f"LeRobot, which would verify the dataset, is not installed: pip install '{LEROBOT}'."
+    report = replace(report, path=out, not_verified=why if options.verify and not verifies else "")
+    if options.push_to_hub:
+        report = replace(report, url=push_to_hub(out, options.repo_id, private=not options.public))
+    return report
+
+
+class _Export:
+    """One export into an empty (or linked) folder."""
+
+    def __init__(
+        self, folder: Path, found: list[ExportSource], options: ExportOptions, existing: Existing | None
+    ) -> None:
+        self._folder = folder
+        self._found = found
+        self._options = options
+        self._existing = existing
+        self._before = episode_digests(existing.root, existing.info) if existing is not None else []
+        self._left_out: tuple[str, ...] = ()
+        self._transcoded: dict[str, None] = {}
+        self._progress: list[EpisodeProgress] = []
+        self._digests: list[str] = []
+        self._recordings: list[Path] = []
+        self._intake = Intake(found, options)
+        self._is_simulated = True
+
+    def run(self, progress: ProgressCallback | None) -> ExportReport:
+        aside = self._folder.with_name(CODED)  # is removed with everything beside the new folder
+        aside.mkdir(exist_ok=True)
+        found = self._noted(readings(self._found, self._options, progress, aside=aside))
+        begun: list[Reading] = []  # up to the first episode, which decides what features there are
+        for reading in found:
+            begun.append(reading)
+            if reading.prepared is not None:
+                break
+        self._intake.check()
+        info = self._dataset_info(begun[-1])
+        self._is_simulated = begun[-1].is_simulated
+        start = self._existing.writer if self._existing else WriterStart()
+        sidecar_start = self._existing.sidecar if self._existing else SidecarStart()
+        limits: dict[str, Any] = {"limit_mb": info.data_files_size_in_mb, "chunks_size": info.chunks_size}
+        with (
+            DatasetWriter(self._folder, info, start, self._facts(begun[-1])) as writer,
+            SidecarWriter(self._folder, sidecar_start, **limits) as sidecar,
+            BoxWriter(self._folder, fps=info.fps) as boxes,
+        ):
+            for reading in chain(begun, found):
+                self._add(writer, sidecar, reading)
+                if reading.prepared is not None and self._options.boxes:
+                    data = reading.prepared.data
+                    boxes.add(writer.num_episodes - 1, reading.prepared.boxes, data.num_frames)
+            self._refuse_duplicates()
+            self._refuse_silence()
+            finished = writer.finish()
+            boxes.finish()
+            configs = sidecar.finish(self._about_this_export())
+        if self._options.progress:
+            write_progress(self._folder, [*self._progress_before(), *self._progress])
+        facts = CardFacts(
+            options=self._options,
+            configs=configs,
+            is_transcoded=bool(self._transcoded),
+            is_simulated=self._is_simulated,
+        )
+        write_card(self._folder, finished, facts)
+        return ExportReport(
+            path=self._folder,
+            num_episodes=finished.total_episodes,
+            num_frames=finished.total_frames,
+            new_episodes=finished.total_episodes - start.num_episodes,
+            new_frames=finished.total_frames - start.num_frames,
+            skipped_failures=self._intake.skipped_failures,
+            skipped_unknown=self._intake.skipped_unknown,
+            skipped_unwanted=self._intake.skipped_unwanted,
+            transcoded=tuple(self._transcoded),
+            left_out=self._left_out,
+            depth_left_out=self._intake.depth_left_out,
+            silent=() if self._options.language is None else tuple(self._intake.silent),
+            digest=combined_digest(finished, [*self._before, *self._digests]),
+        )
+
+    def samples(self) -> list[VerifiedEpisode]:
+        """What shall be verified: the new episodes, or some of them, spread evenly, if there are very many."""
+        first = self._existing.writer.num_episodes if self._existing else 0
+        count = len(self._recordings)
+        chosen = np.unique(np.linspace(0, count - 1, min(count, MAX_EPISODES)).round().astype(int)).tolist()
+        return [VerifiedEpisode(episode_index=first + index, recording=self._recordings[index]) for index in chosen]
+
+    def _dataset_info(self, first: Reading) -> DatasetInfo:
+        if self._existing is not None:
+            self._left_out = features_to_append(self._existing, first.features, fps=first.fps, robot=first.robot)
+            return self._existing.info
+        return DatasetInfo(
+            fps=first.fps,
+            features=first.features,
+            robot_type=first.robot,
+            chunks_size=self._options.files_per_chunk,
+            data_files_size_in_mb=self._options.data_files_mb,
+            video_files_size_in_mb=self._options.video_files_mb,
+        )
+
+    def _facts(self, first: Reading) -> tuple[str, ...]:
+        """Which columns of facts the table of episodes has, or gets from the first episode."""
+        if self._existing is None:
+            return () if first.prepared is None else tuple(first.prepared.data.facts)
+        has_progress = set(STAGE_COLUMNS) <= set(self._existing.facts)
+        if has_progress != self._options.progress:
+            raise ConfigError(
+                f"These recordings cannot be appended, since the dataset {'has' if has_progress else 'lacks'} the "
+                f"stages of --progress: export {'with' if has_progress else 'without'} it: {self._existing.root}"
+            )
+        return self._existing.facts
+
+    def _progress_before(self) -> list[EpisodeProgress]:
+        return [] if self._existing is None else read_progress(self._existing.root)
+
+    def _noted(self, found: Iterable[Reading]) -> Iterator[Reading]:
+        """The same, each counted and held against the others before it is written."""
+        for reading in found:
+            if reading.prepared is None:
+                self._intake.leave_out(reading.outcome)
+            else:
+                self._intake.take(reading.path, reading.profile)
+            yield reading
+
+    def _add(self, writer: DatasetWriter, sidecar: SidecarWriter, reading: Reading) -> None:
+        if reading.prepared is None:
+            sidecar.add_attempt(reading.attempt, in_dataset=False)
+            return
+        written = writer.add(reading.prepared.data)
+        sidecar.add(written, reading.prepared.record)
+        if self._options.progress:
+            facts = reading.prepared.data.facts
+            self._progress.append(EpisodeProgress.from_row(facts, facts["num_goals"]))
+        self._digests.append(written.digest)
+        self._recordings.append(reading.path)
+        self._transcoded.update(dict.fromkeys(reading.transcoded))
+
+    def _refuse_duplicates(self) -> None:
+        """Raise ConfigError when new episodes have the content of some that the dataset appended to has already."""
+        there = {digest: number for number, digest in enumerate(self._before)}
+        pairs = zip(self._recordings, self._digests, strict=True)
+        twice = [f"{path.name} (episode {there[digest]} of it)" for path, digest in pairs if digest in there]
+        if twice and not self._options.allow_duplicates:
+            raise ConfigError(
+                f"The dataset has {len(twice)} of these episodes already: {shown(twice)}. Leave them out with "
+                "--episodes, or give --allow-duplicates to have them twice."
+            )
+
+    def _refuse_silence(self) -> None:
+        """Raise ConfigError when language is asked for and nobody said a word in any episode of a new dataset."""
+        if (
+            self._existing is None
+            and self._options.language is not None
+            and len(self._intake.silent) == self._intake.num_taken
+        ):
+            raise ConfigError(
+                "Language is asked for, but the episodes are external and no source of them states a subtask (in the "
+                "mapping of an import, [subtasks] names the topic of it): leave --language out."
+            )
+
+    def _about_this_export(self) -> dict[str, Any]:
+        options = self._options
+        held = {} if self._is_simulated else {"hold_pictures": options.hold_pictures}
+        return {
+            **held,
+            "demorec": version("demorec"),
+            "action": options.action,
+            "privileged": options.privileged,
+            "features": options.features,
+            "include_failures": options.include_failures,
+            "episodes": options.episodes,
+            "fps": options.fps,
+            "depth": options.depth,
+            **({} if options.state == "joint" else {"state": options.state}),
+            **({"boxes": True} if options.boxes else {}),
+            **({"progress": True} if options.progress else {}),
+            **({} if options.language is None else {"language": options.spoken}),
+        }
+
+
+def push_to_hub(folder: Path, repo_id: str, *, private: bool) -> str:
+    """Upload the folder as a dataset repository, tagged with the format's version as LeRobot expects it.
+
+    Returns:
+        Its address.
+
+    Raises:
+        ExportError: No token, no network, no right to write there; the folder stays as it is.
+        MissingDependencyError: The Hub's client, which comes with LeRobot, is not installed.
+    """
+    try:
+        from huggingface_hub import HfApi, get_token
+    except ImportError as error:
+        raise MissingDependencyError(
+            f"Uploading the dataset, which is kept ({folder}),", "huggingface_hub", "pip install huggingface_hub"
+        ) from error
+    if get_token() is None:
+        raise ExportError(
+            "The dataset was not uploaded, there is no Hugging Face token: type hf auth login, or set HF_TOKEN, and "
+            f"then: hf upload {repo_id} {folder} --repo-type dataset"
+        )
+    hub = HfApi()
+    try:
+        url = hub.create_repo(repo_id, repo_type="dataset", private=private, exist_ok=True)
+        hub.upload_folder(
+            repo_id=repo_id,
+            folder_path=folder,
+            repo_type="dataset",
+            commit_message="Upload dataset",
+        )
+        hub.create_tag(repo_id, tag=CODEBASE_VERSION, repo_type="dataset", exist_ok=True)
+    except Exception as error:  # the hub's client raises errors of several HTTP libraries
+        raise ExportError(
+            f"The dataset was not uploaded to {repo_id} ({in_words(error)}); it is kept: {folder}"
+        ) from error
+    return str(url)

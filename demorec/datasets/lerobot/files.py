@@ -1,0 +1,236 @@
+"""The files of a dataset of unknown origin, opened within bounds: JSON, Parquet tables, mp4 videos.
+
+Anyone writes LeRobot datasets, and people pass them on. A table of a few kB can claim a thousand million rows, a video
+as many pictures, and under the name of either may lie something that is no file at all.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from demorec.core.errors import ExportError, in_words, resource_error
+from demorec.core.files import open_regular, read_text_limited
+from demorec.core.plain import parse_json
+from demorec.datasets.lerobot.pages import longest_row, pages_of
+
+MAX_JSON_BYTES = 32 << 20
+"""Of info.json, stats.json and the like; ours have some ten kB."""
+_FLOOR_BYTES = 64 << 20
+_RATIO = 16
+"""A table may unpack to so much, or so many times its size; rows of a robot that moves hardly compress, and the
+sidecar's JSON, of which each row has much in common with the others, to a third."""
+_BATCH_BYTES = 32 << 20
+"""Of rows that are read at once, as far as that can be known before."""
+_ROWS_AT_ONCE = 64
+_REPEATED = "language_"
+_MOST_SAID = 4096
+"""Values of the language columns in a row; what holds for an episode stands in each of its rows and compresses well."""
+_MOST_SAID_AT_ALL, _SAID_RATIO = 16 << 20, 32
+"""Values of them in any table, and per byte of a larger one; ours have 2 values a byte."""
+_BYTES_PER_VALUE = 8
+_PARENT_BOXES = frozenset((b"moov", b"trak", b"mdia", b"minf", b"stbl", b"moof", b"traf"))
+_MAX_BOXES = 100_000
+
+
+def read_json(path: Path) -> Any:
+    """The content of a JSON file of a dataset; NaN, which other writers leave in statistics, is taken.
+
+    Raises:
+        OSError: It is missing, no regular file, or very large.
+        ValueError: It is no JSON, or nested very deeply.
+    """
+    return parse_json(read_text_limited(path, MAX_JSON_BYTES), allow_nan=True)
+
+
+def open_table(path: Path, columns: Sequence[str] | None = None) -> pq.ParquetFile:
+    """A Parquet file that has these columns, for what its footer says; its rows are read by `table_batches` alone.
+
+    Raises:
+        ExportError: It is missing, no regular file, no Parquet, lacks a column, or claims too many values.
+    """
+    with _table_errors(path):
+        with open_regular(path) as file:
+            size = os.fstat(file.fileno()).st_size
+        table = pq.ParquetFile(path)
+        parts = [part for _, part in _parts(table.metadata)]
+        said = sum(part.num_values for part in parts if part.path_in_schema.startswith(_REPEATED))
+        values = sum(part.num_values for part in parts) - said
+        num_rows = table.metadata.num_rows
+        groups = [table.metadata.row_group(number).num_rows for number in range(table.metadata.num_row_groups)]
+        if min(groups, default=0) < 0 or sum(groups) != num_rows:
+            raise ValueError(f"its parts have {sum(groups):,} rows, it says {num_rows:,}")
+    if _BYTES_PER_VALUE * max(values, num_rows) > _most_bytes(size):
+        raise ExportError(f"The table claims {values:,} values in {size / 1000:,.0f} kB, so it is not read: {path}")
+    if said > _MOST_SAID * num_rows or said > max(_MOST_SAID_AT_ALL, _SAID_RATIO * size):
+        raise ExportError(f"The table claims {said:,} values of language in so few rows, so it is not read: {path}")
+    missing = set(columns or ()) - set(table.schema_arrow.names)
+    if missing:
+        raise ExportError(f"The table has no column {', '.join(sorted(missing))}: {path}")
+    return table
+
+
+def table_batches(
+    path: Path, columns: Sequence[str] | None = None, *, rows: int = _ROWS_AT_ONCE
+) -> Iterator[pa.RecordBatch]:
+    """Some columns of a table, some rows at a time: the only way by which rows of a dataset are read.
+
+    Args:
+        path: The file.
+        columns: Names; None for all.
+        rows: How many at once, at most; fewer where they may be large.
+
+    Raises:
+        ExportError: As `open_table`, or the values unpack to too much.
+    """
+    table = open_table(path, columns)
+    with _table_errors(path):
+        row_bytes = _check_pages(path, table.metadata, columns)
+        names = None if columns is None else list(columns)
+        yield from table.iter_batches(batch_size=max(1, min(rows, _BATCH_BYTES // row_bytes)), columns=names)
+
+
+def read_table(path: Path, columns: Sequence[str] | None = None, *, schema: pa.Schema | None = None) -> pa.Table:
+    """Some columns, or all, of a table.
+
+    Args:
+        path: The file.
+        columns: Names; None for all.
+        schema: Of which types the columns must be.
+
+    Raises:
+        ExportError: As `open_table`, a column has another type, or the values unpack to too much.
+    """
+    found = open_table(path, columns).schema_arrow
+    for name in columns or ():
+        if schema is not None and found.field(name).type != schema.field(name).type:
+            raise ExportError(f"The column {name} is {found.field(name).type}, not {schema.field(name).type}: {path}")
+    allowed = _most_bytes(path.stat().st_size)
+    batches, num_bytes = [], 0
+    for batch in table_batches(path, columns):
+        batches.append(batch)
+        num_bytes += batch.nbytes
+        if num_bytes > allowed:
+            raise _too_large(path, allowed)
+    with _table_errors(path):
+        return pa.Table.from_batches(batches, schema=batches[0].schema if batches else found)
+
+
+@contextmanager
+def _table_errors(path: Path) -> Iterator[None]:
+    """Turn what PyArrow raises into an ExportError; lack of memory says nothing about the table."""
+    try:
+        yield
+    except (OSError, ValueError, IndexError, KeyError, MemoryError, pa.ArrowException) as error:
+        damaged = ExportError(f"The table cannot be read ({in_words(error)}): {path}")
+        raise resource_error(error, path) or damaged from error
+
+
+def _parts(metadata: pq.FileMetaData) -> Iterator[tuple[int, pq.ColumnChunkMetaData]]:
+    """Every column of every row group, with its number."""
+    for group in (metadata.row_group(number) for number in range(metadata.num_row_groups)):
+        for number in range(group.num_columns):
+            yield number, group.column(number)
+
+
+def _check_pages(path: Path, metadata: pq.FileMetaData, columns: Sequence[str] | None) -> int:
+    """About how many bytes a row may take: its numbers, and texts as large as their dictionaries allow.
+
+    Raises:
+        ExportError: The pages of these columns unpack to more than a file of this size may.
+        ValueError: They are none.
+    """
+    num_bytes = num_packed = num_values = 0
+    texts: dict[int, int] = {}
+    beginnings = tuple(f"{name}." for name in columns or ())
+    with open_regular(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        allowed = _most_bytes(size)
+        for number, part in _parts(metadata):
+            if columns is not None and not f"{part.path_in_schema}.".startswith(beginnings):
+                continue
+            num_values += part.num_values
+            num_packed += part.total_compressed_size
+            if num_packed > size:
+                raise ValueError("its columns claim more bytes than it has")
+            dictionary, is_text = 0, part.physical_type.endswith("BYTE_ARRAY")
+            for page in pages_of(file, part):
+                num_bytes += page.num_bytes
+                dictionary = max(dictionary, page.num_bytes if page.is_dictionary and is_text else 0)
+                if num_bytes > allowed:
+                    raise _too_large(path, allowed)
+            depth = metadata.schema.column(number).max_repetition_level
+            if depth and dictionary * part.num_values > _BATCH_BYTES:
+                dictionary = longest_row(file, part, depth)
+            texts[number] = max(texts.get(number, 0), dictionary)
+    if sum(texts.values()) > allowed:
+        raise _too_large(path, allowed)
+    num_rows: int = metadata.num_rows
+    return 1 + sum(texts.values()) + _BYTES_PER_VALUE * num_values // max(1, num_rows)
+
+
+def _too_large(path: Path, allowed: int) -> ExportError:
+    return ExportError(f"The table would unpack to more than {allowed / 1e6:,.0f} MB: {path}")
+
+
+def _most_bytes(size: int) -> int:
+    return max(_FLOOR_BYTES, _RATIO * size)
+
+
+def check_video(path: Path) -> None:
+    """Refuse what no decoder should be given: no regular mp4 file, or one that claims more pictures than it can hold.
+
+    Raises:
+        ExportError: That.
+    """
+    try:
+        with open_regular(path) as file:
+            size = os.fstat(file.fileno()).st_size
+            claimed = sum(_samples(file, size))
+    except (OSError, ValueError, struct.error) as error:
+        raise ExportError(f"The video cannot be opened ({in_words(error)}): {path}") from error
+    if claimed > size:
+        raise ExportError(f"The video claims {claimed:,} bytes or pictures, but has {size:,} bytes: {path}")
+
+
+def _samples(file: BinaryIO, size: int) -> Iterator[int]:
+    """What the sample tables of an mp4 file claim: bytes of their samples, or their number where it is larger.
+
+    ISO/IEC 14496-12: a box has its length (1: 64 bits follow; 0: to the end) and its kind in front.
+    """
+    waiting, num_boxes = [(0, size)], 0
+    while waiting:
+        start, end = waiting.pop()
+        while start + 8 <= end:
+            num_boxes += 1
+            if num_boxes > _MAX_BOXES:
+                raise ValueError(f"more than {_MAX_BOXES:,} boxes")
+            file.seek(start)
+            length, kind = struct.unpack(">I4s", file.read(8))
+            head = 8
+            if length == 1:
+                (length,) = struct.unpack(">Q", file.read(8))
+                head = 16
+            elif length == 0:
+                length = end - start
+            if length < head or start + length > end:
+                raise ValueError("a box that is cut off" if start else "no mp4 file")
+            if kind in _PARENT_BOXES:
+                waiting.append((start + head, start + length))
+            elif kind in (b"stsz", b"stz2"):
+                _, each, count = struct.unpack(">III", file.read(12))
+                if kind == b"stsz" and each == 0 and 4 * count <= length:
+                    found = struct.iter_unpack(">I", file.read(4 * count))
+                    yield max(count, sum(number for (number,) in found))
+                else:
+                    yield max(count, each * count if kind == b"stsz" else 0)
+            elif kind == b"trun":
+                yield struct.unpack(">II", file.read(8))[1]
+            start += length

@@ -1,0 +1,185 @@
+"""What a dataset holds: a summary, and the digest of its content recomputed from its files."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from demorec.core.errors import ExportError, in_words, resource_error, without_path
+from demorec.datasets.lerobot.digest import combined_digest, episode_digest
+from demorec.datasets.lerobot.files import check_video, open_table, read_json, read_table
+from demorec.datasets.lerobot.layout import STATS_PATH, VIDEO_PATH, DatasetInfo
+from demorec.datasets.lerobot.paths import INFO_PATH, SIDECAR_DIR
+from demorec.datasets.lerobot.reader import PacketReader, RowReader, episode_places, read_tasks
+
+
+@dataclass(frozen=True, kw_only=True)
+class DatasetSummary:
+    """What `demorec info` tells about a dataset.
+
+    Attributes:
+        path: Folder.
+        fps, robot_type, num_episodes, num_frames: As info.json says.
+        tasks: Instructions.
+        features: (name, dtype, shape, component names or None).
+        cameras: (name, width, height, codec).
+        num_files, num_bytes: On disk.
+        num_successes: Episodes that succeeded, None in a dataset that does not tell.
+        num_attempts: Attempts that were made for it, None where unknown.
+    """
+
+    path: Path
+    fps: int
+    robot_type: str | None
+    num_episodes: int
+    num_frames: int
+    tasks: tuple[str, ...]
+    features: tuple[tuple[str, str, tuple[int, ...], tuple[str, ...] | None], ...]
+    cameras: tuple[tuple[str, int, int, str], ...]
+    num_files: int
+    num_bytes: int
+    num_successes: int | None
+    num_attempts: int | None
+
+
+def dataset_info(path: Path) -> DatasetSummary:
+    """Read the summary of a LeRobot v3.0 dataset, whoever wrote it.
+
+    Raises:
+        ExportError: None there, or damaged.
+    """
+    info = DatasetInfo.load(path)
+    files = [file for file in path.rglob("*") if file.is_file()]
+    attempts = sorted((path / SIDECAR_DIR / "attempts").glob("*/*.parquet"))
+    successes = sorted((path / SIDECAR_DIR / "episodes").glob("*/*.parquet"))
+    num_attempts = sum(open_table(file).metadata.num_rows for file in attempts) if attempts else None
+    columns = [read_table(file, ["success"]).column("success") for file in successes]
+    return DatasetSummary(
+        path=path,
+        fps=info.fps,
+        robot_type=info.robot_type,
+        num_episodes=info.total_episodes,
+        num_frames=info.total_frames,
+        tasks=tuple(read_tasks(path)) if info.total_tasks else (),
+        features=tuple((name, item.dtype, item.shape, item.names) for name, item in info.features.items()),
+        cameras=tuple(
+            (name, item.shape[1], item.shape[0], str((item.info or {}).get("video.codec", "")))
+            for name, item in info.features.items()
+            if item.is_video
+        ),
+        num_files=len(files),
+        num_bytes=sum(file.stat().st_size for file in files),
+        num_successes=sum(column.to_pylist().count(True) for column in columns) if columns else None,
+        num_attempts=num_attempts,
+    )
+
+
+def dataset_problems(path: Path, info: DatasetInfo) -> list[str]:
+    """What of a dataset is missing, emptied or cut off, one sentence each; by the ends of its files, which is quick.
+
+    `demorec check` reads all that is in them.
+    """
+    problems: list[str] = []
+    rows: dict[str, int] = {}
+    for place in ("data", "meta/episodes"):
+        rows[place] = 0
+        for file in sorted((path / place).glob("*/*.parquet")):
+            with _noted(problems, path):
+                rows[place] += open_table(file).metadata.num_rows
+    if not problems:
+        for place, said in (("data", info.total_frames), ("meta/episodes", info.total_episodes)):
+            if rows[place] != said:
+                problems.append(f"The tables in {place} have {rows[place]} rows, {INFO_PATH} counts {said}")
+    with _noted(problems, path):
+        read_tasks(path)
+    if not (path / STATS_PATH).exists():
+        problems.append(f"The statistics are missing: {STATS_PATH}")
+    with _noted(problems, path):
+        check_tables(path)
+    with _noted(problems, path):
+        videos = {
+            position.path(info.video_path or VIDEO_PATH, key)
+            for place in episode_places(path, info)
+            for key, (position, _) in place.videos.items()
+        }
+        for name in sorted(videos):
+            with _noted(problems, path):
+                check_video(path / name)
+    return list(dict.fromkeys(problems))
+
+
+@contextmanager
+def _noted(problems: list[str], path: Path) -> Iterator[None]:
+    """Turn an ExportError into one more problem, told without the dataset's own path."""
+    try:
+        yield
+    except ExportError as error:
+        if (lack := resource_error(error)) is not None:
+            raise lack from error
+        problems.append(without_path(error, path).replace(f"{path}/", ""))
+
+
+def has_digest(info: DatasetInfo) -> bool:
+    """Whether the content has a digest: all of it is video, numbers or text, that of language columns included."""
+    return not _without_digest(info)
+
+
+def _without_digest(info: DatasetInfo) -> list[str]:
+    return [name for name, feature in info.features.items() if feature.dtype == "image"]
+
+
+def check_tables(path: Path) -> None:
+    """Read the ends of all tables and the JSON files: whether any was emptied or cut off.
+
+    Raises:
+        ExportError: One was.
+    """
+    for file in sorted(path.rglob("*")):
+        try:
+            if file.suffix == ".parquet":
+                open_table(file)
+            elif file.suffix == ".json":
+                read_json(file)
+        except (OSError, ValueError) as error:
+            raise ExportError(f"The dataset is damaged ({in_words(error)}): {file}") from error
+
+
+def dataset_digest(path: Path) -> str:
+    """SHA-256 (hex) of the content, read back from all files; `ExportReport.digest` of a new dataset is the same.
+
+    Raises:
+        ExportError: The dataset is damaged.
+    """
+    info = DatasetInfo.load(path)
+    return combined_digest(info, list(episode_digests(path, info)))
+
+
+def episode_digests(path: Path, info: DatasetInfo) -> list[str]:
+    """The digest of every episode, in order, read back from all files."""
+    if unknown := _without_digest(info):
+        raise ExportError(f"The content of {', '.join(unknown)} has no digest, it is neither video nor numbers: {path}")
+    tasks = read_tasks(path)
+    rows = RowReader(path, info)
+    cameras = {key: PacketReader(path, info, key) for key in info.video_keys}
+    result = []
+    try:
+        for place in episode_places(path, info):
+            columns = rows.read(place)
+            videos = {}
+            for key, packets in cameras.items():
+                pictures = hashlib.sha256()
+                for sample in packets.read(place):
+                    pictures.update(sample)
+                videos[key] = pictures.hexdigest()
+            task_index = columns["task_index"][0, 0] if len(columns["task_index"]) else -1
+            if not 0 <= task_index < len(tasks):  # which NaN, what a null was read as, is neither
+                raise ExportError(f"Episode {place.episode_index} has no task: {path}")
+            task = tasks[int(task_index)]
+            result.append(episode_digest(task, columns, videos))
+    finally:
+        for packets in cameras.values():
+            packets.close()
+    return result

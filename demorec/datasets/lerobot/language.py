@@ -1,0 +1,257 @@
+"""LeRobot's language columns: what an episode's statements look like in its tables, and their digests.
+
+`language_persistent` has every statement of the episode in every row of it, each with the time from which it holds;
+`language_events` has those of one moment in the row of that moment. LeRobot's own types are in
+`lerobot/datasets/language.py`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from demorec.annotate.kinds import STATES
+from demorec.core.errors import ExportError, in_words
+from demorec.datasets.lerobot.files import table_batches
+from demorec.episode.features import IMAGE_PREFIX
+
+if TYPE_CHECKING:
+    from demorec.annotate.narration import Statement
+
+PERSISTENT, EVENTS = "language_persistent", "language_events"
+COLUMNS = (PERSISTENT, EVENTS)
+
+_EVENT_FIELDS = (
+    pa.field("role", pa.string()),
+    pa.field("content", pa.string()),
+    pa.field("style", pa.string()),
+    pa.field("camera", pa.string()),
+    pa.field("tool_calls", pa.list_(pa.json_())),
+)
+_EVENT = pa.struct(_EVENT_FIELDS)
+_STATE = pa.struct([*_EVENT_FIELDS[:3], pa.field("timestamp", pa.float32()), *_EVENT_FIELDS[3:]])
+TYPES: dict[str, pa.DataType] = {PERSISTENT: pa.list_(_STATE), EVENTS: pa.list_(_EVENT)}
+"""Column -> its type, as the package datasets reads LeRobot's own."""
+REPEATING = tuple(f"{name}.list.element.{item}" for name in COLUMNS for item in ("role", "content", "style", "camera"))
+REPEATING += (f"{PERSISTENT}.list.element.timestamp",)
+"""Parquet's names of the parts whose values come again and again."""
+
+
+_AT_ONCE = 16
+"""How many rows of an episode are made in one step."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LanguageRow:
+    """One entry of a language column.
+
+    Attributes:
+        role: "user" or "assistant".
+        content: What is said; None for what a tool says.
+        style: LeRobot's word for its kind, None for what a tool says.
+        timestamp: From when on it holds, seconds; None for an event.
+        camera: Feature that the words are about, None for all but those that are about one picture.
+        spoken: What the tool `say` is told to say to the user, "" for nothing.
+    """
+
+    role: str
+    content: str | None
+    style: str | None
+    timestamp: float | None = None
+    camera: str | None = None
+    spoken: str = ""
+
+    def to_json(self) -> dict[str, Any]:
+        """The entry as the column has it; calls of tools are JSON there."""
+        row: dict[str, Any] = {"role": self.role, "content": self.content, "style": self.style}
+        if self.timestamp is not None:
+            row["timestamp"] = self.timestamp
+        row |= {"camera": self.camera, "tool_calls": None}
+        if self.spoken:
+            call = {"type": "function", "function": {"name": "say", "arguments": {"text": self.spoken}}}
+            row["tool_calls"] = [json.dumps(call)]
+        return row
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodeLanguage:
+    """The language columns of one episode.
+
+    Attributes:
+        persistent: What stands in every row.
+        events: Row -> what stands in it alone.
+    """
+
+    persistent: tuple[LanguageRow, ...] = ()
+    events: Mapping[int, tuple[LanguageRow, ...]] = field(default_factory=dict)
+
+
+def episode_language(statements: Sequence[Statement], *, fps: int) -> EpisodeLanguage:
+    """The statements in LeRobot's form; times are those of the `timestamp` column to the bit."""
+    persistent: list[LanguageRow] = []
+    events: dict[int, list[LanguageRow]] = {}
+    for statement in statements:
+        is_state = statement.kind in STATES
+        is_answer = statement.kind == "interjection" and statement.role == "assistant"  # a call of a tool, in LeRobot
+        said = LanguageRow(
+            role=statement.role,
+            content=None if is_answer else statement.text,
+            style=None if is_answer else statement.kind,
+            timestamp=float(np.float32(statement.row / fps)) if is_state else None,
+            camera=None if statement.camera is None else IMAGE_PREFIX + statement.camera,
+            spoken=statement.text if is_answer else "",
+        )
+        if is_state:
+            persistent.append(said)
+        else:
+            events.setdefault(statement.row, []).append(said)
+    return EpisodeLanguage(persistent=tuple(persistent), events={row: tuple(told) for row, told in events.items()})
+
+
+def language_feature(name: str) -> dict[str, Any]:
+    """What the schema's metadata say of a language column, from which the package datasets takes its types."""
+    text = {"dtype": "string", "_type": "Value"}
+    row: dict[str, Any] = {"role": text, "content": text, "style": text}
+    if name == PERSISTENT:
+        row["timestamp"] = {"dtype": "float32", "_type": "Value"}
+    calls = {"feature": {"_type": "Json"}, "_type": "List"}
+    return {"feature": {**row, "camera": text, "tool_calls": calls}, "_type": "List"}
+
+
+def language_arrays(language: EpisodeLanguage, frames: int) -> dict[str, pa.Array]:
+    """Column -> array of so many rows."""
+    counts = np.zeros(frames + 1, dtype=np.int32)
+    for row, told in language.events.items():
+        counts[row + 1] = len(told)
+    said = [entry for _, told in sorted(language.events.items()) for entry in told]
+    state = _structs(language.persistent, _STATE)
+    # In two steps, since each costs by the number of its parts; `take` costs three times as much.
+    several = pa.concat_arrays([state] * _AT_ONCE)
+    often = pa.concat_arrays([state[:0], *[several] * (frames // _AT_ONCE), *[state] * (frames % _AT_ONCE)])
+    steps = pa.array(np.arange(frames + 1, dtype=np.int32) * np.int32(len(state)))
+    return {
+        PERSISTENT: pa.ListArray.from_arrays(steps, often),
+        EVENTS: pa.ListArray.from_arrays(pa.array(np.cumsum(counts, dtype=np.int32)), _structs(said, _EVENT)),
+    }
+
+
+def _structs(rows: Sequence[LanguageRow], kind: pa.StructType) -> pa.StructArray:
+    found = [row.to_json() for row in rows]
+    arrays = []
+    for part in kind:
+        values = [row[part.name] for row in found]
+        if part.name != "tool_calls":
+            arrays.append(pa.array(values, part.type))
+        elif not any(values):
+            arrays.append(pa.nulls(len(found), part.type))
+        else:  # pyarrow makes none of JSON from Python's lists
+            arrays.append(pa.array(values, pa.list_(pa.string())).cast(part.type))
+    return pa.StructArray.from_arrays(arrays, fields=list(kind))
+
+
+def language_digests(language: EpisodeLanguage, frames: int) -> dict[str, NDArray[np.str_]]:
+    """Column -> (T, 1) SHA-256 (hex) of what stands in each row; equal to `column_digests` of the column read back."""
+    state = _digest([row.to_json() for row in language.persistent])
+    events = np.full((frames, 1), _digest([]))
+    for row, told in language.events.items():
+        events[row] = _digest([entry.to_json() for entry in told])
+    return {PERSISTENT: np.full((frames, 1), state), EVENTS: events}
+
+
+def is_language(kind: pa.DataType) -> bool:
+    """Whether a column of this type can hold statements; where none has any, LeRobot's tools write lists of nulls."""
+    listed = pa.types.is_list(kind) or pa.types.is_large_list(kind)
+    return bool(listed) and bool(pa.types.is_struct(kind.value_type) or pa.types.is_null(kind.value_type))
+
+
+def column_digests(column: pa.Array) -> NDArray[np.str_]:
+    """(T, 1) SHA-256 (hex) of what stands in each row of a language column, whoever wrote it.
+
+    Raises:
+        ValueError: It is no list of structures.
+    """
+    if not is_language(column.type):
+        raise ValueError(f"a language column of type {column.type}")
+    found: list[str] = []
+    before: pa.Array | None = None
+    for index in range(len(column)):
+        rows = column[index].values
+        if before is None or rows is None or not rows.equals(before):
+            found.append(_digest([] if rows is None else rows.to_pylist()))
+        else:  # what holds for an episode stands in each of its rows
+            found.append(found[-1])
+        before = rows
+    return np.array(found, dtype="<U64").reshape(-1, 1)
+
+
+def _digest(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Of the entries that are there; an empty list of tool calls is as good as none, and JSON is what it says."""
+    told = [{name: value for name, value in row.items() if value is not None and value != []} for row in rows]
+    for row in told:
+        if "tool_calls" in row:
+            row["tool_calls"] = [_parsed(call) for call in row["tool_calls"]]
+    return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
+
+
+def _parsed(call: Any) -> Any:
+    try:
+        return json.loads(call)
+    except (TypeError, ValueError, RecursionError):
+        return call
+
+
+@dataclass(kw_only=True)
+class SpokenEpisode:
+    """What the language columns of one episode hold, whoever wrote them.
+
+    Attributes:
+        persistent: What stands in its first row.
+        events: Row -> what stands in it, of rows in which anything does.
+        num_rows: Of the episode.
+        differing: Rows in which `language_persistent` holds something else than in the first.
+    """
+
+    persistent: list[dict[str, Any]]
+    events: dict[int, list[dict[str, Any]]] = field(default_factory=dict)
+    num_rows: int = 0
+    differing: list[int] = field(default_factory=list)
+
+
+def spoken_episodes(root: Path) -> Iterator[SpokenEpisode]:
+    """The language of every episode in order, from the data files of a dataset that has both columns.
+
+    Raises:
+        ExportError: They cannot be read.
+    """
+    current: tuple[int, SpokenEpisode, pa.Array] | None = None
+    names = ["episode_index", *COLUMNS]
+    for path in sorted((root / "data").glob("*/*.parquet")):
+        try:
+            for batch in table_batches(path, names):
+                indices, persistent, events = (batch.column(name) for name in names)
+                if not is_language(persistent.type) or not is_language(events.type):
+                    raise ValueError("language columns of another type")
+                for row, index in enumerate(indices.to_pylist()):
+                    state = persistent[row].values
+                    if current is None or current[0] != index:
+                        if current is not None:
+                            yield current[1]
+                        current = index, SpokenEpisode(persistent=persistent[row].as_py() or []), state
+                    _, episode, first = current
+                    if not (first is state or (first is not None and state is not None and state.equals(first))):
+                        episode.differing.append(episode.num_rows)
+                    if told := events[row].as_py():
+                        episode.events[episode.num_rows] = told
+                    episode.num_rows += 1
+        except (OSError, ValueError, pa.ArrowException) as error:
+            raise ExportError(f"The language of the dataset cannot be read ({in_words(error)}): {path}") from error
+    if current is not None:
+        yield current[1]

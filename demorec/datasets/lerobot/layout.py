@@ -1,0 +1,312 @@
+"""Where everything of a LeRobot v3.0 dataset lies and how its schema is written down; nothing is computed here."""
+
+from __future__ import annotations
+
+import json
+import re
+import reprlib
+import shlex
+import string
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import pyarrow as pa
+
+from demorec.core.errors import ExportError, in_words
+from demorec.datasets.lerobot.files import read_json
+from demorec.datasets.lerobot.language import TYPES, language_feature
+from demorec.datasets.lerobot.paths import INFO_PATH, SIDECAR_DIR
+
+CODEBASE_VERSION = "v3.0"
+MEBIBYTE = 2**20
+
+_CHUNK = "chunk-{chunk_index:03d}/file-{file_index:03d}"
+DATA_PATH = f"data/{_CHUNK}.parquet"
+EPISODES_PATH = f"meta/episodes/{_CHUNK}.parquet"
+VIDEO_PATH = "videos/{video_key}/" + f"{_CHUNK}.mp4"
+TASKS_PATH = "meta/tasks.parquet"
+STATS_PATH = "meta/stats.json"
+
+SIDECAR_EPISODES_PATH = f"{SIDECAR_DIR}/episodes/{_CHUNK}.parquet"
+SIDECAR_ATTEMPTS_PATH = f"{SIDECAR_DIR}/attempts/{_CHUNK}.parquet"
+SIDECAR_CAMERAS_PATH = f"{SIDECAR_DIR}/camera_poses/{_CHUNK}.parquet"
+
+FeatureType = Literal["float32", "float64", "int64", "bool", "string", "video", "image", "language"]
+
+_ARROW_TYPES = {
+    "float32": pa.float32(),
+    "float64": pa.float64(),
+    "int64": pa.int64(),
+    "bool": pa.bool_(),
+    "string": pa.string(),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Feature:
+    """One entry of `features` in info.json.
+
+    Attributes:
+        dtype: LeRobot's name of the type.
+        shape: Without the frame dimension; (1,) is a scalar column.
+        names: Component names of a vector, dimension names of a camera, None for a scalar.
+        info: Of cameras only: the `video.*` entries.
+    """
+
+    dtype: FeatureType
+    shape: tuple[int, ...]
+    names: tuple[str, ...] | None = None
+    info: dict[str, Any] | None = None
+
+    @property
+    def is_video(self) -> bool:
+        """Whether its frames are in mp4 files rather than in the data table."""
+        return self.dtype == "video"
+
+    @property
+    def is_numeric(self) -> bool:
+        """Whether its frames are numbers, which have statistics of their own."""
+        return self.dtype not in ("video", "string", "language")
+
+    @property
+    def is_depth(self) -> bool:
+        """Whether it is a camera whose pixels are distances."""
+        return bool((self.info or {}).get("is_depth_map"))
+
+    def to_json(self) -> dict[str, Any]:
+        """The entry as info.json has it."""
+        entry: dict[str, Any] = {
+            "dtype": self.dtype,
+            "shape": list(self.shape),
+            "names": None if self.names is None else list(self.names),
+        }
+        if self.info is not None:
+            entry["info"] = self.info
+        return entry
+
+    @classmethod
+    def from_json(cls, entry: dict[str, Any]) -> Feature:
+        """Inverse of `to_json`, for datasets written by anyone."""
+        names = entry.get("names")
+        if isinstance(names, dict):  # older recordings of real robots: {"motors": [...]}
+            names = [name for group in names.values() for name in group]
+        shape, info = entry["shape"], entry.get("info")
+        if not isinstance(entry["dtype"], str):
+            raise ValueError("a feature without dtype")
+        if not isinstance(shape, list) or not 1 <= len(shape) <= 8 or not all(_is_count(n, 1, 1 << 24) for n in shape):
+            raise ValueError(f"a feature of shape {reprlib.repr(shape)}")
+        if entry["dtype"] == "video" and len(shape) != 3:
+            raise ValueError(f"a video of shape {reprlib.repr(shape)}")
+        if info is not None and not isinstance(info, dict):
+            raise ValueError("the info of a feature is no object")
+        return cls(
+            dtype=entry["dtype"],  # type: ignore[arg-type]
+            shape=tuple(shape),
+            names=None if names is None else tuple(str(name) for name in names),
+            info=info,
+        )
+
+
+AUTOMATIC_FEATURES: dict[str, Feature] = {
+    "timestamp": Feature(dtype="float32", shape=(1,)),
+    "frame_index": Feature(dtype="int64", shape=(1,)),
+    "episode_index": Feature(dtype="int64", shape=(1,)),
+    "index": Feature(dtype="int64", shape=(1,)),
+    "task_index": Feature(dtype="int64", shape=(1,)),
+}
+"""Come last in every dataset, filled in by the writer."""
+LANGUAGE_FEATURE = Feature(dtype="language", shape=(1,))
+"""Of each of LeRobot's language columns."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FilePosition:
+    """Which of the numbered files: chunk folder, then file within."""
+
+    chunk: int = 0
+    file: int = 0
+
+    def next(self, chunks_size: int) -> FilePosition:
+        """The file after this one; a chunk folder holds `chunks_size` files."""
+        if self.file >= chunks_size - 1:
+            return FilePosition(chunk=self.chunk + 1, file=0)
+        return replace(self, file=self.file + 1)
+
+    def path(self, template: str, video_key: str = "") -> str:
+        """The path within the dataset."""
+        return template.format(chunk_index=self.chunk, file_index=self.file, video_key=video_key)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DatasetInfo:
+    """What meta/info.json says."""
+
+    fps: int
+    features: dict[str, Feature]
+    robot_type: str | None = None
+    total_episodes: int = 0
+    total_frames: int = 0
+    total_tasks: int = 0
+    chunks_size: int = 1000
+    data_files_size_in_mb: float = 100
+    video_files_size_in_mb: float = 200
+    data_path: str = DATA_PATH
+    video_path: str | None = VIDEO_PATH
+    other: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def video_keys(self) -> tuple[str, ...]:
+        """Names of the camera features."""
+        return tuple(name for name, feature in self.features.items() if feature.is_video)
+
+    def to_json(self) -> str:
+        """Text of the file."""
+        data = {
+            "codebase_version": CODEBASE_VERSION,
+            "fps": self.fps,
+            "features": {name: feature.to_json() for name, feature in self.features.items()},
+            "total_episodes": self.total_episodes,
+            "total_frames": self.total_frames,
+            "total_tasks": self.total_tasks,
+            "chunks_size": self.chunks_size,
+            "data_files_size_in_mb": self.data_files_size_in_mb,
+            "video_files_size_in_mb": self.video_files_size_in_mb,
+            "data_path": self.data_path,
+            "video_path": self.video_path if self.video_keys else None,
+            "robot_type": self.robot_type,
+            "splits": {"train": f"0:{self.total_episodes}"},
+            **self.other,
+        }
+        return json.dumps(data, indent=4, ensure_ascii=False) + "\n"
+
+    @classmethod
+    def load(cls, root: Path) -> DatasetInfo:
+        """Read it from a dataset folder.
+
+        Raises:
+            ExportError: No info.json, or of another version of the format.
+        """
+        path = root / INFO_PATH
+        try:
+            data = read_json(path)
+            version = data.pop("codebase_version")
+            if version != CODEBASE_VERSION:
+                raise ExportError(_other_version(version, root))
+            data.pop("splits", None)
+            features = {name: Feature.from_json(entry) for name, entry in data.pop("features").items()}
+            known = {name: data.pop(name) for name in list(data) if name in _INFO_FIELDS}
+            info = cls(features=features, other=data, **known)
+            info._check()
+        except OSError as error:
+            raise ExportError(f"No LeRobot dataset, {INFO_PATH} cannot be read ({error.strerror}): {root}") from error
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise ExportError(f"{INFO_PATH} of the dataset is damaged ({in_words(error)}): {root}") from error
+        return info
+
+    def _check(self) -> None:
+        """ValueError for values that no dataset can have."""
+        for name, low in (
+            ("fps", 1),
+            ("total_episodes", 0),
+            ("total_frames", 0),
+            ("total_tasks", 0),
+            ("chunks_size", 1),
+        ):
+            if not _is_count(getattr(self, name), low, 1 << 40):
+                raise ValueError(f"{name} is {reprlib.repr(getattr(self, name))}")
+        for size in (self.data_files_size_in_mb, self.video_files_size_in_mb):
+            if isinstance(size, bool) or not isinstance(size, int | float) or not 0 < size < 1e9:
+                raise ValueError(f"files of {reprlib.repr(size)} MB")
+        if self.robot_type is not None and not isinstance(self.robot_type, str):
+            raise ValueError(f"robot_type is {reprlib.repr(self.robot_type)}")
+        for name in self.features:
+            if not name.isprintable() or name.startswith("/") or ".." in name.split("/"):
+                raise ValueError(f"a feature is called {name[:80]!r}")
+        for template in (self.data_path, self.video_path):
+            if template is not None:
+                _check_template(template)
+
+
+def _other_version(version: object, root: Path) -> str:
+    """What to do with a dataset of another version of the format, in a sentence; the command is LeRobot 0.6.1's."""
+    found = f"The dataset has format {reprlib.repr(version).strip("'")}, expected {CODEBASE_VERSION}"
+    if version == "v2.1":
+        root = root.resolve()
+        arguments = f"--repo-id {shlex.quote(f'local/{root.name}')} --root {shlex.quote(str(root))} --push-to-hub false"
+        # The converter deletes what has these names, or puts it in the dataset's place.
+        taken = [name for name in (f"{root.name}_old", f"{root.name}_v30") if (root.parent / name).exists()]
+        return (
+            f"{found}; {f'move {" and ".join(taken)} away first, then ' if taken else ''}LeRobot converts it in its "
+            f"place and leaves the old one beside it, as {root.name}_old: python -m "
+            f"lerobot.scripts.convert_dataset_v21_to_v30 {arguments}"
+        )
+    if str(version).startswith(("v1.", "v2.")):
+        found += "; LeRobot 0.6 converts from v2.1 on, so bring it to v2.1 with the LeRobot that wrote it"
+    return f"{found}: {root}"
+
+
+def _is_count(value: object, low: int, high: int) -> bool:
+    """A whole number from `low` to `high`; other writers have some as 30.0."""
+    return (
+        isinstance(value, int | float) and not isinstance(value, bool) and low <= value <= high and value == int(value)
+    )
+
+
+def _check_template(template: object) -> None:
+    """ValueError unless a template of paths stays in the dataset and fills in what every dataset does."""
+    if not isinstance(template, str) or not template.isprintable():
+        raise ValueError("a path that is no text")
+    parts = Path(template).parts
+    if Path(template).is_absolute() or ".." in parts:
+        raise ValueError(f"the path {template[:80]!r} leads out of the dataset")
+    for _, name, kind, conversion in string.Formatter().parse(template):
+        if name is not None and (name not in _PLACEHOLDERS or conversion or not re.fullmatch(r"(0?\dd)?", kind or "")):
+            raise ValueError(f"the path {template[:80]!r} has an unknown placeholder")
+
+
+_PLACEHOLDERS = ("chunk_index", "file_index", "video_key")
+_INFO_FIELDS = frozenset(
+    (
+        "fps", "robot_type", "total_episodes", "total_frames", "total_tasks", "chunks_size",
+        "data_files_size_in_mb", "video_files_size_in_mb", "data_path", "video_path",
+    )
+)  # fmt: skip
+
+
+_ENCODER_INFO = ("video.g", "video.crf", "video.preset", "video.fast_decode", "video.extra_options")
+
+
+def merged_video_info(a: dict[str, Any], b: dict[str, Any]) -> dict[str, Any]:
+    """`a`, less the encoder settings in which `b` differs (null, as LeRobot does when it merges datasets)."""
+    unknown: dict[str, Any] = {"video.extra_options": {}}
+    return {
+        key: value if key not in _ENCODER_INFO or b.get(key) == value else unknown.get(key) for key, value in a.items()
+    }
+
+
+def data_schema(features: dict[str, Feature]) -> pa.Schema:
+    """Schema of the data files, with the metadata from which HF datasets takes its types."""
+    fields, described = [], {}
+    for name, feature in features.items():
+        if feature.is_video:
+            continue
+        if feature.dtype == "language" and name in TYPES:
+            fields.append(pa.field(name, TYPES[name]))
+            described[name] = language_feature(name)
+            continue
+        if feature.dtype not in _ARROW_TYPES or len(feature.shape) != 1:
+            raise ExportError(
+                f"The feature {name!r} has dtype {feature.dtype} and shape {feature.shape}, which demorec cannot "
+                "write: export into a new folder."
+            )
+        arrow_type = _ARROW_TYPES[feature.dtype]
+        value: dict[str, Any] = {"dtype": feature.dtype, "_type": "Value"}
+        if feature.shape == (1,):
+            fields.append(pa.field(name, arrow_type))
+            described[name] = value
+        else:
+            length = feature.shape[0]
+            fields.append(pa.field(name, pa.list_(pa.field("element", arrow_type), length)))
+            described[name] = {"feature": value, "length": length, "_type": "List"}
+    return pa.schema(fields, {"huggingface": json.dumps({"info": {"features": described}})})

@@ -1,0 +1,132 @@
+"""Parquet files that grow row group by row group and roll over to the next number by size."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from demorec.datasets.lerobot.layout import MEBIBYTE, FilePosition
+from demorec.datasets.staging import sync_file
+
+_ROWS_PER_GROUP = 4096
+_BYTES_PER_GROUP = 2 * MEBIBYTE
+"""Tables are collected up to so many rows or bytes: a row group costs a writer and a reader far more than its rows."""
+
+
+class RollingParquet:
+    """Writes tables into numbered files; one table is never split over two of them.
+
+    Attributes:
+        position: Of the file that is being written, or of the next one.
+        schema: Of the tables.
+        num_bytes: Size of the finished files.
+
+    Args:
+        repeating: Columns that are worth a dictionary; all by default.
+    """
+
+    def __init__(
+        self,
+        root: Path,
+        template: str,
+        schema: pa.Schema,
+        *,
+        limit_mb: float,
+        chunks_size: int,
+        start: FilePosition,
+        compression: str = "snappy",
+        repeating: Sequence[str] | None = None,
+    ) -> None:
+        self.position = start
+        self.num_bytes = 0
+        self._root = root
+        self._template = template
+        self.schema = schema
+        self._limit = limit_mb * MEBIBYTE
+        self._chunks_size = chunks_size
+        self._compression = compression
+        # A dictionary of numbers that hardly repeat costs time and makes the file larger.
+        self._dictionary = True if repeating is None else list(repeating)
+        self._rows = 0
+        self._waiting: list[pa.Table] = []
+        self._waiting_rows = 0
+        self._waiting_bytes = 0
+        self._sink: Any = None
+        self._writer: Any = None
+        self._path = Path()
+
+    def make_room(self, rows: int) -> FilePosition:
+        """Begin the next file if these rows would not fit into this one; return where they will be."""
+        if self._writer is not None:
+            size = self._sink.tell() + self._waiting_bytes
+            if size * (1 + rows / max(1, self._rows)) >= self._limit:
+                self._finish_file()
+                self.position = self.position.next(self._chunks_size)
+        return self.position
+
+    def write(self, table: pa.Table) -> None:
+        """Append a table."""
+        if self._writer is None:
+            self._path = self._root / self.position.path(self._template)
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            self._sink = pa.OSFile(str(self._path), "wb")
+            self._writer = pq.ParquetWriter(
+                self._sink, self.schema, compression=self._compression, use_dictionary=self._dictionary
+            )
+            self._rows = 0
+        self._waiting.append(table)
+        self._waiting_rows += table.num_rows
+        self._waiting_bytes += table.nbytes
+        self._rows += table.num_rows
+        if self._waiting_rows >= _ROWS_PER_GROUP or self._waiting_bytes >= _BYTES_PER_GROUP:
+            self._write_group()
+
+    def _write_group(self) -> None:
+        if self._waiting:
+            table = pa.concat_tables(self._waiting)
+            self._writer.write_table(table, row_group_size=max(1, table.num_rows))
+            self._waiting, self._waiting_rows, self._waiting_bytes = [], 0, 0
+
+    def close(self) -> None:
+        """Finish the last file and make it durable; harmless when called twice."""
+        if self._writer is not None:
+            self._finish_file()
+
+    def _finish_file(self) -> None:
+        try:
+            self._write_group()
+            self._writer.close()
+            self.num_bytes += self._sink.tell()
+        finally:
+            self._writer = None
+            self._sink.close()
+        sync_file(self._path)
+
+    def abort(self) -> None:
+        """Let go of the file after an error, whatever state it is in."""
+        if self._sink is not None and not self._sink.closed:
+            self._writer = None
+            self._sink.close()
+
+
+def vector_array(values: NDArray[Any], arrow_type: pa.DataType) -> pa.Array:
+    """A column of scalars (T,) or fixed-size vectors (T, D)."""
+    if pa.types.is_fixed_size_list(arrow_type):
+        flat = pa.array(np.ascontiguousarray(values).reshape(-1), arrow_type.value_type)
+        return pa.FixedSizeListArray.from_arrays(flat, type=arrow_type)
+    return pa.array(np.ascontiguousarray(values).reshape(-1), arrow_type)
+
+
+def nested_array(values: NDArray[Any], depth: int) -> pa.Array:
+    """A column of lists: (rows, D) numbers as list<T>, or with depth 3 as list<list<list<T>>> of shape (D, 1, 1)."""
+    rows, width = values.shape
+    array = pa.array(np.ascontiguousarray(values).reshape(-1))
+    for _ in range(depth - 1):
+        array = pa.ListArray.from_arrays(pa.array(np.arange(len(array) + 1, dtype=np.int32)), array)
+    return pa.ListArray.from_arrays(pa.array(np.arange(rows + 1, dtype=np.int32) * width), array)

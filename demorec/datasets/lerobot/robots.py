@@ -1,0 +1,203 @@
+"""What draws and moves the arm of a dataset's episodes, in the folder `demorec/robots/` of the dataset.
+
+Each arm has two files that are named after a digest of both: `DIGEST.urdf`, and `DIGEST.json` with what no URDF says.
+Episodes name their arm by it, so that arms that differ can stand in one dataset, and appending adds at most a pair.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import re
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from demorec.core.errors import DemorecError, ExportError, in_words
+from demorec.core.files import read_text_limited
+from demorec.core.plain import digest, from_json, to_json
+from demorec.core.tables import ROBOTS
+from demorec.datasets.episode import ExportEpisode
+from demorec.datasets.lerobot.files import MAX_JSON_BYTES
+from demorec.datasets.lerobot.paths import SIDECAR_DIR
+from demorec.datasets.lerobot.writer import write_text
+from demorec.episode.features import STATE
+from demorec.mcap.description import robot_description
+from demorec.robots.assets import asset_path
+from demorec.robots.robot import RobotSpec
+from demorec.robots.urdf import MAX_BYTES, Urdf, parse_xml
+from demorec.robots.urdf_shapes import read_links
+
+ROBOTS_DIR = f"{SIDECAR_DIR}/robots"
+
+ELEMENT_SUFFIX = re.compile(r"[._/](pos|position|vel|velocity|width)$")
+"""What of the name of an element is not that of its joint."""
+_DIGEST = re.compile(r"[0-9a-f]{16}")
+_KEPT = ("material", "link", "joint")
+"""What of a URDF places and draws links; the rest is for simulators and controllers, and full of paths."""
+_IN_PACKAGE = re.compile(r"^(?:file:/*)?/.*/share/([^/]+/.+)$")
+"""An absolute path into an installed ROS package."""
+_ABSOLUTE = re.compile(r"^(file:|/|~|[A-Za-z]:[\\/]|\\\\)")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobotRecord:
+    """What is known of an arm beside its URDF.
+
+    Attributes:
+        name: The dataset's `robot_type`.
+        urdf_sha256: SHA-256 (hex) of the URDF's file.
+        joints: Feature -> for each of its elements the joint of the URDF of which it is the position, "" for none.
+        units: Feature -> of its elements, where they are known; positions are in rad and m otherwise.
+        spec: Of a simulated arm: TCP link, limits, gripper, and `urdf`, the model that the meshes belong to.
+        meshes: Link -> the mesh files that this model draws it with, as its URDF names them, where it is installed;
+            the URDF here has boxes, balls and cylinders in their place.
+    """
+
+    name: str
+    urdf_sha256: str
+    joints: Mapping[str, tuple[str, ...]]
+    units: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    spec: RobotSpec | None = None
+    meshes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DatasetRobot:
+    """An arm: what its two files hold."""
+
+    record: RobotRecord
+    urdf: str
+
+    @functools.cached_property
+    def digest(self) -> str:
+        """The name of its files: of all that is in them."""
+        return digest(self.record)
+
+    @functools.cached_property
+    def model(self) -> Urdf:
+        """The joint tree; lengths are those of the arm, whatever its scale was."""
+        return Urdf.parse(self.urdf)
+
+
+def robot_of(episode: ExportEpisode) -> DatasetRobot | None:
+    """The robot of an episode, and which of its joints the features move; None where its URDF is not known.
+
+    Raises:
+        RecordingError: The recording is damaged.
+    """
+    simulated, urdf = episode.simulated, episode.urdf
+    spec = None if simulated is None else simulated.recording.info.robot
+    if not urdf:
+        return None
+    return _robot(
+        episode.recording.info.robot_name, urdf, tuple(episode.joints.items()), tuple(episode.units.items()), spec
+    )
+
+
+@functools.cache
+def recognised_robot(names: tuple[str, ...]) -> DatasetRobot | None:
+    """The arm of ours whose joints the elements of observation.state are called after, "panda_joint1.pos" or the like.
+
+    Of a dataset that does not say what its robot is; lengths are those of the model.
+    """
+    stems = [ELEMENT_SUFFIX.sub("", name) for name in names]
+    for row in ROBOTS.names():
+        robot = ROBOTS.load(row)
+        if set(robot.arm_joints) <= set(stems):
+            urdf = robot_description(robot.urdf, 1.0)
+            joints = tuple(stem if stem in robot.joint_names else "" for stem in stems)
+            record = RobotRecord(name=robot.name, urdf_sha256=_sha256(urdf), joints={STATE: joints})
+            return DatasetRobot(record=record, urdf=urdf)
+    return None
+
+
+_ByFeature = tuple[tuple[str, tuple[str, ...]], ...]
+
+
+@functools.lru_cache(maxsize=8)  # nearly always the same in all recordings of a run
+def _robot(name: str, text: str, joints: _ByFeature, units: _ByFeature, spec: RobotSpec | None) -> DatasetRobot:
+    urdf = portable_urdf(text) if spec is None else text
+    return DatasetRobot(
+        record=RobotRecord(
+            name=name,
+            urdf_sha256=_sha256(urdf),
+            joints=dict(joints),
+            units=dict(units),
+            spec=spec,
+            meshes={} if spec is None else _mesh_names(spec.urdf),
+        ),
+        urdf=urdf,
+    )
+
+
+def portable_urdf(text: str) -> str:
+    """The links, joints and materials of a URDF, without a path of the machine that it comes from.
+
+    What lies in a ROS package is named by it (package://NAME/...), any other absolute path by the file's name alone.
+    Comments go, in which xacro writes where it was run.
+    """
+    robot = parse_xml(text)
+    for part in list(robot):
+        if part.tag not in _KEPT:
+            robot.remove(part)
+    for part in robot.iter():
+        if (name := part.get("filename")) is not None:
+            part.set("filename", _portable(name))
+    ET.indent(robot, " ")
+    return ET.tostring(robot, encoding="unicode") + "\n"
+
+
+def _portable(name: str) -> str:
+    if found := _IN_PACKAGE.match(name):
+        return f"package://{found[1]}"
+    return re.split(r"[/\\]", name)[-1] if _ABSOLUTE.match(name) else name
+
+
+@functools.lru_cache(maxsize=8)
+def _mesh_names(model: str) -> Mapping[str, tuple[str, ...]]:
+    """Link -> mesh files of a model; none where it is not installed, or may not be looked at."""
+    try:
+        links = read_links(asset_path(model).read_text())
+    except (DemorecError, OSError, ValueError):
+        return {}
+    named = {link.name: tuple(shape.file for shape in link.visuals if shape.kind == "mesh") for link in links}
+    return {link: files for link, files in named.items() if files}
+
+
+def write_robot(root: Path, robot: DatasetRobot) -> None:
+    """Write the files of an arm, unless the dataset has them."""
+    folder = root / ROBOTS_DIR
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, text in ((".urdf", robot.urdf), (".json", to_json(robot.record, indent=2) + "\n")):
+        path = folder / f"{robot.digest}{name}"
+        if not path.exists():
+            write_text(path, text)
+
+
+def read_robot(root: Path, name: str) -> DatasetRobot:
+    """The arm that the episodes of a dataset call by this digest.
+
+    Raises:
+        ExportError: It is missing, has changed since it was written, or cannot be used.
+    """
+    path = root / ROBOTS_DIR / f"{name}.json"
+    try:
+        if not _DIGEST.fullmatch(name):
+            raise ValueError(f"{name[:20]!r} is no digest")
+        record = from_json(read_text_limited(path, MAX_JSON_BYTES), RobotRecord)
+        robot = DatasetRobot(record=record, urdf=read_text_limited(path.with_suffix(".urdf"), MAX_BYTES))
+        if robot.digest != name or _sha256(robot.urdf) != record.urdf_sha256:
+            raise ValueError("it has changed since it was written")
+        joints = {joint.name for joint in robot.model.joints}
+        named = {joint for part in record.joints.values() for joint in part if joint}
+        if missing := named - joints:
+            raise ValueError(f"its URDF lacks the joints {', '.join(sorted(missing))}")
+    except (OSError, ValueError) as error:
+        raise ExportError(f"The description of the robot cannot be read ({in_words(error)}): {path}") from error
+    return robot
+
+
+def _sha256(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()

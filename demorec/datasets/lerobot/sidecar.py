@@ -1,0 +1,307 @@
+"""What LeRobot has no place for and a user still needs, in the folder `demorec/` of the dataset.
+
+- `episodes/`: one row per episode: where it comes from (run's episode number, attempt, seed, config digest), how it
+  ended (every check with its value and limit), what happened when (phases, deliberate misses), the cameras with
+  intrinsics and extrinsics, poses of objects and goals, and `episode_info`: the complete description of scene and
+  robot as JSON, from which `demorec` can build the world again.
+- `camera_poses/`: one row per frame, for cameras that move.
+- `attempts/`: one row per attempt that was seen, failed ones included, for success rates.
+- `robots/`: what draws and moves the arms, in a form that needs nothing of ours (`demorec.datasets.lerobot.robots`).
+- `configs.json`: config digest -> resolved configuration; `export.json`: how the dataset was made.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from demorec.core.geometry import Array
+from demorec.core.plain import to_json, to_plain
+from demorec.datasets.episode import ExportEpisode, Simulated
+from demorec.datasets.lerobot.attempts import ATTEMPT_SCHEMA, AttemptRecord
+from demorec.datasets.lerobot.layout import (
+    SIDECAR_ATTEMPTS_PATH,
+    SIDECAR_CAMERAS_PATH,
+    SIDECAR_EPISODES_PATH,
+    FilePosition,
+)
+from demorec.datasets.lerobot.parquet import RollingParquet, vector_array
+from demorec.datasets.lerobot.paths import SIDECAR_DIR
+from demorec.datasets.lerobot.robots import DatasetRobot, robot_of, write_robot
+from demorec.datasets.lerobot.writer import WrittenEpisode, write_text
+from demorec.episode.episode import EpisodeColumns
+from demorec.episode.scene import Scene
+
+CONFIGS_PATH = f"{SIDECAR_DIR}/configs.json"
+EXPORT_PATH = f"{SIDECAR_DIR}/export.json"
+
+_ROWS_PER_TABLE = 100
+_POSE = pa.list_(pa.float64(), 7)
+_VECTOR = pa.list_(pa.float64())
+
+_CHECK = pa.struct(
+    [
+        ("name", pa.string()),
+        ("value", pa.float64()),
+        ("limit", pa.float64()),
+        ("unit", pa.string()),
+        ("passed", pa.bool_()),
+    ]
+)
+_PHASE = pa.struct([("name", pa.string()), ("from", pa.int64()), ("to", pa.int64())])
+_OBJECT = pa.struct([("name", pa.string()), ("world_from_object_start", _VECTOR), ("world_from_object_end", _VECTOR)])
+_GOAL = pa.struct([("object", pa.string()), ("onto", pa.string()), ("world_from_goal_start", _VECTOR)])
+_CAMERA = pa.struct(
+    [
+        ("name", pa.string()),
+        ("width", pa.int64()),
+        ("height", pa.int64()),
+        ("intrinsics", _VECTOR),
+        ("mount", pa.string()),
+        ("mount_from_camera", _VECTOR),
+        ("world_from_camera_start", _VECTOR),
+    ]
+)
+
+EPISODE_SCHEMA = pa.schema(
+    [
+        ("episode_index", pa.int64()),
+        ("source", pa.string()),
+        ("run_episode_index", pa.int64()),
+        ("attempt", pa.int64()),
+        ("root_seed", pa.uint64()),
+        ("task", pa.string()),
+        ("origin", pa.string()),
+        ("config_digest", pa.string()),
+        ("content_digest", pa.string()),
+        ("frame_stride", pa.int64()),
+        ("success", pa.bool_()),
+        ("failure_phase", pa.string()),
+        ("failure_reason", pa.string()),
+        ("num_retries", pa.int64()),
+        ("final_state_digest", pa.string()),
+        ("checks", pa.list_(_CHECK)),
+        ("behaviour", pa.map_(pa.string(), pa.float64())),
+        ("phases", pa.list_(_PHASE)),
+        ("deliberate_miss_frames", pa.list_(pa.int64())),
+        ("objects", pa.list_(_OBJECT)),
+        ("goals", pa.list_(_GOAL)),
+        ("cameras", pa.list_(_CAMERA)),
+        ("episode_info", pa.string()),
+        ("robot_digest", pa.string()),
+    ]
+)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class EpisodeRecord:
+    """What stands beside one episode of the dataset.
+
+    Attributes:
+        row: Of the episodes' table, less the index.
+        attempt: Of the attempts' table.
+        moving_cameras: Camera -> (T, 7) world_from_camera of every frame in the dataset.
+        config_digest, config: Of its run.
+        robot: What draws and moves its arm; None where that is not known.
+    """
+
+    row: Mapping[str, Any]
+    attempt: AttemptRecord
+    moving_cameras: Mapping[str, Array]
+    config_digest: str
+    config: Mapping[str, Any]
+    robot: DatasetRobot | None
+
+    @classmethod
+    def of(cls, episode: ExportEpisode) -> EpisodeRecord:
+        """Of an episode; frame numbers are those of the dataset."""
+        recording, rows, attempt = episode.recording, episode.rows, AttemptRecord.of(episode.recording)
+        row = {
+            "source": attempt.source,
+            "run_episode_index": attempt.run_episode_index,
+            "attempt": attempt.attempt,
+            "origin": episode.origin,
+            "frame_stride": recording.info.fps // episode.fps if len(rows) > 1 else 1,
+            "success": attempt.success,
+            "failure_reason": attempt.failure_reason,
+            "cameras": episode.described_cameras(),
+        }
+        moving: dict[str, Array] = {}
+        if (simulated := episode.simulated) is not None:
+            row |= _simulated_row(simulated, rows)
+            cameras = simulated.recording.info.scene.cameras
+            poses = simulated.columns.world_from_camera
+            moving = {camera.name: poses[camera.name][rows] for camera in cameras if camera.mount != "world"}
+        return cls(
+            row=row,
+            attempt=attempt,
+            moving_cameras=moving,
+            config_digest="" if simulated is None else simulated.recording.info.config_digest,
+            config={} if simulated is None else simulated.recording.info.config,
+            robot=robot_of(episode),
+        )
+
+
+def _simulated_row(simulated: Simulated, rows: NDArray[np.intp]) -> dict[str, Any]:
+    """What is known of a simulated episode; it failed where its recording ends without an outcome."""
+    info, columns, outcome = simulated.recording.info, simulated.columns, simulated.recording.outcome
+    return {
+        "root_seed": info.root_seed,
+        "task": info.task,
+        "config_digest": info.config_digest,
+        "failure_phase": "" if outcome is None else outcome.failure_phase,
+        "num_retries": 0 if outcome is None else outcome.num_retries,
+        "final_state_digest": "" if outcome is None else outcome.final_state_digest,
+        "checks": [] if outcome is None else [to_plain(check) for check in outcome.checks],
+        "behaviour": sorted(info.behaviour.items()),
+        "phases": _phases(columns, rows),
+        "deliberate_miss_frames": np.flatnonzero(columns.is_deliberate_miss[rows]).tolist(),
+        **_things(info.scene, columns),
+        "episode_info": to_json(info),
+    }
+
+
+def _phases(columns: EpisodeColumns, rows: NDArray[np.intp]) -> list[dict[str, Any]]:
+    """Name, first frame and frame after the last, of each phase."""
+    phases = []
+    for name, group in groupby(range(len(rows)), key=lambda index: columns.phase[rows[index]]):
+        numbers = list(group)
+        phases.append({"name": name, "from": numbers[0], "to": numbers[-1] + 1})
+    return phases
+
+
+def _things(scene: Scene, columns: EpisodeColumns) -> dict[str, list[dict[str, Any]]]:
+    """Where the objects and goals are, at the start and at the end."""
+    return {
+        "objects": [
+            {
+                "name": name,
+                "world_from_object_start": poses[0].tolist(),
+                "world_from_object_end": poses[-1].tolist(),
+            }
+            for name, poses in columns.object_poses.items()
+        ],
+        "goals": [
+            {
+                "object": goal.object,
+                "onto": goal.onto,
+                "world_from_goal_start": scene.world_from_goal(goal).vector().tolist(),
+            }
+            for goal in scene.goals
+        ],
+    }
+
+
+@dataclass(frozen=True, kw_only=True)
+class SidecarStart:
+    """The next unused file numbers in a dataset that has a sidecar already, and its configs."""
+
+    episodes: FilePosition = field(default_factory=FilePosition)
+    attempts: FilePosition = field(default_factory=FilePosition)
+    camera_poses: FilePosition = field(default_factory=FilePosition)
+    configs: Mapping[str, Any] | None = None
+
+
+class SidecarWriter:
+    """Writes the sidecar's tables as the episodes come; `finish` completes them."""
+
+    def __init__(self, root: Path, start: SidecarStart, *, limit_mb: float, chunks_size: int) -> None:
+        self._root = root
+        self._start = start
+        self._limit_mb, self._chunks_size = limit_mb, chunks_size
+        self._episodes = self._table(SIDECAR_EPISODES_PATH, EPISODE_SCHEMA, start.episodes)
+        self._attempts = self._table(SIDECAR_ATTEMPTS_PATH, ATTEMPT_SCHEMA, start.attempts)
+        self._camera_poses: RollingParquet | None = None
+        self._episode_rows: list[dict[str, Any]] = []
+        self._attempt_rows: list[dict[str, Any]] = []
+        self._configs: dict[str, Any] = dict(start.configs or {})
+
+    def _table(
+        self, template: str, schema: pa.Schema, start: FilePosition, repeating: Sequence[str] | None = None
+    ) -> RollingParquet:
+        return RollingParquet(
+            self._root,
+            template,
+            schema,
+            start=start,
+            limit_mb=self._limit_mb,
+            chunks_size=self._chunks_size,
+            compression="zstd",
+            repeating=repeating,
+        )
+
+    def __enter__(self) -> SidecarWriter:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        for table in (self._episodes, self._attempts, self._camera_poses):
+            if table is not None:
+                table.abort()
+
+    def add(self, written: WrittenEpisode, record: EpisodeRecord) -> None:
+        """What belongs to an episode of the dataset."""
+        episode_index = written.episode_index
+        robot = record.robot
+        added = {"episode_index": episode_index, "content_digest": written.digest}
+        self._episode_rows.append({**added, **record.row, "robot_digest": None if robot is None else robot.digest})
+        if robot is not None:
+            write_robot(self._root, robot)
+        if record.config_digest or record.config:
+            self._configs.setdefault(record.config_digest, record.config)
+        self.add_attempt(record.attempt, in_dataset=True)
+        if record.moving_cameras:
+            self._add_camera_poses(episode_index, record.moving_cameras)
+        if len(self._episode_rows) >= _ROWS_PER_TABLE:
+            self._flush_episodes()
+
+    def add_attempt(self, attempt: AttemptRecord, *, in_dataset: bool) -> None:
+        """An attempt that was seen, whether or not it is in the dataset."""
+        row = {item.name: getattr(attempt, item.name) for item in fields(attempt)}
+        self._attempt_rows.append({**row, "in_dataset": in_dataset})
+        if len(self._attempt_rows) >= _ROWS_PER_TABLE:
+            self._flush_attempts()
+
+    def _add_camera_poses(self, episode_index: int, poses: Mapping[str, Array]) -> None:
+        if self._camera_poses is None:
+            schema = pa.schema(
+                [("episode_index", pa.int64()), ("frame_index", pa.int64()), *((name, _POSE) for name in poses)]
+            )
+            self._camera_poses = self._table(
+                SIDECAR_CAMERAS_PATH, schema, self._start.camera_poses, repeating=["episode_index"]
+            )
+        frames = len(next(iter(poses.values())))
+        arrays = [pa.array(np.full(frames, episode_index)), pa.array(np.arange(frames))]
+        arrays += [vector_array(poses[name], _POSE) for name in self._camera_poses.schema.names[2:]]
+        self._camera_poses.make_room(frames)
+        self._camera_poses.write(pa.Table.from_arrays(arrays, schema=self._camera_poses.schema))
+
+    def _flush_episodes(self) -> None:
+        if self._episode_rows:
+            self._episodes.make_room(len(self._episode_rows))
+            self._episodes.write(pa.Table.from_pylist(self._episode_rows, schema=EPISODE_SCHEMA))
+            self._episode_rows.clear()
+
+    def _flush_attempts(self) -> None:
+        if self._attempt_rows:
+            self._attempts.make_room(len(self._attempt_rows))
+            self._attempts.write(pa.Table.from_pylist(self._attempt_rows, schema=ATTEMPT_SCHEMA))
+            self._attempt_rows.clear()
+
+    def finish(self, export: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Close the tables and write the two JSON files; return config digest -> configuration."""
+        self._flush_episodes()
+        self._flush_attempts()
+        for table in (self._episodes, self._attempts, self._camera_poses):
+            if table is not None:
+                table.close()
+        write_text(self._root / CONFIGS_PATH, json.dumps(self._configs, indent=2, sort_keys=True) + "\n")
+        write_text(self._root / EXPORT_PATH, json.dumps(dict(export), indent=2, sort_keys=True) + "\n")
+        return self._configs

@@ -1,0 +1,212 @@
+"""Opens a finished dataset with the installed LeRobot and compares samples of it with the recordings.
+
+Nothing of the writing code is used to read: LeRobot finds the rows, the files and the pictures by itself. It runs in
+a process of its own, since LeRobot brings PyTorch (seconds to load, hundreds of megabytes) and keeps copies of the
+tables in a cache, which here is a temporary folder.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import signal
+import sys
+import tempfile
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from itertools import islice
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.core.errors import DemorecError, ExportError, in_words, resource_error
+from demorec.core.processes import SPAWN
+from demorec.datasets.episode import ExportCamera, ExportEpisode
+from demorec.datasets.exported import exported
+from demorec.datasets.lerobot.depth import code_values, quantised
+from demorec.datasets.lerobot.language import EVENTS, PERSISTENT, EpisodeLanguage
+from demorec.datasets.lerobot.options import ExportOptions
+from demorec.datasets.lerobot.prepare import prepare_episode
+from demorec.datasets.lerobot.transcode import reason_to_transcode
+from demorec.mcap import AnyRecording, open_recording
+
+LEROBOT = "lerobot[dataset]>=0.6.1,<0.7"
+"""What pip has to install for a verification; a test compares it with pyproject.toml."""
+
+MAX_EPISODES = 500
+"""Samples are taken of so many episodes, spread evenly, if there are more."""
+
+_TRANSCODED_TOLERANCE = 12.0
+"""Mean absolute difference in levels (0..255) allowed of a picture that was coded anew; others must be equal."""
+_DEPTH_TOLERANCE = 6e-4
+"""Metres; LeRobot rounds distances to millimetres."""
+
+
+_GRACE_S = 5.0
+"""How long the process may take to end by itself."""
+
+
+def lerobot_is_installed() -> bool:
+    """Whether there is a LeRobot that could verify; tells it without loading it."""
+    return importlib.util.find_spec("lerobot") is not None
+
+
+@dataclass(frozen=True, kw_only=True)
+class VerifiedEpisode:
+    """An episode of the dataset and the recording that it comes from."""
+
+    episode_index: int
+    recording: Path
+
+
+class Verifier:
+    """Context manager over the process that verifies; it starts loading LeRobot at once, while the export runs.
+
+    The process is ended with the context, whatever it does then: with too little memory, loading may never end.
+    """
+
+    def __init__(self) -> None:
+        self._cache = tempfile.TemporaryDirectory(prefix="demorec-verify-")
+        self._pipe, theirs = SPAWN.Pipe()
+        self._process = SPAWN.Process(target=_serve, args=(theirs, self._cache.name), daemon=True)
+        self._process.start()
+        theirs.close()  # else the pipe would never report that the process is gone
+
+    def __enter__(self) -> Verifier:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *exc: object) -> None:
+        self._pipe.close()
+        if kind is not None:
+            self._process.terminate()
+        self._process.join(timeout=_GRACE_S)
+        self._process.kill()
+        self._process.join()
+        self._cache.cleanup()
+
+    def verify(self, root: Path, samples: Sequence[VerifiedEpisode], options: ExportOptions) -> int:
+        """Compare; return how many frames were compared.
+
+        Raises:
+            ExportError: LeRobot cannot open the dataset, or shows something else than the recordings.
+        """
+        try:
+            self._pipe.send((root, tuple(samples), options))
+            found = self._pipe.recv()
+        except (EOFError, OSError) as error:
+            self._process.join()
+            raise ExportError(
+                f"The new dataset was dropped: the process that verifies ended by itself (exit code "
+                f"{self._process.exitcode}), often for lack of memory; free some, or give --no-verify."
+            ) from error
+        if isinstance(found, DemorecError):
+            raise found
+        return int(found)
+
+
+def _serve(pipe: Connection[Any, Any], cache: str) -> None:
+    """Life of the process: load LeRobot, verify what comes through the pipe, answer with a count or an error."""
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(1))  # an orderly end: libraries left semaphores
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; who exports ends us
+    os.environ.update(HF_HUB_OFFLINE="1", HF_DATASETS_OFFLINE="1", HF_DATASETS_CACHE=cache)
+    answer: int | DemorecError
+    try:
+        import lerobot.datasets  # noqa: F401
+
+        root, samples, options = pipe.recv()
+        answer = _verify(root, samples, options)
+    except EOFError:
+        return  # the export has ended without a dataset
+    except DemorecError as error:
+        answer = error
+    except Exception as error:
+        answer = resource_error(error) or ExportError(
+            f"The new dataset was dropped, it cannot be verified ({in_words(error)})."
+        )
+    with suppress(OSError):
+        pipe.send(answer)
+
+
+def _verify(root: Path, samples: tuple[VerifiedEpisode, ...], options: ExportOptions) -> int:
+    from lerobot.datasets import LeRobotDataset
+
+    try:
+        dataset = LeRobotDataset(options.repo_id, root=root, video_backend="pyav", return_uint8=True)
+    except Exception as error:  # whatever LeRobot says, the dataset must not be handed out
+        raise resource_error(error) or ExportError(
+            f"The new dataset was dropped, LeRobot cannot open it ({in_words(error)})."
+        ) from error
+    frames = 0
+    for number, sample in enumerate(samples):
+        with open_recording(sample.recording) as recording:
+            frames += _compare_episode(dataset, sample, recording, options, number)
+    return frames
+
+
+def _compare_episode(
+    dataset: Any, sample: VerifiedEpisode, recording: AnyRecording, options: ExportOptions, number: int
+) -> int:
+    first = int(dataset.meta.episodes[sample.episode_index]["dataset_from_index"])
+    episode = exported(recording, options)
+    length = len(episode.rows)
+    # The last frame, where offsets add up, and one more that differs from episode to episode.
+    moments = sorted({(number * 37) % length, length - 1})
+    expected = prepare_episode(episode, options, code_depth=False, about=moments).data
+    for moment in moments:
+        try:
+            item = dataset[first + moment]
+        except Exception as error:
+            raise ExportError(
+                f"The new dataset was dropped, LeRobot cannot read frame {moment} of episode {sample.episode_index} "
+                f"({in_words(error)})."
+            ) from error
+        wrong = [
+            name for name, values in expected.columns.items() if name in item and not _equal(item[name], values[moment])
+        ]
+        wrong += _wrong_language(item, expected.language, moment)
+        if item["task"] != expected.task:
+            wrong.append("task")
+        if float(item["timestamp"]) != float(np.float32(moment / dataset.meta.fps)):
+            wrong.append("timestamp")
+        wrong += [
+            camera.feature
+            for camera in episode.cameras
+            if camera.feature in item and _is_wrong_image(item[camera.feature], episode, camera, moment)
+        ]
+        if wrong:
+            raise ExportError(
+                f"The new dataset was dropped: read through LeRobot, {', '.join(wrong)} of frame {moment} of episode "
+                f"{sample.episode_index} differ from the recording: {sample.recording}"
+            )
+    return len(moments)
+
+
+def _equal(tensor: Any, values: Any) -> bool:
+    found = np.asarray(tensor)
+    return bool(np.array_equal(found.reshape(-1), np.asarray(values).reshape(-1)))
+
+
+def _wrong_language(item: Any, expected: EpisodeLanguage, moment: int) -> list[str]:
+    rows = {PERSISTENT: expected.persistent, EVENTS: expected.events.get(moment, ())}
+    return [name for name, told in rows.items() if name in item and item[name] != [row.to_json() for row in told]]
+
+
+def _is_wrong_image(tensor: Any, episode: ExportEpisode, camera: ExportCamera, moment: int) -> bool:
+    """Whether an image differs from the one that the frame shows; of depth, as far as its codes tell."""
+    number, recording = int(episode.numbers(camera)[moment]), episode.recording
+    if camera.is_depth:
+        return _is_wrong_depth(tensor, next(islice(recording.depth(camera.name), number, None)))
+    limit = _TRANSCODED_TOLERANCE if reason_to_transcode(episode, camera) else 0.0
+    found = tensor.numpy().transpose(1, 2, 0).astype(np.float64)
+    return bool(np.abs(found - recording.picture(camera.name, number)).mean() > limit)
+
+
+def _is_wrong_depth(tensor: Any, recorded: NDArray[np.float32]) -> bool:
+    """Whether distances, which LeRobot gives in mm, are not the recorded ones (H, W), m, as far as its codes tell."""
+    found = tensor.numpy()
+    found = found.reshape(found.shape[-2:]) / 1000
+    return bool(np.abs(found - code_values()[quantised(recorded)]).max() > _DEPTH_TOLERANCE)

@@ -1,0 +1,360 @@
+"""Writes a LeRobot v3.0 dataset episode by episode, at the same cost for the first and the ten-thousandth.
+
+Nothing that was written is read or written again while episodes come in; tables roll over by size, each kind on its
+own; an episode never straddles two files. The format's rules come from LeRobot's own reader and writer.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from demorec.core.errors import ExportError
+from demorec.datasets.lerobot.data_stats import data_statistics
+from demorec.datasets.lerobot.digest import episode_digest
+from demorec.datasets.lerobot.facts import fact_type
+from demorec.datasets.lerobot.language import REPEATING, EpisodeLanguage, language_arrays, language_digests
+from demorec.datasets.lerobot.layout import (
+    AUTOMATIC_FEATURES,
+    DATA_PATH,
+    EPISODES_PATH,
+    MEBIBYTE,
+    STATS_PATH,
+    TASKS_PATH,
+    VIDEO_PATH,
+    DatasetInfo,
+    FilePosition,
+    data_schema,
+    merged_video_info,
+)
+from demorec.datasets.lerobot.mp4 import CodedVideo, Mp4Writer
+from demorec.datasets.lerobot.parquet import RollingParquet, nested_array, vector_array
+from demorec.datasets.lerobot.paths import INFO_PATH
+from demorec.datasets.lerobot.stats import NAMES, PixelHistogram, Statistics, vector_statistics
+from demorec.datasets.staging import sync_file
+
+_EPISODES_PER_TABLE = 100
+_MAX_SECONDS_PER_VIDEO = 900.0
+"""LeRobot compares timestamps as float32, whose step is 6e-5 s beyond 512 s and 1.2e-4 s beyond 1024 s, with a
+tolerance of 1e-4 s: a new mp4 file is begun before that, except for a single episode that is longer."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class EpisodeData:
+    """One episode, ready to be written.
+
+    Attributes:
+        task: Instruction.
+        columns: Feature -> (T,) or (T, D), without cameras and the automatic features.
+        videos: Camera feature -> coded pictures, T of them.
+        video_info: Camera feature -> how they were coded, the `info` of the feature.
+        pixels: Camera feature -> histogram, for the statistics.
+        language: What is said about it; written where the dataset has the columns for it.
+        facts: Column of the table of episodes -> value; written where the dataset has the column.
+    """
+
+    task: str
+    columns: Mapping[str, NDArray[Any]]
+    videos: Mapping[str, CodedVideo] = field(default_factory=dict)
+    video_info: Mapping[str, dict[str, Any]] = field(default_factory=dict)
+    pixels: Mapping[str, PixelHistogram] = field(default_factory=dict)
+    language: EpisodeLanguage = field(default_factory=EpisodeLanguage)
+    facts: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def num_frames(self) -> int:
+        """T."""
+        return len(next(iter(self.columns.values())))
+
+
+@dataclass(frozen=True, kw_only=True)
+class WriterStart:
+    """Where the writer goes on in a dataset that has episodes already; the defaults are those of an empty one.
+
+    Attributes:
+        num_episodes, num_frames: That are there.
+        tasks: In the order of their indices.
+        data, episodes: The next unused file numbers.
+        videos: Camera feature -> the next unused file number.
+        statistics: Of the camera features over what is there.
+    """
+
+    num_episodes: int = 0
+    num_frames: int = 0
+    tasks: tuple[str, ...] = ()
+    data: FilePosition = field(default_factory=FilePosition)
+    episodes: FilePosition = field(default_factory=FilePosition)
+    videos: Mapping[str, FilePosition] = field(default_factory=dict)
+    statistics: Mapping[str, Statistics] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class WrittenEpisode:
+    """Where an episode went, and its digest (`demorec.datasets.lerobot.digest`)."""
+
+    episode_index: int
+    digest: str
+
+
+class DatasetWriter:
+    """Context manager; `finish` completes the metadata.
+
+    Args:
+        root: Folder of the dataset; for an appending writer it holds the old files already.
+        info: Features and limits; its counters are taken from `start`.
+        start: Where to go on.
+        facts: Which of the episodes' facts the table of episodes has (`demorec.datasets.lerobot.facts`).
+    """
+
+    def __init__(
+        self, root: Path, info: DatasetInfo, start: WriterStart | None = None, facts: Sequence[str] = ()
+    ) -> None:
+        self._root = root
+        self._info = info
+        self._facts = tuple(facts)
+        self._start = start or WriterStart()
+        self._schema = data_schema(info.features)
+        self._numeric = [name for name in self._schema.names if info.features[name].is_numeric]
+        self._language = [name for name in self._schema.names if info.features[name].dtype == "language"]
+        self._tasks = {task: index for index, task in enumerate(self._start.tasks)}
+        self.num_episodes = self._start.num_episodes
+        self.num_frames = self._start.num_frames
+        strings = [name for name in self._schema.names if name not in (*self._numeric, *self._language)]
+        self._data = RollingParquet(
+            root,
+            DATA_PATH,
+            self._schema,
+            start=self._start.data,
+            repeating=["episode_index", "task_index", *strings, *(REPEATING if self._language else ())],
+            **_sizes(info),
+        )
+        self._episodes = RollingParquet(
+            root, EPISODES_PATH, self._episode_schema(), start=self._start.episodes, **_sizes(info)
+        )
+        self._rows: list[dict[str, Any]] = []
+        self._row_statistics: list[dict[str, Statistics]] = []
+        self._videos: dict[str, Mp4Writer] = {}
+        self._video_positions = {key: self._start.videos.get(key, FilePosition()) for key in info.video_keys}
+        self._video_info = {key: info.features[key].info for key in info.video_keys}
+        self._pixels: dict[str, PixelHistogram] = {}
+
+    def __enter__(self) -> DatasetWriter:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        for video in self._videos.values():
+            video.abort()
+        self._data.abort()
+        self._episodes.abort()
+
+    def add(self, episode: EpisodeData) -> WrittenEpisode:
+        """Append an episode."""
+        frames = episode.num_frames
+        if frames == 0:
+            raise ExportError("An episode without frames cannot be exported.")
+        task_index = self._tasks.setdefault(episode.task, len(self._tasks))
+        spoken = set(self._language)
+        columns = {
+            **{
+                name: episode.columns[name] for name in self._schema.names if name not in {*AUTOMATIC_FEATURES, *spoken}
+            },
+            "timestamp": (np.arange(frames) / self._info.fps).astype(np.float32),
+            "frame_index": np.arange(frames),
+            "episode_index": np.full(frames, self.num_episodes),
+            "index": np.arange(self.num_frames, self.num_frames + frames),
+            "task_index": np.full(frames, task_index),
+        }
+        position = self._data.make_room(frames)
+        texts = language_arrays(episode.language, frames) if spoken else {}
+        arrays = [
+            texts[item.name] if item.name in spoken else vector_array(columns[item.name], item.type)
+            for item in self._schema
+        ]
+        self._data.write(pa.Table.from_arrays(arrays, schema=self._schema))
+        row: dict[str, Any] = {
+            "episode_index": self.num_episodes,
+            "tasks": [episode.task],
+            "length": frames,
+            "data/chunk_index": position.chunk,
+            "data/file_index": position.file,
+            "dataset_from_index": self.num_frames,
+            "dataset_to_index": self.num_frames + frames,
+            **{name: episode.facts.get(name) for name in self._facts},
+        }
+        statistics = vector_statistics({name: columns[name] for name in self._numeric})
+        digests = {}
+        for key in self._info.video_keys:
+            row.update(self._add_video(key, episode.videos[key], frames))
+            digests[key] = episode.videos[key].digest
+            self._video_info[key] = merged_video_info(self._video_info[key] or {}, dict(episode.video_info[key]))
+            pixels = episode.pixels[key]
+            self._pixels[key] = self._pixels[key] + pixels if key in self._pixels else pixels
+            statistics[key] = pixels.statistics()
+        self._rows.append(row)
+        self._row_statistics.append(statistics)
+        if len(self._rows) >= _EPISODES_PER_TABLE:
+            self._write_episode_rows()
+        self.num_frames += frames
+        self.num_episodes += 1
+        if spoken:
+            columns.update(language_digests(episode.language, frames))
+        return WrittenEpisode(
+            episode_index=self.num_episodes - 1, digest=episode_digest(episode.task, columns, digests)
+        )
+
+    def _add_video(self, key: str, video: CodedVideo, frames: int) -> dict[str, int | float]:
+        if video.num_frames != frames:
+            raise ExportError(f"{key} has {video.num_frames} pictures for {frames} frames.")
+        file = self._videos.get(key)
+        fps = self._info.fps
+        if file is not None and (
+            file.num_bytes + video.num_bytes >= self._info.video_files_size_in_mb * MEBIBYTE
+            or (file.num_pictures + len(video.sizes)) / fps > _MAX_SECONDS_PER_VIDEO
+            or file.parameter_sets != video.parameter_sets()
+        ):
+            file.close()
+            file = None
+            self._video_positions[key] = self._video_positions[key].next(self._info.chunks_size)
+        position = self._video_positions[key]
+        if file is None:
+            path = self._root / position.path(VIDEO_PATH, key)
+            file = self._videos[key] = Mp4Writer(path, video, fps=fps)
+        start = file.num_pictures + video.lead
+        file.add(video)
+        return {
+            f"videos/{key}/chunk_index": position.chunk,
+            f"videos/{key}/file_index": position.file,
+            f"videos/{key}/from_timestamp": start / fps,
+            f"videos/{key}/to_timestamp": (start + frames) / fps,
+        }
+
+    def finish(self) -> DatasetInfo:
+        """Close all files and write tasks, statistics and info.json; return what it says."""
+        for video in self._videos.values():
+            video.close()
+        self._data.close()
+        self._write_episode_rows()
+        self._episodes.close()
+        write_tasks(self._root / TASKS_PATH, list(self._tasks))
+        statistics: dict[str, Statistics] = dict(
+            data_statistics(sorted((self._root / "data").glob("*/*.parquet")), self._info.features)
+        )
+        for key in self._info.video_keys:
+            new = self._pixels[key].statistics() if key in self._pixels else None
+            parts = [part for part in (self._start.statistics.get(key), new) if part is not None]
+            if parts:
+                statistics[key] = merge_statistics(parts)
+        ordered = {name: statistics[name].to_json() for name in self._info.features if name in statistics}
+        write_text(self._root / STATS_PATH, json.dumps(ordered, indent=4) + "\n")
+        coded = {key: replace(self._info.features[key], info=found) for key, found in self._video_info.items()}
+        info = replace(
+            self._info,
+            features={**self._info.features, **coded},
+            total_episodes=self.num_episodes,
+            total_frames=self.num_frames,
+            total_tasks=len(self._tasks),
+        )
+        write_text(self._root / INFO_PATH, info.to_json())
+        return info
+
+    def _episode_schema(self) -> pa.Schema:
+        integers = ("data/chunk_index", "data/file_index", "dataset_from_index", "dataset_to_index")
+        fields = [("episode_index", pa.int64()), ("tasks", pa.list_(pa.string())), ("length", pa.int64())]
+        fields += [(name, pa.int64()) for name in integers]
+        for key in self._info.video_keys:
+            fields += [(f"videos/{key}/{name}", pa.int64()) for name in ("chunk_index", "file_index")]
+            fields += [(f"videos/{key}/{name}", pa.float64()) for name in ("from_timestamp", "to_timestamp")]
+        for key in (*self._numeric, *self._info.video_keys):
+            number = pa.list_(pa.float64())
+            if key in self._info.video_keys:
+                number = pa.list_(pa.list_(number))
+            fields += [(f"stats/{key}/{name}", pa.list_(pa.int64()) if name == "count" else number) for name in NAMES]
+        fields += [(name, fact_type(name)) for name in self._facts]
+        fields += [("meta/episodes/chunk_index", pa.int64()), ("meta/episodes/file_index", pa.int64())]
+        return pa.schema(fields)
+
+    def _write_episode_rows(self) -> None:
+        if not self._rows:
+            return
+        position = self._episodes.make_room(len(self._rows))
+        arrays = []
+        for item in self._episodes.schema:
+            kind, _, rest = item.name.partition("/")
+            if kind == "stats":
+                feature, _, name = rest.rpartition("/")
+                of_rows = [statistics[feature] for statistics in self._row_statistics]
+                if name == "count":
+                    arrays.append(nested_array(np.array([[row.count] for row in of_rows], dtype=np.int64), 1))
+                else:
+                    values = np.stack([row.values[name] for row in of_rows])
+                    arrays.append(nested_array(values, 3 if of_rows[0].is_camera else 1))
+            elif kind == "meta":
+                number = position.chunk if rest.endswith("chunk_index") else position.file
+                arrays.append(pa.array([number] * len(self._rows), item.type))
+            else:
+                arrays.append(pa.array([row[item.name] for row in self._rows], item.type))
+        self._episodes.write(pa.Table.from_arrays(arrays, schema=self._episodes.schema))
+        self._rows.clear()
+        self._row_statistics.clear()
+
+
+def _sizes(info: DatasetInfo) -> dict[str, Any]:
+    return {"limit_mb": info.data_files_size_in_mb, "chunks_size": info.chunks_size}
+
+
+def merge_statistics(parts: Sequence[Statistics]) -> Statistics:
+    """Of several sets of pictures together: exact but for the quantiles, which are averaged as LeRobot does."""
+    if len(parts) == 1:
+        return parts[0]
+    counts = np.array([part.count for part in parts], dtype=np.float64)
+    weights = counts / counts.sum()
+
+    def weighted(name: str) -> NDArray[np.float64]:
+        return np.asarray(sum(w * part.values[name] for w, part in zip(weights, parts, strict=True)))
+
+    mean = weighted("mean")
+    variance = sum(
+        w * (part.values["std"] ** 2 + (part.values["mean"] - mean) ** 2)
+        for w, part in zip(weights, parts, strict=True)
+    )
+    values = {name: weighted(name) for name in NAMES if name.startswith("q")}
+    values["min"] = np.min([part.values["min"] for part in parts], axis=0)
+    values["max"] = np.max([part.values["max"] for part in parts], axis=0)
+    values["mean"], values["std"] = mean, np.sqrt(np.asarray(variance))
+    return Statistics(values=values, count=int(counts.sum()), is_camera=parts[0].is_camera)
+
+
+def write_tasks(path: Path, tasks: Sequence[str]) -> None:
+    """tasks.parquet: LeRobot looks tasks up in the index of the data frame that pandas makes of it."""
+    column = {"pandas_type": "unicode", "numpy_type": "object", "metadata": None}
+    number = {"pandas_type": "int64", "numpy_type": "int64", "metadata": None}
+    index = {"name": None, "field_name": None, **column, "metadata": {"encoding": "UTF-8"}}
+    description = {
+        "index_columns": ["task"],
+        "column_indexes": [index],
+        "columns": [
+            {"name": "task_index", "field_name": "task_index", **number},
+            {"name": "task", "field_name": "task", **column},
+        ],
+        "creator": {"library": "pyarrow", "version": pa.__version__},
+        "pandas_version": "2.2.3",
+    }
+    table = pa.table({"task_index": pa.array(range(len(tasks)), pa.int64()), "task": pa.array(tasks, pa.string())})
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pq.write_table(table.replace_schema_metadata({"pandas": json.dumps(description)}), path)
+    sync_file(path)
+
+
+def write_text(path: Path, text: str) -> None:
+    """A durable text file."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+    sync_file(path)

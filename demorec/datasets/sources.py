@@ -1,0 +1,203 @@
+"""Which recordings go into a dataset, and whether they go together."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from demorec.core.errors import ConfigError
+from demorec.core.plain import listed
+from demorec.datasets.episode import ExportEpisode
+from demorec.datasets.exported import exported
+from demorec.datasets.options import CommonOptions, parse_episodes
+from demorec.episode.collected import CollectedOutcome
+from demorec.episode.episode import POLICY_PHASE, Outcome, interventions
+from demorec.mcap import AnyRecording, open_recording
+from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportSource:
+    """One recording.
+
+    Attributes:
+        path: The file.
+        is_chosen: False for a failed attempt that only counts for the success rate.
+    """
+
+    path: Path
+    is_chosen: bool = True
+
+
+def find_recordings(paths: Sequence[Path], *, include_failures: bool) -> list[ExportSource]:
+    """The recordings in the given files, runs (folders with episodes/) and folders of recordings, in order.
+
+    Raises:
+        ConfigError: A path is missing, holds no recording, or the same recording is given twice.
+    """
+    found: list[ExportSource] = []
+    for path in paths:
+        there = expect(path, "recording", *EPISODE_FOLDERS)
+        of_path = [ExportSource(path=file) for file in there.recordings]
+        of_path += [ExportSource(path=file, is_chosen=include_failures) for file in there.failed]
+        expect_recordings(there, [source.path for source in of_path])
+        found += sorted(of_path, key=_attempt_order)
+    seen: set[Path] = set()
+    for source in found:
+        resolved = source.path.resolve()
+        if resolved in seen:
+            raise ConfigError(f"The same recording is given twice: {source.path}")
+        seen.add(resolved)
+    return found
+
+
+def is_wanted(recording: AnyRecording, options: CommonOptions) -> bool:
+    """Whether its episode is one of those that the options ask for (`--episodes`, `--corrected-only`).
+
+    Raises:
+        RecordingError: It is damaged.
+    """
+    if not parse_episodes(options.episodes)(recording.info.episode_index):
+        return False
+    if not options.corrected_only:
+        return True
+    phases = recording.phases()
+    return POLICY_PHASE not in phases or bool(interventions(phases).any())
+
+
+def goes_in(source: ExportSource, recording: AnyRecording, options: CommonOptions) -> bool:
+    """Whether a recording of a wanted episode goes into the dataset, and is no failed attempt to be left out.
+
+    An external episode of which nobody said whether it succeeded is no failure.
+    """
+    return source.is_chosen and (not recording.has_failed or options.include_failures)
+
+
+def places_of(sources: Iterable[ExportSource]) -> list[Path]:
+    """What an export must not write over: the recordings, and a run's folders of them with all that is in there.
+
+    A dataset that lies beside them, as a run's own does, may be replaced.
+    """
+    files = [source.path for source in sources]
+    folders = dict.fromkeys(file.absolute().parent for file in files)
+    return [*(folder for folder in folders if folder.name in ("episodes", "failed")), *files]
+
+
+def _attempt_order(source: ExportSource) -> tuple[str, bool, str]:
+    """Failed attempts at an episode before the one that succeeded."""
+    episode, _, attempt = source.path.stem.partition(".")
+    return episode, not attempt, attempt
+
+
+@dataclass(frozen=True, kw_only=True)
+class Profile:
+    """What all recordings of a dataset must have in common, as (what, value) in words.
+
+    Attributes:
+        traits: That.
+        depth_left_out: Depth cameras that were not asked for.
+        is_silent: Whether it is an external episode whose source states no subtask.
+    """
+
+    traits: tuple[tuple[str, str], ...] = ()
+    depth_left_out: tuple[str, ...] = field(default=(), compare=False)
+    is_silent: bool = field(default=False, compare=False)
+
+    @classmethod
+    def of(cls, episode: ExportEpisode) -> Profile:
+        """That of an episode."""
+        return cls(traits=tuple(episode.traits()), depth_left_out=episode.depth_left_out, is_silent=episode.is_silent)
+
+    def differences(self, other: Profile) -> tuple[str, ...]:
+        """How `other` differs, in words."""
+        mine, theirs = dict(self.traits), dict(other.traits)
+        return tuple(
+            f"{what} is {theirs[what]} instead of {mine[what]}"
+            for what in mine
+            if what in theirs and theirs[what] != mine[what]
+        )
+
+
+class Intake:
+    """What goes into one dataset: recordings that go together, and the count of failed attempts that are left out.
+
+    Args:
+        found: All recordings of the export.
+        options: Its options.
+
+    Attributes:
+        skipped_failures: Failed attempts that were left out so far.
+        skipped_unknown: Recordings that were left out since they end before their outcome.
+        depth_left_out: Depth cameras that were not asked for.
+        silent: Names of recordings of external episodes whose source states no subtask.
+        num_taken: Recordings that go in.
+    """
+
+    def __init__(self, found: Sequence[ExportSource], options: CommonOptions) -> None:
+        self.skipped_failures = self.skipped_unknown = 0
+        self.depth_left_out: tuple[str, ...] = ()
+        self.silent: list[str] = []
+        self.num_taken = 0
+        self._found = found
+        self._options = options
+        self._first: tuple[Profile, Path] | None = None
+
+    def take(self, path: Path, profile: Profile) -> None:
+        """Note a recording that goes in.
+
+        Raises:
+            ConfigError: It does not go together with the first one.
+        """
+        if self._first is None:
+            self._first = profile, path
+            self.depth_left_out = profile.depth_left_out
+        elif profile != self._first[0]:
+            _refuse_differences(*self._first, self._found, self._options)
+        self.num_taken += 1
+        if profile.is_silent:
+            self.silent.append(path.name)
+
+    def leave_out(self, outcome: Outcome | CollectedOutcome | None) -> None:
+        """Note a failed attempt, or one of unknown outcome, that only counts for the success rate."""
+        if outcome is None:
+            self.skipped_unknown += 1
+        else:
+            self.skipped_failures += 1
+
+    @property
+    def skipped_unwanted(self) -> int:
+        """Recordings that the options do not ask for; known once all have been read."""
+        return len(self._found) - self.num_taken - self.skipped_failures - self.skipped_unknown
+
+    def check(self) -> None:
+        """Raise ConfigError when not one recording has gone in."""
+        if self._first is None:
+            corrected = " or were not corrected" if self._options.corrected_only else ""
+            raise ConfigError(
+                f"Nothing to export. Recordings: {len(self._found)}, of failed attempts: {self.skipped_failures}, "
+                f"of unknown outcome: {self.skipped_unknown} (--include-failures takes both); the others are not among "
+                f"the wanted --episodes{corrected}."
+            )
+
+
+def _refuse_differences(
+    profile: Profile, reference: Path, sources: Iterable[ExportSource], options: CommonOptions
+) -> None:
+    """Raise ConfigError with every difference between the reference and any of the recordings that go in.
+
+    Called only when one is known to differ: then all headers are read, so that the user hears of everything at once.
+    """
+    files_by_difference: dict[str, list[str]] = {}
+    for source in sources:
+        with open_recording(source.path) as recording:
+            if is_wanted(recording, options) and goes_in(source, recording, options):
+                for difference in profile.differences(Profile.of(exported(recording, options))):
+                    files_by_difference.setdefault(difference, []).append(source.path.name)
+    if files_by_difference:
+        told = "; ".join(
+            f"{difference} ({listed(files, 3, ', ')})" for difference, files in files_by_difference.items()
+        )
+        raise ConfigError(
+            f"These recordings do not go into one dataset with {reference.name}: {told}. Export them separately."
+        )

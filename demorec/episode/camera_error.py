@@ -1,0 +1,61 @@
+"""By how much recorded camera poses are off on purpose (`--variation full`), among the numbers of the behaviour."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from demorec.core.geometry import Pose
+from demorec.episode.scene import Camera
+from demorec.robots.motion import angle_between
+
+ANGLE_MARGIN = 1e-6
+"""Radians by which quaternion and angle may disagree."""
+
+
+def error_values(errors: Mapping[str, Pose]) -> dict[str, float]:
+    """The errors as they are recorded.
+
+    Args:
+        errors: Camera name -> true_from_recorded, a turn of less than half a revolution.
+
+    Returns:
+        Of each camera that has an error: `calibration_NAME_x`, `_y`, `_z` (m), `_angle` (rad), and x, y, z of the
+        quaternion, whose w is positive, as `_qx`, `_qy`, `_qz`.
+    """
+    values: dict[str, float] = {}
+    for name, error in errors.items():
+        if error != Pose():
+            values |= {f"calibration_{name}_{axis}": float(v) for axis, v in zip("xyz", error.position, strict=True)}
+            values[f"calibration_{name}_angle"] = angle_between(error, Pose())
+            x, y, z, w = error.quat_xyzw
+            turn = math.copysign(1.0, w) * np.array([x, y, z])
+            values |= {f"calibration_{name}_q{axis}": float(v) for axis, v in zip("xyz", turn, strict=True)}
+    return values
+
+
+def told_error(name: str, behaviour: Mapping[str, float]) -> Pose | None:
+    """true_from_recorded of a camera, as recorded numbers have it.
+
+    Args:
+        name: Of the camera.
+        behaviour: Of the episode; from a file, so that anything may stand there.
+
+    Returns:
+        None where they do not tell it: older recordings lack the quaternion; or where they contradict each other.
+    """
+    words = [f"calibration_{name}_{word}" for word in ("x", "y", "z", "qx", "qy", "qz", "angle")]
+    numbers = np.array([behaviour.get(word, math.nan) for word in words])
+    position, turn, angle = numbers[:3], numbers[3:6], float(numbers[6])
+    size = float(np.linalg.norm(turn))
+    if not (np.isfinite(numbers).all() and size < 1.0 and abs(2 * math.asin(size) - angle) <= ANGLE_MARGIN):
+        return None
+    return Pose(position=position, quat_xyzw=np.array([*turn, math.sqrt(1.0 - size * size)]))
+
+
+def true_camera(recorded: Camera, true_from_recorded: Pose) -> Camera:
+    """The camera where it truly was."""
+    return replace(recorded, mount_from_camera=recorded.mount_from_camera @ true_from_recorded.inverse())

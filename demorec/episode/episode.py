@@ -1,0 +1,274 @@
+"""What is recorded at each control step, and about each episode.
+
+The (observation, action) contract, everywhere: frame t holds the observation at time t, taken *before* action t
+is applied. `action` is what the expert wanted (the label to learn from); `command` is what was sent to the motors
+(the same, plus exploration noise where there was any), in float64 as sent: replaying the commands reproduces the
+episode to the bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.core.geometry import Array, Pose
+from demorec.episode.scene import Scene
+from demorec.robots.robot import RobotSpec
+
+POLICY_PHASE = "policy"
+"""Phase of the frames in which a policy acts, or somebody else who tells no phase; all others are the expert's."""
+HALT_PHASE = "halt"
+"""Phase in which an expert that has taken over does nothing yet but stop the arm. That is not to be learned: it stops
+in states in which a demonstration goes on."""
+MISTAKEN_PHASE, CORRECTED_PHASE = "mistake", "correct"
+"""Phases of an episode with an interjection: the wrong thing is gone for; what was said is listened to."""
+INTERJECTION_EVENT = "interjection"
+"""Event between these two: "NAME is meant, not NAME"."""
+
+FORMAT_VERSION = 2
+"""Of the recordings. A reader knows every version up to this one; `recordings/sample/` holds a file of each."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Observation:
+    """All that is sensed at one instant.
+
+    Attributes:
+        joint_position: (n_joints,) in the order of `RobotSpec.joint_names`; rad, fingers m.
+        joint_velocity: (n_joints,) rad/s, fingers m/s.
+        joint_effort: (n_joints,) motor torque N m, fingers N.
+        gripper_width: Opening between the fingers, metres.
+        base_from_tcp: TCP pose in the base frame.
+        object_poses: name -> world_from_object, of every movable body of the scene.
+        contact_force: Sum of the normal forces on the fingers, N.
+        wrench: (6,) force (N) and torque (N m) with which the arm holds the hand, as a force-torque sensor at the
+            hand's mount feels them: about the origin of `RobotSpec.hand_link` and along its axes. Nothing is taken off:
+            the weight and the inertia of hand, fingers and what they hold are in it. None when there is no sensor.
+    """
+
+    joint_position: Array
+    joint_velocity: Array
+    joint_effort: Array
+    gripper_width: float
+    base_from_tcp: Pose
+    object_poses: Mapping[str, Pose]
+    contact_force: float
+    wrench: Array | None = None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Action:
+    """One command: absolute joint targets and gripper opening, reached by linear interpolation over the step.
+
+    Attributes:
+        joint_target: (n_arm,) rad.
+        gripper_target: Opening, metres.
+        base_from_tcp_target: Forward kinematics of `joint_target`, in the base frame.
+    """
+
+    joint_target: Array
+    gripper_target: float
+    base_from_tcp_target: Pose
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class JointSample:
+    """Joint states between two frames (recorded at the physics rate when asked for); shapes as in Observation."""
+
+    time_ns: int
+    joint_position: Array
+    joint_velocity: Array
+    joint_effort: Array
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CameraImages:
+    """What one camera sees at one instant.
+
+    Attributes:
+        color: (H, W, 3) uint8 RGB, row 0 on top.
+        depth: (H, W) float32 metres along the optical axis, 0 where nothing is hit; None when not asked for.
+        segmentation: (H, W) int32, body index + ((link index + 1) << 24) as PyBullet numbers them, -1 for the
+            background; None when not asked for.
+        world_from_camera: Pose, OpenCV axes.
+    """
+
+    color: NDArray[np.uint8]
+    depth: NDArray[np.float32] | None = None
+    segmentation: NDArray[np.int32] | None = None
+    world_from_camera: Pose
+
+
+@dataclass(frozen=True, kw_only=True)
+class Event:
+    """Something that happened, for people to read: a grasp, a miss, a retry."""
+
+    name: str
+    message: str
+    level: Literal["info", "warning", "error"] = "info"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Frame:
+    """One control step.
+
+    Attributes:
+        frame_index: t, from 0.
+        time_ns: Simulated time since the episode's start, computed from frame_index.
+        observation: At t.
+        action: What the expert wanted at t.
+        command: What was sent to the motors at t.
+        phase: Of the scripted motion ("approach", "lift", ...).
+        events: At t.
+        images: camera name -> images at t.
+        joint_samples: Joint states since the previous frame, both ends left out; empty unless asked for.
+        is_deliberate_miss: Whether this frame belongs to a deliberate miss, which no policy can predict.
+    """
+
+    frame_index: int
+    time_ns: int
+    observation: Observation
+    action: Action
+    command: Action
+    phase: str
+    events: tuple[Event, ...] = ()
+    images: Mapping[str, CameraImages] = field(default_factory=dict)
+    joint_samples: tuple[JointSample, ...] = ()
+    is_deliberate_miss: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodeInfo:
+    """What is known before the first frame; recorded as metadata. Holds no clock, host name or path.
+
+    Attributes:
+        format_version: Of the recording.
+        episode_index, attempt: Which attempt at which episode of the run.
+        root_seed: Of the run.
+        task: Name of the task (or "package.module:Name").
+        instruction: In words; LeRobot's task text.
+        robot: The arm.
+        scene: The world at the start, cameras with intrinsics and mounts included.
+        fps: Frames per second.
+        physics_hz: Steps per second.
+        behaviour: name -> value of everything else that was drawn for this episode (speed, approach height,
+            noise level), for the card and for analysis.
+        config: The resolved GenerateConfig as plain JSON data.
+        config_digest: SHA-256 of it, 16 hex digits.
+        versions: package -> version, of what decides the bits (demorec, pybullet, numpy, numba, av), with
+            the sources of modules of one's own.
+        origin: "" for a generated episode; "replay of DIGEST", "render of DIGEST" for a derived one.
+    """
+
+    format_version: int = FORMAT_VERSION
+    episode_index: int
+    attempt: int
+    root_seed: int
+    task: str
+    instruction: str
+    robot: RobotSpec
+    scene: Scene
+    fps: int
+    physics_hz: int
+    behaviour: Mapping[str, float] = field(default_factory=dict)
+    config: Mapping[str, Any] = field(default_factory=dict)
+    config_digest: str = ""
+    versions: Mapping[str, str] = field(default_factory=dict)
+    origin: str = ""
+
+    @property
+    def robot_name(self) -> str:
+        """What the robot is called."""
+        return self.robot.name
+
+
+@dataclass(frozen=True, kw_only=True)
+class SuccessCheck:
+    """One condition of success.
+
+    Attributes:
+        name: What is measured ("distance_to_goal").
+        value: What was found, in `unit`.
+        limit: What is allowed; `passed` tells on which side.
+        unit: "m", "rad", "m/s", "N" or "".
+        passed: Whether it holds.
+    """
+
+    name: str
+    value: float
+    limit: float
+    unit: str
+    passed: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """How an episode ended.
+
+    Attributes:
+        success: Whether every check passed.
+        checks: The task's conditions, with the values found.
+        failure_phase: Phase in which it went wrong, "" on success.
+        failure_reason: Name of the first failed check or of what made the expert give up, "" on success.
+        num_frames: Length.
+        num_retries: How often the expert tried again within the episode.
+        final_state_digest: SHA-256 (hex) over positions and velocities of all joints and movable bodies at the end.
+    """
+
+    success: bool
+    checks: tuple[SuccessCheck, ...]
+    failure_phase: str = ""
+    failure_reason: str = ""
+    num_frames: int
+    num_retries: int = 0
+    final_state_digest: str = ""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class EpisodeColumns:
+    """All numbers of an episode, one row a frame (T rows); pictures are read on their own.
+
+    Poses are position, then quaternion xyzw. Shapes and units as in Observation and Action.
+    """
+
+    time_ns: NDArray[np.int64]  # (T,)
+    joint_position: Array  # (T, n_joints)
+    joint_velocity: Array  # (T, n_joints)
+    joint_effort: Array  # (T, n_joints)
+    gripper_width: Array  # (T,)
+    base_from_tcp: Array  # (T, 7)
+    object_poses: Mapping[str, Array]  # name -> (T, 7), world_from_object
+    contact_force: Array  # (T,)
+    wrench: Array | None = None  # (T, 6); None in recordings of format version 1
+    action_joint_target: Array  # (T, n_arm)
+    action_gripper: Array  # (T,)
+    action_base_from_tcp: Array  # (T, 7)
+    command_joint_target: Array  # (T, n_arm)
+    command_gripper: Array  # (T,)
+    command_base_from_tcp: Array  # (T, 7)
+    phase: tuple[str, ...]  # T
+    is_deliberate_miss: NDArray[np.bool_]  # (T,)
+    world_from_camera: Mapping[str, Array]  # name -> (T, 7)
+
+    @property
+    def num_frames(self) -> int:
+        """T."""
+        return len(self.time_ns)
+
+
+def frame_time_ns(frame_index: int, fps: int) -> int:
+    """Nanoseconds of a frame since the episode's start: exact integer arithmetic, rounded half up."""
+    return (frame_index * 2_000_000_000 + fps) // (2 * fps)
+
+
+def interventions(phases: Sequence[str]) -> NDArray[np.bool_]:
+    """(T,) where an expert acts that has taken over from a policy, and does more than stop the arm.
+
+    False in all frames of a demonstration, which nobody took over.
+    """
+    acts = np.array([phase not in (POLICY_PHASE, HALT_PHASE) for phase in phases], dtype=np.bool_)
+    return acts & (POLICY_PHASE in phases)

@@ -1,0 +1,388 @@
+"""The vectors that a policy sees and gives: one computation for the export and for the environments.
+
+A policy trained on an exported dataset meets the same numbers in closed loop only if both come from the same
+arithmetic. So everything here works on rows (T frames, or one) with additions, multiplications, divisions and
+square roots alone: IEEE 754 rounds these the same on every CPU and for every array length, unlike the
+vectorised sines of NumPy. The result is rounded once, at the end, where float32 is asked for.
+
+Frames: everything is expressed in the robot's base frame (the world's, where the robot stands at its origin).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterable, Mapping
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.core.geometry import Array, Pose, quat_multiply, quat_product, rotation_rows
+from demorec.episode.episode import EpisodeColumns
+from demorec.episode.scene import Goal, Scene
+from demorec.episode.sensed import SENSED, ObservationRows
+from demorec.robots.robot import RobotSpec
+
+Vectors = NDArray[np.float32] | NDArray[np.float64]
+VectorType = type[np.float32] | type[np.float64]
+
+STATE = "observation.state"
+VELOCITY = "observation.velocity"
+EE_POSE = "observation.ee_pose"
+ENVIRONMENT_STATE = "observation.environment_state"
+ACTION = "action"
+COMMAND = "command"
+"""What the motors were sent: the action in joint space plus exploration noise."""
+IMAGE_PREFIX, DEPTH_SUFFIX = "observation.images.", "_depth"
+"""A camera's pictures are called IMAGE_PREFIX + its name, its distances have the suffix, too."""
+
+ActionKind = Literal["joint", "joint_increment", "ee", "ee_delta"]
+"""What the action column holds; `action_vectors` defines each."""
+
+StateKind = Literal["joint", "joint_ee"]
+STATE_KINDS: tuple[StateKind, ...] = get_args(StateKind)
+"""What `observation.state` holds; `observation_vectors` defines both."""
+
+NOISE_DECAY = 0.3
+"""Share of the exploration noise on the executed commands that goes away within 1/30 s, when none is added.
+
+Known to both sides: `demorec.loop.noise.ActionNoise` makes the noise so, and the increments below contain this return.
+"""
+
+NEAR = 0.02
+"""Offset, metres, at which a near-field component is a half. A centimetre decides whether an object is where it shall
+be, but is a twentieth of a standard deviation of the plain offset, which a policy learns last."""
+
+_POSITION = ("x", "y", "z")
+_POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
+_TCP_NAMES = tuple(f"tcp.{axis}" for axis in _POSE)
+
+
+def state_names(robot: RobotSpec, kind: StateKind) -> tuple[str, ...]:
+    """Name of every component of `observation.state`."""
+    joints = (*(f"{joint}.pos" for joint in robot.arm_joints), "gripper.width")
+    return (*joints, *_TCP_NAMES) if kind == "joint_ee" else joints
+
+
+def observation_names(
+    robot: RobotSpec,
+    scene: Scene,
+    *,
+    privileged: bool = False,
+    state: StateKind = "joint",
+    sensed: Collection[str] = (),
+) -> dict[str, tuple[str, ...]]:
+    """Feature name -> name of every component, in the order of `observation_vectors`."""
+    names = {
+        STATE: state_names(robot, state),
+        VELOCITY: (*(f"{joint}.vel" for joint in robot.arm_joints), "gripper.vel"),
+        EE_POSE: _TCP_NAMES,
+    }
+    if privileged:
+        names[ENVIRONMENT_STATE] = tuple(_environment_names(robot, scene))
+    return names | {name: feature.names(robot) for name, feature in SENSED.items() if name in sensed}
+
+
+def observation_vectors(
+    rows: ObservationRows,
+    robot: RobotSpec,
+    scene: Scene,
+    *,
+    privileged: bool = False,
+    state: StateKind = "joint",
+    sensed: Collection[str] = (),
+    dtype: VectorType = np.float32,
+) -> dict[str, Vectors]:
+    """Feature name -> (T, D) numbers of that type.
+
+    - `observation.state`: arm joint positions (rad), gripper opening (m); with `state` "joint_ee" the seven numbers of
+      `observation.ee_pose` behind them, for policies that take no second vector (LeRobot's ACT).
+    - `observation.velocity`: arm joint velocities (rad/s), speed of the gripper's opening (m/s).
+    - `observation.ee_pose`: base_from_tcp, xyz (m) and quaternion xyzw. Of the two signs of the quaternion the one
+      with x >= 0: it does not jump for a hand that points down within 180 degrees of yaw.
+    - `observation.environment_state` (only if `privileged`): see `_environment_columns`.
+    - those of `SENSED` that `sensed` names, as far as they were sensed.
+    """
+    arm = len(robot.arm_joints)
+    tcp = _continuous(rows.base_from_tcp)
+    features = {
+        STATE: [rows.joint_position[:, :arm], rows.gripper_width, *([tcp] if state == "joint_ee" else [])],
+        VELOCITY: [rows.joint_velocity[:, :arm], _gripper_velocity(rows, robot)],
+        EE_POSE: [tcp],
+    }
+    if privileged:
+        features[ENVIRONMENT_STATE] = _environment_columns(rows, robot, scene)
+    for name, feature in SENSED.items():
+        if name in sensed and (values := feature.values(rows, robot)) is not None:
+            features[name] = [values]
+    return {name: _joined(columns, dtype) for name, columns in features.items()}
+
+
+# ---------------------------------------------------------------------------------------------- environment state
+
+
+def _environment_names(robot: RobotSpec, scene: Scene) -> Iterable[str]:
+    yield from (*_axes("tcp."), "tcp.yaw.sin", "tcp.yaw.cos")
+    for label, goal in _labelled_goals(scene):
+        n, wanted = scene.body(goal.object).yaw_symmetry, f"{label}.goal"
+        yield from _axes(f"{label}.", f"{label}.size.", f"{label}.from_tcp.", f"{label}.from_tcp.hand_")
+        if n:
+            yield from _yaw_names(f"{label}.yaw", n)
+            yield from _yaw_names(f"{label}.from_tcp.yaw", n)
+        yield from _axes(f"{wanted}.", f"{wanted}.size.", f"{wanted}.from_tcp.", f"{wanted}.from_tcp.hand_")
+        yield from _axes(f"{label}.from_tcp.near_", f"{wanted}.from_tcp.near_", f"{wanted}.from_{goal.object}.near_")
+        if goal.yaw_symmetry:
+            yield from _yaw_names(f"{wanted}.yaw", goal.yaw_symmetry)
+            yield from _yaw_names(f"{wanted}.from_{goal.object}.yaw", goal.yaw_symmetry)
+    yield from (f"{joint}.vel" for joint in robot.arm_joints)
+    yield "gripper.vel"
+    for body in scene.movable:
+        yield from (f"{body.name}.pose.{axis}" for axis in _POSE)
+
+
+def _axes(*prefixes: str) -> Iterable[str]:
+    return (f"{prefix}{axis}" for prefix in prefixes for axis in _POSITION)
+
+
+def _yaw_names(prefix: str, n: int) -> tuple[str, str]:
+    times = "" if n == 1 else str(n)
+    return f"{prefix}.sin{times}", f"{prefix}.cos{times}"
+
+
+def _environment_columns(rows: ObservationRows, robot: RobotSpec, scene: Scene) -> list[Array]:
+    """What a policy learns best from, then what is as it is (metres, rad; base frame).
+
+    First the TCP: position, yaw of the hand as sine and cosine. Per goal, the object: position, full extents,
+    position relative to the TCP in base axes and in hand axes, and, for a body that looks the same every 2 pi / n,
+    its yaw as sine and cosine of n times the angle, absolute and relative to the hand. The same of the wanted pose
+    (the extents are those of the body that is placed onto, 0 for a place in the world; the relative yaw is that
+    to the object), and the offsets object - TCP, goal - TCP and goal - object once more as near-field components
+    (`_near`). Then the velocities of `observation.velocity`, because LeRobot's ACT takes no second state
+    vector, and last the raw poses of all movable bodies.
+    """
+    count = len(rows.gripper_width)
+    base_from_world = scene.robot.world_from_base.inverse().vector()[np.newaxis]
+    tcp = rows.base_from_tcp
+    poses = {name: _compose(base_from_world, pose) for name, pose in rows.object_poses.items()}
+    hand_yaw = _yaw(tcp, 1)
+    columns = [tcp[:, :3], *hand_yaw]
+    for _, goal in _labelled_goals(scene):
+        body = scene.body(goal.object)
+        onto_pose, onto_size = _onto(scene, goal, poses, base_from_world)
+        wanted = _compose(onto_pose, goal.onto_from_goal.vector()[np.newaxis])
+        wanted = np.broadcast_to(wanted, (count, 7))
+        object_ = poses[goal.object]
+        columns += [object_[:, :3], _repeat(body.shape.extents, count), *_seen_from(tcp, object_)]
+        if body.yaw_symmetry:
+            object_yaw = _yaw(object_, body.yaw_symmetry)
+            columns += [*object_yaw, *_difference(object_yaw, _yaw(tcp, body.yaw_symmetry))]
+        columns += [wanted[:, :3], _repeat(onto_size, count), *_seen_from(tcp, wanted)]
+        columns += [_near(object_, tcp), _near(wanted, tcp), _near(wanted, object_)]
+        if goal.yaw_symmetry:
+            wanted_yaw = _yaw(wanted, goal.yaw_symmetry)
+            columns += [*wanted_yaw, *_difference(wanted_yaw, _yaw(object_, goal.yaw_symmetry))]
+    arm = len(robot.arm_joints)
+    columns += [rows.joint_velocity[:, :arm], _gripper_velocity(rows, robot)]
+    columns += [poses[body.name] for body in scene.movable]
+    return columns
+
+
+def _labelled_goals(scene: Scene) -> list[tuple[str, Goal]]:
+    """Each goal with a unique label: its object's name, numbered from the second goal for the same object on."""
+    seen: dict[str, int] = {}
+    labelled = []
+    for goal in scene.goals:
+        seen[goal.object] = seen.get(goal.object, 0) + 1
+        labelled.append((goal.object if seen[goal.object] == 1 else f"{goal.object}#{seen[goal.object]}", goal))
+    return labelled
+
+
+def _onto(
+    scene: Scene, goal: Goal, poses: Mapping[str, Array], base_from_world: Array
+) -> tuple[Array, tuple[float, float, float]]:
+    if not goal.onto:
+        return base_from_world, (0.0, 0.0, 0.0)
+    body = scene.body(goal.onto)
+    if goal.onto in poses:
+        return poses[goal.onto], body.shape.extents
+    return _compose(base_from_world, body.world_from_body.vector()[np.newaxis]), body.shape.extents
+
+
+def _seen_from(tcp: Array, pose: Array) -> tuple[Array, Array]:
+    offset = pose[:, :3] - tcp[:, :3]
+    conjugate = tcp[:, 3:] * np.array([-1.0, -1.0, -1.0, 1.0])
+    return offset, _rotate(conjugate, offset)
+
+
+def _near(pose: Array, origin: Array) -> Array:
+    """(T, 3) offset d from another pose, base axes, each as d / (|d| + 2 cm): -1 .. 1, steep where it matters."""
+    offset = pose[:, :3] - origin[:, :3]
+    return near_field(offset)
+
+
+def near_field(offset: Array) -> Array:
+    """Offsets (metres, any shape) as near-field components d / (|d| + NEAR), in -1..1 and steep around 0."""
+    return np.asarray(offset / (np.abs(offset) + NEAR), dtype=np.float64)
+
+
+def _yaw(pose: Array, n: int) -> tuple[Array, Array]:
+    """Sine and cosine (T,) of n times the yaw of the body axis that `demorec.episode.scene.yaw_of` takes."""
+    rotation = _rotation(pose[:, 3:])
+    vertical = np.argmax(np.abs(rotation[:, 2]), axis=1)
+    horizontal = (vertical + 1) % 3
+    frame = np.arange(len(pose))
+    x, y = rotation[frame, 0, horizontal], rotation[frame, 1, horizontal]
+    length = np.sqrt(x * x + y * y)
+    sin1, cos1 = y / length, x / length
+    sin, cos = sin1, cos1
+    for _ in range(n - 1):
+        sin, cos = sin * cos1 + cos * sin1, cos * cos1 - sin * sin1
+    return sin, cos
+
+
+def _difference(a: tuple[Array, Array], b: tuple[Array, Array]) -> tuple[Array, Array]:
+    (sin_a, cos_a), (sin_b, cos_b) = a, b
+    return sin_a * cos_b - cos_a * sin_b, cos_a * cos_b + sin_a * sin_b
+
+
+# --------------------------------------------------------------------------------------------------------- actions
+
+
+def action_names(robot: RobotSpec, kind: ActionKind) -> tuple[str, ...]:
+    """Name of every component of `action_vectors`."""
+    if kind == "joint":
+        return (*(f"{joint}.pos" for joint in robot.arm_joints), "gripper.width")
+    if kind == "joint_increment":
+        return (*(f"{joint}.delta" for joint in robot.arm_joints), "gripper.width")
+    if kind == "ee":
+        return (*(f"tcp.{axis}" for axis in _POSE), "gripper.width")
+    return ("tcp.dx", "tcp.dy", "tcp.dz", "tcp.rx", "tcp.ry", "tcp.rz", "gripper.width")
+
+
+def action_vectors(
+    columns: EpisodeColumns,
+    scene: Scene,
+    kind: ActionKind,
+    rows: NDArray[np.intp] | slice = slice(None),
+    *,
+    dtype: VectorType = np.float32,
+) -> Vectors:
+    """(T, D) numbers, the expert's wanted commands; the last component is always the absolute gripper opening (m).
+
+    - `joint`: absolute joint targets, rad.
+    - `joint_increment`: joint target minus the one of the frame before; the first minus the scene's initial joint
+      positions. Sum them up to execute them (`joint_target_from_increment`). Where the executed command of the frame
+      before had noise on it, the increment also takes back the share that lets go within a frame (`NOISE_DECAY`):
+      it is then what the robot is expected to do next from where the noise has brought it. Without this, noise would
+      teach a policy to stay off the path: increments of the clean targets alone do not know that it left it.
+    - `ee`: absolute base_from_tcp target, xyz (m) and quaternion xyzw with x >= 0.
+    - `ee_delta`: change of that pose since the frame before, the first since the TCP pose observed at frame 0:
+      translation in base axes (m), then rotation vector in base axes (rad, |r| <= pi), to be applied from the left
+      (`pose_from_delta`); noise is taken back as in `joint_increment`, the rotation vectors being added.
+
+    Args:
+        columns: Of the whole episode.
+        scene: Of the episode.
+        kind: Which form.
+        rows: Frames whose actions are wanted; increments are taken between these.
+        dtype: Of the numbers.
+    """
+    gripper = columns.action_gripper[rows]
+    if kind == "joint":
+        return _joined([columns.action_joint_target[rows], gripper], dtype)
+    if kind == "joint_increment":
+        targets, commands = columns.action_joint_target[rows], columns.command_joint_target[rows]
+        increments = targets - np.concatenate([np.array([scene.robot.joint_position]), targets[:-1]])
+        increments[1:] += _noise_share(columns.time_ns[rows]) * (targets[:-1] - commands[:-1])
+        return _joined([increments, gripper], dtype)
+    poses, executed = columns.action_base_from_tcp[rows], columns.command_base_from_tcp[rows]
+    if kind == "ee":
+        return _joined([_continuous(poses), gripper], dtype)
+    before = np.concatenate([columns.base_from_tcp[:1], poses[:-1]])
+    shifts, turns = poses[:, :3] - before[:, :3], _rotation_vectors(before[:, 3:], poses[:, 3:])
+    share = _noise_share(columns.time_ns[rows])
+    shifts[1:] += share * (poses[:-1, :3] - executed[:-1, :3])
+    turns[1:] += share * _rotation_vectors(executed[:-1, 3:], poses[:-1, 3:])
+    return _joined([shifts, turns, gripper], dtype)
+
+
+def command_vectors(columns: EpisodeColumns, rows: NDArray[np.intp] | slice = slice(None)) -> Vectors:
+    """(T, D) float64, what the motors were sent: joint targets (rad), gripper opening (m)."""
+    return _joined([columns.command_joint_target[rows], columns.command_gripper[rows]], np.float64)
+
+
+def _noise_share(time_ns: NDArray[np.int64]) -> float:
+    """`NOISE_DECAY` for the interval between these frames."""
+    if len(time_ns) < 2:
+        return 0.0
+    return float(1.0 - (1.0 - NOISE_DECAY) ** (30.0 * 1e-9 * int(time_ns[1] - time_ns[0])))
+
+
+def joint_target_from_increment(previous: Array, action: NDArray[np.floating]) -> Array:
+    """(n_arm,) joint target after one action of kind `joint_increment`; start from the initial joint positions."""
+    return np.asarray(previous + np.asarray(action, dtype=np.float64)[: len(previous)], dtype=np.float64)
+
+
+def pose_from_delta(previous: Pose, action: NDArray[np.floating]) -> Pose:
+    """base_from_tcp target after one action of kind `ee_delta`; start from the observed TCP pose."""
+    delta = np.asarray(action, dtype=np.float64)
+    angle = math.sqrt(float(delta[3]) ** 2 + float(delta[4]) ** 2 + float(delta[5]) ** 2)
+    scale = math.sin(angle / 2) / angle if angle > 0 else 0.5
+    turn = np.array([delta[3] * scale, delta[4] * scale, delta[5] * scale, math.cos(angle / 2)])
+    return Pose(position=previous.position + delta[:3], quat_xyzw=quat_multiply(turn, previous.quat_xyzw))
+
+
+def _rotation_vectors(before: Array, after: Array) -> Array:
+    """(T, 3) rotation vector that turns `before` into `after`, applied from the left.
+
+    Python's scalar functions, since those of NumPy round differently from one CPU to the next.
+    """
+    vectors = np.empty((len(after), 3))
+    for t, (a, b) in enumerate(zip(after, before, strict=True)):
+        x, y, z, w = quat_multiply(a, [-b[0], -b[1], -b[2], b[3]]).tolist()
+        if w < 0:
+            x, y, z, w = -x, -y, -z, -w
+        sine = math.sqrt(x * x + y * y + z * z)
+        scale = 2 * math.atan2(sine, w) / sine if sine > 0 else 2.0
+        vectors[t] = x * scale, y * scale, z * scale
+    return vectors
+
+
+# ---------------------------------------------------------------------------------------------- arithmetic on rows
+
+
+def _joined(columns: Iterable[Array], dtype: VectorType) -> Vectors:
+    parts = [part[:, np.newaxis] if part.ndim == 1 else part for part in columns]
+    joined: Array = np.concatenate(parts, axis=1)
+    return joined if dtype is np.float64 else joined.astype(np.float32)
+
+
+def _repeat(values: tuple[float, ...], count: int) -> Array:
+    return np.broadcast_to(np.array(values, dtype=np.float64), (count, len(values)))
+
+
+def _gripper_velocity(rows: ObservationRows, robot: RobotSpec) -> Array:
+    arm = len(robot.arm_joints)
+    return robot.gripper.width_velocity(rows.joint_position[:, arm:], rows.joint_velocity[:, arm:])
+
+
+def _continuous(pose: Array) -> Array:
+    """The same poses, quaternions with x >= 0."""
+    sign = np.where(pose[:, 3:4] < 0, -1.0, 1.0)
+    return np.concatenate([pose[:, :3], pose[:, 3:] * sign], axis=1)
+
+
+def _compose(a: Array, b: Array) -> Array:
+    """(T, 7) of a @ b; either may have one row."""
+    position = a[:, :3] + _rotate(a[:, 3:], b[:, :3])
+    return np.concatenate([position, np.stack(quat_product(a[:, 3:].T, b[:, 3:].T), axis=1)], axis=1)
+
+
+def _rotation(quat: Array) -> Array:
+    """(T, 3, 3) of unit quaternions (T, 4) xyzw."""
+    return np.stack([np.stack(row, axis=1) for row in rotation_rows(*quat.T)], axis=1)
+
+
+def _rotate(quat: Array, vector: Array) -> Array:
+    r = _rotation(quat)
+    return np.asarray(r[:, :, 0] * vector[:, 0:1] + r[:, :, 1] * vector[:, 1:2] + r[:, :, 2] * vector[:, 2:3])

@@ -1,0 +1,299 @@
+"""What a world is made of, as plain data: enough to rebuild it years later without the task's code.
+
+A task samples a `Scene`; the simulator builds it; every recording contains it. Replay and re-render start from
+the recorded scene, so they need neither the task nor its random numbers.
+Frames: `world` has z up, the robot's base stands where `RobotPlacement` says. SI units throughout.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from demorec.core.geometry import Array, Pose, intrinsic_matrix
+from demorec.core.plain import leave_out_defaults
+
+Rgba = tuple[float, float, float, float]
+Vector3 = tuple[float, float, float]
+
+ShapeKind = Literal["box", "sphere", "cylinder", "capsule", "mesh", "urdf"]
+Role = Literal["object", "target", "support", "distractor", "fixture"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shape:
+    """The geometry of a body, in its own frame (origin at the centre of mass, unless the URDF says otherwise).
+
+    Attributes:
+        kind: Which geometry; decides what `size` means.
+        size: box: (x, y, z) full extents; sphere: (radius,); cylinder and capsule: (radius, length) along z;
+            mesh and urdf: (x, y, z) extents of the bounding box after scaling, for features and grasping.
+        file: mesh and urdf: path below pybullet_data, or "demorec:NAME" for a file of `demorec/sim/assets`,
+            or "module:PATH" for one beside a module of the user's own (a task may give it relative to its module).
+        scale: mesh and urdf: uniform scale of the file.
+        origin: mesh: the point of the file, in its own axes before scaling, that becomes the body's origin.
+        y_up: mesh: whether the file's y axis points up (its x axis stays x).
+    """
+
+    kind: ShapeKind
+    size: tuple[float, ...]
+    file: str = ""
+    scale: float = 1.0
+    origin: Vector3 = (0.0, 0.0, 0.0)
+    y_up: bool = False
+
+    @property
+    def body_from_mesh(self) -> Pose:
+        """mesh: pose of the scaled file's axes in the body's frame."""
+        half = math.sqrt(0.5)
+        turn = Pose(quat_xyzw=np.array([half, 0.0, 0.0, half])) if self.y_up else Pose()
+        return Pose(position=-turn.apply(self.scale * np.array(self.origin)), quat_xyzw=turn.quat_xyzw)
+
+    @property
+    def extents(self) -> Vector3:
+        """(x, y, z) full extents of the bounding box, metres."""
+        if self.kind == "sphere":
+            return (2 * self.size[0],) * 3
+        if self.kind == "cylinder":
+            return (2 * self.size[0], 2 * self.size[0], self.size[1])
+        if self.kind == "capsule":
+            return (2 * self.size[0], 2 * self.size[0], self.size[1] + 2 * self.size[0])
+        return (self.size[0], self.size[1], self.size[2])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Texture:
+    """A procedural texture, a pure function of its fields: nothing is downloaded.
+
+    Attributes:
+        pattern: Which pattern.
+        colors: The two colours (r, g, b in 0..1) between which it runs.
+        scale: Repetitions over the texture's side.
+        seed: Of the pattern's noise.
+    """
+
+    pattern: Literal["plain", "checker", "stripes", "noise", "wood"]
+    colors: tuple[Vector3, Vector3]
+    scale: float = 4.0
+    seed: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Body:
+    """One body beside the robot.
+
+    Attributes:
+        name: Unique in the scene; also its topic and coordinate frame.
+        role: object: to be manipulated; target: where to; support, fixture: stand still; distractor: in the way.
+        shape: Geometry.
+        world_from_body: Pose at the start.
+        mass: kg; 0 stands still for ever.
+        lateral_friction, spinning_friction, rolling_friction: Coulomb coefficients, as PyBullet's changeDynamics.
+        restitution: 0 (no bounce) .. 1.
+        linear_damping, angular_damping: 1/s.
+        rgba: Colour; (1, 1, 1, 1) leaves a URDF's or mesh's own.
+        color_name: The word for it in instructions, or "".
+        texture: Procedural texture, or None.
+        collides: False for a mark that is only seen.
+        yaw_symmetry: n when it looks the same every 2 pi / n about its vertical axis; 0 when at every angle.
+    """
+
+    name: str
+    role: Role
+    shape: Shape
+    world_from_body: Pose
+    mass: float = 0.0
+    lateral_friction: float = 0.6
+    spinning_friction: float = 0.0
+    rolling_friction: float = 0.0
+    restitution: float = 0.0
+    linear_damping: float = 0.04
+    angular_damping: float = 0.04
+    rgba: Rgba = (1.0, 1.0, 1.0, 1.0)
+    color_name: str = ""
+    texture: Texture | None = None
+    collides: bool = True
+    yaw_symmetry: int = 1
+
+    @property
+    def movable(self) -> bool:
+        """Whether physics can move it."""
+        return self.mass > 0 and self.collides
+
+
+@dataclass(frozen=True, kw_only=True)
+class Goal:
+    """Where one object shall end: the plain-data part of a task's aim, for features, cards and checks.
+
+    Attributes:
+        object: Name of the body to be placed.
+        onto: Name of the body that it is placed onto or into, or "" for a place in the world.
+        onto_from_goal: Wanted pose of the object in that body's frame (in the world for "").
+        yaw_symmetry: As `Body.yaw_symmetry`, for the wanted yaw; 0 when any yaw will do.
+    """
+
+    object: str
+    onto: str
+    onto_from_goal: Pose
+    yaw_symmetry: int = 4
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobotPlacement:
+    """Which robot stands where, and how it starts.
+
+    Attributes:
+        name: Row of the robots' table.
+        world_from_base: Pose of the base.
+        scale: Uniform scale of the URDF.
+        joint_position: (n_arm,) initial arm joint positions, rad.
+        gripper_width: Initial opening, metres.
+    """
+
+    name: str
+    world_from_base: Pose
+    scale: float = 1.0
+    joint_position: tuple[float, ...]
+    gripper_width: float
+
+
+POSITION_GAIN = 0.2
+"""Of the arm joints' position control: the share of the error that is gone after a physics step."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Physics:
+    """Engine parameters, all set at every reset (PyBullet leaks some into later clients).
+
+    Attributes:
+        hz: Steps a second.
+        solver_iterations: Of each step, at most.
+        gravity: m/s^2.
+        contact_breaking_threshold: How far two bodies may move along each other until Bullet forgets a contact point
+            that it found before, as a share of the smaller one's radius.
+        finger_stiffness: Of the contact of a finger, N/m: a finger that pushes with a force at one point is as deep in
+            what it holds as the force divided by it.
+    """
+
+    hz: int = 240
+    solver_iterations: int = 50
+    gravity: Vector3 = (0.0, 0.0, -9.81)
+    contact_breaking_threshold: float = 0.02
+    finger_stiffness: float = 30_000.0
+
+
+leave_out_defaults(Physics, "contact_breaking_threshold", "finger_stiffness")
+
+CONTACT_BREAKING_THRESHOLD = 0.05
+"""Of new episodes; recordings that do not say it have 0.02. With that, a small, light, slippery cube could rock between
+fingers that touched it in one point each, and they sank into it (docs/simulation.md)."""
+FINGER_STIFFNESS = 120_000.0
+"""Of new episodes; recordings that do not say it have 30,000, with which a finger that pushes with 20 N is 0.7 mm deep
+in what it touches in one point, and more than a millimetre when that meets the table (docs/simulation.md)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Light:
+    """One directional light and the sky, for every renderer.
+
+    Attributes:
+        direction: From the scene towards the light, world frame; need not be of unit length.
+        color: Of the light, r, g, b in 0..1.
+        ambient, diffuse, specular: Coefficients of the Phong terms.
+        shadow: How much of the direct light a shadow takes away, 0 (no shadows) .. 1.
+        sky_color: Of the background, r, g, b in 0..1.
+    """
+
+    direction: Vector3 = (0.5, -0.4, 1.0)
+    color: Vector3 = (1.0, 1.0, 1.0)
+    ambient: float = 0.5
+    diffuse: float = 0.55
+    specular: float = 0.1
+    shadow: float = 0.6
+    sky_color: Vector3 = (0.72, 0.80, 0.88)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Camera:
+    """A pinhole camera, fixed in the world or carried by a robot link.
+
+    Attributes:
+        name: Unique; also its topic.
+        width, height: Pixels.
+        fov_y: Vertical field of view, rad.
+        mount: "world", or the name of a robot link.
+        mount_from_camera: Pose in the mount's frame, OpenCV axes (x right, y down, z forward).
+        near, far: Clipping distances along the optical axis, metres.
+    """
+
+    name: str
+    width: int
+    height: int
+    fov_y: float
+    mount: str
+    mount_from_camera: Pose
+    near: float = 0.02
+    far: float = 6.0
+
+    @property
+    def intrinsics(self) -> Array:
+        """(3, 3) K, pixels."""
+        return intrinsic_matrix(width=self.width, height=self.height, fov_y=self.fov_y)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scene:
+    """Everything that the simulator and the renderers need to rebuild an episode's start.
+
+    Attributes:
+        robot: The robot.
+        bodies: In loading order, which is part of the physics' determinism.
+        goals: What shall be where at the end, in the order of execution.
+        physics, light: Parameters.
+        cameras: All cameras, in order; empty without pictures.
+        hold: How the hand holds things: by friction alone, or by a rigid constraint from the moment when both
+            fingers press on something until the gripper is told to open (a shortcut of many tutorials).
+    """
+
+    robot: RobotPlacement
+    bodies: tuple[Body, ...]
+    goals: tuple[Goal, ...] = ()
+    physics: Physics = field(default_factory=Physics)
+    light: Light = field(default_factory=Light)
+    cameras: tuple[Camera, ...] = ()
+    hold: Literal["friction", "constraint"] = "friction"
+
+    def body(self, name: str) -> Body:
+        """The body called `name`; KeyError when there is none."""
+        for body in self.bodies:
+            if body.name == name:
+                return body
+        raise KeyError(name)
+
+    def world_from_goal(self, goal: Goal) -> Pose:
+        """Where the goal's object shall end, as things stand at the start."""
+        return self.body(goal.onto).world_from_body @ goal.onto_from_goal if goal.onto else goal.onto_from_goal
+
+    @property
+    def fixed(self) -> tuple[Body, ...]:
+        """The bodies that stand still; worlds load and number them first, then the robot, then what is movable."""
+        return tuple(body for body in self.bodies if not body.movable)
+
+    @property
+    def movable(self) -> tuple[Body, ...]:
+        """The bodies whose poses are recorded at every frame."""
+        return tuple(body for body in self.bodies if body.movable)
+
+
+def yaw_of(pose: Pose) -> float:
+    """Rotation about the vertical, rad, of the body axis that is nearest to horizontal.
+
+    A cube that rests on any of its faces gives a meaningful value: the axis nearest to vertical is left out.
+    """
+    rotation = pose.rotation
+    vertical = int(np.argmax(np.abs(rotation[2])))
+    horizontal = (vertical + 1) % 3
+    return math.atan2(rotation[1, horizontal], rotation[0, horizontal])

@@ -1,0 +1,171 @@
+"""Whether the description of an episode that comes from a file can be worked with at all.
+
+Types are right when `demorec.core.plain` has read it; here is what else the rest of the program takes for granted:
+sizes that are positive, names that are unique, references that lead somewhere. Whether the numbers are *plausible* is
+what `demorec check` judges.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Iterator
+
+from demorec.core.config import MAX_PIXELS
+from demorec.core.geometry import Pose
+from demorec.core.plain import from_json
+from demorec.episode.episode import EpisodeInfo
+from demorec.episode.scene import Body, Camera, Scene, Shape
+from demorec.robots.robot import RobotSpec
+
+MAX_DESCRIPTION_BYTES = 1 << 20
+"""Of one description as JSON: the longest of 720 that the generator made, with all cameras, has 13 kB, 700 values."""
+_MAX_VALUES = 20_000
+"""In one description: 255 bodies have about 12,000."""
+_MOST = {"bodies": 255, "goals": 255, "cameras": 64, "arm joints": 64, "gripper joints": 64}
+"""Segmentation pictures tell 255 bodies apart; the others are far beyond any scene that was ever made."""
+_SIZE_LENGTH = {"box": 3, "sphere": 1, "cylinder": 2, "capsule": 2, "mesh": 3, "urdf": 3}
+_MAX_METRES = 1e4
+_MAX_TOLD = 5
+
+
+def from_description[T](text: str, cls: type[T]) -> T:
+    """`from_json` of a text whose size is bounded first.
+
+    Raises:
+        ValueError: It is too large, or not what `cls` needs.
+    """
+    if len(text) > MAX_DESCRIPTION_BYTES or text.count(",") > _MAX_VALUES:
+        raise ValueError(f"a description of {len(text):,} characters and {text.count(','):,} values or more")
+    return from_json(text, cls)
+
+
+def read_episode_info(text: str) -> EpisodeInfo:
+    """The description of an episode from its JSON.
+
+    Raises:
+        ValueError: One line that says what is wrong with it.
+    """
+    info = from_description(text, EpisodeInfo)
+    wrong = list(_episode(info))
+    if wrong:
+        raise ValueError("; ".join(wrong[:_MAX_TOLD]))
+    return info
+
+
+def _episode(info: EpisodeInfo) -> Iterator[str]:
+    yield from _within("episode_index", info.episode_index, 0, 2**63 - 1)
+    yield from _within("attempt", info.attempt, 0, 2**31)
+    yield from _within("root_seed", info.root_seed, 0, 2**63 - 1)
+    yield from _within("fps", info.fps, 1, 10_000)
+    yield from _within("physics_hz", info.physics_hz, 1, 100_000)
+    yield from _robot(info.robot)
+    yield from _scene(info.scene)
+    placed = len(info.scene.robot.joint_position)
+    if placed != len(info.robot.arm_joints):
+        yield f"the robot has {len(info.robot.arm_joints)} arm joints, the scene places {placed}"
+
+
+def _robot(robot: RobotSpec) -> Iterator[str]:
+    yield from _count("arm joints", robot.arm_joints, least=1)
+    yield from _count("gripper joints", robot.gripper.joints, least=0)
+    yield from _unique("joints of the robot", robot.joint_names)
+    for name in ("home_q", "position_lower", "position_upper", "velocity_limit", "acceleration_limit", "torque_limit"):
+        values: tuple[float, ...] = getattr(robot, name)
+        if len(values) != len(robot.arm_joints):
+            yield f"{name} of the robot has {len(values)} numbers for {len(robot.arm_joints)} arm joints"
+        if name.endswith("_limit") and not all(value > 0 for value in values):
+            yield f"{name} of the robot is not positive"
+
+
+def _scene(scene: Scene) -> Iterator[str]:
+    yield from _count("bodies", scene.bodies, least=0)
+    yield from _count("goals", scene.goals, least=0)
+    yield from _count("cameras", scene.cameras, least=0)
+    yield from _unique("bodies", [body.name for body in scene.bodies])
+    yield from _unique("cameras", [camera.name for camera in scene.cameras])
+    yield from _pose("world_from_base", scene.robot.world_from_base)
+    yield from _positive("scale of the robot", scene.robot.scale)
+    yield from _within("hz of the physics", scene.physics.hz, 1, 100_000)
+    yield from _within("solver_iterations", scene.physics.solver_iterations, 1, 10_000)
+    yield from _positive("contact_breaking_threshold", scene.physics.contact_breaking_threshold)
+    yield from _within("finger_stiffness", scene.physics.finger_stiffness, 1, 1e9)
+    for body in scene.bodies:
+        yield from _body(body)
+    for camera in scene.cameras:
+        yield from _camera(camera)
+    movable = {body.name for body in scene.movable}
+    known = {body.name for body in scene.bodies}
+    for goal in scene.goals:
+        yield from _pose("onto_from_goal", goal.onto_from_goal)
+        yield from _within("yaw_symmetry of a goal", goal.yaw_symmetry, 0, 360)
+        if goal.object not in movable:
+            yield f"a goal is for {goal.object!r}, which is no movable body of the scene"
+        if goal.onto and goal.onto not in known:
+            yield f"a goal is on {goal.onto!r}, which is no body of the scene"
+
+
+def _body(body: Body) -> Iterator[str]:
+    what = f"the body {body.name!r}"
+    yield from _pose(what, body.world_from_body)
+    yield from _shape(what, body.shape)
+    yield from _within(f"yaw_symmetry of {what}", body.yaw_symmetry, 0, 360)
+    yield from _within(f"mass of {what}", body.mass, 0, 1e6)
+    colors = [body.rgba, *(body.texture.colors if body.texture is not None else ())]
+    if not all(0 <= part <= 1 for color in colors for part in color):
+        yield f"a colour of {what} is outside 0 to 1"
+    if body.texture is not None:
+        yield from _within(f"texture scale of {what}", body.texture.scale, 1e-3, 1e4)
+        yield from _within(f"texture seed of {what}", body.texture.seed, 0, 2**63 - 1)
+
+
+def _shape(what: str, shape: Shape) -> Iterator[str]:
+    expected = _SIZE_LENGTH[shape.kind]
+    if len(shape.size) != expected:
+        yield f"the size of {what}, a {shape.kind}, has {len(shape.size)} numbers instead of {expected}"
+    for value in (*shape.size, shape.scale):
+        yield from _positive(f"a size of {what}", value)
+    if max(map(abs, shape.origin)) > _MAX_METRES:
+        yield f"the origin of {what} is far away"
+
+
+def _camera(camera: Camera) -> Iterator[str]:
+    what = f"the camera {camera.name!r}"
+    yield from _pose(what, camera.mount_from_camera)
+    for side in (camera.width, camera.height):
+        yield from _within(f"a side of {what}", side, 1, 8192)
+    if camera.width * camera.height > MAX_PIXELS:
+        yield f"{what} has {camera.width}x{camera.height} pixels, more than {MAX_PIXELS}"
+    if not 1e-3 <= camera.fov_y <= math.pi - 1e-3:
+        yield f"fov_y of {what} is {camera.fov_y:g}, it must be between 0 and pi"
+    if not 0 < camera.near < camera.far:
+        yield f"{what} sees from {camera.near:g} to {camera.far:g} m"
+
+
+def _pose(what: str, pose: Pose) -> Iterator[str]:
+    if float(abs(pose.position).max()) > _MAX_METRES:
+        yield f"the position of {what} is far away"
+    if not 0.5 < math.hypot(*pose.quat_xyzw.tolist()) < 2.0:  # how exact it is, `demorec check` judges
+        yield f"the rotation of {what} is none"
+
+
+def _positive(what: str, value: float) -> Iterator[str]:
+    if not 0 < value <= _MAX_METRES:
+        yield f"{what} is {value:g}"
+
+
+def _within(what: str, value: float, low: float, high: float) -> Iterator[str]:
+    if not low <= value <= high:
+        yield f"{what} is {value}, allowed are {low} to {high}"
+
+
+def _count(what: str, items: Iterable[object], *, least: int) -> Iterator[str]:
+    yield from _within(f"the number of {what}", len(tuple(items)), least, _MOST[what])
+
+
+def _unique(what: str, names: Iterable[str]) -> Iterator[str]:
+    for name, count in Counter(names).items():
+        if count > 1:
+            yield f"{count} {what} are called {name!r}"
+        if not name or not name.isprintable():
+            yield f"one of the {what} is called {name!r}"

@@ -1,0 +1,1 @@
+"""Policies: reading datasets for training, pretraining, evaluation and correction."""

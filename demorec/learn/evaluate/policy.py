@@ -1,0 +1,159 @@
+"""A policy that LeRobot saved, ready to act in an environment; the only importer of torch and of LeRobot's policies."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import io
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.core.errors import ConfigError, MissingDependencyError, NotAllowedError, OptionError, in_words
+from demorec.core.files import read_json_object
+from demorec.core.user_modules import is_allowed
+from demorec.datasets.lerobot.paths import INFO_PATH
+from demorec.episode.features import ActionKind
+
+CONFIG_NAME, TRAIN_CONFIG_NAME = "config.json", "train_config.json"
+
+
+def find_checkpoint(path: Path) -> Path:
+    """The folder that holds config.json: `path`, its pretrained_model, or the last checkpoint of a training.
+
+    Raises:
+        ConfigError: There is none.
+    """
+    for candidate in (path, path / "pretrained_model", path / "checkpoints" / "last" / "pretrained_model"):
+        if (candidate / CONFIG_NAME).is_file():
+            return candidate
+    raise ConfigError(
+        f"No policy that LeRobot saved: there is no {CONFIG_NAME}; give the output folder of lerobot-train or a "
+        f"pretrained_model folder in it: {path}"
+    )
+
+
+def policy_summary(checkpoint: Path) -> tuple[dict[str, Any], str]:
+    """The policy's config as plain data, and the first 16 hex digits of the SHA-256 of its config and weights."""
+    sha = hashlib.sha256()
+    for path in sorted(checkpoint.iterdir()):
+        # The training's own settings name folders of the machine that trained.
+        if path.suffix in (".json", ".safetensors") and path.name != TRAIN_CONFIG_NAME:
+            sha.update(path.name.encode() + b"\0" + path.read_bytes())
+    try:
+        config = read_json_object(checkpoint / CONFIG_NAME)
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{CONFIG_NAME} of the policy cannot be used ({in_words(error)}): {checkpoint}") from error
+    return config, sha.hexdigest()[:16]
+
+
+def check_steps(checkpoint: Path, allowed: Iterable[str]) -> None:
+    """Refuse a policy whose processing steps are classes that nobody has allowed.
+
+    LeRobot's own steps go by a name of its registry; whatever a step's "class" names, LeRobot imports and calls.
+
+    Raises:
+        NotAllowedError: A step is of a module that is not among those `allowed`.
+    """
+    for path in sorted(checkpoint.glob("*.json")):
+        try:
+            steps = read_json_object(path).get("steps")
+        except (OSError, ValueError):
+            continue  # LeRobot cannot read it either, and says so
+        for step in steps if isinstance(steps, list) else ():
+            if not isinstance(step, dict) or "registry_name" in step or "class" not in step:
+                continue
+            module = str(step["class"]).rpartition(".")[0]
+            if not is_allowed(module, allowed):
+                raise NotAllowedError(
+                    f"The policy names the code of a processing step, {step['class']!r}, instead of LeRobot's name of "
+                    f"one, and only you can say whether to run it: if you trust it, add --allow {module}: {path}"
+                )
+
+
+def trained_action(checkpoint: Path) -> ActionKind | None:
+    """What the policy's actions mean, from the names in the dataset that it was trained on; None if that is gone."""
+    try:
+        root = read_json_object(checkpoint / TRAIN_CONFIG_NAME)["dataset"]["root"]
+        info = read_json_object(Path(root) / INFO_PATH)
+        names = info["features"]["action"]["names"]
+        first = str(names[0] if isinstance(names, list) else next(iter(names.values()))[0])
+    except (OSError, ValueError, KeyError, TypeError, IndexError, AttributeError, StopIteration):
+        return None
+    if first.endswith(".delta"):
+        return "joint_increment"
+    return {"tcp.x": "ee", "tcp.dx": "ee_delta"}.get(first, "joint")  # type: ignore[return-value]
+
+
+class Policy:
+    """Acts on one environment at a time.
+
+    Args:
+        checkpoint: As of `find_checkpoint`.
+        action_steps: Actions of a chunk that are executed before the policy looks again; None: as trained.
+        device: Of torch.
+
+    Raises:
+        ConfigError: LeRobot cannot load it, or it has no such setting.
+        MissingDependencyError: torch is not installed.
+    """
+
+    def __init__(self, checkpoint: Path, *, action_steps: int | None = None, device: str = "cpu") -> None:
+        try:
+            import torch
+            from lerobot.configs import PreTrainedConfig
+            from lerobot.envs.utils import preprocess_observation
+            from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+        except ImportError as error:
+            raise MissingDependencyError(
+                "Running a policy", error.name or "lerobot", "pip install 'demorec[train]'"
+            ) from error
+        if device == "cpu":
+            torch.set_num_threads(1)
+        self._torch, self._preprocess = torch, preprocess_observation
+        try:
+            config = PreTrainedConfig.from_pretrained(checkpoint)
+            config.device = device
+            with contextlib.redirect_stdout(io.StringIO()):  # LeRobot says where it loads weights from
+                self._policy = get_policy_class(config.type).from_pretrained(checkpoint, config=config)
+            self._before, self._after = make_pre_post_processors(
+                policy_cfg=config,
+                pretrained_path=str(checkpoint),
+                preprocessor_overrides={"device_processor": {"device": device}},
+            )
+        except Exception as error:  # whatever a foreign format may lack
+            raise ConfigError(f"LeRobot cannot load this policy ({in_words(error)}): {checkpoint}") from error
+        self.inputs = tuple(config.input_features)
+        if action_steps is not None:
+            chunk = getattr(config, "chunk_size", None)
+            if chunk is None or not 1 <= action_steps <= chunk:
+                raise OptionError("action_steps", f"is {action_steps}, allowed are 1 to {chunk} (the policy's chunk).")
+            config.n_action_steps = action_steps
+            self._policy.config.n_action_steps = action_steps
+        self._policy.eval()
+
+    def reset(self, seed: int) -> None:
+        """Begin an episode; policies that draw random numbers draw those of this seed."""
+        self._torch.manual_seed(seed)
+        self._policy.reset()
+        for steps in (self._before, self._after):
+            steps.reset()
+
+    def act(self, observation: dict[str, Any], instruction: str) -> NDArray[np.float32]:
+        """(D,) action for an observation of `DemorecEnv`."""
+        batch = self._preprocess(_batched(observation))
+        batch["task"] = [instruction]
+        with self._torch.inference_mode():
+            action = self._after(self._policy.select_action(self._before(batch)))
+        return np.asarray(action.to("cpu").numpy()[0], dtype=np.float32)
+
+
+def _batched(observation: dict[str, Any]) -> dict[str, Any]:
+    """With a leading axis of one."""
+    return {
+        key: _batched(value) if isinstance(value, dict) else np.ascontiguousarray(value)[np.newaxis]
+        for key, value in observation.items()
+    }

@@ -1,0 +1,155 @@
+"""lerobot-train, with the one difference that its datasets are read by `FastDataset`."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from pathlib import Path
+from typing import Any
+
+from demorec.core.errors import ConfigError, DemorecError, MissingDependencyError, resource_error
+
+PROGRAM = "lerobot-train"
+
+
+class TrainingError(DemorecError):
+    """lerobot-train did not come to its end."""
+
+
+def train(
+    arguments: Sequence[str],
+    *,
+    frame_cache_bytes: int,
+    on_replaced: Callable[[], None],
+    expert_only: bool = False,
+    freeze_encoder: bool = False,
+) -> None:
+    """Run lerobot-train in this process.
+
+    Args:
+        arguments: As for lerobot-train.
+        frame_cache_bytes: Limit of the decoded frames that each process keeps; of a frozen encoder's maps as well.
+        expert_only: As of `FastDataset`.
+        freeze_encoder: Do not train an ACT policy's encoder of pictures (`freeze_encoder`).
+        on_replaced: Called when the first dataset is opened by `FastDataset`: streamed ones are not.
+
+    Raises:
+        ConfigError: The limit is negative, the file of --config_path is missing, or there is no encoder to freeze.
+        TrainingError: lerobot-train ended with an error.
+        MissingDependencyError: LeRobot, or what it needs for training, is not installed.
+        SystemExit: lerobot-train refused its arguments (2), and said why, or told its help (0).
+    """
+    if frame_cache_bytes < 0:
+        raise ConfigError(f"frame-cache-mb is {frame_cache_bytes / (1 << 20):g}, at least 0 is needed.")
+    check_settings_file(arguments)
+    try:
+        import accelerate  # noqa: F401  # which lerobot-train asks for late
+        from lerobot.scripts import lerobot_train
+    except ImportError as error:
+        raise MissingDependencyError("Training", error.name or "lerobot", "pip install 'demorec[train]'") from error
+    with (
+        _reading_fast(frame_cache_bytes, on_replaced, expert_only=expert_only, is_frozen=freeze_encoder),
+        _freezing(frame_cache_bytes) if freeze_encoder else nullcontext(),
+        _called_with(arguments),
+    ):
+        try:
+            lerobot_train.main()
+        except Exception as error:  # whatever a foreign program raises
+            if isinstance(error, DemorecError) or resource_error(error) is not None:
+                raise
+            raise TrainingError(
+                f"{PROGRAM} stopped ({type(error).__name__}: {error}); run {PROGRAM} with the same flags to see where."
+            ) from error
+
+
+def check_settings_file(arguments: Sequence[str]) -> None:
+    """Raise ConfigError if the file of --config_path is missing."""
+    for argument in arguments:
+        flag, _, path = argument.partition("=")
+        if flag == "--config_path" and path.endswith(".json") and not Path(path).exists():
+            raise ConfigError(f"There is no such file of settings: {path}")
+
+
+def training_config(arguments: Sequence[str]) -> Any:
+    """lerobot-train's settings (TrainPipelineConfig), as its parser reads them from its arguments.
+
+    Raises:
+        ConfigError: The file of --config_path is missing.
+        MissingDependencyError: LeRobot, or what it needs for training, is not installed.
+        SystemExit: The parser refused the arguments (2), and said why.
+    """
+    check_settings_file(arguments)
+    try:
+        import draccus
+        from lerobot.configs.train import TrainPipelineConfig
+        from lerobot.policies import factory  # noqa: F401  # which registers the policies' types
+    except ImportError as error:
+        raise MissingDependencyError("Training", error.name or "lerobot", "pip install 'demorec[train]'") from error
+    with _called_with(arguments):
+        try:
+            return draccus.parse(TrainPipelineConfig, args=list(arguments))
+        except Exception as error:  # whatever a foreign parser raises
+            raise ConfigError(f"{PROGRAM} does not take these settings ({type(error).__name__}: {error}).") from error
+
+
+def _reading_fast(
+    frame_cache_bytes: int, on_replaced: Callable[[], None], *, expert_only: bool, is_frozen: bool
+) -> AbstractContextManager[None]:
+    """LeRobot's factory of datasets makes `FastDataset`s meanwhile."""
+    from lerobot.datasets import factory
+
+    from demorec.learn.training.dataset import FastDataset
+
+    is_told = False
+
+    def open_dataset(*args: Any, **kwargs: Any) -> FastDataset:
+        nonlocal is_told
+        if is_frozen and kwargs.get("image_transforms") is not None:
+            raise ConfigError(
+                "--freeze-encoder keeps what the encoder made of each picture, so pictures must not change: leave out "
+                "--dataset.image_transforms.enable."
+            )
+        if not is_told:
+            on_replaced()
+            is_told = True
+        return FastDataset(*args, frame_cache_bytes=frame_cache_bytes, expert_only=expert_only, **kwargs)
+
+    return _replaced(factory, "LeRobotDataset", open_dataset)
+
+
+def _freezing(limit_bytes: int) -> AbstractContextManager[None]:
+    """Policies that lerobot-train makes have a frozen encoder meanwhile."""
+    from lerobot.scripts import lerobot_train
+
+    from demorec.learn.training.frozen import freeze_encoder
+
+    make_policy = lerobot_train.make_policy
+
+    def frozen(*args: Any, **kwargs: Any) -> Any:
+        policy = make_policy(*args, **kwargs)
+        freeze_encoder(policy, num_frames=kwargs["ds_meta"].total_frames, limit_bytes=limit_bytes)
+        return policy
+
+    return _replaced(lerobot_train, "make_policy", frozen)
+
+
+@contextmanager
+def _called_with(arguments: Sequence[str]) -> Iterator[None]:
+    """The command line that LeRobot's parser looks at, here and there, by itself; it exits with 0 or 2."""
+    try:
+        with _replaced(sys, "argv", [PROGRAM, *arguments]):
+            yield
+    except SystemExit as ended:  # its parser exits with 1 for some wrong requests and with 2 for others
+        raise SystemExit(2 if ended.code else 0) from None
+
+
+@contextmanager
+def _replaced(owner: Any, name: str, value: Any) -> Iterator[None]:
+    """Another value of an attribute meanwhile."""
+    before = getattr(owner, name)
+    setattr(owner, name, value)
+    try:
+        yield
+    finally:
+        setattr(owner, name, before)

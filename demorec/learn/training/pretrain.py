@@ -1,0 +1,336 @@
+"""Teaching the encoder of a policy's pictures to see, before the policy is trained.
+
+    OUT/pretraining.json    what decides the result; at the end also what came out
+    OUT/unfinished.pt       weights and optimizer, until it is done
+    OUT/config.json, ...    an ACT policy whose encoder has been taught: for --policy.path=OUT of lerobot-train
+
+The same command goes on where the last one stopped.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from lerobot.policies import make_policy, make_pre_post_processors
+from numpy.typing import NDArray
+from torch.utils.data import default_collate
+
+from demorec.core.errors import ConfigError, DemorecError, in_words
+from demorec.core.files import read_json_object, replace_text
+from demorec.learn.training.columns import numbers
+from demorec.learn.training.dataset import FastDataset
+from demorec.learn.training.encoder import KeyframeEncoder, loss_of
+from demorec.learn.training.keyframes import KeyframeTargets, find_keyframes, keyframe_targets
+from demorec.runs.lock import LOCK_NAME, run_lock
+
+RESULT_NAME, UNFINISHED_NAME = "pretraining.json", "unfinished.pt"
+_STATE, _EE_POSE, _ACTION = "observation.state", "observation.ee_pose", "action"
+_TCP = ("tcp.x", "tcp.y", "tcp.z", "tcp.qx", "tcp.qy", "tcp.qz", "tcp.qw")
+_OPENING = "gripper.width"
+_HELD_OUT_SHARE, _JUDGED_FRAMES = 0.05, 1000
+_WARM_UP, _WEIGHT_DECAY, _GRADIENT_NORM = 50, 1e-3, 1.0
+_SMOOTHING = 0.95
+
+Rows = NDArray[np.int64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Teaching:
+    """How an encoder is taught.
+
+    Attributes:
+        updates: Of its weights.
+        batch_size: Frames of each update, with the pictures of all cameras.
+        learning_rate: At its highest; it falls along a cosine.
+        seed: Of the weights at the start, and of which frames are seen.
+    """
+
+    updates: int = 1500
+    batch_size: int = 64
+    learning_rate: float = 1e-3
+    seed: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Taught:
+    """What the encoder tells of the episodes that were left out, the last twentieth.
+
+    Attributes:
+        median_m, most_m: Error of the offset from the TCP to the next keyframe in metres: of half of the frames, and
+            of nine tenths.
+        blind_m: Median error of always telling the mean offset.
+        episodes: That were left out.
+        cpu_seconds: Of the last call.
+    """
+
+    median_m: float
+    most_m: float
+    blind_m: float
+    episodes: int
+    cpu_seconds: float
+
+
+def pretrain(
+    config: Any,
+    teaching: Teaching,
+    out: Path,
+    *,
+    frame_cache_bytes: int,
+    on_progress: Callable[[int, float], None],
+    save_every: int = 50,
+) -> Taught:
+    """Teach the encoder that the ACT policy of a training will have, and save the policy; go on with what was begun.
+
+    Args:
+        config: TrainPipelineConfig of LeRobot, of which the dataset and the policy count; with the policy's `use_amp`
+            the network computes in bfloat16, while its weights and the loss stay in float32.
+        teaching: How.
+        out: Folder of the policy.
+        frame_cache_bytes: Limit of the decoded frames that are kept.
+        on_progress: Is told the updates done and the loss, smoothed.
+        save_every: Updates from one to the next state that a stopped call can go on from.
+
+    Raises:
+        ConfigError: The policy is no ACT, the dataset has no pictures or does not tell where the hand is, or the folder
+            holds something else.
+        DemorecError: What is in the folder is damaged.
+    """
+    if getattr(config.policy, "type", None) != "act":
+        raise ConfigError("Only the encoder of an ACT policy can be taught: --policy.type=act.")
+    chosen = config.dataset
+    dataset = FastDataset(
+        chosen.repo_id,
+        root=chosen.root,
+        episodes=chosen.episodes,
+        revision=chosen.revision,
+        video_backend=chosen.video_backend,
+        frame_cache_bytes=frame_cache_bytes,
+    )
+    targets = read_targets(dataset)
+    if not dataset.meta.camera_keys:
+        raise ConfigError(f"The dataset has no pictures to learn from: {dataset.root}")
+    settings = {
+        **asdict(teaching),
+        "dataset": _digest(dataset),
+        "episodes": chosen.episodes,
+        "policy": _deciding(config.policy),
+    }
+    out.mkdir(parents=True, exist_ok=True)
+    with run_lock(out):
+        done = _settle(out, settings)
+        if done is not None:
+            return done
+        lessons = _Lessons(config.policy, teaching, dataset, targets)
+        started = time.process_time()
+        lessons.go_on(out / UNFINISHED_NAME, on_progress, save_every)
+        found = lessons.judge(time.process_time() - started)
+        lessons.save(out)
+        replace_text(out / RESULT_NAME, json.dumps({"settings": settings, "taught": asdict(found)}, indent=1))
+        (out / UNFINISHED_NAME).unlink(missing_ok=True)
+        return found
+
+
+def read_targets(dataset: FastDataset) -> KeyframeTargets:
+    """What is to be told of each row of a dataset.
+
+    Raises:
+        ConfigError: The dataset does not tell the TCP's pose or the opening that is commanded.
+    """
+    features = dataset.meta.features
+    pose = next((name for name in (_EE_POSE, _STATE) if set(_TCP) <= set(_names(features.get(name)))), None)
+    if pose is None or _OPENING not in _names(features.get(_ACTION)):
+        missing = f"an action {_OPENING}" if pose else f"{_TCP[0]} to {_TCP[-1]} in {_EE_POSE} or {_STATE}"
+        raise ConfigError(
+            f"The dataset does not tell where the hand will grasp, it lacks {missing}: demorec export lerobot "
+            f"--state joint_ee has both: {dataset.root}"
+        )
+    places = [_names(features[pose]).index(name) for name in _TCP]
+    tcp = _column(dataset, pose)[:, places]
+    opening = _column(dataset, _ACTION)[:, _names(features[_ACTION]).index(_OPENING)]
+    keyframes = find_keyframes(opening, _column(dataset, "episode_index").reshape(-1))
+    return keyframe_targets(tcp[:, :3], tcp[:, 3:], keyframes)
+
+
+class _Lessons:
+    """The encoder, its optimizer, and how far they are."""
+
+    def __init__(self, policy: Any, teaching: Teaching, dataset: FastDataset, targets: KeyframeTargets) -> None:
+        self._teaching, self._dataset, self._targets = teaching, dataset, targets
+        torch.manual_seed(teaching.seed)
+        self._policy = make_policy(policy, ds_meta=dataset.meta)
+        self._before, self._after = make_pre_post_processors(self._policy.config, dataset_stats=dataset.meta.stats)
+        self._device = torch.device(policy.device)
+        self._learnt, self._held_out, self._num_held_out = split(_column(dataset, "episode_index").reshape(-1))
+        learnt = targets.values[self._learnt]
+        spread = learnt.std(0)
+        self._mean = learnt.mean(0)
+        self._spread = np.where(spread > 1e-4, spread, np.inf).astype(np.float32)
+        self._network = KeyframeEncoder(
+            self._policy.config,
+            num_cameras=len(self._policy.config.image_features),
+            state_dim=self._policy.config.robot_state_feature.shape[0],
+            num_targets=len(targets.names),
+        ).to(self._device)
+        self._optimizer = torch.optim.AdamW(
+            self._network.parameters(), lr=teaching.learning_rate, weight_decay=_WEIGHT_DECAY
+        )
+        self._done, self._loss = 0, math.nan
+
+    def go_on(self, unfinished: Path, on_progress: Callable[[int, float], None], save_every: int) -> None:
+        """From where a stopped call was to the last update."""
+        if unfinished.exists():
+            self._load(unfinished)
+        self._network.train()
+        while self._done < self._teaching.updates:
+            loss = self._update()
+            self._loss = loss if math.isnan(self._loss) else _SMOOTHING * self._loss + (1 - _SMOOTHING) * loss
+            self._done += 1
+            if self._done % save_every == 0 or self._done == self._teaching.updates:
+                self._store(unfinished)
+                on_progress(self._done, self._loss)
+
+    def judge(self, cpu_seconds: float) -> Taught:
+        """Of the episodes that were left out."""
+        rows = self._held_out[:: max(1, len(self._held_out) // _JUDGED_FRAMES)]
+        self._network.eval()
+        told = []
+        with torch.no_grad():
+            for start in range(0, len(rows), self._teaching.batch_size):
+                together, _ = self._tell(rows[start : start + self._teaching.batch_size])
+                told.append(together.cpu().numpy())
+        offsets = list(self._targets.offsets)
+        spread = np.where(np.isinf(self._spread), 0, self._spread)
+        found = (np.concatenate(told) * spread + self._mean)[:, offsets]
+        true = self._targets.values[rows][:, offsets]
+        error = np.linalg.norm(found - true, axis=1)
+        return Taught(
+            median_m=round(float(np.median(error)), 5),
+            most_m=round(float(np.quantile(error, 0.9)), 5),
+            blind_m=round(float(np.median(np.linalg.norm(true - self._mean[offsets], axis=1))), 5),
+            episodes=self._num_held_out,
+            cpu_seconds=round(cpu_seconds, 1),
+        )
+
+    def save(self, out: Path) -> None:
+        """The policy with the encoder, and its processing steps, as LeRobot's trainings leave them."""
+        self._policy.model.backbone.load_state_dict(self._network.weights())
+        for part in (self._policy, self._before, self._after):
+            part.save_pretrained(out)
+
+    def _update(self) -> float:
+        teaching = self._teaching
+        # Which frames are seen follows from the seed and the update alone, so that a stopped call goes on as if not.
+        rows = np.random.default_rng([teaching.seed, self._done]).choice(self._learnt, teaching.batch_size)
+        wanted = (self._targets.values[rows] - self._mean) / self._spread
+        rate = min(1.0, (self._done + 1) / _WARM_UP) * 0.5 * (1 + math.cos(math.pi * self._done / teaching.updates))
+        for group in self._optimizer.param_groups:
+            group["lr"] = teaching.learning_rate * rate
+        loss = loss_of(self._tell(rows), torch.from_numpy(wanted).to(self._device))
+        self._optimizer.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self._network.parameters(), _GRADIENT_NORM)
+        self._optimizer.step()
+        return float(loss.item())
+
+    def _tell(self, rows: Rows) -> tuple[torch.Tensor, list[torch.Tensor]]:
+        batch = self._before(default_collate(self._dataset.__getitems__(rows.tolist())))
+        pictures: Sequence[torch.Tensor] = [batch[key] for key in self._policy.config.image_features]
+        # bfloat16 has the range of float32, so that no loss needs to be scaled, unlike LeRobot's float16 on CUDA.
+        with torch.autocast(self._device.type, dtype=torch.bfloat16, enabled=self._policy.config.use_amp):
+            together, by_camera = self._network(pictures, batch[_STATE])
+        return together.float(), [each.float() for each in by_camera]
+
+    def _store(self, path: Path) -> None:
+        state = {
+            "network": self._network.state_dict(),
+            "optimizer": self._optimizer.state_dict(),
+            "done": self._done,
+            "loss": self._loss,
+        }
+        part = path.with_suffix(".part")
+        with part.open("wb") as file:
+            torch.save(state, file)
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(path)
+
+    def _load(self, path: Path) -> None:
+        try:
+            state = torch.load(path, map_location=self._device, weights_only=True)  # tensors and numbers, no code
+            self._network.load_state_dict(state["network"])
+            self._optimizer.load_state_dict(state["optimizer"])
+            self._done, self._loss = int(state["done"]), float(state["loss"])
+        except Exception as error:  # whatever a damaged file makes of torch
+            raise DemorecError(f"What a stopped call left is damaged, delete it to begin anew: {path}") from error
+
+
+def split(episode: NDArray[np.integer]) -> tuple[Rows, Rows, int]:
+    """Rows that are learned from, rows of the last twentieth of the episodes (one at least), and how many these are.
+
+    Raises:
+        ConfigError: There is one episode only.
+    """
+    numbers_of = np.unique(episode)
+    if len(numbers_of) < 2:
+        raise ConfigError("The dataset has one episode only: at least 2 are needed, one of which is left out.")
+    count = max(1, round(_HELD_OUT_SHARE * len(numbers_of)))
+    is_held_out = np.isin(episode, numbers_of[-count:])
+    return np.flatnonzero(~is_held_out), np.flatnonzero(is_held_out), count
+
+
+def _settle(out: Path, settings: dict[str, Any]) -> Taught | None:
+    """Write down what decides, or compare it with what is written there; what came out, if it is done."""
+    path = out / RESULT_NAME
+    if not path.exists():
+        if strangers := [each.name for each in out.iterdir() if each.name != LOCK_NAME]:
+            raise ConfigError(f"The folder holds something else ({strangers[0]}), choose another --out: {out}")
+        replace_text(path, json.dumps({"settings": settings}, indent=1))
+        return None
+    try:
+        found = read_json_object(path)
+        before = found["settings"]
+        taught = Taught(**found["taught"]) if "taught" in found else None
+        others = sorted(name for name in settings if before.get(name) != settings[name])
+    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+        raise DemorecError(f"{RESULT_NAME} is damaged ({in_words(error)}): {path}") from error
+    if others:
+        raise ConfigError(
+            f"Another encoder is taught in this folder (another {', another '.join(others)}), choose another --out: "
+            f"{out}"
+        )
+    return taught
+
+
+def _deciding(policy: Any) -> dict[str, Any]:
+    """Of the policy's settings those that decide over its encoder and over what it is saved with."""
+    plain: dict[str, Any] = json.loads(json.dumps(asdict(policy), default=str))
+    return {name: value for name, value in plain.items() if name not in ("device", "pretrained_path")}
+
+
+def _digest(dataset: FastDataset) -> str:
+    """Of the dataset's statistics, by which it is known again."""
+    path = Path(dataset.root) / "meta" / "stats.json"
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+
+
+def _column(dataset: FastDataset, name: str) -> NDArray[Any]:
+    table = dataset.hf_dataset.with_format("arrow").select_columns([name])[:]
+    column = numbers(table.column(name))
+    if column is None:
+        raise ConfigError(f"The feature {name} of the dataset holds more than numbers: {dataset.root}")
+    return column.take(np.arange(len(column)))
+
+
+def _names(feature: Any) -> list[str]:
+    names = (feature or {}).get("names")
+    return names if isinstance(names, list) else []

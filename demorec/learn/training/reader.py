@@ -1,0 +1,244 @@
+"""Items of a LeRobot dataset, made for a whole batch at once; key for key and bit for bit those of LeRobot's reader."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Sequence
+from operator import index as as_index
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from lerobot.configs import DEPTH_METER_UNIT
+from lerobot.datasets.dataset_reader import DatasetReader
+from lerobot.datasets.depth_utils import MM_PER_METRE, dequantize_depth
+from numpy.typing import NDArray
+
+from demorec.learn.training.columns import Column, numbers
+from demorec.learn.training.pictures import PictureReader
+from demorec.learn.training.statements import Statements, is_statements
+from demorec.learn.training.stretches import STRETCH_COLUMNS, Stretches
+
+Rows = NDArray[np.int64]
+Item = dict[str, Any]
+
+
+class FastReader(DatasetReader):  # type: ignore[misc]
+    """Reads what LeRobot's reader reads.
+
+    Args:
+        reader: LeRobot's, ready to read or not; its settings and its table are taken over.
+        cache_bytes: Limit of the decoded frames that each process keeps.
+        expert_only: As of `FastDataset`.
+    """
+
+    def __init__(self, reader: DatasetReader, cache_bytes: int, *, expert_only: bool = False) -> None:
+        self.__dict__.update(vars(reader))
+        self._cache_bytes = cache_bytes
+        self._expert_only = expert_only
+        self._tables: _Tables | None = None
+        self._pictures: PictureReader | None = None
+        self._process = 0
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Settings and LeRobot's table: a worker process finds its own arrays and opens its own files."""
+        return {**self.__dict__, "_tables": None, "_pictures": None}
+
+    def get_item(self, idx: int) -> Item:
+        """One item; IndexError for an index beyond the table."""
+        return self.get_items([idx])[0]
+
+    def get_items(self, indices: Sequence[int]) -> list[Item]:
+        """The items of a batch, in the given order.
+
+        Args:
+            indices: Rows of the table (of the chosen episodes), negative ones counted from its end.
+
+        Raises:
+            IndexError: One lies beyond the table.
+            FrameTimestampError: A video has no frame at the time of a row.
+        """
+        tables = self._current_tables()
+        rows = np.array([_row(index, len(self.hf_dataset)) for index in indices], np.int64)
+        if tables.stretches is not None:
+            rows = tables.stretches.shown[rows]
+        episodes, absolute = (tables.numbers[name].take(rows) for name in ("episode_index", "index"))
+        windows: dict[str, Rows] = {}
+        padding: dict[str, Sequence[torch.Tensor]] = {}
+        for key, deltas in (self.delta_indices or {}).items():
+            windows[key], is_pad = tables.window(rows, absolute, episodes, deltas)
+            padding[f"{key}_is_pad"] = torch.from_numpy(is_pad).unbind(0)
+        values = {name: self._values(tables, name, windows.get(name, rows)) for name in tables.names}
+        for key in windows.keys() - values.keys() - set(self._meta.video_keys):
+            raise KeyError(key)
+        values |= padding
+        if self._meta.video_keys:
+            times = values["timestamp"]
+            values = self._videos(tables, episodes, times, windows) | values
+        items = [dict(zip(values, item, strict=True)) for item in zip(*values.values(), strict=True)]
+        depth_keys = self._meta.depth_keys
+        colors = [key for key in self._meta.camera_keys if key not in depth_keys]
+        for item in items:
+            self._finish(item, colors, tables.tasks)
+        return items
+
+    def _current_tables(self) -> _Tables:
+        if self._tables is None or self._tables.source is not self.hf_dataset:
+            self._tables = _Tables(self)
+        return self._tables
+
+    def _current_pictures(self) -> PictureReader:
+        """Of this process: a forked one shares the places in the files that its parent has opened."""
+        if self._pictures is None or self._process != os.getpid():
+            self._pictures = PictureReader(self._video_backend, self._tolerance_s, self._cache_bytes)
+            self._process = os.getpid()
+        return self._pictures
+
+    def _values(self, tables: _Tables, name: str, rows: Rows) -> Sequence[Any]:
+        """A feature's value for each item: of its row (B,), or stacked of the rows of its window (B, T)."""
+        if name in tables.numbers:
+            return list(tables.numbers[name].tensor(rows).unbind(0))
+        if name in tables.statements and rows.ndim == 1:
+            return tables.statements[name].take(rows)
+        once, places = np.unique(rows, return_inverse=True) if rows.ndim > 1 else (rows, None)
+        values: list[Any] = tables.others[name][once.tolist()][name]
+        if places is None:
+            return values
+        return [torch.stack([values[place] for place in item]) for item in places.reshape(rows.shape)]
+
+    def _videos(
+        self, tables: _Tables, episodes: Rows, times: Sequence[torch.Tensor], windows: dict[str, Rows]
+    ) -> dict[str, list[torch.Tensor]]:
+        """Video feature -> pictures of each item, (C, H, W) or (T, C, H, W), as LeRobot gives them."""
+        now_s = np.array([time.item() for time in times], np.float64)[:, None]
+        videos: dict[str, list[torch.Tensor]] = {}
+        for key in self._meta.video_keys:
+            times_s = tables.numbers["timestamp"].tensor(windows[key]).double().numpy() if key in windows else now_s
+            times_s = times_s + tables.video_start_s[key][episodes][:, None]
+            files = tables.video_file[key][episodes]
+            found: list[Any] = [None] * len(episodes)
+            is_depth = key in self._meta.depth_keys
+            for file in np.unique(files):
+                places = np.flatnonzero(files == file)
+                path = tables.video_paths[key][file]
+                pictures = self._current_pictures().read(path, times_s[places], is_depth=is_depth)
+                for place, picture in zip(places, pictures, strict=True):
+                    found[place] = (self._depth(key, picture) if is_depth else self._color(picture)).squeeze(0)
+            videos[key] = found
+        return videos
+
+    def _color(self, pictures: torch.Tensor) -> torch.Tensor:
+        """As it is, or as float32 in 0..1."""
+        return pictures if self._return_uint8 else pictures.to(torch.float32) / 255
+
+    def _depth(self, key: str, codes: torch.Tensor) -> torch.Tensor:
+        """Distances in the wanted unit, float32."""
+        coder = self._depth_encoder_configs[key]
+        depth: torch.Tensor = dequantize_depth(
+            codes,
+            depth_min=coder.depth_min,
+            depth_max=coder.depth_max,
+            shift=coder.shift,
+            use_log=coder.use_log,
+            output_unit=self._depth_output_unit,
+        )
+        return depth
+
+    def _finish(self, item: Item, colors: Iterable[str], tasks: Sequence[str]) -> None:
+        """What is made of an item's values one by one: transforms (they may draw random numbers), units, the task."""
+        if self._image_transforms is not None:
+            for key in colors:
+                item[key] = self._image_transforms(item[key])
+        for key, unit in self._image_depth_units.items():
+            if unit not in (None, self._depth_output_unit):
+                item[key] = item[key] * MM_PER_METRE if unit == DEPTH_METER_UNIT else item[key] / MM_PER_METRE
+        item["task"] = tasks[item["task_index"].item()]
+
+
+class _Tables:
+    """A dataset's tables, ready for batches.
+
+    Attributes:
+        source: The table of rows that they were made from.
+        names: Its columns in order.
+        numbers: Those that are arrays.
+        others: The rest, each as a table that LeRobot's conversion is applied to: pictures, texts, gaps.
+        statements: Those of them that are language columns.
+        video_paths: Video feature -> its files.
+        video_file: Video feature -> number of the file of each episode, (E,).
+        video_start_s: Video feature -> where each episode begins in its file, in seconds, (E,) float64.
+        tasks: Instructions by task index.
+        stretches: Where the expert acts, if only that counts.
+    """
+
+    def __init__(self, reader: FastReader) -> None:
+        meta, self.source = reader._meta, reader.hf_dataset
+        self.names = self.source.column_names
+        columns = _columns(self.source, self.names)
+        found = {name: numbers(column) for name, column in columns.items()}
+        self.numbers: dict[str, Column] = {name: column for name, column in found.items() if column is not None}
+        self.others = {name: self.source.select_columns([name]) for name in self.names if name not in self.numbers}
+        self.statements = {
+            name: Statements(table) for name, table in self.others.items() if is_statements(columns[name])
+        }
+        self.tasks = meta.tasks.index.tolist()
+        episodes = _columns(meta.episodes, meta.episodes.column_names)
+        self._starts, self._ends = (_array(episodes[f"dataset_{end}_index"]) for end in ("from", "to"))
+        self.stretches = None
+        if reader._expert_only:
+            of_row = {name: self.numbers[name].take(np.arange(len(self.source))) for name in STRETCH_COLUMNS}
+            self.stretches = Stretches(**of_row)
+        self._row_of: Rows | None = None
+        if reader._absolute_to_relative_idx is not None:
+            absolute = self.numbers["index"].take(np.arange(len(self.source)))
+            self._row_of = np.full(int(self._ends.max()), -1)
+            self._row_of[absolute] = np.arange(len(absolute))
+        self.video_paths: dict[str, list[Path]] = {}
+        self.video_file: dict[str, Rows] = {}
+        self.video_start_s: dict[str, NDArray[np.float64]] = {}
+        for key in meta.video_keys:
+            places = np.stack([_array(episodes[f"videos/{key}/{name}_index"]) for name in ("chunk", "file")], axis=1)
+            _, first, self.video_file[key] = np.unique(places, axis=0, return_index=True, return_inverse=True)
+            self.video_paths[key] = [reader.root / meta.get_video_file_path(int(episode), key) for episode in first]
+            self.video_start_s[key] = _array(episodes[f"videos/{key}/from_timestamp"]).astype(np.float64)
+
+    def window(
+        self, rows_now: Rows, absolute: Rows, episodes: Rows, deltas: Iterable[int]
+    ) -> tuple[Rows, NDArray[np.bool_]]:
+        """Rows beside those of a batch, held at the ends of their episodes (or of the expert's stretches), and which
+        of them lie beyond: (B, T).
+
+        Raises:
+            KeyError: A chosen episode lacks rows in the table.
+        """
+        wanted = absolute[:, None] + np.array(list(deltas), np.int64)
+        first, end = self._starts[episodes][:, None], self._ends[episodes][:, None]
+        if self.stretches is not None:
+            first, end = self.stretches.first[rows_now][:, None], self.stretches.end[rows_now][:, None]
+        rows = np.clip(wanted, first, end - 1)
+        is_beyond = (wanted < first) | (wanted >= end)
+        if self._row_of is None:  # the table has all episodes, so that row and index are the same
+            return rows, is_beyond
+        found = self._row_of[rows]
+        if (found < 0).any():
+            raise KeyError(int(rows[found < 0][0]))
+        return found, is_beyond
+
+
+def _columns(table: Any, names: Iterable[str]) -> dict[str, Any]:
+    """Column -> its memory, not copied, of a table of the package datasets."""
+    arrow = table.with_format("arrow")[:]
+    return {name: arrow.column(name) for name in names}
+
+
+def _array(column: Any) -> NDArray[Any]:
+    values: NDArray[Any] = column.to_numpy()
+    return values
+
+
+def _row(index: int, length: int) -> int:
+    row = as_index(index)
+    if not -length <= row < length:
+        raise IndexError(f"Index {row} is beyond the {length} frames of the dataset.")
+    return row % length

@@ -1,0 +1,233 @@
+"""Chunks of an MCAP file: where they are, what is in them, and all messages of a topic as one table of bytes.
+
+An export reads every message of every recording. So nothing is made per message here: one walk over a chunk finds
+where its records begin, and NumPy takes their heads and their contents apart, a whole topic at a time.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from array import array
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from io import BytesIO
+
+import numpy as np
+import zstandard
+from numpy.typing import NDArray
+
+from demorec.mcap.limits import Limits
+
+RECORD_HEAD = struct.Struct("<BQ")
+"""Opcode and length of what follows (MCAP specification, Records)."""
+MAX_RECORD_BYTES = 1 << 30
+"""No recording has larger records; a damaged length must not fill the memory."""
+
+_MESSAGE = 5
+_MESSAGE_HEAD = np.dtype(
+    [
+        ("opcode", "u1"),
+        ("length", "<u8"),
+        ("channel", "<u2"),
+        ("sequence", "<u4"),
+        ("log_time", "<u8"),
+        ("publish_time", "<u8"),
+    ]
+)
+_GATHERED_ROWS = 4096
+"""Messages that are taken out of a chunk at once: the places of their bytes take eight times as much as the bytes."""
+_CHUNK_HEAD = struct.Struct("<QQQII")
+_PLACE_HEAD = struct.Struct("<QQQQI")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChunkPlace:
+    """What the index at the end of the file says about a chunk.
+
+    Attributes:
+        start, length: Of the chunk's record in the file, bytes.
+        channels: That it has messages of.
+        uncompressed_size: Of its records, bytes.
+    """
+
+    start: int
+    length: int
+    channels: frozenset[int]
+    uncompressed_size: int
+
+    @classmethod
+    def read(cls, record: bytes) -> ChunkPlace:
+        """Of the content of a Chunk Index record; struct.error when it is too short."""
+        _, _, start, length, num_bytes = _PLACE_HEAD.unpack_from(record)
+        position = _PLACE_HEAD.size
+        offsets = record[position : position + num_bytes]
+        position += num_bytes + 8  # message_index_length
+        (name_bytes,) = struct.unpack_from("<I", record, position)
+        (uncompressed_size,) = struct.unpack_from("<Q", record, position + 4 + name_bytes + 8)
+        channels = np.frombuffer(offsets, dtype=[("channel", "<u2"), ("offset", "<u8")])["channel"]
+        return cls(
+            start=start, length=length, channels=frozenset(channels.tolist()), uncompressed_size=uncompressed_size
+        )
+
+    @classmethod
+    def together(cls, places: Iterable[ChunkPlace], num_bytes: int) -> Iterator[list[ChunkPlace]]:
+        """Neighbours that have at most so many bytes together, at least one each."""
+        group: list[ChunkPlace] = []
+        total = 0
+        for place in places:
+            if group and total + place.uncompressed_size > num_bytes:
+                yield group
+                group, total = [], 0
+            group.append(place)
+            total += place.uncompressed_size
+        if group:
+            yield group
+
+
+def chunk_content(record: bytes | memoryview, limits: Limits, expected_size: int | None = None) -> bytes:
+    """The records in a chunk, given the content of its record; a checksum of 0 stands for none.
+
+    Raises:
+        ValueError, struct.error, zstandard.ZstdError: It is damaged, larger than the limits allow, or not of the
+            expected size.
+    """
+    _, _, size, stored_crc, name_bytes = _CHUNK_HEAD.unpack_from(record)
+    position = _CHUNK_HEAD.size
+    compression = bytes(record[position : position + name_bytes])
+    (num_bytes,) = struct.unpack_from("<Q", record, position + name_bytes)
+    start = position + name_bytes + 8
+    if expected_size is not None and size != expected_size:
+        raise ValueError("a chunk differs from its index")
+    if start + num_bytes > len(record):
+        raise ValueError("a chunk that is cut off")
+    limits.check_chunk(size, num_bytes)
+    stored = memoryview(record)[start : start + num_bytes]
+    if compression == b"zstd":
+        # Where the compressed data tell their size, that much is reserved, whatever is said here to be the most.
+        if zstandard.frame_content_size(stored) not in (size, -1):
+            raise ValueError("a chunk of another size than its compressed data")
+        content = zstandard.ZstdDecompressor().decompress(stored, max_output_size=size)
+    elif compression == b"lz4":  # not ours; the writers of other people's bags know it
+        content = _lz4_content(stored, size)
+    elif compression == b"":
+        content = bytes(stored)
+    else:
+        raise ValueError(f"a chunk compressed with {compression!r}, expected zstd or lz4")
+    if len(content) != size or (stored_crc and zlib.crc32(content) != stored_crc):
+        raise ValueError("a chunk fails its checksum")
+    return content
+
+
+def _lz4_content(stored: memoryview, size: int) -> bytes:
+    import lz4.frame
+
+    try:
+        content: bytes = lz4.frame.LZ4FrameDecompressor().decompress(stored, max_length=size)
+    except RuntimeError as error:  # all that lz4 raises
+        raise ValueError("a chunk that lz4 cannot unpack") from error
+    return content
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Block:
+    """All messages of one topic, in the order of the file.
+
+    Attributes:
+        content: The bytes in which they lie, shared by the topics that were read together.
+        time_ns: (N,) int64.
+        starts, lengths: (N,) int64, where each message lies in `content`.
+    """
+
+    content: bytes
+    time_ns: NDArray[np.int64]
+    starts: NDArray[np.int64]
+    lengths: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.starts)
+
+    def messages(self) -> Iterator[bytes]:
+        """The messages one by one."""
+        ends = self.starts + self.lengths
+        for start, end in zip(self.starts.tolist(), ends.tolist(), strict=True):
+            yield self.content[start:end]
+
+    def joined(self) -> bytes:
+        """The messages back to back."""
+        content, ends = memoryview(self.content), self.starts + self.lengths
+        return b"".join([content[a:b] for a, b in zip(self.starts.tolist(), ends.tolist(), strict=True)])
+
+    def select(self, chosen: NDArray[np.bool_] | NDArray[np.intp]) -> Block:
+        """Some of the messages."""
+        return Block(
+            content=self.content,
+            time_ns=self.time_ns[chosen],
+            starts=self.starts[chosen],
+            lengths=self.lengths[chosen],
+        )
+
+    def heads(self, length: int) -> NDArray[np.uint8]:
+        """(N, length): the first bytes of every message; ValueError when one is shorter."""
+        if len(self) and int(self.lengths.min()) < length:
+            raise ValueError(f"a message of {int(self.lengths.min())} bytes where at least {length} were expected")
+        return _gathered(np.frombuffer(self.content, dtype=np.uint8), self.starts, length)
+
+    def rows(self, length: int) -> NDArray[np.uint8]:
+        """(N, length): the messages, if all have that length; else ValueError."""
+        wrong = self.lengths[self.lengths != length]
+        if len(wrong):
+            raise ValueError(f"a message of {wrong[0]} bytes where {length} were expected")
+        return self.heads(length)
+
+
+def blocks_of(contents: Iterable[bytes], topics: Mapping[str, int], limits: Limits) -> dict[str, Block]:
+    """topic -> its messages in the contents of chunks, given topic -> channel.
+
+    Raises:
+        ValueError, struct.error: The records do not fill their chunk, or are more than the limits allow.
+    """
+    found = array("q")
+    joined = BytesIO()
+    for chunk in contents:
+        _find_records(chunk, joined.tell(), found.append)
+        limits.check_records(len(found))
+        joined.write(chunk)
+    content = joined.getvalue()
+    values = np.frombuffer(content, dtype=np.uint8)
+    starts = np.frombuffer(found, dtype=np.int64)
+    starts = starts[values[starts] == _MESSAGE]
+    if len(starts) and int(starts[-1]) + _MESSAGE_HEAD.itemsize > len(values):
+        raise ValueError("a message that ends within its head")
+    heads = _gathered(values, starts, _MESSAGE_HEAD.itemsize).view(_MESSAGE_HEAD).reshape(-1)
+    lengths = heads["length"].astype(np.int64) - (_MESSAGE_HEAD.itemsize - RECORD_HEAD.size)
+    if len(lengths) and int(lengths.min()) < 0:
+        raise ValueError("a message that ends within its head")
+    starts = starts + _MESSAGE_HEAD.itemsize
+    times = heads["log_time"].astype(np.int64)
+    blocks = {}
+    for topic, channel in topics.items():
+        chosen = np.flatnonzero(heads["channel"] == channel)
+        blocks[topic] = Block(content=content, time_ns=times[chosen], starts=starts[chosen], lengths=lengths[chosen])
+    return blocks
+
+
+def _gathered(values: NDArray[np.uint8], starts: NDArray[np.int64], length: int) -> NDArray[np.uint8]:
+    """(N, length): as many bytes from each start on."""
+    rows = np.empty((len(starts), length), dtype=np.uint8)
+    places = np.arange(length)
+    for first in range(0, len(starts), _GATHERED_ROWS):
+        part = slice(first, first + _GATHERED_ROWS)
+        rows[part] = values[starts[part, np.newaxis] + places]
+    return rows
+
+
+def _find_records(content: bytes, offset: int, found: Callable[[int], None]) -> None:
+    """Tell where each record of a chunk begins, counted from `offset`."""
+    unpack, head_bytes = RECORD_HEAD.unpack_from, RECORD_HEAD.size
+    position, end = 0, len(content)
+    while position < end:
+        found(offset + position)
+        position += unpack(content, position)[1] + head_bytes
+    if position != end:
+        raise ValueError("a record that reaches beyond its chunk")

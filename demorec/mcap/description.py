@@ -1,0 +1,177 @@
+"""URDF text of the robot and of each body that needs no other file to be drawn (see `shapes`)."""
+
+from __future__ import annotations
+
+import functools
+import math
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.core.errors import SceneError, in_words
+from demorec.core.geometry import Array, Pose
+from demorec.episode.scene import Body, Rgba
+from demorec.mcap.shapes import Primitive, fit_primitives
+from demorec.robots.assets import asset_path, mesh_path
+from demorec.robots.obj import read_obj
+from demorec.robots.urdf import parse_xml, quat_from_rpy
+from demorec.robots.urdf_shapes import UrdfShape, read_links
+
+_WHITE: Rgba = (1.0, 1.0, 1.0, 1.0)
+_KINDS: dict[str, Literal["box", "sphere", "cylinder"]] = {
+    "box": "box",
+    "sphere": "sphere",
+    "cylinder": "cylinder",
+    "capsule": "cylinder",
+}
+"""Shape -> the primitive that it is, but for a capsule's ends."""
+
+
+@functools.lru_cache(maxsize=8)
+def robot_description(urdf: str, scale: float) -> str:
+    """The robot with every mesh replaced by primitives, without masses and collision shapes.
+
+    Raises:
+        SceneError: The URDF or one of its meshes cannot be read.
+    """
+    path = asset_path(urdf)
+    return self_contained(path.read_text(), path.parent, scale=scale)
+
+
+def self_contained(text: str, folder: Path, *, scale: float = 1.0) -> str:
+    """A URDF that needs no other file, as `robot_description`, of the text of one whose meshes lie below `folder`.
+
+    Raises:
+        SceneError: One of its meshes cannot be read.
+        ValueError: The text is no URDF.
+    """
+    source = parse_xml(text)
+    robot = ET.Element("robot", name=source.get("name", "robot"))
+    for link in read_links(text, scale=scale):
+        target = ET.SubElement(robot, "link", name=link.name)
+        # Collision shapes are simpler to begin with; their pose may differ from the picture's.
+        shapes = link.collisions if len(link.collisions) == len(link.visuals) else link.visuals
+        for visual, shape in zip(link.visuals, shapes, strict=True):
+            for primitive in _primitives(shape, folder):
+                _add_visual(target, primitive, shape.link_from_shape, visual.rgba or _WHITE)
+    for joint in source.findall("joint"):
+        robot.append(_joint(joint, scale))
+    return _text(robot)
+
+
+def body_description(body: Body) -> str:
+    """A URDF of one link, named like the body."""
+    robot = ET.Element("robot", name=body.name)
+    link = ET.SubElement(robot, "link", name=body.name)
+    rgba = body.rgba
+    if body.texture is not None:
+        first, second = body.texture.colors
+        rgba = (*((a + b) / 2 for a, b in zip(first, second, strict=True)), 1.0)  # type: ignore[assignment]
+    for primitive, pose in _body_primitives(body):
+        _add_visual(link, primitive, pose, rgba)
+    return _text(robot)
+
+
+def _body_primitives(body: Body) -> Iterator[tuple[Primitive, Pose]]:
+    shape = body.shape
+    if shape.kind == "mesh":
+        for primitive in _mesh_primitives(asset_path(shape.file), (shape.scale,) * 3):
+            yield primitive, shape.body_from_mesh
+    elif shape.kind == "urdf":
+        path = asset_path(shape.file)
+        for link in read_links(path.read_text(), scale=shape.scale):
+            for visual in link.visuals:
+                for primitive in _primitives(visual, path.parent):
+                    yield primitive, visual.link_from_shape
+    else:
+        yield Primitive(kind=_KINDS[shape.kind], size=shape.size), Pose()
+        if shape.kind == "capsule":
+            radius, length = shape.size
+            for end in (-length / 2, length / 2):
+                yield Primitive(kind="sphere", center=(0.0, 0.0, end), size=(radius,)), Pose()
+
+
+def _primitives(shape: UrdfShape, folder: Path) -> Iterator[Primitive]:
+    """A shape of a URDF as primitives in its own frame."""
+    if shape.kind == "mesh":
+        yield from _mesh_primitives(mesh_path(folder, shape.file), shape.size)
+    elif shape.kind in _KINDS:
+        yield Primitive(kind=_KINDS[shape.kind], size=shape.size)
+
+
+@functools.lru_cache(maxsize=256)
+def _mesh_primitives(path: Path, scale: tuple[float, ...]) -> list[Primitive]:
+    try:
+        vertices, faces = _load_mesh(path)
+    except (OSError, ValueError, IndexError) as error:
+        raise SceneError(f"A mesh of the scene cannot be read ({in_words(error)}): {path}") from error
+    return fit_primitives(vertices * np.array(scale), faces)
+
+
+def _load_mesh(path: Path) -> tuple[Array, NDArray[np.int64]]:
+    """Vertices (V, 3) and triangles (F, 3) of a mesh file."""
+    if path.suffix.lower() == ".obj":
+        found = read_obj(path)
+        if not len(found.faces):
+            raise ValueError("no triangles")
+        return found.points, found.faces
+    import trimesh  # takes a second to load, and the usual robot needs it for nothing
+
+    mesh = trimesh.load(path, force="mesh", process=False)
+    return np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
+
+
+def _add_visual(link: ET.Element, primitive: Primitive, frame: Pose, rgba: Sequence[float]) -> None:
+    half = math.pi / 2
+    along = {0: (0.0, half, 0.0), 1: (-half, 0.0, 0.0), 2: (0.0, 0.0, 0.0)}[primitive.axis]
+    pose = frame @ Pose(position=np.array(primitive.center), quat_xyzw=quat_from_rpy(along))
+    visual = ET.SubElement(link, "visual")
+    ET.SubElement(visual, "origin", xyz=_numbers(pose.position.tolist()), rpy=_numbers(_rpy(pose)))
+    geometry = ET.SubElement(visual, "geometry")
+    if primitive.kind == "box":
+        ET.SubElement(geometry, "box", size=_numbers(primitive.size))
+    elif primitive.kind == "sphere":
+        ET.SubElement(geometry, "sphere", radius=_numbers(primitive.size))
+    else:
+        radius, length = primitive.size
+        ET.SubElement(geometry, "cylinder", radius=_numbers((radius,)), length=_numbers((length,)))
+    material = ET.SubElement(visual, "material", name="color_" + "_".join(f"{round(v * 255):02x}" for v in rgba))
+    ET.SubElement(material, "color", rgba=_numbers(rgba))
+
+
+def _rpy(pose: Pose) -> tuple[float, float, float]:
+    """Roll, pitch, yaw about fixed axes (rad), as URDF has them."""
+    r = pose.rotation
+    pitch = math.asin(min(1.0, max(-1.0, -float(r[2, 0]))))
+    if abs(r[2, 0]) > 1 - 1e-9:  # roll and yaw turn about the same axis
+        return math.atan2(-float(r[1, 2]), float(r[1, 1])), pitch, 0.0
+    return math.atan2(float(r[2, 1]), float(r[2, 2])), pitch, math.atan2(float(r[1, 0]), float(r[0, 0]))
+
+
+def _joint(source: ET.Element, scale: float) -> ET.Element:
+    joint = ET.Element("joint", name=source.attrib["name"], type=source.attrib["type"])
+    for child in source:
+        if child.tag not in ("origin", "parent", "child", "axis", "limit", "mimic"):
+            continue
+        copy = ET.SubElement(joint, child.tag, dict(child.attrib))
+        if child.tag == "origin" and scale != 1.0:
+            # Every bit, since kinematics is computed from this; a single product is the same on every CPU.
+            copy.set("xyz", " ".join(repr(float(v) * scale) for v in child.get("xyz", "0 0 0").split()))
+        if child.tag == "limit" and scale != 1.0 and joint.get("type") == "prismatic":
+            for bound in ("lower", "upper"):
+                copy.set(bound, _numbers([float(child.get(bound, "0")) * scale]))
+    return joint
+
+
+def _numbers(values: Sequence[float]) -> str:
+    # Tenths of a millimetre and of a milliradian: more would only differ between CPUs.
+    return " ".join(f"{round(value, 4) + 0.0:g}" for value in values)
+
+
+def _text(robot: ET.Element) -> str:
+    ET.indent(robot, " ")
+    return ET.tostring(robot, encoding="unicode") + "\n"

@@ -1,0 +1,157 @@
+"""What the readers of all recordings share: an open MCAP file, its topics and its coded pictures."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from abc import abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import islice
+from pathlib import Path
+
+from demorec.core.closing import Closing
+from demorec.core.errors import RecordingError
+from demorec.core.plain import to_json, to_plain
+from demorec.episode.collected import CollectedInfo, CollectedOutcome
+from demorec.episode.episode import EpisodeInfo, Outcome
+from demorec.mcap import messages, metadata
+from demorec.mcap.channels import camera_topic
+from demorec.mcap.chunks import Block
+from demorec.mcap.container import Container, damage_as_recording_error
+from demorec.mcap.pixels import PixelCounter, PixelStatistics
+from demorec.mcap.video import Rgb, VideoPacket, VideoSettings, decode
+
+
+class EpisodeFile[O: (Outcome, CollectedOutcome), C](Closing):
+    """Context manager over the file of one episode.
+
+    Attributes:
+        path: Of the file.
+        info: What was known before the first frame.
+        outcome: How the episode ended; None when a crash cut it off.
+        num_frames: Length.
+        is_recovered: Whether a crash cut it off.
+    """
+
+    info: EpisodeInfo | CollectedInfo
+    outcome: O | None
+    num_frames: int
+    is_recovered: bool
+    _cameras: Mapping[str, C]
+    """What is known of each camera."""
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self._container = Container(self.path)
+        try:
+            self._read_metadata()
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Close the file; harmless when called twice."""
+        self._container.close()
+
+    @abstractmethod
+    def _read_metadata(self) -> None:
+        """Read what is known without reading messages."""
+
+    def _read_end(self, topic: str, kind: type[O]) -> None:
+        """Read how it ended; RecordingError unless its end is that of as many frames as `topic` has messages."""
+        outcome, recovered = self._container.metadata(metadata.OUTCOME), self._container.metadata(metadata.RECOVERED)
+        self.outcome = None if outcome is None else metadata.read_outcome_metadata(outcome, kind)
+        self.num_frames = self._container.counts.get(topic, 0)
+        if recovered is not None:
+            metadata.check_seal(metadata.RECOVERED, recovered)
+        self.is_recovered = recovered is not None
+        if self.outcome is None and not self.is_recovered:
+            raise RecordingError("The recording was never finished; demorec recover keeps what is whole")
+        if self.outcome is not None and self.outcome.num_frames != self.num_frames:
+            raise RecordingError(
+                f"The recording has {self.num_frames} frames, but its outcome says {self.outcome.num_frames}"
+            )
+
+    def _camera(self, name: str) -> C:
+        if name not in self._cameras:
+            raise RecordingError(
+                f"The recording has no camera {name!r}, its cameras are {', '.join(self._cameras) or 'none'}: "
+                f"{self.path}"
+            )
+        return self._cameras[name]
+
+    def _digest_of_description(self) -> hashlib._Hash:
+        """That of the metadata, to go on with: not of what versions wrote them."""
+        described = to_plain(self.info)
+        del described["versions"], described["format_version"]
+        result = hashlib.sha256(json.dumps(described, sort_keys=True).encode())
+        result.update(b"no outcome" if self.outcome is None else to_json(self.outcome).encode())
+        return result
+
+    @property
+    @abstractmethod
+    def has_failed(self) -> bool:
+        """Whether its attempt failed."""
+
+    @property
+    def success(self) -> bool | None:
+        """How its attempt ended; None where nobody said."""
+        return False if self.has_failed else None if self.outcome is None else self.outcome.success
+
+    @abstractmethod
+    def phases(self) -> Sequence[str]:
+        """Phase of each frame; empty where nobody stated any."""
+
+    @property
+    def topics(self) -> dict[str, tuple[str, int]]:
+        """topic -> (type, number of messages), sorted by topic."""
+        container = self._container
+        return {
+            topic: (container.schemas[container.channels[topic].schema_id].name, container.counts[topic])
+            for topic in sorted(container.channels)
+        }
+
+    def _read[V](self, topic: str, read: Callable[[bytes], V]) -> Iterator[tuple[int, V]]:
+        """(time_ns, what was read) of the messages of a topic, in order."""
+        for message in self._container.messages((topic,)):
+            with damage_as_recording_error(self.path):
+                found = read(message.data)
+            yield message.time_ns, found
+
+    @abstractmethod
+    def video_settings(self, camera: str) -> VideoSettings:
+        """How the pictures of a camera were coded."""
+
+    @abstractmethod
+    def packets(self, camera: str) -> Iterator[VideoPacket]:
+        """The coded pictures of a camera, in order."""
+
+    @abstractmethod
+    def coded_pictures(self, cameras: Sequence[str]) -> dict[str, Block]:
+        """camera -> all its coded pictures, in memory together."""
+
+    def images(self, camera: str) -> Iterator[Rgb]:
+        """The decoded pictures of a camera, (H, W, 3) uint8 RGB, in order."""
+        return decode(self.video_settings(camera), self.packets(camera))
+
+    def picture(self, camera: str, number: int) -> Rgb:
+        """One decoded picture of a camera, (H, W, 3) uint8 RGB, by its own number."""
+        return next(self._images(camera, [number]))
+
+    def _images(self, camera: str, numbers: Sequence[int]) -> Iterator[Rgb]:
+        """Some decoded pictures, read in one pass, each decoded from the keyframe before it on."""
+        packets = list(islice(self.packets(camera), max(numbers, default=-1) + 1))
+        for number in numbers:
+            keyframe = max(index for index, packet in enumerate(packets[: number + 1]) if packet.is_keyframe)
+            *_, picture = decode(self.video_settings(camera), packets[keyframe : number + 1])
+            yield picture
+
+    def pixel_statistics(self, camera: str) -> PixelStatistics:
+        """Histograms of a camera's pictures: as written, or counted now where none were written."""
+        self.video_settings(camera)
+        for _, statistics in self._read(camera_topic(camera, "histogram"), messages.read_pixel_statistics):
+            return statistics
+        counter = PixelCounter()
+        for picture in self.images(camera):
+            counter.add(picture)
+        return counter.statistics()

@@ -1,0 +1,265 @@
+"""The messages that are written one by one: pictures, text, and what is said once."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import islice
+
+import numpy as np
+
+from demorec.core.geometry import Array, Pose
+from demorec.episode.episode import Event
+from demorec.mcap.cdr import CdrReader, encode
+from demorec.mcap.chunks import Block
+from demorec.mcap.pixels import PixelStatistics
+
+JOINT_STATE = "sensor_msgs/msg/JointState"
+POSE = "geometry_msgs/msg/PoseStamped"
+WRENCH = "geometry_msgs/msg/WrenchStamped"
+STRING = "std_msgs/msg/String"
+BOOL = "std_msgs/msg/Bool"
+LOG = "rcl_interfaces/msg/Log"
+FLOAT64_ARRAY = "std_msgs/msg/Float64MultiArray"
+INT64_ARRAY = "std_msgs/msg/Int64MultiArray"
+IMAGE = "sensor_msgs/msg/Image"
+COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
+PROTOBUF_VIDEO = "foxglove.CompressedVideo"
+COMPRESSED_VIDEO = "foxglove_msgs/msg/CompressedVideo"
+CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
+LABEL_INFO = "vision_msgs/msg/LabelInfo"
+
+_MOST_PIXELS = 1 << 50
+"""Of one value in a histogram: sums of them stay exact in float64."""
+_LOG_LEVELS = {"info": 20, "warning": 30, "error": 40}
+
+
+def read_string(data: bytes) -> str:
+    """The text of a std_msgs/String."""
+    text: str = next(CdrReader(data).values(STRING))
+    return text
+
+
+def read_boolean(data: bytes) -> bool:
+    """The value of a std_msgs/Bool."""
+    return bool(next(CdrReader(data).values(BOOL)))
+
+
+def log(time_ns: int, event: Event) -> bytes:
+    """rcl_interfaces/Log, without file, function and line."""
+    return encode(LOG, _stamp(time_ns), _LOG_LEVELS[event.level], event.name, event.message, "", "", 0)
+
+
+def read_log(data: bytes) -> Event:
+    """Inverse of `log`; ValueError for an unknown level."""
+    values = CdrReader(data).values(LOG)
+    _, level_number = islice(values, 2)
+    for level, number in _LOG_LEVELS.items():
+        if number == level_number:
+            return Event(name=next(values), message=next(values), level=level)  # type: ignore[arg-type]
+    raise ValueError(f"a log message of level {level_number}")
+
+
+def _stamp(time_ns: int) -> tuple[int, int]:
+    """builtin_interfaces/Time."""
+    return divmod(time_ns, 1_000_000_000)
+
+
+class PictureMessages:
+    """sensor_msgs/CompressedImage and foxglove_msgs/CompressedVideo of one camera and format, laid out once.
+
+    Args:
+        frame_id: Coordinate frame of the camera.
+        picture_format: As the type wants it.
+    """
+
+    def __init__(self, frame_id: str, picture_format: str) -> None:
+        header = (_stamp(0), frame_id)
+        self._image = encode(COMPRESSED_IMAGE, header, picture_format, b"")
+        self._video = encode(COMPRESSED_VIDEO, *header, b"")
+        self._format = struct.pack("<I", len(picture_format) + 1) + picture_format.encode() + b"\x00"
+
+    def compressed_image(self, time_ns: int, data: bytes) -> bytes:
+        """sensor_msgs/CompressedImage."""
+        return self._filled(self._image, time_ns, data)
+
+    def compressed_video(self, time_ns: int, data: bytes) -> bytes:
+        """foxglove_msgs/CompressedVideo."""
+        message = self._filled(self._video, time_ns, data)
+        return message + b"\x00" * (-len(message) % 4) + self._format
+
+    @staticmethod
+    def _filled(head: bytes, time_ns: int, data: bytes) -> bytes:
+        # Encapsulation, stamp, the constant fields, length of the data, data.
+        stamp = struct.pack("<II", *_stamp(time_ns))
+        return head[:4] + stamp + head[12:-4] + struct.pack("<I", len(data)) + data
+
+
+_U32 = struct.Struct("<I")
+
+
+def image(time_ns: int, frame_id: str, encoding: str, size: tuple[int, int], data: bytes) -> bytes:
+    """sensor_msgs/Image of (height, width) pixels in little endian."""
+    height, width = size
+    head = encode(IMAGE, (_stamp(time_ns), frame_id), height, width, encoding, False, len(data) // height)
+    return head + _U32.pack(len(data)) + data
+
+
+def read_image(data: bytes) -> bytes:
+    """The pixels of an `image`; ValueError when it is cut off."""
+    *_, pixels = CdrReader(data).values(IMAGE)
+    return bytes(pixels)
+
+
+def read_compressed_image(data: bytes) -> bytes:
+    """The coded picture of a `compressed_image`."""
+    start = _compressed_image_start(data)
+    (length,) = _U32.unpack_from(data, start - 4)
+    picture = data[start : start + length]
+    if len(picture) != length:
+        raise ValueError("a picture that is cut off")
+    return picture
+
+
+def _compressed_image_start(data: bytes) -> int:
+    """Where the picture begins in a message, its length in the four bytes before."""
+    # Encapsulation (4 bytes) and stamp (8), then two strings and the octets, each after its length, which starts at a
+    # multiple of four.
+    position = 12
+    for _ in range(2):
+        (length,) = _U32.unpack_from(data, position)
+        position = (position + 4 + length + 3) & ~3
+    return position + 4
+
+
+def coded_pictures(block: Block, codec: str) -> Block:
+    """The coded pictures alone, given the messages of a camera; ValueError for what is no picture."""
+    if codec == "av1":
+        return _one_by_one(block, read_protobuf_video)
+    if not len(block):
+        return block
+    start = _compressed_image_start(next(iter(block.messages())))
+    heads = block.heads(start)
+    constant = np.ones(start, dtype=np.bool_)
+    constant[4:12] = constant[-4:] = False  # stamp, length of the picture
+    if not (heads[:, constant] == heads[0, constant]).all():
+        return _one_by_one(block, read_compressed_image)
+    lengths = np.ascontiguousarray(heads[:, -4:]).view("<u4").reshape(-1).astype(np.int64)
+    if (lengths > block.lengths - start).any():
+        raise ValueError("a picture that is cut off")
+    return replace(block, starts=block.starts + start, lengths=lengths)
+
+
+def _one_by_one(block: Block, read: Callable[[bytes], bytes]) -> Block:
+    pictures = [read(message) for message in block.messages()]
+    lengths = np.array([len(picture) for picture in pictures], dtype=np.int64)
+    return Block(
+        content=b"".join(pictures), time_ns=block.time_ns, starts=np.cumsum(lengths) - lengths, lengths=lengths
+    )
+
+
+def protobuf_video(time_ns: int, frame_id: str, video_format: str, data: bytes) -> bytes:
+    """foxglove.CompressedVideo in protobuf: the only form in which Rerun plays AV1 from an MCAP file."""
+    from foxglove.messages import CompressedVideo, Timestamp
+
+    stamp = Timestamp(sec=time_ns // 1_000_000_000, nsec=time_ns % 1_000_000_000)
+    message = CompressedVideo(timestamp=stamp, frame_id=frame_id, data=data, format=video_format)
+    return bytes(message.encode())
+
+
+def read_protobuf_video(data: bytes) -> bytes:
+    """The coded picture of a `protobuf_video`."""
+    for name, value in protobuf_fields(data):
+        if name == "data":
+            return value
+    raise ValueError("a video message without a picture")
+
+
+_VIDEO_FIELDS = {1: "timestamp", 2: "frame_id", 3: "data", 4: "format"}
+
+
+def protobuf_fields(data: bytes) -> Iterator[tuple[str, bytes]]:
+    """(name, bytes) of the fields of a foxglove.CompressedVideo, all of which are length-delimited."""
+    position = 0
+    while position < len(data):
+        tag, position = _varint(data, position)
+        if tag & 7 != 2:
+            raise ValueError(f"a video message with a field of wire type {tag & 7}")
+        length, position = _varint(data, position)
+        if position + length > len(data):
+            raise ValueError("a video message that ends within a field")
+        yield _VIDEO_FIELDS.get(tag >> 3, f"field {tag >> 3}"), data[position : position + length]
+        position += length
+
+
+def _varint(data: bytes, position: int) -> tuple[int, int]:
+    value = shift = 0
+    while position < len(data):
+        byte = data[position]
+        position += 1
+        value |= (byte & 127) << shift
+        if byte < 128:
+            return value, position
+        shift += 7
+    raise ValueError("a video message that ends within a number")
+
+
+def pixel_statistics(statistics: PixelStatistics) -> bytes:
+    """std_msgs/Int64MultiArray, a table of 3 x 256 counts after one number: how many pictures were counted."""
+    dimensions = (("red, green, blue", 3, 3 * 256), ("value", 256, 256))
+    data_offset = 1  # what comes in front of the table
+    values = np.concatenate(([statistics.num_images], statistics.counts.reshape(-1)))
+    return encode(INT64_ARRAY, (dimensions, data_offset), values)
+
+
+def read_pixel_statistics(data: bytes) -> PixelStatistics:
+    """Inverse of `pixel_statistics`."""
+    _, values = CdrReader(data).values(INT64_ARRAY)
+    if len(values) != 1 + 3 * 256 or not ((values >= 0) & (values < _MOST_PIXELS)).all():
+        raise ValueError("a histogram of other numbers than counts")
+    return PixelStatistics(num_images=int(values[0]), counts=values[1:].reshape(3, 256).copy())
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Calibration:
+    """What a `camera_info` message says: picture size in pixels and K (3, 3)."""
+
+    width: int
+    height: int
+    intrinsics: Array
+
+
+def camera_info(frame_id: str, size: tuple[int, int], k: Array, distortion: Sequence[float] = (0.0,) * 5) -> bytes:
+    """sensor_msgs/CameraInfo of (height, width) pixels and K (3, 3), with the distortion of the plumb bob model."""
+    projection = np.hstack((k, np.zeros((3, 1))))
+    matrices = (matrix.reshape(-1) for matrix in (k, np.eye(3), projection))
+    whole_picture = (0, 0, 0, 0, False)  # as the region of interest; without binning
+    header = (_stamp(0), frame_id)
+    return encode(CAMERA_INFO, header, *size, "plumb_bob", distortion, *matrices, 0, 0, whole_picture)
+
+
+def read_camera_info(data: bytes) -> Calibration:
+    """Inverse of `camera_info`."""
+    _, height, width, _, _, k = islice(CdrReader(data).values(CAMERA_INFO), 6)
+    return Calibration(width=width, height=height, intrinsics=k.astype(np.float64).reshape(3, 3))
+
+
+def transforms(rows: Sequence[tuple[str, str, Pose]]) -> bytes:
+    """tf2_msgs/TFMessage at time 0: (parent frame, child frame, parent_from_child) each."""
+    return encode(
+        TRANSFORMS,
+        [((_stamp(0), parent), child, (pose.position, pose.quat_xyzw)) for parent, child, pose in rows],
+    )
+
+
+def label_info(labels: Sequence[tuple[int, str]]) -> bytes:
+    """vision_msgs/LabelInfo: which number stands for what in segmentation pictures."""
+    return encode(LABEL_INFO, (_stamp(0), ""), labels, 0.0)
+
+
+def read_label_info(data: bytes) -> dict[int, str]:
+    """Inverse of `label_info`."""
+    _, labels = islice(CdrReader(data).values(LABEL_INFO), 2)
+    return dict(labels)

@@ -1,0 +1,228 @@
+"""An MCAP file in the making: NAME.mcap.part, which gets its name when it is complete and on the disk."""
+
+from __future__ import annotations
+
+import io
+import os
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import foxglove
+from foxglove.mcap import MCAPCompression, MCAPWriteOptions
+from foxglove.messages import CompressedVideo
+
+from demorec.core.errors import ConfigError, RecordingError, in_words
+from demorec.core.replacing import RECORDING, check_replaceable, lock_part
+from demorec.mcap import messages
+from demorec.mcap.ros2 import DEFINITIONS
+
+_CHUNK_BYTES = 1 << 20
+_LATCHED_QOS = (
+    "- history: 1\n  depth: 1\n  reliability: 1\n  durability: 1\n"
+    "  deadline:\n    sec: 9223372036\n    nsec: 854775807\n"
+    "  lifespan:\n    sec: 9223372036\n    nsec: 854775807\n"
+    "  liveliness: 1\n  liveliness_lease_duration:\n    sec: 9223372036\n    nsec: 854775807\n"
+    "  avoid_ros_namespace_conventions: false"
+)
+"""Quality of service of topics that are said once: "transient local", so that a late subscriber hears them too."""
+
+
+class _Disk(io.FileIO):
+    """The file below the MCAP writer, unbuffered.
+
+    It keeps the first error, stores nothing more after it and goes on as if it did: the writer, told of it, would print
+    a line for every message that is logged until the recorder looks at `error`.
+    """
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, "w")
+        self._place = self._end = 0  # as the writer knows them
+        self.error: OSError | None = None
+
+    def write(self, data: bytes) -> int:  # type: ignore[override]
+        """Write all of it, unless an earlier write failed."""
+        rest = memoryview(data)
+        try:
+            while rest and self.error is None:
+                rest = rest[super().write(rest) :]
+        except OSError as error:
+            self.error = error
+        self._place += len(data)
+        self._end = max(self._end, self._place)
+        return len(data)
+
+    def seek(self, offset: int, whence: int = 0) -> int:
+        """As any file."""
+        self._place = offset + (0, self._place, self._end)[whence]
+        if self.error is None:
+            super().seek(self._place)
+        return self._place
+
+    def sync(self) -> None:
+        """Have the operating system put everything on the disk."""
+        try:
+            os.fsync(self.fileno())
+        except OSError as error:
+            self.error = self.error or error
+
+
+class PartFile:
+    """Writes messages and metadata through foxglove-sdk's MCAP writer, unbuffered below it.
+
+    Args:
+        path: The finished file.
+        part: Where it is until then, when that is not NAME.part.
+        overwrite: Whether `path`, or an unfinished recording of its name, may be replaced by the new one.
+        is_worthless: Whether an unfinished recording, whose writer is dead, holds nothing that could not be made again,
+            so that it is replaced whether or not that is asked for.
+
+    Raises:
+        ConfigError: A file of that name, or an unfinished one, is there already and not to be replaced.
+        RecordingError: It cannot be written.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        part: Path | None = None,
+        overwrite: bool = False,
+        is_worthless: Callable[[Path], bool] = lambda part: False,
+    ) -> None:
+        self.path, self.part, self._overwrite = path, part or path.with_name(f"{path.name}.part"), overwrite
+        self._check_free()
+        try:
+            # Held until the file has its name or is left: no other process takes it for what a dead one left.
+            self._lock: int | None = lock_part(self.part, RECORDING)
+            try:
+                if os.fstat(self._lock).st_size and not overwrite and not is_worthless(self.part):
+                    raise ConfigError(
+                        "An unfinished recording of that name is there already; recover it, delete it, or --overwrite: "
+                        f"{self.part}"
+                    )
+                self._disk = _Disk(self.part)
+            except BaseException:
+                os.close(self._lock)
+                self._lock = None
+                raise
+        except OSError as error:
+            raise self._unwritable(error) from error
+        self._channels: dict[str, foxglove.Channel] = {}
+        self._log: dict[str, Callable[..., None]] = {}
+        self._context = foxglove.Context()
+        self._mcap = foxglove.open_mcap(
+            self._disk,
+            context=self._context,
+            writer_options=MCAPWriteOptions(
+                compression=MCAPCompression.Zstd, chunk_size=_CHUNK_BYTES, profile="ros2", compression_threads=0
+            ),
+        )
+        self._is_open = True
+
+    def _check_free(self) -> None:
+        check_replaceable(self.path, RECORDING, overwrite=self._overwrite)
+
+    def _unwritable(self, error: Exception) -> RecordingError:
+        return RecordingError(f"The recording cannot be written ({in_words(error)}): {self.path}")
+
+    def log(self, topic: str, schema: str, data: bytes, time_ns: int, *, latched: bool = False) -> None:
+        """Add a message; every topic has one type."""
+        self.logger(topic, schema, latched=latched)(data, log_time=time_ns)
+
+    def logger(self, topic: str, schema: str, *, latched: bool = False) -> Callable[..., None]:
+        """What adds messages to a topic, for many of them: called with the data and, by name, log_time."""
+        log = self._log.get(topic)
+        if log is None:
+            channel = self._channels[topic] = self._open_channel(topic, schema, latched)
+            log = self._log[topic] = channel.base.log  # without the wrapper, which looks for JSON in every message
+        return log
+
+    def _open_channel(self, topic: str, schema: str, latched: bool) -> foxglove.Channel:
+        if schema == messages.PROTOBUF_VIDEO:
+            encoding, definition = "protobuf", CompressedVideo.get_schema()
+        else:
+            encoding = "cdr"
+            definition = foxglove.Schema(name=schema, encoding="ros2msg", data=DEFINITIONS[schema].encode())
+        return foxglove.Channel(
+            topic,
+            message_encoding=encoding,
+            schema=definition,
+            context=self._context,
+            metadata={"offered_qos_profiles": _LATCHED_QOS} if latched else {},
+        )
+
+    def metadata(self, name: str, values: Mapping[str, str]) -> None:
+        """Add a metadata record."""
+        with self._disk_errors():
+            self._mcap.write_metadata(name, dict(values))
+
+    def flush(self) -> None:
+        """End the chunk; when this returns, what was logged is with the operating system and survives this process.
+
+        Raises:
+            RecordingError: The disk is full or gone.
+        """
+        with self._disk_errors():
+            self._mcap.flush()
+
+    @contextmanager
+    def _disk_errors(self) -> Iterator[None]:
+        try:
+            yield
+        except RuntimeError as error:  # what foxglove makes of any failure below it
+            raise self._unwritable(self._disk.error or error) from (self._disk.error or error)
+        if self._disk.error is not None:
+            raise self._unwritable(self._disk.error) from self._disk.error
+
+    def end(self) -> None:
+        """Write the index and make NAME.part durable, whole but without its name; harmless when called twice.
+
+        Raises:
+            RecordingError: The disk is full.
+        """
+        if self._is_open:
+            self._is_open = False
+            try:
+                with self._disk_errors():
+                    self._mcap.close()
+                    self._disk.sync()
+            finally:
+                self._disk.close()
+
+    def close(self) -> None:
+        """End it and leave NAME.part as it is; harmless when called twice."""
+        try:
+            self.end()
+        finally:
+            if self._lock is not None:
+                os.close(self._lock)
+                self._lock = None
+
+    def discard(self) -> None:
+        """Give it up and remove what was written; harmless when called twice, and after `publish`."""
+        if self._lock is not None:
+            self.part.unlink(missing_ok=True)  # while the lock is held: nobody else's file has that name
+        with suppress(RecordingError):
+            self.close()
+
+    def publish(self) -> None:
+        """End the file and give it its name.
+
+        Raises:
+            ConfigError: A file of that name has appeared meanwhile.
+            RecordingError: The disk is full.
+        """
+        try:
+            self.end()
+            self._check_free()
+            self.part.replace(self.path)
+            folder = os.open(self.path.parent, os.O_RDONLY)
+            try:
+                os.fsync(folder)
+            finally:
+                os.close(folder)
+        except OSError as error:
+            raise self._unwritable(error) from error
+        finally:
+            self.close()

@@ -1,0 +1,160 @@
+"""The threads that code pictures and write frames, so that the program that gives them need not wait.
+
+Libraries that code pictures and write files release Python's lock, so threads are enough, one a camera beside the one
+that writes, and nothing has to be carried to another process. What waits is bounded: a queue that grew without end
+would hide that the machine cannot keep up.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from queue import Empty, Full, Queue
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.episode.collected import CollectedCamera, CollectedFrame, CollectedInfo
+from demorec.mcap import CollectedWriter
+
+WhenFull = Literal["error", "drop", "wait"]
+
+_FLUSH_SECONDS = 0.25
+_WAITING_SECONDS = 0.5
+"""What has come is written after the first, and of the second at most waits to be coded: so a crash loses less than a
+second, with the time that writing takes."""
+_WAIT_SECONDS = 0.001
+_MAX_WAITING_BYTES = 256 << 20
+_MIN_WAITING_FRAMES = 8
+
+WaitingPictures = Mapping[str, tuple[int, NDArray[np.uint8] | None]]
+"""Camera -> stamp and pixels of a new picture, or its stamp and None for the same one again."""
+
+
+class Buffers:
+    """Memory for pictures that wait, used again and again: fresh memory costs as much as copying into it."""
+
+    def __init__(self, cameras: Sequence[CollectedCamera]) -> None:
+        self._free: dict[tuple[int, ...], deque[NDArray[np.uint8]]] = {
+            (camera.height, camera.width, 3): deque() for camera in cameras
+        }
+
+    def copy(self, pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """A copy that belongs to nobody else until `give_back`."""
+        free = self._free[pixels.shape]
+        try:
+            buffer = free.popleft()
+        except IndexError:
+            buffer = np.empty(pixels.shape, dtype=np.uint8)
+        np.copyto(buffer, pixels)
+        return buffer
+
+    def give_back(self, buffer: NDArray[np.uint8]) -> None:
+        """Let the copy's memory be used again."""
+        self._free[buffer.shape].append(buffer)
+
+
+class Coder:
+    """Feeds a writer from a queue in a thread of its own.
+
+    Args:
+        buffers: Where pictures are given back to.
+        cameras: Of the episode; they decide how many frames may wait.
+        fps: Frames a second, nominal: as many may wait as come in half a second, if memory allows.
+        waits: Whether `put` waits for room.
+
+    Attributes:
+        writer: Of the episode; used by the thread alone until `end` returns.
+        info: What the episode is, to be set before the first frame is put.
+        error: What ended the thread, if anything did.
+        capacity: How many frames may wait.
+    """
+
+    def __init__(
+        self,
+        writer: CollectedWriter,
+        buffers: Buffers,
+        *,
+        cameras: Sequence[CollectedCamera],
+        fps: int,
+        waits: bool = False,
+    ) -> None:
+        self.writer, self._buffers, self._waits = writer, buffers, waits
+        self.info: CollectedInfo | None = None
+        self.error: BaseException | None = None
+        frame_bytes = sum(3 * camera.width * camera.height for camera in cameras)
+        most = _MAX_WAITING_BYTES // max(frame_bytes, 1)
+        self.capacity = max(_MIN_WAITING_FRAMES, min(round(_WAITING_SECONDS * fps), most))
+        self._queue: Queue[tuple[CollectedFrame, WaitingPictures] | None] = Queue(self.capacity)
+        self._last: dict[str, int] = {}
+        self._flushed_at = time.monotonic()
+        self._pool = ThreadPoolExecutor(max(len(cameras), 1), thread_name_prefix="demorec-camera")
+        self._thread = threading.Thread(target=self._run, name="demorec-coder", daemon=True)
+        self._thread.start()
+
+    def put(self, frame: CollectedFrame, pictures: WaitingPictures) -> bool:
+        """Copy the pictures that a frame holds and queue both; False when the queue is full and is not waited for.
+
+        Only one thread may put frames.
+        """
+        while self._queue.full():
+            if not self._waits:
+                return False
+            if self.error is not None:
+                raise self.error
+            time.sleep(_WAIT_SECONDS)
+        copies = {
+            camera: (stamp_ns, None if pixels is None else self._buffers.copy(pixels))
+            for camera, (stamp_ns, pixels) in pictures.items()
+        }
+        self._queue.put_nowait((frame, copies))
+        return True
+
+    def end(self) -> None:
+        """Wait until all that was queued is with the writer, or the thread has died; harmless when called twice."""
+        while self._thread.is_alive():
+            try:
+                self._queue.put(None, timeout=0.1)
+                break
+            except Full:
+                continue
+        self._thread.join()
+        self._pool.shutdown()
+
+    def _run(self) -> None:
+        try:
+            while True:
+                wait = self._flushed_at + _FLUSH_SECONDS - time.monotonic()
+                try:
+                    waiting = self._queue.get(timeout=wait) if wait > 0 else self._queue.get_nowait()
+                except Empty:
+                    self._flush()
+                    continue
+                if waiting is None:
+                    return
+                self._write(*waiting)
+                if time.monotonic() - self._flushed_at >= _FLUSH_SECONDS:
+                    self._flush()
+        except BaseException as error:
+            self.error = error
+
+    def _flush(self) -> None:
+        self.writer.flush()
+        self._flushed_at = time.monotonic()
+
+    def _write(self, frame: CollectedFrame, pictures: WaitingPictures) -> None:
+        if self.info is not None:
+            self.writer.begin(self.info)
+            self.info = None
+        new = [(camera, stamp, pixels) for camera, (stamp, pixels) in pictures.items() if pixels is not None]
+        numbers = list(self._pool.map(lambda picture: self.writer.picture(*picture), new))
+        for (camera, _, pixels), number in zip(new, numbers, strict=True):
+            self._last[camera] = number
+            self._buffers.give_back(pixels)
+        held = {camera: self._last[camera] for camera in pictures}
+        self.writer.write(replace(frame, pictures=held))

@@ -1,0 +1,383 @@
+"""The recorder of somebody's own robot or program: a run of episodes, each written while it happens."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from importlib.metadata import version
+from pathlib import Path
+from types import TracebackType
+from typing import Self, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.core.closing import Closing
+from demorec.core.config import VideoConfig
+from demorec.core.errors import ConfigError, RecordingError, in_words
+from demorec.core.registry import nearest_match
+from demorec.episode.collected import (
+    CollectedCamera,
+    CollectedFeature,
+    CollectedFrame,
+    CollectedInfo,
+    CollectedOutcome,
+    Sample,
+)
+from demorec.mcap import CollectedWriter
+from demorec.mcap.external.frame_check import CollectedCheck
+from demorec.mcap.external.validity import what_is_wrong
+from demorec.mcap.recorder.coder import Buffers, Coder, WaitingPictures, WhenFull
+from demorec.mcap.recorder.robot import RobotLike, robot_facts
+from demorec.mcap.recorder.vectors import NamedVectors, Vectors, as_declared, features_of, named_vectors
+from demorec.mcap.video import size_problem
+from demorec.runs.collected import CollectedFolder, open_collected_run
+
+Image = NDArray[np.uint8] | tuple[NDArray[np.uint8], int]
+"""(H, W, 3) uint8 RGB, alone or with the stamp (ns) of when it was taken."""
+
+FRAMES = "frames"
+"""Name of frames among the drops."""
+
+_REAL_TIME = VideoConfig(preset="ultrafast")
+
+
+class RecordedEpisode:
+    """Context manager over one episode; `Recorder.episode` makes it.
+
+    An exception that ends the `with` block marks the episode as failed, Ctrl-C does not; either way all that came is
+    kept. An episode without a frame leaves nothing behind.
+
+    Attributes:
+        success: Whether it succeeded, for you to set; None when you do not say.
+        drops: "frames" -> how many were dropped because the coder could not keep up, where that is allowed.
+        num_frames: Frames that were taken.
+    """
+
+    def __init__(self, run: Recorder, info: CollectedInfo, coder: Coder) -> None:
+        self.success: bool | None = None
+        self.drops: dict[str, int] = {}
+        self.num_frames = 0
+        self._run = run
+        self._info = info
+        self._coder: Coder | None = coder
+        self._features: dict[str, CollectedFeature] = {}
+        self._picture_stamps: dict[str, int] = {}
+
+    @property
+    def is_open(self) -> bool:
+        """Whether it takes more frames."""
+        return self._coder is not None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        try:
+            if isinstance(exc, Exception):
+                self.finish(success=False, reason=in_words(exc))
+            else:
+                self.finish(reason="" if exc is None else "interrupted")
+        except RecordingError:
+            if exc is None:
+                raise  # else the first error is the one to be told
+
+    def write(
+        self,
+        observation: Vectors,
+        action: Vectors | None = None,
+        images: Mapping[str, Image | None] | None = None,
+        *,
+        time_ns: int | None = None,
+        stamps: Mapping[str, int] | None = None,
+    ) -> bool:
+        """Take one frame: copied at once, coded and written by another thread.
+
+        Args:
+            observation: At this time: (D,) numbers; or element -> number; or feature -> numbers.
+            action: What was commanded upon it: (D,) numbers, or element -> number.
+            images: Camera -> (H, W, 3) uint8 RGB, or that with its own stamp. A camera that is left out, or None, has
+                no picture at this frame. A picture with the stamp of the camera's last one is taken for that one, and
+                not coded again.
+            time_ns: Stamp of the frame; by the recorder's clock when left out.
+            stamps: Feature -> stamp of its numbers; that of the frame where left out.
+
+        Returns:
+            Whether the frame was taken; False only where drops are allowed, when the coder cannot keep up.
+
+        Raises:
+            RecordingError: What was given cannot be recorded, the coder cannot keep up and drops are not allowed, or
+                the disk is full.
+        """
+        if self._coder is None:
+            raise RecordingError("The episode has ended: begin another with recorder.episode().")
+        if self._coder.error is not None:
+            raise _as_recording_error(self._coder.error)
+        if time_ns is None:
+            time_ns = self._run.clock()
+        vectors = named_vectors(observation, action)
+        if not self._features:
+            info = self._coder.info = self._run.described(self._info, vectors)
+            self._check = CollectedCheck(info)
+            self._features = {feature.name: feature for feature in info.features}
+        samples = self._samples(vectors, time_ns, stamps or {})
+        pictures = self._pictures(images or {}, time_ns)
+        return self._queue(CollectedFrame(time_ns=time_ns, samples=samples), pictures)
+
+    def _samples(
+        self,
+        vectors: NamedVectors,
+        time_ns: int,
+        stamps: Mapping[str, int],
+    ) -> dict[str, Sample]:
+        if unknown := [name for name in stamps if name not in self._features]:
+            raise RecordingError(
+                f"The stamps name an unknown feature {unknown[0]!r}.{nearest_match(unknown[0], self._features)} The "
+                f"features are: {', '.join(self._features)}."
+            )
+        samples = {}
+        for name, (vector, names) in vectors.items():
+            if name in self._features:
+                vector = as_declared(self._features[name], vector, names)
+            samples[name] = Sample(stamp_ns=stamps.get(name, time_ns), vector=vector)
+        return samples
+
+    def _pictures(self, images: Mapping[str, Image | None], time_ns: int) -> WaitingPictures:
+        """What came of pictures, checked and not yet copied; one that came before is None."""
+        pictures: dict[str, tuple[int, NDArray[np.uint8] | None]] = {}
+        for camera, image in images.items():
+            if isinstance(image, tuple) and len(image) != 2:
+                raise RecordingError(
+                    f"The picture of the camera {camera!r} is a tuple, it must be (pixels, stamp in ns)."
+                )
+            pixels, stamp_ns = image if isinstance(image, tuple) else (image, time_ns)
+            if pixels is None:
+                continue
+            is_same = camera in self._picture_stamps and stamp_ns == self._picture_stamps[camera]
+            pictures[camera] = stamp_ns, None if is_same else pixels
+        return pictures
+
+    def _queue(self, frame: CollectedFrame, pictures: WaitingPictures) -> bool:
+        assert self._coder is not None
+        self._check.check_frame(frame)
+        new = {camera: (stamp, pixels) for camera, (stamp, pixels) in pictures.items() if pixels is not None}
+        for camera, (stamp_ns, pixels) in new.items():
+            self._check.check_picture(camera, stamp_ns, pixels)
+        if not self._coder.put(frame, pictures):
+            if self._run.when_full == "drop":
+                self.drops[FRAMES] = self.drops.get(FRAMES, 0) + 1
+                return False
+            raise RecordingError(
+                f"The coder cannot keep up, {self._coder.capacity} frames wait for it: give quicker coding "
+                '(video=VideoConfig(codec="jpeg")), smaller or fewer pictures, or when_full="drop" or "wait".'
+            )
+        for camera, (stamp_ns, _) in new.items():
+            self._check.note_picture(camera, stamp_ns)
+            self._picture_stamps[camera] = stamp_ns
+        self._check.note_frame(frame)
+        self.num_frames += 1
+        return True
+
+    def finish(self, success: bool | None = None, *, reason: str = "") -> Path | None:
+        """End the episode and make its recording whole; harmless when called twice.
+
+        Args:
+            success: In place of the attribute of that name.
+            reason: Why it is no success, in words.
+
+        Returns:
+            The recording; None when there was not one frame.
+
+        Raises:
+            RecordingError: The disk is full. What was written so far stays, and is recovered when the run is opened
+                again.
+        """
+        if success is not None:
+            self.success = success
+        coder = self._end()
+        if coder is None:
+            return None
+        if self.num_frames == 0:
+            coder.writer.discard()
+            return None
+        if coder.error is not None:
+            coder.writer.close()
+            raise _as_recording_error(coder.error)
+        outcome = CollectedOutcome(success=self.success, num_frames=self.num_frames, drops=self.drops, reason=reason)
+        path = coder.writer.finish(outcome).path
+        self._run.add(path)
+        return path
+
+    def discard(self) -> None:
+        """End the episode and keep nothing of it; harmless when called twice, and after `finish`."""
+        coder = self._end()
+        if coder is not None:
+            coder.writer.discard()
+
+    def _end(self) -> Coder | None:
+        """Take no more frames; the coder, with all that came, if nobody else has ended it."""
+        coder, self._coder = self._coder, None
+        if coder is not None:
+            coder.end()
+        return coder
+
+
+class Recorder(Closing):
+    """Context manager over a run: a folder of recorded episodes, which goes on where it ended.
+
+    Args:
+        folder: Of the run; made if it is not there. Nothing that is in it is ever written over.
+        robot: Its name, the path or text of its URDF, an arm of demorec's, or the names of its joints. Vectors as long
+            as there are joints are taken for their positions (rad, m).
+        cameras: Name -> (height, width) of its pictures, or all that is known of it.
+        fps: Nominal frames per second of the loop; the frames' own stamps say what they were.
+        task: What the robot is asked to do, in words; LeRobot's task text.
+        features: Of the vectors, where the first frame does not say enough: names and units of their elements.
+        video: How pictures are coded; H.264 with the preset "ultrafast" where left out, which takes half the CPU time
+            of generate-dataset's "veryfast".
+        clock: Tells the stamp of a frame that comes without one, in nanoseconds; it must never go backwards.
+        when_full: What happens to a frame when the coder cannot keep up and no more frames may wait: "error" raises,
+            "drop" leaves it out and counts it, "wait" holds up your program, which suits a simulator.
+
+    Attributes:
+        path: Of the run's folder.
+        recovered: Recordings of episodes that a crash had cut off and that were made whole now.
+        clock, when_full: As above.
+
+    Raises:
+        ConfigError: The folder is in use, holds something else or cannot be written to; or the robot, the cameras or
+            the features cannot be.
+    """
+
+    def __init__(
+        self,
+        folder: str | Path,
+        *,
+        robot: RobotLike,
+        cameras: Mapping[str, tuple[int, int] | CollectedCamera] | None = None,
+        fps: int,
+        task: str = "",
+        features: Sequence[CollectedFeature] = (),
+        video: VideoConfig | None = None,
+        clock: Callable[[], int] = time.monotonic_ns,
+        when_full: WhenFull = "error",
+    ) -> None:
+        self._robot = robot_facts(robot)
+        self._cameras = tuple(_camera(name, camera) for name, camera in (cameras or {}).items())
+        self._fps, self._task, self._features = fps, _text(task), tuple(features)
+        self._video = video or _REAL_TIME
+        self._video.validate()
+        self.clock, self.when_full = clock, when_full
+        self._check_request()
+        self._buffers = Buffers(self._cameras)
+        self._stack = ExitStack()
+        self._open: RecordedEpisode | None = None
+        self._folder: CollectedFolder = self._stack.enter_context(open_collected_run(Path(folder)))
+        self.path = self._folder.path
+        self.recovered = tuple(self._folder.recovered)
+
+    def _check_request(self) -> None:
+        """Refuse at once what no first frame could make good."""
+        placeholder = CollectedFeature(name="observation.state", names=("0",))
+        asked = self._info(self._features or (placeholder,), 0, self._task or "placeholder")
+        wrong = what_is_wrong(asked)
+        sizes = [size_problem(self._video, camera.width, camera.height) for camera in self._cameras]
+        wrong += list(filter(None, sizes))
+        if self.when_full not in get_args(WhenFull):
+            wrong.append(f"when_full is {self.when_full!r}, allowed are {', '.join(get_args(WhenFull))}")
+        if wrong:
+            raise ConfigError(f"This cannot be recorded: {'; '.join(wrong)}.")
+
+    def close(self) -> None:
+        """End the open episode, if there is one, and the run; harmless when called twice."""
+        try:
+            if self._open is not None:
+                self._open.finish()
+        finally:
+            self._stack.close()
+
+    @property
+    def num_episodes(self) -> int:
+        """How many the run has, those of earlier programs included."""
+        return len(self._folder.episodes)
+
+    def episode(self, task: str = "") -> RecordedEpisode:
+        """Begin an episode: its file and its encoders are opened now, so that no frame waits for that.
+
+        Args:
+            task: Of this episode, in place of the recorder's.
+
+        Raises:
+            RecordingError: One is being recorded already, or the disk is full.
+            ConfigError: There is no task text.
+        """
+        if self._open is not None and self._open.is_open:
+            raise RecordingError(
+                "An episode is being recorded already: end it first, one robot does one thing at a time."
+            )
+        instruction = _text(task) or self._task
+        if not instruction.strip():
+            raise ConfigError("The episode has no task text: give Recorder(task=...) or recorder.episode(task=...).")
+        info = self._info(self._features, self._folder.next_index, instruction)
+        path = self._folder.path_of(info.episode_index)
+        writer = CollectedWriter(path, info, video=self._video, begins=False)
+        coder = Coder(writer, self._buffers, cameras=info.cameras, fps=info.fps, waits=self.when_full == "wait")
+        self._open = RecordedEpisode(self, info, coder)
+        return self._open
+
+    # ------------------------------------------------------------------------------- for the episode
+
+    def described(self, info: CollectedInfo, vectors: NamedVectors) -> CollectedInfo:
+        """An episode whose first frame has these vectors; ConfigError when the run has episodes of another kind."""
+        info = replace(info, features=self._features or features_of(vectors, self._robot))
+        if wrong := what_is_wrong(info):
+            raise ConfigError(f"This cannot be recorded: {'; '.join(wrong)}.")
+        self._folder.check_fits(info)
+        return info
+
+    def add(self, recording: Path) -> None:
+        """Take a finished recording into the run."""
+        self._folder.add(recording)
+
+    def _info(self, features: tuple[CollectedFeature, ...], episode_index: int, instruction: str) -> CollectedInfo:
+        return CollectedInfo(
+            episode_index=episode_index,
+            instruction=instruction,
+            robot=self._robot.name,
+            urdf=self._robot.urdf,
+            fps=self._fps,
+            features=features,
+            cameras=self._cameras,
+            versions={"demorec": version("demorec")},
+        )
+
+
+def _text(task: object) -> str:
+    if not isinstance(task, str):
+        raise ConfigError(f"The task is {task!r}, it must be a text: say what the robot is asked to do.")
+    return task
+
+
+def _camera(name: str, camera: tuple[int, int] | CollectedCamera) -> CollectedCamera:
+    if isinstance(camera, CollectedCamera):
+        if camera.name != name or camera.kept:
+            raise ConfigError(
+                f"The camera {name!r} is described as {camera.name!r}{' of kept packets' if camera.kept else ''}: a "
+                "recorder takes pixels, under the camera's own name."
+            )
+        return camera
+    try:
+        height, width = camera
+        return CollectedCamera(name=name, width=int(width), height=int(height))
+    except (TypeError, ValueError):
+        raise ConfigError(f"The camera {name!r} is {camera!r}, it must be (height, width) in pixels.") from None
+
+
+def _as_recording_error(error: BaseException) -> RecordingError:
+    if isinstance(error, RecordingError):
+        return error
+    return RecordingError(f"The episode cannot be recorded any more ({in_words(error)}).")

@@ -1,0 +1,135 @@
+"""Observations and actions as a program has them, as the vectors of named features.
+
+An observation is a vector, or a mapping: of numbers by the names of elements (as LeRobot's robots give them), which
+makes one vector, or of vectors by the names of features. So is an action, which is always one vector.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from numbers import Real
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from demorec.core.errors import RecordingError
+from demorec.core.registry import nearest_match
+from demorec.episode.collected import CollectedFeature
+from demorec.episode.features import ACTION, STATE
+from demorec.mcap.recorder.robot import RobotFacts
+
+NamedVectors = Mapping[str, tuple[NDArray[Any], tuple[str, ...]]]
+"""Feature -> its numbers, and the names of its elements where a mapping gave them."""
+
+Vectors = ArrayLike | Mapping[str, ArrayLike]
+
+_PREFIX = "observation."
+
+
+def named_vectors(observation: Vectors, action: Vectors | None) -> NamedVectors:
+    """What was given, copied.
+
+    Raises:
+        RecordingError: Values that are no vectors of numbers, or a mapping of vectors and of single numbers.
+    """
+    found: dict[str, tuple[NDArray[Any], tuple[str, ...]]] = {}
+    if isinstance(observation, Mapping) and not _is_of_numbers(STATE, observation):
+        for key, value in observation.items():
+            name = key if str(key).startswith(_PREFIX) else f"{_PREFIX}{key}"
+            found[name] = _vector(name, value), ()
+    else:
+        found[STATE] = _one_vector(STATE, observation)
+    if action is not None:
+        found[ACTION] = _one_vector(ACTION, action)
+    return found
+
+
+def _is_of_numbers(name: str, mapping: Mapping[str, Any]) -> bool:
+    single = [key for key, value in mapping.items() if _is_number(value)]
+    if single and len(single) != len(mapping):
+        other = next(key for key in mapping if key not in single)
+        raise RecordingError(
+            f"The {name} is a mapping of single numbers ({single[0]!r}) and of others ({other!r}): give single numbers "
+            "by the names of elements, or vectors by the names of features."
+        )
+    return bool(single)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, Real | np.number | np.bool_) or (isinstance(value, np.ndarray) and value.ndim == 0)
+
+
+def _one_vector(name: str, value: Vectors) -> tuple[NDArray[Any], tuple[str, ...]]:
+    if isinstance(value, Mapping):
+        if not _is_of_numbers(name, value):
+            raise RecordingError(f"The {name} is a mapping without numbers: give a vector, or name -> number.")
+        return _vector(name, np.array(list(value.values()), dtype=np.float64)), tuple(map(str, value))
+    return _vector(name, value), ()
+
+
+def _vector(name: str, value: ArrayLike) -> NDArray[Any]:
+    try:
+        vector = np.array(value)
+    except ValueError:
+        raise RecordingError(f"The feature {name!r} is no vector: its parts have different lengths.") from None
+    if vector.dtype.kind not in "fiub" or vector.ndim != 1:
+        raise RecordingError(
+            f"The feature {name!r} is {vector.dtype} of shape {vector.shape}: give a vector of numbers, of shape (D,)."
+        )
+    return vector if vector.dtype in (np.float32, np.float64) else vector.astype(np.float64)
+
+
+def as_declared(feature: CollectedFeature, vector: NDArray[Any], names: tuple[str, ...]) -> NDArray[Any]:
+    """The vector in the feature's type and order of elements, where no bit is lost by that.
+
+    Raises:
+        RecordingError: Elements that are missing or unknown, or numbers that the feature's type cannot hold.
+    """
+    if names and names != feature.names:
+        if unknown := [name for name in names if name not in feature.names]:
+            raise RecordingError(
+                f"The feature {feature.name!r} has no element {unknown[0]!r}."
+                f"{nearest_match(unknown[0], feature.names)} Its elements are: {', '.join(feature.names)}."
+            )
+        if missing := [name for name in feature.names if name not in names]:
+            raise RecordingError(f"The feature {feature.name!r} lacks the element {missing[0]!r}.")
+        vector = vector[[names.index(name) for name in feature.names]]
+    return vector.astype(np.float64) if feature.dtype == "float64" else vector
+
+
+def features_of(vectors: NamedVectors, robot: RobotFacts) -> tuple[CollectedFeature, ...]:
+    """What the first frame says of the features that nobody described."""
+    found = []
+    for name, (vector, given) in vectors.items():
+        is_robot = name in (STATE, ACTION)
+        names = given or (_element_names(len(vector), robot.joints) if is_robot else _numbers(len(vector)))
+        joints = tuple(_joint(element, robot) if is_robot else "" for element in names)
+        found.append(
+            CollectedFeature(
+                name=name,
+                dtype="float32" if vector.dtype == np.float32 else "float64",
+                names=names,
+                joints=joints if any(joints) else (),
+            )
+        )
+    return tuple(found)
+
+
+def _numbers(count: int) -> tuple[str, ...]:
+    return tuple(map(str, range(count)))
+
+
+def _element_names(count: int, joints: tuple[str, ...]) -> tuple[str, ...]:
+    """The robot's joints where there are so many, or one more for a gripper."""
+    if joints and count == len(joints):
+        return joints
+    if joints and count == len(joints) + 1 and "gripper" not in joints:
+        return (*joints, "gripper")
+    return _numbers(count)
+
+
+def _joint(element: str, robot: RobotFacts) -> str:
+    """The joint of which an element is the position: LeRobot's robots call that "JOINT.pos"."""
+    name = element.removesuffix(".pos")
+    return name if name in robot.joints else ""

@@ -1,0 +1,222 @@
+"""What a crash left of a recording, as an indexed recording.
+
+A file without its end has no index, but every chunk in it is whole and has its checksum. They are read from the
+front until one is cut off or damaged; what all streams have in common up to there are the frames that are kept.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+from mcap.records import Metadata
+
+from demorec.core.errors import ConfigError, RecordingError, resource_error, without_path
+from demorec.core.files import make_folder
+from demorec.episode.collected import CollectedOutcome, Origin
+from demorec.episode.episode import Outcome, frame_time_ns
+from demorec.mcap import channels, messages, metadata
+from demorec.mcap.container import SalvagedMessage, salvage
+from demorec.mcap.external.metadata import read_collected_metadata
+from demorec.mcap.external.reader import CollectedRecording
+from demorec.mcap.external.streams import FRAMES, feature_streams
+from demorec.mcap.opening import open_recording
+from demorec.mcap.part_file import PartFile
+from demorec.mcap.recording import Recording
+from demorec.mcap.ros2 import DEFINITIONS
+from demorec.mcap.streams import frame_streams
+
+_KNOWN_TYPES = {*DEFINITIONS, messages.PROTOBUF_VIDEO}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recovered:
+    """What was kept.
+
+    Attributes:
+        path: The indexed recording.
+        num_frames: Kept.
+        num_messages: Kept, of all streams.
+        is_complete: Whether nothing was missing, only the name.
+        reason: Why reading stopped, "" when the file was complete.
+    """
+
+    path: Path
+    num_frames: int
+    num_messages: int
+    is_complete: bool
+    reason: str
+
+
+def recover(source: Path, target: Path, *, overwrite: bool = False) -> Recovered:
+    """Write an indexed recording of all whole frames of `source`, which stays as it is.
+
+    Raises:
+        ConfigError: `target` is `source`, or is there already.
+        RecordingError: Not one frame could be kept, or a file cannot be read or written.
+    """
+    if source.resolve() == target.resolve():
+        raise ConfigError(f"The recovered recording needs another name than the damaged one: {source}")
+    try:
+        survey = _survey(source)
+        frames = survey.frames
+    except RecordingError as error:
+        raise RecordingError(f"{without_path(error, source)}: {source}") from error
+    make_folder(target.parent)
+    num_messages = 0
+    seen: Counter[str] = Counter()
+    # The usual place for an unfinished file is where the source may lie.
+    part = target.with_name(f"{target.name}.recovering")
+    file = PartFile(target, part=part, overwrite=overwrite, is_worthless=lambda part: True)
+    try:
+        file.metadata(*survey.episode)
+        for item in _items(source):
+            if isinstance(item, str):
+                break
+            if isinstance(item, SalvagedMessage):
+                seen[item.topic] += 1
+                if frames.keeps(item, seen[item.topic]) and item.schema in _KNOWN_TYPES:
+                    file.log(item.topic, item.schema, item.data, item.time_ns, latched=item.is_latched)
+                    num_messages += 1
+            elif item is None:
+                file.flush()
+        if survey.outcome is not None:
+            file.metadata(metadata.OUTCOME, survey.outcome)
+        else:
+            file.metadata(metadata.RECOVERED, metadata.sealed({"kept_frames": str(frames.num_frames)}))
+        file.end()
+        with frames.reader(part) as recording:
+            recording.columns()  # a recovered file that cannot be read would be worse than none
+        file.publish()
+    except BaseException:
+        file.discard()  # it holds nothing that the source does not
+        raise
+    return Recovered(
+        path=target,
+        num_frames=frames.num_frames,
+        num_messages=num_messages,
+        is_complete=survey.outcome is not None,
+        reason="" if survey.outcome is not None else survey.reason,
+    )
+
+
+def is_whole(source: Path) -> bool:
+    """Whether a recording opens, ended in order, and can be read to its end."""
+    try:
+        with open_recording(source) as recording:
+            return recording.outcome is not None and bool(recording.digest())
+    except RecordingError:
+        return False
+
+
+def can_be_made_again(part: Path, *, origin: str | Origin) -> bool:
+    """Whether an unfinished recording holds nothing yet, or was derived from the same thing in the same way.
+
+    Args:
+        part: What a crash left.
+        origin: That of the recording that is about to be written in its place, as its info has it.
+    """
+    for item in _items(part):
+        if isinstance(item, Metadata) and item.name == metadata.EPISODE:
+            info, _ = metadata.read_episode_metadata(item.metadata)
+            return bool(origin) and info.origin == origin
+        if isinstance(item, Metadata) and item.name == metadata.COLLECTED:
+            collected, _, _ = read_collected_metadata(item.metadata)
+            return collected.origin.kind == "import" and collected.origin == origin
+        if isinstance(item, str):
+            return item == "the end is missing"  # after nothing: the writer was killed before the first frame
+        if item is not None:
+            return False
+    return True  # it ended in order, before the first frame
+
+
+class _Frames(NamedTuple):
+    """What the metadata and the messages of an episode say of its frames.
+
+    Attributes:
+        num_frames: That all streams have in common.
+        keeps: Whether a message belongs to these frames, given which message of its topic it is, from 1.
+        reader: Of such recordings.
+        outcome: Of such episodes.
+    """
+
+    num_frames: int
+    keeps: Callable[[SalvagedMessage, int], bool]
+    reader: type[Recording] | type[CollectedRecording]
+    outcome: type[Outcome] | type[CollectedOutcome]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Survey:
+    """What is whole in a file.
+
+    Attributes:
+        episode: Name and values of the metadata that say what is recorded.
+        outcome: How it ended, where all of it is there.
+        frames: What is there of them.
+        reason: Why reading stopped.
+    """
+
+    episode: tuple[str, dict[str, str]]
+    outcome: dict[str, str] | None
+    frames: _Frames
+    reason: str
+
+
+def _items(source: Path) -> Iterator[SalvagedMessage | Metadata | str | None]:
+    try:
+        yield from salvage(source)
+    except OSError as error:
+        unreadable = RecordingError(f"The file cannot be read ({error.strerror}): {source}")
+        raise resource_error(error, source) or unreadable from error
+
+
+def _survey(source: Path) -> _Survey:
+    """Read everything once to learn how many frames all streams have in common; RecordingError when it is none."""
+    found: dict[str, dict[str, str]] = {}
+    reason = ""
+    counts: Counter[str] = Counter()
+    for item in _items(source):
+        if isinstance(item, str):
+            reason = item
+        elif isinstance(item, Metadata):
+            metadata.check_seal(item.name, item.metadata)
+            found[item.name] = item.metadata
+        elif item is not None:
+            counts[item.topic] += 1
+    for name, look in ((metadata.EPISODE, _frames_of_episode), (metadata.COLLECTED, _frames_of_collected)):
+        if name not in found:
+            continue
+        frames, outcome, reason = look(found[name], counts), found.get(metadata.OUTCOME), reason or "the end is missing"
+        if outcome is not None:
+            ended = metadata.read_outcome_metadata(outcome, frames.outcome)
+            outcome = outcome if ended.num_frames == frames.num_frames else None
+        if frames.num_frames:
+            return _Survey(episode=(name, found[name]), outcome=outcome, frames=frames, reason=reason)
+    raise RecordingError(f"Nothing can be recovered, the file holds no whole frame ({reason or 'no episode metadata'})")
+
+
+def _frames_of_episode(episode: dict[str, str], counts: Counter[str]) -> _Frames:
+    info, cameras = metadata.read_episode_metadata(episode)
+    topics = [stream.topic for stream in frame_streams(info) if stream.topic != channels.JOINT_STATES]
+    for camera, streams in cameras.items():
+        topics.append(channels.video_topic(camera, streams.video.codec))
+        topics += [channels.camera_topic(camera, name) for name in ("depth", "segmentation") if getattr(streams, name)]
+    num_frames = min(counts[topic] for topic in topics)
+    last_ns = frame_time_ns(max(num_frames - 1, 0), info.fps)
+    return _Frames(num_frames, lambda message, count: message.time_ns <= last_ns, Recording, Outcome)
+
+
+def _frames_of_collected(episode: dict[str, str], counts: Counter[str]) -> _Frames:
+    """Pictures come before the frames that hold them, so what is there of the frames has its pictures."""
+    info, _, _ = read_collected_metadata(episode)
+    topics = {FRAMES, *(stream.topic for stream in feature_streams(info).values())}
+    num_frames = min(counts[topic] for topic in topics)
+
+    def keeps(message: SalvagedMessage, count: int) -> bool:
+        return message.topic not in topics | {channels.TF} or count <= num_frames
+
+    return _Frames(num_frames, keeps, CollectedRecording, CollectedOutcome)

@@ -1,0 +1,268 @@
+"""The streams with one message a frame, one row each: topic, ROS 2 type, layout, encoding and decoding.
+
+`frame_streams` is the table. A row says which values of a frame its message holds (`parts`) and which columns of
+`EpisodeColumns` they become when a recording is read (`columns`); the writer, the reader, recovery and the checks go
+through the rows and know no topic by name. `since` is the format version that brought a stream: in older recordings it
+is neither expected nor written, and what it would tell is None.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from operator import attrgetter
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from demorec.core.geometry import Array, Pose
+from demorec.episode.episode import Action, EpisodeColumns, EpisodeInfo, Frame, Observation
+from demorec.mcap import messages
+from demorec.mcap.cdr import Layout, Slot, layout
+from demorec.mcap.channels import (
+    ACTION,
+    COMMAND,
+    EE_POSE,
+    GRIPPER,
+    JOINT_STATES,
+    TF,
+    WRENCH,
+    camera_topic,
+    object_topic,
+)
+from demorec.mcap.transforms import WORLD, FrameTree
+from demorec.robots.robot import RobotSpec
+
+GRIPPER_JOINT = "gripper"
+"""Name of the gripper's opening beside the joints' names."""
+
+POSE_SLOTS = ((Slot.VALUE,) * 3, (Slot.VALUE,) * 4)
+"""Position and quaternion xyzw in a layout."""
+_WRENCH_SLOTS = ((Slot.VALUE,) * 3, (Slot.VALUE,) * 3)
+
+Columns = dict[str, Array | dict[str, Array]]
+"""Field of `EpisodeColumns` -> its rows, or name -> rows where the field is a mapping."""
+
+
+class FrameValues(NamedTuple):
+    """The numbers of a frame; they wait for the rest of their second, and must not be changed meanwhile."""
+
+    observation: Observation
+    action: Action
+    command: Action
+    world_from_camera: dict[str, Pose]
+
+    @classmethod
+    def of(cls, frame: Frame) -> FrameValues:
+        """Those of a frame, without its pictures."""
+        poses = {name: image.world_from_camera for name, image in frame.images.items()}
+        return cls(frame.observation, frame.action, frame.command, poses)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FrameStream:
+    """One stream that has a message at each frame.
+
+    Attributes:
+        topic: Where.
+        schema: ROS 2 type.
+        layout: Of its messages, which hold K values.
+        parts: The values of a frame, in pieces.
+        columns: The K values of T messages, (T, K), as columns.
+        arrange: All pieces of N frames, (N, ...), to the layout's values (N, K); None when they are these already.
+        since: The first format version that has it.
+    """
+
+    topic: str
+    schema: str
+    layout: Layout
+    parts: Callable[[FrameValues], Sequence[Array]]
+    columns: Callable[[Array], Columns]
+    arrange: Callable[[Array], Array] | None = None
+    since: int = 1
+
+    def rows(self, frames: Sequence[FrameValues]) -> Array:
+        """All pieces of N frames, (N, ...)."""
+        pieces = [piece for frame in frames for piece in self.parts(frame)]
+        return np.concatenate(pieces).reshape(len(frames), -1)
+
+    def encode(self, time_ns: Sequence[int], values: Array) -> list[bytes]:
+        """One message for each row of all pieces (N, ...)."""
+        if self.arrange is not None:
+            values = self.arrange(values)
+        return self.layout.encode(np.array(time_ns, dtype=np.int64), values)
+
+
+def frame_streams(info: EpisodeInfo) -> tuple[FrameStream, ...]:
+    """The streams of a recording of the version that `info` names.
+
+    `/joint_states` comes first; it may have more messages between the frames.
+    """
+    return tuple(stream for stream in _every_stream(info) if stream.since <= info.format_version)
+
+
+def _every_stream(info: EpisodeInfo) -> Iterator[FrameStream]:
+    """The table of all versions' streams."""
+    robot, scene = info.robot, info.scene
+    arm_and_gripper = (*robot.arm_joints, GRIPPER_JOINT)
+    base = robot.base_link
+    joint_state = attrgetter(*(f"observation.{name}" for name in _JOINT_STATE))
+    yield _joints(JOINT_STATES, robot.joint_names, joint_state, _joint_state_columns)
+    yield _joints(GRIPPER, (GRIPPER_JOINT,), partial(_gripper_parts, robot), _gripper_columns)
+    for topic, kind in ((ACTION, "action"), (COMMAND, "command")):
+        yield _joints(topic, arm_and_gripper, partial(_targets, kind), partial(_target_columns, kind), _with_zeros)
+    yield _pose(EE_POSE, base, "observation.base_from_tcp", "base_from_tcp")
+    yield _pose(ACTION + EE_POSE, base, "action.base_from_tcp_target", "action_base_from_tcp")
+    yield _pose(COMMAND + EE_POSE, base, "command.base_from_tcp_target", "command_base_from_tcp")
+    yield FrameStream(
+        topic=WRENCH,
+        schema=messages.WRENCH,
+        layout=layout(messages.WRENCH, (Slot.TIME, robot.hand_link), _WRENCH_SLOTS),
+        parts=_wrench_parts,
+        columns=lambda values: {"wrench": values},
+        since=2,
+    )
+    for body in scene.movable:
+        yield _pose(object_topic(body.name), WORLD, "observation.object_poses", "object_poses", body.name)
+    for camera in scene.cameras:
+        topic = camera_topic(camera.name, "pose")
+        yield _pose(topic, WORLD, "world_from_camera", "world_from_camera", camera.name)
+
+
+def tf_stream(frames: FrameTree) -> FrameStream:
+    """The moving coordinate frames; they follow from other streams, so they become no column."""
+    return FrameStream(
+        topic=TF,
+        schema=messages.TRANSFORMS,
+        layout=transforms_layout(frames.moving),
+        parts=lambda values: frames.parts(values.observation),
+        columns=lambda values: {},
+        arrange=frames.arrange,
+    )
+
+
+def transforms_layout(frames: Sequence[tuple[str, str]]) -> Layout:
+    """Of tf2_msgs/TFMessage with these (parent, child): position and quaternion xyzw of each."""
+    rows = tuple(((Slot.TIME, parent), child, POSE_SLOTS) for parent, child in frames)
+    return layout(messages.TRANSFORMS, rows)
+
+
+def merged_columns(found: Iterable[Columns]) -> dict[str, Any]:
+    """The columns of several streams as arguments of `EpisodeColumns`; the mappings are there even when empty."""
+    merged: dict[str, Any] = {"object_poses": {}, "world_from_camera": {}}
+    for columns in found:
+        for name, rows in columns.items():
+            if isinstance(rows, Mapping):
+                merged[name].update(rows)
+            else:
+                merged[name] = rows
+    return merged
+
+
+# --------------------------------------------------------------------------- columns back into one frame's values
+
+
+def observation_at(columns: EpisodeColumns, frame: int) -> Observation:
+    """The observation of a frame, to the bit."""
+    return Observation(
+        joint_position=columns.joint_position[frame].copy(),
+        joint_velocity=columns.joint_velocity[frame].copy(),
+        joint_effort=columns.joint_effort[frame].copy(),
+        gripper_width=float(columns.gripper_width[frame]),
+        base_from_tcp=pose_of(columns.base_from_tcp[frame]),
+        object_poses={name: pose_of(rows[frame]) for name, rows in columns.object_poses.items()},
+        contact_force=float(columns.contact_force[frame]),
+        wrench=None if columns.wrench is None else columns.wrench[frame].copy(),
+    )
+
+
+def action_at(columns: EpisodeColumns, frame: int, kind: Literal["action", "command"]) -> Action:
+    """What the expert wanted at a frame, or the command that was sent to the motors."""
+    return Action(
+        joint_target=getattr(columns, f"{kind}_joint_target")[frame].copy(),
+        gripper_target=float(getattr(columns, f"{kind}_gripper")[frame]),
+        base_from_tcp_target=pose_of(getattr(columns, f"{kind}_base_from_tcp")[frame]),
+    )
+
+
+def pose_of(row: Array) -> Pose:
+    """The pose of a row (7,): position, quaternion xyzw."""
+    return Pose(position=row[:3], quat_xyzw=row[3:])
+
+
+# ------------------------------------------------------------------------------------ what the rows are made of
+
+
+_JOINT_STATE = ("joint_position", "joint_velocity", "joint_effort")
+
+
+def _joint_state_columns(values: Array) -> Columns:
+    return {name: part.copy() for name, part in zip(_JOINT_STATE, np.split(values, 3, axis=1), strict=True)}
+
+
+def _gripper_parts(robot: RobotSpec, values: FrameValues) -> Sequence[Array]:
+    # The force on the fingers stands in for the effort.
+    observation, n = values.observation, len(robot.arm_joints)
+    velocity = float(robot.gripper.width_velocity(observation.joint_position[n:], observation.joint_velocity[n:]))
+    return (np.array((observation.gripper_width, velocity, observation.contact_force)),)
+
+
+def _gripper_columns(values: Array) -> Columns:
+    return {"gripper_width": values[:, 0].copy(), "contact_force": values[:, 2].copy()}
+
+
+def _targets(kind: str, values: FrameValues) -> Sequence[Array]:
+    action: Action = getattr(values, kind)
+    return action.joint_target, np.array((action.gripper_target,))
+
+
+def _with_zeros(targets: Array) -> Array:
+    # No velocity or effort is commanded; zeros, since a viewer makes an empty plot of an empty array.
+    return np.concatenate((targets, np.zeros((len(targets), 2 * targets.shape[1]))), axis=1)
+
+
+def _target_columns(kind: str, values: Array) -> Columns:
+    num_arm = values.shape[1] // 3 - 1
+    return {f"{kind}_joint_target": values[:, :num_arm].copy(), f"{kind}_gripper": values[:, num_arm].copy()}
+
+
+def _wrench_parts(values: FrameValues) -> Sequence[Array]:
+    wrench = values.observation.wrench
+    assert wrench is not None, "FrameCheck lets no frame without it into a recording that has the stream"
+    return (wrench,)
+
+
+def _joints(
+    topic: str,
+    names: Sequence[str],
+    parts: Callable[[FrameValues], Sequence[Array]],
+    columns: Callable[[Array], Columns],
+    arrange: Callable[[Array], Array] | None = None,
+) -> FrameStream:
+    slots = (Slot.VALUE,) * len(names)  # position, velocity, effort
+    return FrameStream(
+        topic=topic,
+        schema=messages.JOINT_STATE,
+        layout=layout(messages.JOINT_STATE, (Slot.TIME, ""), tuple(names), slots, slots, slots),
+        parts=parts,
+        columns=columns,
+        arrange=arrange,
+    )
+
+
+def _pose(topic: str, frame_id: str, path: str, column: str, key: str = "") -> FrameStream:
+    """A pose at a path in `FrameValues` that becomes the rows of `column`; or with a key one of the poses there."""
+    found = attrgetter(path)
+
+    def parts(values: FrameValues) -> Sequence[Array]:
+        pose: Pose = found(values)[key] if key else found(values)
+        return pose.position, pose.quat_xyzw
+
+    return FrameStream(
+        topic=topic,
+        schema=messages.POSE,
+        layout=layout(messages.POSE, (Slot.TIME, frame_id), POSE_SLOTS),
+        parts=parts,
+        columns=lambda values: {column: {key: values}} if key else {column: values},
+    )

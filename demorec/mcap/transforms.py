@@ -1,0 +1,116 @@
+"""The coordinate frames of an episode (ROS: TF): which frame hangs on which, and how the moving ones move.
+
+Every link of the robot, every body and every camera is a frame. What the joints and the physics move is on `/tf` at
+each frame, the rest on `/tf_static`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from demorec.core.geometry import Array, Pose, quat_multiply
+from demorec.episode.episode import EpisodeInfo, Observation
+from demorec.robots.assets import asset_path
+from demorec.robots.urdf import Urdf, joint_motion
+
+WORLD = "world"
+RERUN_ROOT = "tf#/"
+"""Rerun's name of its scene's root: without this one row its 3D view finds no way to any of the frames."""
+
+Row = tuple[str, str, Pose]
+"""Parent frame, child frame, parent_from_child."""
+
+
+def camera_frame(camera: str) -> str:
+    """Coordinate frame of a camera, in OpenCV axes (ROS: "optical")."""
+    return f"camera_{camera}"
+
+
+class FrameTree:
+    """The frames of one episode.
+
+    Attributes:
+        static: Rows that never change.
+        moving: (parent, child) of those that do, in the order of `arrange`.
+    """
+
+    def __init__(self, info: EpisodeInfo) -> None:
+        urdf = Urdf.load(asset_path(info.robot.urdf), scale=info.scene.robot.scale)
+        self._num_joints = len(info.robot.joint_names)
+        self._objects = [body.name for body in info.scene.movable]
+        self._joints = MovingJoints(urdf, info.robot.joint_names)
+        self.moving = (*self._joints.moving, *((WORLD, name) for name in self._objects))
+        self.static: tuple[Row, ...] = (
+            (RERUN_ROOT, WORLD, Pose()),
+            (WORLD, urdf.root, info.scene.robot.world_from_base),
+            *self._joints.static,
+            *((WORLD, body.name, body.world_from_body) for body in info.scene.bodies if not body.movable),
+            *((camera.mount, camera_frame(camera.name), camera.mount_from_camera) for camera in info.scene.cameras),
+        )
+
+    def parts(self, observation: Observation) -> list[Array]:
+        """What `arrange` needs of an observation."""
+        result = [observation.joint_position]
+        for name in self._objects:
+            pose = observation.object_poses[name]
+            result += [pose.position, pose.quat_xyzw]
+        return result
+
+    def arrange(self, parts: Array) -> Array:
+        """(N, 7 n) position and quaternion xyzw of every moving row at N frames."""
+        joints = self._joints.values(parts[:, : self._num_joints])
+        return np.concatenate((joints.reshape(len(parts), -1), parts[:, self._num_joints :]), axis=1)
+
+
+class MovingJoints:
+    """parent_from_child of all joints that move and are recorded, at once; the others stay at 0.
+
+    Args:
+        urdf: The robot.
+        names: Of the recorded joints, in the order in which vectors have them.
+
+    Attributes:
+        moving: (parent, child) of those that move.
+        static: Rows of the others.
+
+    A turning joint about axis a from the fixed rotation q0: q0 * (a sin(t/2), cos(t/2)), linear in sine and cosine.
+    """
+
+    def __init__(self, urdf: Urdf, names: Sequence[str]) -> None:
+        places = {name: index for index, name in enumerate(names)}
+        joints = [joint for joint in urdf.joints if joint.kind != "fixed" and joint.name in places]
+        self.moving = tuple((joint.parent, joint.child) for joint in joints)
+        self.static: tuple[Row, ...] = tuple(
+            (joint.parent, joint.child, joint.parent_from_joint @ joint_motion(joint, 0.0))
+            for joint in urdf.joints
+            if joint not in joints
+        )
+        slides = [joint.kind == "prismatic" for joint in joints]
+        self._indices = np.array([places[joint.name] for joint in joints], dtype=np.intp)
+        self._half = np.array([0.0 if slide else 0.5 for slide in slides])
+        self._origin = np.zeros((len(joints), 3))
+        self._slide = np.zeros((len(joints), 3))
+        self._sine, self._cosine = np.zeros((len(joints), 4)), np.zeros((len(joints), 4))
+        for row, joint in enumerate(joints):
+            fixed = joint.parent_from_joint
+            self._origin[row] = fixed.position
+            self._cosine[row] = fixed.quat_xyzw
+            if slides[row]:
+                self._slide[row] = fixed.apply(np.array(joint.axis)) - fixed.position
+            else:
+                self._sine[row] = quat_multiply(fixed.quat_xyzw, (*joint.axis, 0.0))
+
+    def values(self, joint_position: Array) -> Array:
+        """(N, n, 7) for N joint vectors."""
+        position = joint_position[:, self._indices]
+        # math.sin, not numpy's, whose last bit depends on the CPU's vector unit.
+        angles = (position * self._half).reshape(-1).tolist()
+        sine = np.array([math.sin(angle) for angle in angles]).reshape(*position.shape, 1)
+        cosine = np.array([math.cos(angle) for angle in angles]).reshape(*position.shape, 1)
+        result = np.empty((*position.shape, 7))
+        result[..., :3] = self._origin + self._slide * position[..., None]
+        result[..., 3:] = self._sine * sine + self._cosine * cosine
+        return result

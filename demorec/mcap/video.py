@@ -1,0 +1,347 @@
+"""Pictures to coded packets and back.
+
+Every picture is coded once, while recording; the packets go into the recording as they are and later into the
+dataset unchanged. One encoder per camera and episode, one thread each (the same bits on every machine of a type, and
+a pool of workers already fills the cores), no reordering: packet t shows frame t.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from pathlib import Path
+from typing import Literal, Protocol, cast
+
+import av
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, UnidentifiedImageError
+
+from demorec.core.config import VideoConfig
+from demorec.core.errors import ConfigError, RecordingError, in_words
+
+Rgb = NDArray[np.uint8]
+Codec = Literal["h264", "h265", "av1", "jpeg", "16UC1", "32FC1"]
+
+# SVT-AV1 tells its settings on standard error unless this says "errors only"; it reads it when it starts.
+os.environ.setdefault("SVT_LOG", "1")
+
+# Code points of ITU-T H.273, the same in H.264 and AV1: sRGB pictures through the matrix that libswscale uses by itself
+# (BT.601, 16 to 235). Without them a player guesses, and many guess BT.709: (200, 30, 30) then shows as (214, 45, 28).
+_LIMITED_RANGE = 1
+_PRIMARIES_BT709 = 1
+_TRANSFER_SRGB = 13
+_MATRIX_BT601 = 6
+
+
+_PIXEL_FORMATS = {"jpeg": "yuvj420p", "16UC1": "gray16le", "32FC1": "grayf32le"}
+"""Codec -> FFmpeg's name of the pixel format, of codecs whose every picture stands by itself."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class VideoSettings:
+    """How the pictures of one camera were coded: what a dataset's metadata and an mp4 file need to know.
+
+    Attributes:
+        codec: Of the bit stream; of depth the encoding of its distances.
+        encoder: FFmpeg's name of the encoder, "" for jpeg and for packets that came coded.
+        width, height: Pixels.
+        fps: Pictures per second.
+        pix_fmt: FFmpeg's name of the pixel format.
+        gop: Pictures from one keyframe to the next; 0 when unknown, of packets that came coded.
+        crf: Constant rate factor; None for jpeg.
+        preset: Encoder preset; "" for jpeg.
+        options: Further encoder options, as given to FFmpeg.
+        jpeg_quality: 1..100; None unless the codec is jpeg.
+    """
+
+    codec: Codec
+    encoder: str
+    width: int
+    height: int
+    fps: int
+    pix_fmt: str
+    gop: int
+    crf: int | None
+    preset: str
+    options: dict[str, str]
+    jpeg_quality: int | None = None
+
+
+def settings_of_coded(codec: Codec, width: int, height: int, fps: int) -> VideoSettings:
+    """Those of packets that came coded, of which nobody knows how."""
+    return VideoSettings(
+        codec=codec,
+        encoder="",
+        width=width,
+        height=height,
+        fps=fps,
+        pix_fmt=_PIXEL_FORMATS.get(codec, "yuv420p"),
+        gop=1 if codec in _PIXEL_FORMATS else 0,
+        crf=None,
+        preset="",
+        options={},
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class VideoPacket:
+    """One coded picture: an H.264 or H.265 access unit (Annex B), an AV1 temporal unit (OBUs) or a JPEG file.
+
+    Attributes:
+        frame_index: Which frame it shows.
+        time_ns: Of that frame.
+        data: The bytes; parameter sets are in front of every keyframe.
+        is_keyframe: Whether it can be decoded without the packets before it.
+    """
+
+    frame_index: int
+    time_ns: int
+    data: bytes
+    is_keyframe: bool
+
+
+class Encoder(Protocol):
+    """Codes the pictures of one camera, in order."""
+
+    settings: VideoSettings
+
+    def encode(self, picture: Rgb) -> list[bytes]:
+        """Take one picture; return the packets that are ready, oldest first."""
+
+    def finish(self) -> list[bytes]:
+        """Return the packets that were held back."""
+
+
+def size_problem(video: VideoConfig, width: int, height: int) -> str:
+    """Why images of this size cannot be encoded so, and what can be done; "" when they can.
+
+    libx264 refuses odd sizes; for AV1 libswscale leaves the last column of colours of an odd width as its memory was.
+    """
+    if video.codec == "jpeg" or width % 2 == height % 2 == 0:
+        return ""
+    return (
+        f"images of {width}x{height} pixels cannot be {video.codec} video, which needs even sizes: cut or scale them, "
+        'or use the codec jpeg (--codec jpeg, VideoConfig(codec="jpeg")), of which no LeRobot dataset can be made'
+    )
+
+
+def make_encoder(video: VideoConfig, width: int, height: int, fps: int) -> Encoder:
+    """An encoder as configured; RecordingError when this build of FFmpeg lacks the codec."""
+    if video.codec == "jpeg":
+        return _JpegEncoder(video, width, height, fps)
+    return _StreamEncoder(video, width, height, fps)
+
+
+class _StreamEncoder:
+    def __init__(self, video: VideoConfig, width: int, height: int, fps: int) -> None:
+        if video.codec == "h264":
+            # Keyframes at a fixed distance; no reordering, no delay. Zero latency also leaves x264's macroblock tree
+            # out, which reads memory that it has not set (seen with MALLOC_PERTURB_), so that packets would depend
+            # on what the process did before. The same quality takes about 5 % more bytes at GOP 2 without it.
+            # Without "cpu-independent" x264 takes shortcuts that differ between CPUs; it costs no time and 1.5 % bytes.
+            options = {"bf": "0", "sc_threshold": "0", "tune": "zerolatency", "x264-params": "cpu-independent=1"}
+            encoder, crf, preset = "libx264", 23, "veryfast"
+        else:
+            # Low delay, one thread: frames leave in the order and at the pace in which they came.
+            encoder, crf, preset, options = "libsvtav1", 30, "12", {"svtav1-params": "fast-decode=0:lp=1:pred-struct=1"}
+        if problem := size_problem(video, width, height):
+            raise ConfigError(f"{problem[0].upper()}{problem[1:]}.")
+        self.settings = replace(
+            settings_of_coded(video.codec, width, height, fps),
+            encoder=encoder,
+            gop=video.gop,
+            crf=crf if video.crf is None else video.crf,
+            preset=preset if video.preset is None else video.preset,
+            options=options,
+        )
+        try:
+            context = av.CodecContext.create(encoder, "w")
+            context = cast(av.VideoCodecContext, context)
+            context.width, context.height, context.pix_fmt = width, height, self.settings.pix_fmt
+            self._time_base = Fraction(1, fps)
+            context.time_base, context.framerate = self._time_base, Fraction(fps, 1)
+            context.color_range, context.colorspace = _LIMITED_RANGE, _MATRIX_BT601
+            context.color_primaries, context.color_trc = _PRIMARIES_BT709, _TRANSFER_SRGB
+            context.gop_size = video.gop
+            context.thread_count = 1
+            context.options = {
+                "g": str(video.gop),
+                "crf": str(self.settings.crf),
+                "preset": self.settings.preset,
+                **options,
+            }
+            with ordinary_scheduling():
+                context.open()
+        except (av.FFmpegError, ValueError) as error:
+            raise ConfigError(
+                f"The video encoder {encoder} does not start with {width}x{height} pixels, crf {self.settings.crf}, "
+                f"preset {self.settings.preset} ({in_words(error)}): choose another preset, or --codec jpeg."
+            ) from error
+        self._context = context
+        self._num_pictures = 0
+
+    def encode(self, picture: Rgb) -> list[bytes]:
+        frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
+        frame.pts, frame.time_base = self._num_pictures, self._time_base
+        self._num_pictures += 1
+        return _bare(self._context.encode(frame))
+
+    def finish(self) -> list[bytes]:
+        return _bare(self._context.encode(None))
+
+
+def _bare(packets: Iterable[av.Packet]) -> list[bytes]:
+    result = []
+    for packet in packets:
+        if packet.dts != packet.pts:
+            raise RecordingError(f"The video encoder reordered its pictures (pts {packet.pts}, dts {packet.dts}).")
+        result.append(bytes(packet))
+    return result
+
+
+class _JpegEncoder:
+    def __init__(self, video: VideoConfig, width: int, height: int, fps: int) -> None:
+        settings = settings_of_coded("jpeg", width, height, fps)
+        self.settings = replace(settings, jpeg_quality=video.jpeg_quality)
+
+    def encode(self, picture: Rgb) -> list[bytes]:
+        buffer = io.BytesIO()
+        Image.fromarray(picture).save(buffer, format="JPEG", quality=self.settings.jpeg_quality, subsampling="4:2:0")
+        return [buffer.getvalue()]
+
+    def finish(self) -> list[bytes]:
+        return []
+
+
+def decode(settings: VideoSettings, packets: Iterable[VideoPacket]) -> Iterator[Rgb]:
+    """Decode packets in order, from a keyframe on: (H, W, 3) uint8 RGB, one a packet.
+
+    Raises:
+        RecordingError: A packet cannot be decoded, has another size, or pictures are missing at the end.
+    """
+    shape = (settings.height, settings.width, 3)
+    pictures = _decode_jpeg(settings, packets) if settings.codec == "jpeg" else _decode_stream(settings, packets)
+    for picture in pictures:
+        if picture.shape != shape:
+            raise RecordingError(
+                f"A picture is {picture.shape[1]}x{picture.shape[0]} pixels where the metadata says "
+                f"{settings.width}x{settings.height}."
+            )
+        yield picture
+
+
+def _decode_jpeg(settings: VideoSettings, packets: Iterable[VideoPacket]) -> Iterator[Rgb]:
+    for packet in packets:
+        try:
+            with Image.open(io.BytesIO(packet.data), formats=("JPEG",)) as image:
+                if image.width * image.height > settings.width * settings.height:  # before anything is unpacked
+                    raise OSError(f"{image.width}x{image.height} pixels")
+                yield np.asarray(image.convert("RGB"))
+        except UnidentifiedImageError as error:
+            raise RecordingError(f"The picture of frame {packet.frame_index} is no JPEG.") from error
+        except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+            reason = in_words(error)
+            raise RecordingError(f"The picture of frame {packet.frame_index} is no valid JPEG ({reason}).") from error
+
+
+def _decode_stream(settings: VideoSettings, packets: Iterable[VideoPacket]) -> Iterator[Rgb]:
+    decoder = {"av1": "libdav1d", "h265": "hevc"}.get(settings.codec, settings.codec)
+    context = cast(av.VideoCodecContext, av.CodecContext.create(decoder, "r"))
+    context.thread_count = 1
+    # A few bytes can announce pictures of gigabytes; coded pictures are whole blocks of at most 128 pixels.
+    context.options = {"max_pixels": str((settings.width + 128) * (settings.height + 128))}
+    num_packets = num_pictures = 0
+    try:
+        for packet in packets:
+            raw = av.Packet(packet.data)
+            raw.pts = num_packets
+            num_packets += 1
+            for frame in context.decode(raw):
+                num_pictures += 1
+                yield cast(Rgb, frame.to_ndarray(format="rgb24"))
+        for frame in context.decode(None):
+            num_pictures += 1
+            yield cast(Rgb, frame.to_ndarray(format="rgb24"))
+    except (av.FFmpegError, ValueError) as error:
+        raise RecordingError(f"The {settings.codec} video cannot be decoded near frame {num_pictures}.") from error
+    if num_pictures != num_packets:
+        raise RecordingError(f"{num_packets} packets of {settings.codec} video gave {num_pictures} pictures.")
+
+
+def is_keyframe(codec: str, data: bytes) -> bool:
+    """Whether a coded picture can be decoded without those before it.
+
+    H.264 (ITU-T H.264, table 7-1): an access unit with a slice of type 5 (IDR). H.265 (ITU-T H.265, table 7-1): one
+    with a slice of the types 16 to 21 (IRAP). AV1: our encoder puts a sequence header (OBU type 1) in front of
+    keyframes and nowhere else.
+    """
+    if codec == "h264":
+        return any(head & 31 == 5 for head in _nal_heads(data, lambda head: head & 31 in (1, 5)))
+    if codec in ("h265", "hevc"):
+        return any(16 <= head >> 1 <= 21 for head in _nal_heads(data, lambda head: head >> 1 < 32))
+    if codec == "av1":
+        return any(kind == 1 for kind in _obu_types(data))
+    return True
+
+
+def _nal_heads(data: bytes, is_slice: Callable[[int], bool]) -> Iterator[int]:
+    """First byte of each NAL unit, up to the first slice: the parameter sets are in front of it."""
+    position = data.find(b"\x00\x00\x01")
+    while 0 <= position < len(data) - 3:
+        head = data[position + 3]
+        yield head
+        if is_slice(head):
+            return
+        position = data.find(b"\x00\x00\x01", position + 3)
+
+
+def _obu_types(data: bytes) -> Iterator[int]:
+    position = 0
+    while position < len(data):
+        head = data[position]
+        yield (head >> 3) & 15
+        position += 2 if head & 4 else 1
+        size = shift = 0
+        while position < len(data):
+            byte = data[position]
+            size |= (byte & 127) << shift
+            shift += 7
+            position += 1
+            if not byte & 128:
+                break
+        position += size
+
+
+@contextmanager
+def ordinary_scheduling() -> Iterator[None]:
+    """Give the threads of this process back, at the end, how they were scheduled before; new ones are as the caller is.
+
+    SVT-AV1 gives its threads, and the one that starts it, the highest real-time priority when root runs it (as in most
+    containers): all that the process starts later inherits that, and whatever else runs on the machine stands still.
+    """
+    if not hasattr(os, "sched_setscheduler"):  # not Linux
+        yield
+        return
+    own = (os.sched_getscheduler(0), os.sched_getparam(0))
+    before = dict(_scheduling())
+    try:
+        yield
+    finally:
+        for thread, found in _scheduling():
+            wanted = before.get(thread, own)
+            if found[0] != wanted[0]:
+                with suppress(ProcessLookupError):
+                    os.sched_setscheduler(thread, *wanted)
+
+
+def _scheduling() -> Iterator[tuple[int, tuple[int, os.sched_param]]]:
+    """(thread, (policy, parameters)) of every thread of this process."""
+    for task in Path("/proc/self/task").iterdir():
+        with suppress(ProcessLookupError):  # it has ended meanwhile
+            thread = int(task.name)
+            yield thread, (os.sched_getscheduler(thread), os.sched_getparam(thread))

@@ -1,0 +1,119 @@
+"""Where model files are: pybullet_data's, our own and those of the user's modules, found without the simulator.
+
+A recording names its models by what is the same on every machine: a path below pybullet_data, "demorec:NAME", or
+"my_robots:PATH" for a file beside a module of the user's own. A name never leads out of these folders, and into that of
+a module only if the user has allowed it.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib.util
+import os
+from collections.abc import Iterable
+from pathlib import Path
+
+from demorec.core.errors import ConfigError, MissingDependencyError, NotAllowedError, SceneError
+from demorec.core.user_modules import import_root, is_allowed, is_module_name, module_file
+
+OWN_PREFIX = "demorec:"
+
+_modules_with_models: set[str] = set()
+"""Of this process, as `sys.path` is: models are looked up deep below whatever reads or draws a recording."""
+
+
+def allow_models(modules: Iterable[str]) -> None:
+    """From now on, model files beside these modules of the user's own are found."""
+    _modules_with_models.update(modules)
+
+
+@functools.cache
+def data_folder() -> Path:
+    """The folder of pybullet_data; MissingDependencyError when it is not installed."""
+    spec = importlib.util.find_spec("pybullet_data")
+    if spec is None or spec.origin is None:
+        raise MissingDependencyError("Loading robot models", "pybullet", "pip install pybullet")
+    return Path(spec.origin).parent
+
+
+def asset_path(name: str) -> Path:
+    """Absolute path of a path below pybullet_data, "demorec:NAME" (of `demorec/sim/assets`) or "module:PATH".
+
+    Raises:
+        SceneError: There is no such file, or the name leads out of its folder.
+        NotAllowedError: It is beside a module that the user has not allowed (`allow_models`).
+        ConfigError: That module cannot be found.
+    """
+    module, _, relative = name.rpartition(":")
+    if modules_of_models([name]):
+        if not is_allowed(module, _modules_with_models):
+            raise NotAllowedError(
+                f"The model {name!r} lies beside a module from outside of demorec: if you trust that module, add "
+                f"--allow {module}."
+            )
+        file = module_file(module)
+        folder, limit = file.parent, _top_folder(module)
+    else:
+        folder = limit = Path(__file__).parent.parent / "sim" / "assets" if module else data_folder()
+    path = Path(os.path.normpath(folder / relative))
+    if not path.is_relative_to(limit):
+        raise SceneError(f"The model file {name!r} lies outside of {limit}, where it has to be.")
+    if not path.is_file():
+        raise SceneError(
+            f"The model file {name!r} was not found: give a path below pybullet_data, demorec:NAME, or a file beside "
+            "your own module."
+        )
+    return path
+
+
+def modules_of_models(names: Iterable[str]) -> tuple[str, ...]:
+    """The modules of the user's own beside which these models lie, each once."""
+    modules = (name.rpartition(":")[0] for name in names)
+    return tuple(dict.fromkeys(m for m in modules if f"{m}:" != OWN_PREFIX and is_module_name(m)))
+
+
+def model_name(file: str | Path, module: str) -> str:
+    """The name under which recordings keep a model that a module of the user's own gives.
+
+    Args:
+        file: Absolute, relative to the module's file, below pybullet_data, or "demorec:NAME".
+        module: Which gives it.
+
+    Raises:
+        ConfigError: An absolute path that lies neither beside the module (or in its package) nor in pybullet_data.
+    """
+    name = str(file)
+    if ":" in name:
+        return name
+    folder = module_file(module).parent
+    path = Path(os.path.normpath(folder / name))
+    if path.is_file() and path.is_relative_to(_top_folder(module)):
+        return f"{module}:{os.path.relpath(path, folder)}"
+    if not Path(name).is_absolute():
+        return name
+    if path.is_relative_to(data_folder()):
+        return path.relative_to(data_folder()).as_posix()
+    raise ConfigError(
+        f"The module {module!r} names a model that is no file of its own folder nor of pybullet_data, so that no other "
+        f"machine would find what a recording says about it: put it beside the module, found {name}"
+    )
+
+
+def mesh_path(folder: Path, name: str) -> Path:
+    """Absolute path of a mesh that a URDF in `folder` names: beside it, or below pybullet_data for our own URDFs.
+
+    Raises:
+        SceneError: There is no such file.
+    """
+    relative = name.removeprefix("package://").removeprefix("file://")
+    for candidate in (folder / relative, folder.parent / relative, data_folder() / relative):
+        if candidate.is_file():
+            return candidate
+    raise SceneError(f"The mesh {name!r} is neither beside its URDF nor in pybullet_data: {folder}")
+
+
+def _top_folder(module: str) -> Path:
+    """The folder of the outermost package that a module is in, or that of its file."""
+    root = import_root(module)
+    package = root / module.partition(".")[0]
+    return package if module_file(module).is_relative_to(package) else root

@@ -1,0 +1,117 @@
+"""What the links of a robot weigh, read from its URDF and judged before a simulator makes up what is missing.
+
+PyBullet gives a link without `<inertial>` 1 kg, also a frame that only marks a point. In a URDF such a link weighs
+nothing, which is right for a frame and for what is fixed to the ground, and wrong for a part of the arm.
+"""
+
+from __future__ import annotations
+
+import math
+import xml.etree.ElementTree as ET
+
+import numpy as np
+
+from demorec.core.errors import ConfigError
+from demorec.core.geometry import Array
+from demorec.core.plain import listed
+from demorec.robots.assets import asset_path
+from demorec.robots.urdf import Urdf, parse_xml
+
+MAX_MASS = 5_000.0
+"""kg of a link: the heaviest arms that are sold weigh that as a whole (grams for kilograms are found)."""
+MAX_GYRATION = 10.0
+"""Metres, sqrt(inertia / mass): farther than an arm reaches (inertias in kg mm^2 or g mm^2 are found)."""
+_SHOWN = 5
+_NOTHING = '<inertial><mass value="0"/><inertia ixx="0" ixy="0" ixz="0" iyy="0" iyz="0" izz="0"/></inertial>'
+_AXES = ("ixx", "ixy", "ixz", "ixy", "iyy", "iyz", "ixz", "iyz", "izz")
+
+
+def check_masses(model: str) -> None:
+    """Raise ConfigError unless the URDF of a robot, named as by `asset_path`, says what its links weigh."""
+    try:
+        link_masses(asset_path(model).read_text())
+    except ValueError as error:
+        raise ConfigError(f"The robot cannot be simulated, since {error}: {model}") from error
+
+
+def link_masses(text: str) -> dict[str, tuple[float, Array]]:
+    """Link -> mass, kg, and centre of mass in the link's frame (3,), metres, of every link that weighs something.
+
+    Raises:
+        ValueError: The text is no URDF; or a link moves without a mass and an inertia that a body can have.
+    """
+    urdf, links = Urdf.parse(text), {link.attrib["name"]: link for link in parse_xml(text).findall("link")}
+    carrier = {urdf.root: urdf.root}
+    """Link -> the link that it is rigidly one with, which hangs on a joint that moves, or the root."""
+    for joint in urdf.depth_first():
+        carrier[joint.child] = carrier[joint.parent] if joint.kind == "fixed" else joint.child
+    masses: dict[str, tuple[float, Array]] = {}
+    wrong: dict[str, str] = {}
+    for name, link in links.items():
+        try:
+            masses[name] = _mass(link, must_be_whole=carrier[name] != urdf.root)
+        except ValueError as error:
+            wrong[name] = str(error)
+    carried = dict.fromkeys(carrier.values(), 0.0)
+    for name, (mass, _) in masses.items():
+        carried[carrier[name]] += mass
+    for name, mass in carried.items():
+        if not mass and name != urdf.root:
+            wrong.setdefault(name, "moves, but weighs nothing")
+    if wrong:
+        told = listed([f"{name!r} ({problem})" for name, problem in wrong.items()], _SHOWN, ", ")
+        raise ValueError(
+            f"its URDF does not say what these links weigh: {told}; give each the mass and inertia of a body (only "
+            "frames without shapes on fixed joints need none)"
+        )
+    return {name: found for name, found in masses.items() if found[0]}
+
+
+def with_massless_frames(text: str) -> str:
+    """The URDF, in which every link has an `<inertial>`: of no mass where it had none."""
+    robot = parse_xml(text)
+    without = [link for link in robot.findall("link") if link.find("inertial") is None]
+    for link in without:
+        link.append(ET.fromstring(_NOTHING))
+    return ET.tostring(robot, encoding="unicode") if without else text
+
+
+def _mass(link: ET.Element, *, must_be_whole: bool) -> tuple[float, Array]:
+    """Of one link; ValueError, with what is wrong, unless a body can have it and `must_be_whole` holds."""
+    inertial = link.find("inertial")
+    if inertial is None:
+        if must_be_whole and (link.find("visual") is not None or link.find("collision") is not None):
+            raise ValueError("moves and has a shape, but no <inertial>")
+        return 0.0, np.zeros(3)
+    (mass,) = _numbers(inertial.find("mass"), ("value",))
+    origin = inertial.find("origin")
+    words = "0 0 0" if origin is None else origin.get("xyz", "0 0 0")
+    centre = np.array(_finite(words.split(), "a centre of mass that is no three numbers"))
+    if len(centre) != 3:
+        raise ValueError("a centre of mass that is no three numbers")
+    inertia = np.array(_numbers(inertial.find("inertia"), _AXES)).reshape(3, 3)
+    if not 0 <= mass <= MAX_MASS:
+        raise ValueError(f"a mass of {mass:g} kg")
+    least, *_, most = np.linalg.eigvalsh(inertia)
+    if mass and must_be_whole and not least > 0:
+        raise ValueError(f"an inertia whose smallest principal value is {least:.3g} kg m^2")
+    if most > MAX_GYRATION**2 * max(mass, 1.0) or least < -1e-9:
+        raise ValueError(f"principal inertias of {least:.3g} to {most:.3g} kg m^2 for {mass:g} kg")
+    return mass, centre
+
+
+def _numbers(element: ET.Element | None, names: tuple[str, ...]) -> list[float]:
+    """Finite attributes of an element; ValueError for others."""
+    if element is None:
+        raise ValueError("an <inertial> without mass or inertia")
+    return _finite([element.get(name, "") for name in names], "a mass or an inertia that is no number")
+
+
+def _finite(words: list[str], problem: str) -> list[float]:
+    try:
+        found = [float(word) for word in words]
+    except ValueError:
+        found = [math.nan]
+    if not all(map(math.isfinite, found)):
+        raise ValueError(problem)
+    return found

@@ -1,0 +1,118 @@
+"""Timed straight-line motions of the tool centre point within the joint limits.
+
+A quintic time law (zero velocity and acceleration at both ends) along a straight line with slerp, slowed down until
+every joint keeps to its velocity and acceleration limits.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from demorec.core.geometry import Array, Pose
+from demorec.robots.kinematics import ArmKinematics
+
+# Peaks of the quintic time law u^3 (10 - 15 u + 6 u^2) over unit time and distance.
+PEAK_VELOCITY = 1.875
+PEAK_ACCELERATION = 5.774
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MotionLimits:
+    """What a motion keeps to.
+
+    Attributes:
+        joint_velocity, joint_acceleration: (n,) rad/s, rad/s^2, already reduced by a margin.
+        linear_acceleration: Of the TCP, m/s^2.
+        angular_velocity, angular_acceleration: Of the TCP, rad/s, rad/s^2.
+        min_seconds: Shortest motion.
+    """
+
+    joint_velocity: Array
+    joint_acceleration: Array
+    linear_acceleration: float = 1.5
+    angular_velocity: float = 1.5
+    angular_acceleration: float = 6.0
+    min_seconds: float = 0.2
+
+
+def quintic(u: Array) -> Array:
+    """Fraction of the way at fraction `u` of the time, both 0..1."""
+    return np.asarray(u * u * u * (10.0 + u * (6.0 * u - 15.0)), dtype=np.float64)
+
+
+def angle_between(a: Pose, b: Pose) -> float:
+    """Angle of the rotation from a to b, rad, 0..pi."""
+    dot = abs(sum(float(x) * float(y) for x, y in zip(a.quat_xyzw, b.quat_xyzw, strict=True)))
+    return 2.0 * math.acos(min(1.0, dot))
+
+
+def plan_straight(
+    arm: ArmKinematics,
+    *,
+    start: Array,
+    goal: Pose,
+    rest: Array,
+    speed: float,
+    turn_speed: float = 1.0,
+    limits: MotionLimits,
+    dt: float,
+) -> Array | None:
+    """Joint targets (T, n) of a straight motion, one per control step, the start left out; None if unreachable.
+
+    Args:
+        arm: Kinematics.
+        start: (n,) commanded configuration now, rad: the path starts from its forward kinematics, not from an
+            idealised pose, since the first step would exceed the limits.
+        goal: base_from_tcp at the end.
+        rest: (n,) configuration towards which the goal configuration is pulled in the null space.
+        speed: Peak speed of the TCP, m/s.
+        turn_speed: Factor on the angular velocity limit.
+        limits: Joint and TCP limits.
+        dt: Control step, s.
+    """
+    goal_q = arm.inverse(goal, start=start, rest=rest)
+    if goal_q is None:
+        return None
+    base_from_start = arm.forward(start)
+    delta = goal.position - base_from_start.position
+    distance = math.sqrt(float((delta * delta).sum()))
+    angle = angle_between(base_from_start, goal)
+    seconds = max(
+        limits.min_seconds,
+        PEAK_VELOCITY * distance / speed,
+        math.sqrt(PEAK_ACCELERATION * distance / limits.linear_acceleration),
+        PEAK_VELOCITY * angle / (limits.angular_velocity * turn_speed),
+        math.sqrt(PEAK_ACCELERATION * angle / limits.angular_acceleration),
+    )
+    for _ in range(5):
+        steps = max(1, math.ceil(seconds / dt))
+        path = arm.straight_path(
+            start=start,
+            goal=goal_q,
+            base_from_start=base_from_start,
+            base_from_goal=goal,
+            fractions=quintic(np.arange(1, steps + 1) / steps),
+        )
+        if path is None:
+            return None
+        factor = slowdown(path, start=start, limits=limits, dt=dt)
+        if factor <= 1.0:
+            return path
+        seconds *= 1.02 * factor
+    return None
+
+
+def slowdown(path: Array, *, start: Array, limits: MotionLimits, dt: float) -> float:
+    """By which factor a path (T, n) that starts and ends at rest must be stretched in time to keep the limits."""
+    padded = np.vstack([start, start, path, path[-1:]])
+    velocity = np.abs(np.diff(padded, axis=0)) / dt
+    acceleration = np.abs(np.diff(padded, 2, axis=0)) / (dt * dt)
+    return float(
+        max(
+            (velocity.max(axis=0) / limits.joint_velocity).max(),
+            math.sqrt(float((acceleration.max(axis=0) / limits.joint_acceleration).max())),
+        )
+    )

@@ -1,0 +1,222 @@
+"""The joint tree of a URDF: enough for kinematics and for placing links, without the simulator."""
+
+from __future__ import annotations
+
+import math
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+
+from demorec.core.geometry import Array, Pose
+
+MAX_BYTES = 4 << 20
+"""Of a URDF: the largest of pybullet_data has 32 kB."""
+_MAX_JOINTS = 500
+_MAX_SHAPES = 5000
+_SHAPE_SIZES = {"box": {"size": 3}, "sphere": {"radius": 1}, "cylinder": {"radius": 1, "length": 1}}
+"""Tag of a primitive -> its attributes, and how many numbers each has."""
+
+
+def parse_xml(text: str) -> ET.Element:
+    """The root of an XML text of unknown origin; ValueError for what is none, is very large or defines entities.
+
+    Entities can expand a small file without end; no URDF needs a document type.
+    """
+    if len(text) > MAX_BYTES:
+        raise ValueError(f"the URDF has {len(text):,} characters, allowed are {MAX_BYTES:,}")
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise ValueError("the URDF has a document type, which none needs")
+    try:
+        return ET.fromstring(text)
+    except ET.ParseError as error:
+        raise ValueError(f"the URDF is no XML ({error})") from error
+
+
+@lru_cache(maxsize=8)  # all recordings of a robot have the same
+def check_primitives(text: str) -> None:
+    """ValueError unless a URDF can be used, and drawn without any other file: boxes, balls and cylinders alone."""
+    Urdf.parse(text)
+    robot = parse_xml(text)
+    shapes = robot.findall("link/visual")
+    if len(shapes) > _MAX_SHAPES:
+        raise ValueError(f"a URDF of {len(shapes)} shapes")
+    for visual in shapes:
+        origin = visual.find("origin")
+        if origin is not None:
+            _numbers(origin.get("xyz", "0 0 0"), 3)
+            _numbers(origin.get("rpy", "0 0 0"), 3)
+        for shape in visual.findall("geometry/*"):
+            if shape.tag not in _SHAPE_SIZES:
+                raise ValueError(f"a shape of the URDF is a {shape.tag[:20]!r}, allowed are {', '.join(_SHAPE_SIZES)}")
+            for name, count in _SHAPE_SIZES[shape.tag].items():
+                if min(_numbers(shape.get(name, ""), count)) < 0:
+                    raise ValueError(f"the {name} of a {shape.tag} of the URDF is negative")
+    for color in robot.iter("color"):
+        if not all(0 <= part <= 1 for part in _numbers(color.get("rgba", ""), 4)):
+            raise ValueError("a colour of the URDF is outside 0 to 1")
+
+
+def _numbers(text: str, count: int) -> list[float]:
+    """So many finite numbers; ValueError for others."""
+    values = [float(word) for word in text.split()]
+    if len(values) != count or not all(math.isfinite(value) for value in values):
+        raise ValueError(f"{text[:40]!r} of the URDF should be {count} numbers")
+    return values
+
+
+@dataclass(frozen=True, kw_only=True)
+class UrdfJoint:
+    """One joint of a URDF.
+
+    Attributes:
+        name, parent, child: Joint, parent link, child link.
+        kind: "revolute", "continuous", "prismatic" or "fixed".
+        parent_from_joint: Pose of the joint frame (= child link frame at position 0).
+        axis: Unit vector in the joint frame.
+        lower, upper: Position limits, rad or m; infinite where the URDF has none.
+        max_speed: rad/s or m/s; infinite where the URDF has none.
+    """
+
+    name: str
+    parent: str
+    child: str
+    kind: str
+    parent_from_joint: Pose
+    axis: tuple[float, float, float]
+    lower: float
+    upper: float
+    max_speed: float = math.inf
+
+
+@dataclass(frozen=True, kw_only=True)
+class Urdf:
+    """The joint tree of a URDF, lengths multiplied by `scale`; ValueError when the joints make no tree."""
+
+    joints: tuple[UrdfJoint, ...]
+    root: str
+
+    def __post_init__(self) -> None:
+        below: dict[str, list[UrdfJoint]] = {}
+        for joint in self.joints:
+            below.setdefault(joint.parent, []).append(joint)
+        reached, waiting, strays = {self.root}, [self.root], []
+        while waiting:
+            for joint in below.pop(waiting.pop(), ()):
+                if joint.child in reached:
+                    strays.append(joint)
+                reached.add(joint.child)
+                waiting.append(joint.child)
+        strays += [joint for joints in below.values() for joint in joints]
+        if strays:
+            names = ", ".join(joint.name for joint in strays)
+            raise ValueError(f"the joints of a URDF make one tree, but these do not belong to it: {names}")
+
+    @classmethod
+    def load(cls, path: Path, *, scale: float = 1.0) -> Urdf:
+        """Read the joints of a URDF file; ValueError when they are no tree with one root link."""
+        return cls.parse(path.read_text(), scale=scale)
+
+    @classmethod
+    @lru_cache(maxsize=8)
+    def parse(cls, text: str, *, scale: float = 1.0) -> Urdf:
+        """The same from its text; ValueError also when that is no XML, or its joints are no tree."""
+        robot = parse_xml(text)
+        elements = robot.findall("joint")
+        if len(elements) > _MAX_JOINTS:
+            raise ValueError(f"a URDF of {len(elements)} joints")
+        try:
+            joints = tuple(_joint(element, scale) for element in elements)
+            links = [link.attrib["name"] for link in robot.findall("link")]
+        except KeyError as error:
+            raise ValueError(f"a joint or link of the URDF lacks something, its {error}") from error
+        except AttributeError as error:
+            raise ValueError("a joint of the URDF lacks something, its parent or its child") from error
+        children = {joint.child for joint in joints}
+        roots = [link for link in links if link not in children]
+        if len(roots) != 1:
+            raise ValueError(f"a URDF needs one root link, found {len(roots)}: {', '.join(roots[:5])}")
+        return cls(joints=joints, root=roots[0])
+
+    def link_poses(self, joint_position: Mapping[str, float]) -> dict[str, Pose]:
+        """Link name -> base_from_link for the given joint positions (rad, m); joints left out are at 0."""
+        poses = {self.root: Pose()}
+        for joint in self.depth_first():
+            moved = joint_motion(joint, joint_position.get(joint.name, 0.0))
+            poses[joint.child] = poses[joint.parent] @ joint.parent_from_joint @ moved
+        return poses
+
+    def depth_first(self) -> tuple[UrdfJoint, ...]:
+        """Every joint below the root, in the order in which PyBullet numbers the links that hang on them."""
+
+        def below(link: str) -> Iterator[UrdfJoint]:
+            for joint in self.joints:
+                if joint.parent == link:
+                    yield joint
+                    yield from below(joint.child)
+
+        return tuple(below(self.root))
+
+    def path_to(self, link: str) -> tuple[UrdfJoint, ...]:
+        """The joints from the root to `link`; KeyError when there is no such link."""
+        by_child = {joint.child: joint for joint in self.joints}
+        path: list[UrdfJoint] = []
+        while link != self.root:
+            path.append(by_child[link])
+            link = by_child[link].parent
+        return tuple(reversed(path))
+
+
+def joint_motion(joint: UrdfJoint, position: float) -> Pose:
+    """The transform of a joint at `position` (rad or m), about or along its axis."""
+    if joint.kind == "prismatic":
+        return Pose(position=np.array(joint.axis) * position)
+    if joint.kind == "fixed":
+        return Pose()
+    half = math.sin(position / 2)
+    x, y, z = joint.axis
+    return Pose(quat_xyzw=np.array([x * half, y * half, z * half, math.cos(position / 2)]))
+
+
+def _joint(element: ET.Element, scale: float) -> UrdfJoint:
+    def vector(tag: str, attribute: str, default: str) -> list[float]:
+        child = element.find(tag)
+        return _numbers(default if child is None else child.get(attribute, default), 3)
+
+    kind = element.attrib["type"]
+    axis = np.array(vector("axis", "xyz", "1 0 0"))
+    length = math.sqrt(float((axis * axis).sum()))
+    limit = element.find("limit")
+    bounded = limit is not None and kind in ("revolute", "prismatic")
+    unit = scale if kind == "prismatic" else 1.0
+    return UrdfJoint(
+        name=element.attrib["name"],
+        parent=cast(ET.Element, element.find("parent")).attrib["link"],
+        child=cast(ET.Element, element.find("child")).attrib["link"],
+        kind=kind,
+        parent_from_joint=Pose(
+            position=np.array(vector("origin", "xyz", "0 0 0")) * scale,
+            quat_xyzw=quat_from_rpy(vector("origin", "rpy", "0 0 0")),
+        ),
+        axis=(1.0, 0.0, 0.0) if length == 0.0 else tuple(float(v) for v in axis / length),  # type: ignore[arg-type]
+        lower=unit * float(cast(ET.Element, limit).get("lower", 0)) if bounded else -math.inf,
+        upper=unit * float(cast(ET.Element, limit).get("upper", 0)) if bounded else math.inf,
+        max_speed=math.inf if limit is None else unit * float(limit.get("velocity") or math.inf),
+    )
+
+
+def quat_from_rpy(rpy: Sequence[float]) -> Array:
+    """URDF's roll, pitch, yaw about fixed axes (rad) as a unit quaternion (x, y, z, w)."""
+    (sr, sp, sy), (cr, cp, cy) = [math.sin(a / 2) for a in rpy], [math.cos(a / 2) for a in rpy]
+    return np.array(
+        [
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+            cr * cp * cy + sr * sp * sy,
+        ]
+    )

@@ -1,1 +1,0 @@
-"""What keeps the user's files and programs safe from us and from foreign data."""

@@ -1,0 +1,205 @@
+"""The bags of one import: which are new, which are bad, and the order in which they come into the run."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import BrokenExecutor, Executor, Future
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+from demorec.core.errors import ConfigError, DemorecError, resource_error, without_path
+from demorec.episode.collected import CollectedInfo
+from demorec.runs.collected import CollectedEpisode, CollectedFolder, differences
+from demorec.sources.bag import Bag, open_bag
+from demorec.sources.episode_writer import PlannedEpisode
+from demorec.sources.import_file import ImportFile, SkippedBag, save_import_file
+from demorec.sources.pipeline import in_order
+from demorec.sources.report import BagReport
+
+Files = tuple[tuple[str, str], ...]
+"""Name and SHA-256 of each of a bag's files."""
+
+
+_MAX_REASON = 1000
+"""Characters: an error may quote what a bag holds."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportResult:
+    """What an import made.
+
+    Attributes:
+        reports: Of every bag that is in the run, in the order in which they were given.
+        num_new: Bags that were read now; the others were there.
+        skipped: Bags that were left out -> why.
+    """
+
+    reports: tuple[BagReport, ...]
+    num_new: int
+    skipped: Mapping[Path, str]
+
+
+class Batch:
+    """The bags of one call: numbered and taken into the run in their order, whoever reads and writes them when.
+
+    So what is in the run depends neither on how many processes there are nor on when they were interrupted.
+    """
+
+    def __init__(
+        self, paths: Sequence[Path], known: ImportFile, *, skips: bool, progress: Callable[[int, int], None]
+    ) -> None:
+        self._paths, self._known, self._skips, self._progress = paths, known, skips, progress
+        self._files: dict[Path, Files] = {}  # of bags that are in the run, or will be
+        self._skipped: dict[Path, str] = {}
+        self._num_new = self._num_done = 0
+        self._next_index = known.num_episodes
+        self._kind: CollectedInfo | None = None
+        self._progress(0, len(paths))
+
+    def look(self, pool: Executor) -> list[Bag]:
+        """Open all bags; those that are not in the run yet."""
+        bags = []
+        for path in self._paths:
+            try:
+                bags.append(open_bag(path))
+            except DemorecError as error:
+                if not os.path.lexists(path):  # a name that was mistyped is no bad bag
+                    raise
+                self._refuse(path, error)
+        known = {report.files for report in self._known.bags}
+        sizes = {(report.num_bytes, *(name for name, _ in report.files)) for report in self._known.bags}
+        likely = [bag for bag in bags if (bag.num_bytes, *(file.name for file in bag.files)) in sizes]
+        for bag, files in zip(likely, pool.map(files_of, likely), strict=True):
+            if files in known:
+                self._files[bag.path] = files
+                self._advance()
+        return [bag for bag in bags if bag.path not in self._files]
+
+    def run(
+        self,
+        bags: Sequence[Bag],
+        folder: CollectedFolder,
+        pool: Executor,
+        *,
+        ahead: int,
+        read: Callable[[Bag], PlannedBag],
+        write: Callable[[Job], tuple[BagReport, list[CollectedEpisode]]],
+        tell: Callable[[BagReport], None],
+    ) -> None:
+        """Take new bags into a run.
+
+        Args:
+            bags: Those that are not there yet.
+            folder: Of the run.
+            pool: Calls `read` and `write`.
+            ahead: How many bags are under way at a time.
+            read: Reads and judges a bag.
+            write: Writes its episodes; its report, and their lines of run.json.
+            tell: Called with the report of each bag that is in the run now.
+        """
+        self._kind = folder.kind()
+        accept = partial(self._accept, folder)
+        for report, lines in in_order(bags, pool, ahead=ahead, read=read, accept=accept, write=write):
+            folder.extend(lines)
+            self._known = replace(self._known, bags=(*self._known.bags, report), skipped=self.skipped_bags())
+            save_import_file(self._known, folder.path)
+            self._num_new += 1
+            self._advance()
+            tell(report)
+        if self._known.bags:
+            save_import_file(replace(self._known, skipped=self.skipped_bags()), folder.path)
+
+    def _accept(self, folder: CollectedFolder, bag: Bag, read: Future[PlannedBag]) -> Job | None:
+        """What is to be written of a bag, with its episodes' numbers; None for one that is left out or there."""
+        try:
+            planned = read.result()
+            self._check_kind(planned, bag)
+        except Exception as error:
+            self._refuse(bag.path, error)
+            return None
+        is_there = planned.report.files in self._files.values()
+        self._files[bag.path] = planned.report.files
+        if is_there:  # another one with the same bytes
+            self._advance()
+            return None
+        planned = planned.numbered(self._next_index)
+        self._next_index += len(planned.episodes)
+        missing = [episode for episode in planned.episodes if not folder.has(episode.info)]
+        return Job(bag=bag, report=planned.report, episodes=missing, folder=folder.path)
+
+    def _check_kind(self, planned: PlannedBag, bag: Bag) -> None:
+        """ConfigError unless the episodes are of the kind that the run has."""
+        for episode in planned.episodes[:1]:
+            if self._kind is not None and (different := differences(self._kind, episode.info)):
+                raise ConfigError(
+                    f"The run holds episodes of another kind ({'; '.join(different)}): import the bag into another "
+                    f"folder: {bag.path}"
+                )
+            self._kind = self._kind or episode.info
+
+    def _refuse(self, path: Path, error: Exception) -> None:
+        """Leave a bag out, or raise: where that was not asked for, or is the machine's fault."""
+        if (lack := resource_error(error)) is not None:
+            raise lack from error
+        if not self._skips or isinstance(error, BrokenExecutor):
+            raise error
+        known = isinstance(error, DemorecError)
+        self._skipped[path] = (
+            without_path(error, path)[:_MAX_REASON] if known else f"unexpected {type(error).__name__}, please report it"
+        )
+        self._advance()
+
+    def _advance(self) -> None:
+        self._num_done += 1
+        self._progress(self._num_done, len(self._paths))
+
+    def skipped_bags(self) -> tuple[SkippedBag, ...]:
+        """Those of this call, in order, behind those of earlier calls that are not given now."""
+        given = {path.name for path in self._paths}
+        before = [bag for bag in self._known.skipped if bag.name not in given]
+        now = [SkippedBag(name=path.name, reason=self._skipped[path]) for path in self._paths if path in self._skipped]
+        return (*before, *now)
+
+    def result(self) -> ImportResult:
+        """What came of it."""
+        reports = {report.files: report for report in self._known.bags}
+        files = dict.fromkeys(self._files[path] for path in self._paths if path in self._files)
+        skipped = {path: self._skipped[path] for path in self._paths if path in self._skipped}
+        return ImportResult(reports=tuple(reports[key] for key in files), num_new=self._num_new, skipped=skipped)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PlannedBag:
+    """A bag that has been read; its episodes are numbered from 0."""
+
+    report: BagReport
+    episodes: tuple[PlannedEpisode, ...]
+
+    def numbered(self, first: int) -> PlannedBag:
+        """The same with the numbers of a run."""
+        reports = (
+            replace(row, episode_index=None if row.episode_index is None else row.episode_index + first)
+            for row in self.report.episodes
+        )
+        episodes = (
+            replace(episode, info=replace(episode.info, episode_index=episode.info.episode_index + first))
+            for episode in self.episodes
+        )
+        return PlannedBag(report=replace(self.report, episodes=tuple(reports)), episodes=tuple(episodes))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Job:
+    """Episodes of a bag that are to be written into the folder of a run, and the report of all of them."""
+
+    bag: Bag
+    report: BagReport
+    episodes: Sequence[PlannedEpisode]
+    folder: Path
+
+
+def files_of(bag: Bag) -> Files:
+    """By which a bag is known again."""
+    return tuple(bag.sha256s().items())

@@ -1,0 +1,331 @@
+"""Which numbers in a topic's messages may say what a robot does, or shall do.
+
+The words that people give topics, types and fields are what there is to go by: a follower, a puppet and a measured
+state are what the robot does, a leader, a master and a command what it shall do; `q` and `position` are positions.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from demorec.sources.fields import (
+    SourceLayout,
+    SourceReader,
+    follow,
+    layout_of,
+    numbers_in,
+    parse_path,
+)
+from demorec.sources.mapping import Source
+from demorec.sources.mapping_file import MAX_ELEMENTS
+from demorec.sources.ros_types import Values
+from demorec.sources.words import first_numbers
+
+Kind = Literal["arm", "gripper", "base", "pose", "twist", "numbers"]
+_LEADER = r"leader|master|gello|teleop|(?<![a-z])(?:lead|haptic|spacemouse|operator|vr|oculus)(?![a-z])"
+_ACTION = re.compile(
+    rf"{_LEADER}|command|cmd|target|desired|goal|setpoint|(?<![a-z])(?:actions?|ref|reference)(?![a-z])"
+)
+_STATE = re.compile(r"follower|puppet|measured|actual|feedback|lowstate|(?<![a-z])(?:joint|robot)?states?(?![a-z])")
+_COMMAND_TYPE = re.compile(r"(Cmds?|Commands?|Goal|Target|Jog|Action|JointTrajectory)$")
+_STATE_TYPE = re.compile(r"(?<!^Joint)(States?|StateList|StateRTMsg)$")
+_GRIPPER = re.compile(r"gripper|finger|jaw|claw|knuckle|(?<![a-z])(?:hand(?!le|eye|held)|robotiq)")
+_WHEEL = re.compile(r"wheel|caster|steer")
+_BASE = re.compile(rf"{_WHEEL.pattern}|(?<![a-z])(hip|knee|thigh|calf|ankle|foot|hx|hy|kn)(?![a-z])")
+_ROBOT_POSE = re.compile(
+    r"odom|end_effector|(?<![a-z])(ee|eef|tcp|tool\d*|flange|hand|gripper|current|robot|arm|cartesian)(?![a-z])"
+)
+_OTHER_NUMBERS = re.compile(
+    r"force|wrench|torque|effort|velocit|tactile|temperature|imu|(?<![a-z])(vel|current)(?![a-z])"
+)
+_CARTESIAN = re.compile(r"cartesian|(?<![a-z])(?:tcp|ee|eef|pose)(?![a-z])")
+_WORD = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])")
+_POSITION = {"q", "qpos", "position", "positions", "pos", "joint", "joints", "angle", "angles"}
+_DESIRED = {"desired", "target", "command", "commanded", "cmd", "goal", "reference", "ref", "setpoint", "d", "des"}
+_MEASURED = {"measured", "actual", "present", "feedback", "follower", "puppet"}
+_LEADING = {"leader", "master"}
+_SIDES = {"left", "right", "l", "r"}
+_PARTS = _SIDES | {"state", "states", "arm", "robot", "gripper", "hand", "finger", "fingers", "current", "rad"}
+_GRIPPER_FIELD = _SIDES | {"gripper", "finger", "hand", "width", "opening"} | _LEADING | _MEASURED
+_ANY_COMMAND = {"cmd", "command", "commands", "action", "actions", "values", "joint", "velocity", "velocities"}
+"""Words of a field that is a command though it holds no positions."""
+_TIMES = {"header", "timestamp", "stamp", "ts", "time"}
+_MAX_NESTED, _MAX_FIELDS = 4, 100
+_MAX_UNKNOWN = 3
+"""Fields that are offered of a message whose topic or type says what it is for, but none of whose fields does."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Vector:
+    """Numbers of a topic that could be part of a feature.
+
+    Attributes:
+        topic, type: Where they are.
+        field, layout: As of a source.
+        kind: Of what: joints of an arm, a gripper or a base (wheels, legs), a pose, a velocity in space, or others.
+        role: state, action, or "" where no word says which.
+        is_sure: Whether nothing in the message suits that role better.
+        names: Of the elements, where neither the message nor the field has a good one.
+        prefix: In front of each name.
+        first: The first numbers.
+        rate_hz: Of the messages that hold it; 0 for fewer than two.
+        has_stamp: Whether the headers of its messages have a time.
+        age_s: How old a message may have to be for a row to have one, where that is more than usual; 0 elsewhere.
+    """
+
+    topic: str
+    type: str
+    field: str
+    layout: SourceLayout
+    kind: Kind
+    role: str
+    is_sure: bool = True
+    names: tuple[str, ...] = ()
+    prefix: str = ""
+    first: str = ""
+    rate_hz: float = 0.0
+    has_stamp: bool = True
+    age_s: float = 0.0
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Names of its elements without a prefix for the topic."""
+        return tuple(self.prefix + name for name in self.names or self.layout.names)
+
+    @property
+    def words(self) -> list[str]:
+        """Of its topic."""
+        return _split(self.topic)
+
+    @property
+    def place(self) -> list[str]:
+        """The words of its topic and field."""
+        return [*self.words, *_split(self.field)]
+
+    @property
+    def is_other(self) -> bool:
+        """Whether its topic is, for a vector of numbers, that of another quantity than joint positions."""
+        lower = self.topic.lower()
+        return bool(_CARTESIAN.search(lower) or _OTHER_NUMBERS.search(lower))
+
+    @property
+    def is_leader(self) -> bool:
+        """Whether its topic is that of an arm that a person moves."""
+        return re.search(_LEADER, self.topic.lower()) is not None
+
+    @property
+    def is_robot(self) -> bool:
+        """Whether its topic is, for a pose, that of the robot, and not that of a thing or a tag."""
+        return _ROBOT_POSE.search(self.topic.lower()) is not None
+
+    @property
+    def has_wheels(self) -> bool:
+        """Whether all elements are called like wheels."""
+        return all(_WHEEL.search(label.lower()) for label in self.labels)
+
+    @property
+    def has_gripper(self) -> bool:
+        """Whether an element is called like a gripper's joint."""
+        return any(_GRIPPER.search(label.lower()) for label in self.labels)
+
+    def of_joints(self, joints: Sequence[str], messages: Iterable[Values]) -> Vector:
+        """A part of it, which some of the messages may hold."""
+        layout = replace(self.layout, names=tuple(joints), joints=tuple(joints))
+        leads = self.role == "state" and all(re.search(_LEADER, joint.lower()) for joint in joints)
+        role = "action" if leads else self.role
+        source = Source(topic=self.topic, field=self.field, joints=tuple(joints))
+        for values in messages:
+            with suppress(ValueError):
+                first = first_numbers(SourceReader(source, layout).read(values))
+                return replace(self, layout=layout, kind=_kind_of(joints), role=role, first=first)
+        return replace(self, layout=layout, kind=_kind_of(joints), role=role, first="")
+
+
+def vectors_of(topic: str, type_name: str, values: Values) -> Iterator[Vector]:
+    """What a message holds, the likeliest joint positions first."""
+    if "/_action/" in topic or topic.endswith("/tf_static"):
+        return
+    empty = Vector(topic=topic, type=type_name, field="", layout=_NOTHING, kind="numbers", role=_role(topic, type_name))
+    found = [*_positions(empty, values)]
+    if not found and empty.role == "action":
+        found = [*_any_command(empty, values)][:1]
+    seen: set[tuple[bool, str, frozenset[str]]] = set()
+    for vector in sorted(found, key=_doubt):
+        place = (vector.kind == "gripper", vector.role, frozenset(_words(vector.field) & _SIDES))
+        yield replace(vector, is_sure=vector.is_sure and place not in seen)
+        seen.add(place)
+    others = [*_in_space(empty, values), *_plain(empty, values)]
+    if not found and not others and empty.role:
+        paths = [path for path, size in _numbers(values) if size > 1 or empty.role == "action"]
+        others = [vector for path in paths[:_MAX_UNKNOWN] for vector in _made(empty, values, path)]
+    yield from (replace(vector, is_sure=not found) for vector in others)
+
+
+def transforms_of(topic: str, type_name: str, messages: Iterable[Values]) -> Iterator[Vector]:
+    """The frames of a topic like /tf, each once."""
+    seen: set[str] = set()
+    for values in messages:
+        items = values.get("transforms")
+        for item in items if isinstance(items, list) and not topic.endswith("/tf_static") else ():
+            key = next((key for key in ("child_frame_id", "child_frame") if isinstance(item, dict) and key in item), "")
+            frame = str(item[key]) if key else ""
+            if not frame or frame in seen or "]" in frame:
+                continue
+            seen.add(frame)
+            inner = f"transforms[{key}={frame}]" + (".transform" if "transform" in item else "")
+            empty = Vector(topic=topic, type=type_name, field="", layout=_NOTHING, kind="numbers", role="")
+            yield from (replace(made, prefix=f"{frame}.") for made in _made(empty, values, inner))
+
+
+_NOTHING = SourceLayout(names=(), joints=(), steps=(), names_steps=None, quaternions=())
+
+
+def _made(empty: Vector, values: Values, path: str) -> Iterator[Vector]:
+    """The vector of a path, if it is one."""
+    try:
+        layout = layout_of(Source(topic=empty.topic, field=path), values)
+        parts = [np.ravel(item) for _, item in numbers_in(follow(values, layout.steps))]
+    except ValueError:  # it has none, or one of another shape
+        return
+    count = len(layout.names)
+    names = tuple(f"joint_{number}" for number in range(count)) if len(set(layout.names)) < count else ()
+    yield replace(empty, field=path, layout=layout, names=names, first=first_numbers(np.concatenate(parts)))
+
+
+def _role(topic: str, type_name: str) -> str:
+    lower, last = topic.lower(), re.split(r"[/.]", type_name)[-1]
+    if _ACTION.search(lower):
+        return "action"
+    if _STATE_TYPE.search(last) or _STATE.search(lower):
+        return "state"
+    return "action" if _COMMAND_TYPE.search(last) else ""
+
+
+def _kind_of(joints: Sequence[str]) -> Kind:
+    if all(_GRIPPER.search(joint.lower()) for joint in joints):
+        return "gripper"
+    return "base" if all(_BASE.search(joint.lower()) for joint in joints) else "arm"
+
+
+def _split(place: str) -> list[str]:
+    return [word for word in re.split(r"[^A-Za-z0-9]+", place) if word]
+
+
+def _words(path: str) -> set[str]:
+    return {word.lower() for word in _WORD.findall(path)}
+
+
+def _numbers(values: Mapping[str, Any], place: str = "") -> Iterator[tuple[str, int]]:
+    """(path, how many) of the numbers in a message; of a list of messages, of the same field of each."""
+    for key, item in list(values.items())[:_MAX_FIELDS]:
+        path = f"{place}{key}"
+        if key in _TIMES or not re.fullmatch(r"\w+", key) or isinstance(item, bool):
+            continue
+        if isinstance(item, int | float | np.ndarray) and 0 < np.size(item) <= MAX_ELEMENTS:
+            yield path, np.size(item)
+        elif isinstance(item, Mapping) and place.count(".") < _MAX_NESTED:
+            if not {"x", "y"} & set(item) and all(isinstance(value, int | float) for value in item.values()):
+                yield path, len(item)  # a field for each joint
+            yield from _numbers(item, f"{path}.")
+        elif isinstance(item, list) and 0 < len(item) <= MAX_ELEMENTS and isinstance(item[0], Mapping):
+            for inner, value in item[0].items():
+                if inner == "positions" and isinstance(value, np.ndarray) and value.size:
+                    yield f"{path}[0].positions", value.size
+                elif isinstance(value, int | float) and not isinstance(value, bool):
+                    yield f"{path}.{inner}", len(item)
+
+
+def _positions(empty: Vector, values: Values) -> Iterator[Vector]:
+    """The fields whose words say that they hold positions of joints."""
+    for path, size in _numbers(values):
+        words = _words(path.rpartition(".")[2])
+        beside = _words(path) - words
+        is_position = words & _POSITION and not words - _POSITION - _DESIRED - _MEASURED - _LEADING - _PARTS
+        is_position = is_position or (size == 1 and words & {"gripper", "width"} and words <= _GRIPPER_FIELD)
+        if not is_position or beside & {"error", "cartesian", "tcp", "elbow", "imu", "pose"}:
+            continue
+        called = values.get("name")
+        text = f"{empty.topic} {empty.type} {path} {called if isinstance(called, str) else ''}".lower()
+        for vector in _made(empty, values, path):
+            if vector.layout.joints:
+                vector = replace(vector, kind=_kind_of(vector.layout.joints))
+            elif _GRIPPER.search(text):
+                vector = replace(vector, kind="gripper", role=empty.role or "state")
+            elif size > 1:
+                vector = replace(vector, kind="arm")
+            else:
+                continue
+            is_single = "[0]" not in path or len(follow(values, parse_path(path.partition("[0]")[0]))) == 1
+            if (words | beside) & _MEASURED:
+                vector = replace(vector, role="state")
+            elif (words | beside) & (_DESIRED | _LEADING) and empty.role != "action":
+                is_single = is_single and bool((words | beside) & _LEADING)
+                vector = replace(vector, role="action")
+            yield replace(vector, is_sure=is_single)
+
+
+def _doubt(vector: Vector) -> tuple[bool, ...]:
+    """What makes one field of positions less likely than another one of the same message."""
+    words = _words(vector.field)
+    is_few = len(vector.layout.names) < 3
+    return (vector.kind == "gripper", is_few, "motor" in words, not words & _MEASURED, not vector.layout.joints)
+
+
+def _any_command(empty: Vector, values: Values) -> Iterator[Vector]:
+    called = values.get("name")
+    text = f"{empty.topic} {called if isinstance(called, str) else ''}".lower()
+    for path, size in _numbers(values):
+        if _words(path) <= _ANY_COMMAND and (size > 1 or _GRIPPER.search(text)):
+            kind: Kind = "gripper" if _GRIPPER.search(text) else "arm"
+            yield from (replace(vector, kind=kind) for vector in _made(empty, values, path))
+
+
+def _plain(empty: Vector, values: Values) -> Iterator[Vector]:
+    """The numbers of std_msgs: what they are, the topic alone says."""
+    data, lower = values.get("data"), empty.topic.lower()
+    is_vector = isinstance(data, np.ndarray) and data.dtype.kind == "f"
+    is_gripper = bool(_GRIPPER.search(lower)) and not _OTHER_NUMBERS.search(lower)
+    if "encoding" in values or "format" in values:
+        return
+    if not (is_vector or isinstance(data, float) or (is_gripper and isinstance(data, int))):  # or a boolean
+        return
+    may_be_joints = not _OTHER_NUMBERS.search(lower) and not _CARTESIAN.search(lower)
+    says_joints = empty.role or _words(empty.topic) & _POSITION
+    are_joints = is_vector and (empty.role == "action" or (may_be_joints and says_joints))
+    kind: Kind = "gripper" if is_gripper else "arm" if are_joints else "numbers"
+    role = empty.role or ("state" if is_gripper else "")
+    names = () if is_vector else ("_".join(empty.words) or "data",)
+    yield from (replace(vector, kind=kind, role=role, names=names) for vector in _made(empty, values, "data"))
+
+
+def _in_space(empty: Vector, values: Values) -> Iterator[Vector]:
+    """The first pose and the first velocity in space."""
+    first: dict[Kind, tuple[str, tuple[str, str]]] = {}
+    for kind, place, pair in _pairs(values, ""):
+        first.setdefault(kind, (place, pair))
+    for kind, (place, pair) in first.items():
+        fields = [place] if place else pair
+        for field in fields:
+            prefix = "" if place else f"{field}."
+            yield from (replace(made, kind=kind, prefix=prefix) for made in _made(empty, values, field))
+
+
+def _pairs(values: Mapping[str, Any], place: str) -> Iterator[tuple[Kind, str, tuple[str, str]]]:
+    pairs: dict[tuple[str, str], Kind] = {
+        ("position", "orientation"): "pose",
+        ("translation", "rotation"): "pose",
+        ("linear", "angular"): "twist",
+    }
+    for pair, kind in pairs.items():
+        if all(isinstance(values.get(name), Mapping) for name in pair):
+            yield kind, place, pair
+            return
+    for key, item in values.items():
+        if isinstance(item, Mapping) and key not in _TIMES and place.count(".") < 1 and re.fullmatch(r"\w+", key):
+            yield from _pairs(item, f"{place}.{key}" if place else key)

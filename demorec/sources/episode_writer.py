@@ -1,0 +1,215 @@
+"""An episode on its way into its recording, while its bag is read a second time for the pictures.
+
+Pictures that are coded already stay as they are, byte for byte; pixels are coded once. A frame is written as soon as
+its pictures are, so that of a bag of any size only what is under way is in memory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Self, cast
+
+import numpy as np
+
+from demorec.core.config import VideoConfig
+from demorec.episode.collected import DEPTH_UNITS, CollectedFrame, CollectedInfo, CollectedOutcome, Kept, Sample
+from demorec.mcap import CollectedWriter
+from demorec.sources.channel import BagError
+from demorec.sources.clock import Int, Timeline
+from demorec.sources.fields import picture_bytes
+from demorec.sources.picture_messages import KEPT_FORMATS, PictureHead, decode_picture
+from demorec.sources.ros_types import Values
+from demorec.sources.rows import CameraRows, EpisodeRows
+
+_MAX_WAITING = 1 << 29
+"""Bytes of pictures that wait for earlier ones, which come later in the bag."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PicturePlan:
+    """The pictures that an episode takes of a camera.
+
+    Attributes:
+        topic: Of them.
+        head: Of the first.
+        kept: The codec whose packets stay as they are, or the encoding of distances; "" for pixels, which are coded
+            once.
+        numbers: (P,) which of the topic's messages are taken, in the order of their times.
+        stamps_ns: (P,) their times.
+        positions: (R,) which of the taken ones each row shows.
+    """
+
+    topic: str
+    head: PictureHead
+    kept: Kept
+    numbers: Int
+    stamps_ns: Int
+    positions: Int
+
+    @property
+    def num_bytes(self) -> int:
+        """Of one in memory: of its pixels, or about those of what stays coded."""
+        pixels = self.head.width * self.head.height
+        return pixels // 10 if self.kept and self.kept not in DEPTH_UNITS else 3 * pixels
+
+    @property
+    def told(self) -> str:
+        """What becomes of them, for people."""
+        shown = len(np.unique(self.positions))
+        what = f"{len(self.numbers)} pictures {self.head.width}x{self.head.height}, "
+        kind = self.head.encoding if self.head.format == "raw" else self.head.format
+        what += f"{self.kept} kept as it is" if self.kept else f"{kind}, coded once"
+        repeated = len(self.positions) - shown
+        rows = "row shows" if repeated == 1 else "rows show"
+        what += f", {repeated} {rows} the picture of the row before" if repeated else ""
+        return what + (f", {len(self.numbers) - shown} shown by no row" if len(self.numbers) > shown else "")
+
+
+def picture_plan(rows: CameraRows, line: Timeline) -> PicturePlan:
+    """Of a camera in an episode: of stills those that rows show, of video all from the keyframe before on."""
+    stream = line.stream
+    place = np.searchsorted(line.times_ns, line.stamps_ns[rows.index])
+    head = stream.heads[int(line.order[place[0]])]
+    taken = np.unique(place)
+    if head.format in KEPT_FORMATS and head.format != "jpeg":
+        first = int(taken[0])
+        while not stream.heads[int(line.order[first])].is_keyframe:
+            first -= 1
+        head = stream.heads[int(line.order[first])]
+        taken = np.arange(first, int(taken[-1]) + 1)
+    return PicturePlan(
+        topic=stream.topic,
+        head=head,
+        kept=_kept(head),
+        numbers=stream.numbers[line.order[taken]],
+        stamps_ns=line.times_ns[taken],
+        positions=np.searchsorted(taken, place),
+    )
+
+
+def _kept(head: PictureHead) -> Kept:
+    """What stays as it is of pictures like this one."""
+    if head.encoding in DEPTH_UNITS:
+        return cast(Kept, head.encoding)
+    return cast(Kept, head.format) if head.format in KEPT_FORMATS else ""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PlannedEpisode:
+    """An episode that shall be written.
+
+    Attributes:
+        info: What is known of it.
+        rows: Its rows.
+        plans: Camera -> its pictures.
+        subtasks: Row -> what is begun there, in words.
+    """
+
+    info: CollectedInfo
+    rows: EpisodeRows
+    plans: Mapping[str, PicturePlan]
+    subtasks: Mapping[int, str]
+
+
+@dataclass(kw_only=True, eq=False)
+class _Waiting:
+    plan: PicturePlan
+    first: int
+    places: Int
+    num_written: int = 0
+    pictures: dict[int, tuple[bytes | Any, int]] = field(default_factory=dict)
+    num_bytes: int = 0
+
+
+def _places(numbers: Int, first: int) -> Int:
+    """(K,) of each message of a topic, from the first taken one to the last: which taken one it is, -1 for none."""
+    places: Int = np.full(int(numbers.max(initial=first - 1)) - first + 1, -1)
+    places[numbers - first] = np.arange(len(numbers))
+    return places
+
+
+class ImportedEpisodeWriter:
+    """Writes one episode; a context manager, which leaves nothing behind unless `finish` was called.
+
+    Args:
+        path: Of the recording.
+        episode: The episode.
+        video: How pixels are coded.
+    """
+
+    def __init__(self, path: Path, episode: PlannedEpisode, *, video: VideoConfig) -> None:
+        self._rows, self._subtasks = episode.rows, episode.subtasks
+        self._waiting: dict[str, _Waiting] = {}
+        for name, plan in episode.plans.items():
+            first = int(plan.numbers.min()) if len(plan.numbers) else 0
+            self._waiting[name] = _Waiting(plan=plan, first=first, places=_places(plan.numbers, first))
+        self._next_row = 0
+        self._writer = CollectedWriter(path, episode.info, video=video)
+        self._is_finished = False
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if not self._is_finished:
+            self._writer.discard()
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether nothing more is needed of the bag."""
+        return all(waiting.num_written == len(waiting.plan.numbers) for waiting in self._waiting.values())
+
+    def add(self, topic: str, number: int, values: Values) -> None:
+        """Take a message of a camera's topic, if the episode wants it.
+
+        Raises:
+            FieldError: Its picture cannot be decoded.
+            RecordingError: It cannot be written.
+        """
+        for name, waiting in self._waiting.items():
+            place = number - waiting.first
+            if waiting.plan.topic == topic and 0 <= place < len(waiting.places) and waiting.places[place] >= 0:
+                self._take(name, waiting, int(waiting.places[place]), values)
+        self._write_rows()
+
+    def _take(self, name: str, waiting: _Waiting, place: int, values: Values) -> None:
+        is_coded = waiting.plan.kept and waiting.plan.kept not in DEPTH_UNITS
+        data: Any = picture_bytes(values) if is_coded else decode_picture(values)
+        size = len(data) if isinstance(data, bytes) else data.nbytes
+        waiting.pictures[place] = (data, size)
+        waiting.num_bytes += size
+        while waiting.num_written in waiting.pictures:
+            picture, size = waiting.pictures.pop(waiting.num_written)
+            waiting.num_bytes -= size
+            self._writer.picture(name, int(waiting.plan.stamps_ns[waiting.num_written]), picture)
+            waiting.num_written += 1
+        if waiting.num_bytes > _MAX_WAITING:
+            raise BagError(
+                f"The pictures of {waiting.plan.topic} are too far out of order to be read in bounded memory."
+            )
+
+    def _write_rows(self) -> None:
+        while self._next_row < len(self._rows.times_ns) and all(
+            int(waiting.plan.positions[self._next_row]) < waiting.num_written for waiting in self._waiting.values()
+        ):
+            row = self._next_row
+            time_ns = int(self._rows.times_ns[row])
+            samples = {
+                name: Sample(stamp_ns=time_ns - int(feature.ages_ns[row]), vector=feature.values[row])
+                for name, feature in self._rows.features.items()
+            }
+            pictures = {name: int(waiting.plan.positions[row]) for name, waiting in self._waiting.items()}
+            subtask = self._subtasks.get(row, "")
+            self._writer.write(CollectedFrame(time_ns=time_ns, samples=samples, pictures=pictures, subtask=subtask))
+            self._next_row += 1
+
+    def finish(self) -> None:
+        """Write what is left and give the recording its name; BagError when pictures have not come."""
+        self._write_rows()
+        if self._next_row < len(self._rows.times_ns):
+            missing = [w.plan.topic for w in self._waiting.values() if w.num_written < len(w.plan.numbers)]
+            raise BagError(f"The bag has changed while it was read: pictures of {missing[0]} are missing.")
+        self._writer.finish(CollectedOutcome(success=self._rows.window.success, num_frames=self._next_row))
+        self._is_finished = True

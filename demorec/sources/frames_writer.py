@@ -1,0 +1,87 @@
+"""An episode whose frames are evenly spaced and come one after the other, as those of datasets do."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from numpy.typing import NDArray
+
+from demorec.core.config import VideoConfig
+from demorec.episode.collected import CollectedFrame, CollectedInfo, CollectedOutcome, Sample, Vector
+from demorec.episode.episode import frame_time_ns
+from demorec.mcap import CollectedWriter
+from demorec.runs.collected import CollectedFolder
+
+Picture = bytes | NDArray[Any]
+"""A packet that stays as it is, (H, W, 3) uint8 RGB, or (H, W) distances as `CollectedWriter.picture` takes them."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FramesImport:
+    """What an import of such episodes made.
+
+    Attributes:
+        num_episodes, num_frames: In the run.
+        num_new: Episodes that were written now; the others were there.
+        cameras: Camera -> what became of its pictures, in words.
+        left_out: What the run does not have, by its name in the source -> why; "" for what the mapping does not name.
+    """
+
+    num_episodes: int
+    num_frames: int
+    num_new: int
+    cameras: Mapping[str, str]
+    left_out: Mapping[str, str]
+
+
+def write_frames(
+    folder: CollectedFolder,
+    info: CollectedInfo,
+    frames: Iterable[Mapping[str, Vector]],
+    pictures: Mapping[str, Iterator[Picture]],
+    *,
+    success: bool | None,
+    video: VideoConfig,
+    leads: Mapping[str, int] | None = None,
+    subtasks: Mapping[int, str] | None = None,
+) -> None:
+    """Record an episode of a run at `info.fps`: whole, or not at all.
+
+    Args:
+        folder: The run.
+        info: What is known of the episode.
+        frames: Feature -> its vector, of each frame.
+        pictures: Camera -> its pictures, one a frame, its lead in front.
+        success: How it ended; None when nobody said.
+        video: How pixels are coded.
+        leads: Camera -> how many of its pictures come before the first frame; 0 where not given.
+        subtasks: Frame -> what the robot begins to do with it.
+
+    Raises:
+        ConfigError: The run holds episodes of another kind.
+        RecordingError: A number is not finite, or the disk is full.
+    """
+    folder.check_fits(info)
+    path = folder.path_of(info.episode_index)
+    writer = CollectedWriter(path, info, video=video)
+    leads = leads or {}
+    begin = max(leads.values(), default=0)
+    try:
+        for name, lead in leads.items():
+            for number in range(begin - lead, begin):
+                writer.picture(name, frame_time_ns(number, info.fps), next(pictures[name]))
+        count = 0
+        for vectors in frames:
+            time_ns = frame_time_ns(begin + count, info.fps)
+            shown = {name: writer.picture(name, time_ns, next(images)) for name, images in pictures.items()}
+            samples = {name: Sample(stamp_ns=time_ns, vector=vector) for name, vector in vectors.items()}
+            subtask = (subtasks or {}).get(count, "")
+            writer.write(CollectedFrame(time_ns=time_ns, samples=samples, pictures=shown, subtask=subtask))
+            count += 1
+        writer.finish(CollectedOutcome(success=success, num_frames=count))
+    except BaseException:
+        writer.discard()
+        raise
+    folder.add(path)

@@ -1,0 +1,181 @@
+"""The pictures of a camera in an HDF5 file: JPEG files and distances as they are, pixels in any order of their axes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.core.config import MAX_PIXELS
+from demorec.datasets.hdf5.foreign import StoredArray
+from demorec.episode.collected import CollectedCamera, Kept
+from demorec.sources.fields import FieldError
+from demorec.sources.frames_writer import Picture
+from demorec.sources.hdf5_features import Hdf5FitError
+from demorec.sources.hdf5_mapping import CameraDataset
+from demorec.sources.picture_messages import PictureHead, decode_picture, picture_head
+from demorec.sources.ros_types import Values
+
+_LEAST_SIDE = 16
+"""Pixels, below which arrays of floats are no pictures unless the mapping says so."""
+_JPEG, _JPEG_END = b"\xff\xd8\xff", b"\xff\xd9"
+
+
+class StoredCamera:
+    """A camera of an episode.
+
+    Attributes:
+        width, height: Pixels.
+        kept: "jpeg" where JPEG files stay as they are, "16UC1" or "32FC1" of distances; "" for pixels, which are coded
+            once.
+        told: What becomes of the pictures, in words.
+
+    Args:
+        name: Of the camera.
+        camera: What the mapping says of it.
+        array: Its dataset.
+        lengths: (C, T) of the JPEG files of all cameras, in an order of cameras that nobody tells; None where the file
+            has none.
+
+    Raises:
+        Hdf5FitError: They are no pictures.
+        Hdf5Error: They cannot be read.
+    """
+
+    def __init__(
+        self, name: str, camera: CameraDataset, array: StoredArray, lengths: NDArray[np.generic] | None
+    ) -> None:
+        self.name = name
+        self._camera, self._array, self._lengths = camera, array, lengths
+        self._scale = 0.0
+        self.kept: Kept = ""
+        shape = array.shape
+        form = picture_form(array)
+        if form is None:
+            found = f"{array.dtype.name} of {'x'.join(map(str, shape))}"
+            raise Hdf5FitError(
+                f"{array.place} is {found}, pictures are uint8 or floats of rows, height, width and 3 colours, or of "
+                "rows, 3 colours, height and width, or rows of JPEG, distances uint16 or float32 of rows, height, width"
+            )
+        self._form = form
+        if form == "jpeg":
+            head = self._head(array.read(0, 1)[0], 0)[1]
+            self.width, self.height = head.width, head.height
+            self.kept = "jpeg" if camera.colors == "rgb" else ""
+            self.told = "jpeg kept as it is" if self.kept else "jpeg with red and blue exchanged, coded once"
+        elif form == "depth":
+            self.height, self.width = shape[1:3]
+            self.kept = "16UC1" if array.dtype.itemsize == 2 else "32FC1"
+            self.told = f"distances ({self.kept}) kept as they are"
+        else:
+            self.height, self.width = shape[1:3] if shape[3] == 3 else shape[2:]
+            self.told = f"pixels{'' if camera.colors == 'rgb' else ' with red and blue exchanged'}, coded once"
+        if not 1 <= self.width * self.height <= MAX_PIXELS:
+            raise Hdf5FitError(f"{array.place} has {self.width}x{self.height} pixels, allowed are 1 to {MAX_PIXELS}")
+        if form == "pixels" and array.dtype.kind == "f":
+            self._scale = _float_scale(array)
+            self.told = f"{array.dtype.name} from 0 to {255 / self._scale:g} to 8 bits, {self.told}"
+
+    def described(self) -> CollectedCamera:
+        """The camera as recordings know it."""
+        return CollectedCamera(
+            name=self.name, width=self.width, height=self.height, kept=self.kept, source=self._camera.dataset
+        )
+
+    def pictures(self) -> Iterator[Picture]:
+        """One a row.
+
+        Raises:
+            Hdf5FitError: A JPEG file is cut off, or of another size.
+            Hdf5Error: They cannot be read.
+        """
+        for number, row in enumerate(self._array.rows()):
+            if self._form == "depth":
+                yield row.reshape(self.height, self.width).astype(row.dtype.newbyteorder("="), copy=False)
+                continue
+            if self._form == "pixels":
+                picture = row if row.shape[2] == 3 else row.transpose(1, 2, 0)
+                scaled = np.rint(picture.astype(np.float64) * self._scale) if self._scale else picture
+                yield self._ordered(np.ascontiguousarray(scaled, dtype=np.uint8))
+                continue
+            data, head = self._head(row, number)
+            if (head.width, head.height) != (self.width, self.height):
+                raise Hdf5FitError(
+                    f"{self._array.place} changes its size to {head.width}x{head.height} in row {number}"
+                )
+            yield data if self.kept else self._ordered(self._used(decode_picture, data, number))
+
+    def _ordered(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        return picture if self._camera.colors == "rgb" else np.ascontiguousarray(picture[:, :, ::-1])
+
+    def _head(self, row: NDArray[np.generic], number: int) -> tuple[bytes, PictureHead]:
+        """The JPEG file of a row and its head, without what pads it: it ends with its own mark, never with a zero."""
+        data = row.tobytes().rstrip(b"\0")
+        if not data.endswith(_JPEG_END):
+            raise Hdf5FitError(f"{self._array.place} holds no whole JPEG file in row {number}")
+        if self._lengths is not None and len(data) not in self._lengths[:, number].tolist():
+            raise Hdf5FitError(
+                f"{self._array.place} holds {len(data):,} bytes of JPEG in row {number}, which is none of the lengths "
+                "that compress_len tells"
+            )
+        head = self._used(picture_head, data, number)
+        if head.format != "jpeg":
+            raise Hdf5FitError(f"{self._array.place} holds {head.format} in row {number}, no JPEG file")
+        return data, head
+
+    def _used[T](self, read: Callable[[Values], T], data: bytes, number: int) -> T:
+        """What is read of the JPEG file in a row."""
+        try:
+            return read({"format": "jpeg", "data": data})
+        except FieldError as error:
+            raise Hdf5FitError(f"{self._array.place} cannot be used in row {number}, since {error}") from error
+
+
+def _float_scale(array: StoredArray) -> float:
+    """What pixels that are floats are multiplied with: 255 where none is above 1; Hdf5FitError for other numbers."""
+    lowest, highest = 0.0, 0.0
+    for number, row in enumerate(array.rows()):
+        values = row.astype(np.float64)
+        if not np.isfinite(values).all():
+            raise Hdf5FitError(f"{array.place} has pixels that are not finite in row {number}")
+        lowest, highest = min(lowest, float(values.min())), max(highest, float(values.max()))
+    if lowest < 0 or highest > 255:
+        raise Hdf5FitError(
+            f"{array.place} has pixels from {lowest:g} to {highest:g}, floats are read from 0 to 1 or from 0 to 255"
+        )
+    return 255.0 if highest <= 1 else 1.0
+
+
+def is_camera(array: StoredArray) -> bool:
+    """Whether a dataset holds pictures, JPEG files or, by its name, distances.
+
+    Raises:
+        Hdf5Error: Its first row cannot be read.
+    """
+    form, place = picture_form(array), array.place.rpartition("/")[2]
+    if form == "jpeg":
+        return len(array) > 0 and array.read(0, 1)[0].tobytes().startswith(_JPEG)
+    if form == "pixels" and array.dtype.kind == "f":  # points and transforms are arrays like these
+        first = array.read(0, min(1, len(array))).astype(np.float64)
+        return min(sorted(array.shape[1:])[1:]) >= _LEAST_SIDE and bool(((first >= 0) & (first <= 255)).all())
+    return form == "pixels" or (form == "depth" and "depth" in place)
+
+
+def picture_form(array: StoredArray) -> Literal["pixels", "jpeg", "depth"] | None:
+    """What the rows of a dataset can be as pictures; None for numbers that are none."""
+    shape, kind = array.shape, array.dtype
+    if array.is_ragged or (kind == np.uint8 and len(shape) == 2):
+        return "jpeg"
+    if len(shape) == 4 and (kind == np.uint8 or kind.kind == "f") and 3 in (shape[1], shape[3]):
+        return "pixels"
+    is_flat = len(shape) == 3 or (len(shape) == 4 and shape[3] == 1)
+    return "depth" if is_flat and (kind.kind, kind.itemsize) in (("u", 2), ("f", 4)) else None
+
+
+def picture_lengths(array: StoredArray, num_rows: int) -> NDArray[np.generic]:
+    """(C, T) of ALOHA's `compress_len`; Hdf5FitError when it is of another shape."""
+    if len(array.shape) != 2 or array.shape[1] != num_rows:
+        raise Hdf5FitError(f"{array.place} has the shape {array.shape}, it must have {num_rows} columns")
+    return array.read(0, len(array))

@@ -1,0 +1,235 @@
+"""A mapping from what is in an HDF5 file of robomimic's or ALOHA's layout: everything listed, every number placed.
+
+Both layouts name what they hold: robomimic's observations are called as robosuite calls them, ALOHA's as its recorder
+does. What the file does not say, and the layout does not either, is commented out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from demorec.core.errors import without_path
+from demorec.datasets.hdf5.foreign import ForeignFile, Hdf5Error, StoredArray
+from demorec.episode.features import EE_POSE, ENVIRONMENT_STATE, STATE, VELOCITY
+from demorec.runs.find import expect
+from demorec.sources.hdf5_episodes import episode_places, found_attribute, told_rate
+from demorec.sources.hdf5_mapping import Hdf5Episodes
+from demorec.sources.hdf5_pictures import is_camera
+from demorec.sources.words import SHOWN, first_numbers, quoted, task_in_name, unique_name
+
+_ROBOMIMIC, _OBSERVATIONS = "data", "obs"
+_FOLDERS = (f"{_OBSERVATIONS}/", "observations/")
+_ALOHA_FPS = 50
+"""ALOHA's recorders take a row every `DT = 0.02` seconds; nothing in their files says so."""
+_ALOHA_JOINTS = ("waist", "shoulder", "elbow", "forearm_roll", "wrist_angle", "wrist_rotate", "gripper")
+_TASKS = ("instruction", "ep_meta.lang", "problem_info.language_instruction", "language_instruction")
+_ROBOTS = ("env_args.env_kwargs.robot", "env_args.env_kwargs.robots", "env_args.env_kwargs.robots.0")
+_PARTS = {
+    "joint_pos": STATE,
+    "gripper_qpos": STATE,
+    "joint_vel": VELOCITY,
+    "gripper_qvel": VELOCITY,
+    "eef_pos": EE_POSE,
+    "eef_quat": EE_POSE,
+    "object": ENVIRONMENT_STATE,
+    "qpos": STATE,
+    "qvel": VELOCITY,
+}
+"""How an observation's name ends -> the feature that it is a part of; others are features of their own."""
+
+
+class _Contents:
+    """An episode of a file: its datasets by their names below it, which are cameras, and why others cannot be used."""
+
+    def __init__(self, file: ForeignFile, place: str) -> None:
+        self.file, self.place = file, place
+        self.arrays: dict[str, StoredArray] = {}
+        self.cameras: list[str] = []
+        self.unusable: list[str] = []
+        for dataset in file.datasets(place):
+            try:
+                name, array = dataset.removeprefix(place).lstrip("/"), file.array(dataset, may_be_ragged=True)
+                if is_camera(array):
+                    self.cameras.append(name)
+                self.arrays[name] = array
+            except Hdf5Error as error:
+                self.unusable.append(without_path(error, file.path))
+
+    def is_vector(self, name: str) -> bool:
+        """Whether it holds rows of numbers."""
+        array = self.arrays[name]
+        return len(array.shape) <= 2 and not array.is_ragged and name not in self.cameras
+
+
+def suggested_hdf5_mapping(path: Path) -> list[str]:
+    """The lines of a mapping for a file, with what is in it as comments.
+
+    Raises:
+        ConfigError: There is no HDF5 file.
+        Hdf5Error: It cannot be read, or is of another layout.
+    """
+    expect(path, "hdf5")
+    with ForeignFile(path) as file:
+        is_aloha = file.has("action") and file.is_group("observations")
+        if not is_aloha and not file.is_group(_ROBOMIMIC):
+            held = ", ".join(list(file.children(""))[:SHOWN]) or "nothing"
+            raise Hdf5Error(
+                "This is neither robomimic's layout (data/demo_0/actions) nor ALOHA's (action, observations/qpos), it "
+                f"holds {held}: write the mapping by hand (docs/import.md): {path}"
+            )
+        episodes = Hdf5Episodes(group="" if is_aloha else _ROBOMIMIC)
+        places = episode_places(file, episodes)
+        contents = _Contents(file, places[0])
+        lines = [f"# A mapping for {path.name}, suggested from what is in it; docs/import.md explains every key.", "#"]
+        lines += [*_listed(contents, len(places)), *_last_row(contents, is_aloha), "", *_left_out(contents)]
+        lines += ["[robot]", f"name = {quoted(_robot(contents, is_aloha))}", *_model(contents), ""]
+        lines += ["[task]", *_task(contents, path), ""]
+        lines += ["[clock]", *_clock(contents, is_aloha), ""]
+        lines += ["[episodes]", *_episodes(contents, is_aloha)]
+        lines += [*_features(contents, is_aloha), *_cameras(contents)]
+    return lines
+
+
+def _listed(contents: _Contents, count: int) -> Iterator[str]:
+    """Every dataset of the first episode with its shape and first numbers."""
+    where = f"{contents.place}, the first of {count} episodes" if contents.place else "the file, which is an episode"
+    yield f"# What is in {where}:"
+    for name, array in contents.arrays.items():
+        length = " of variable length" if array.is_ragged else ""
+        yield f"#   {name}  {array.dtype.name} {'x'.join(map(str, array.shape))}{length}"
+        if contents.is_vector(name) and array.shape[0]:
+            yield f"#     {_first_row(contents, array)}"
+    for reason in contents.unusable:
+        yield f"#   {reason}"
+
+
+def _last_row(contents: _Contents, is_aloha: bool) -> Iterator[str]:
+    """Where observations have one row more than actions, what becomes of it."""
+    action = contents.arrays.get("action" if is_aloha else "actions")
+    observed = [len(array) for name, array in contents.arrays.items() if name.startswith(_FOLDERS)]
+    if action is not None and observed and min(observed) == len(action) + 1:
+        yield "# The last observation of each episode is left out: no action follows it."
+
+
+def _left_out(contents: _Contents) -> Iterator[str]:
+    """The key that leaves out cameras that are no observations, as those of next_obs."""
+    others = dict.fromkeys(name.partition("/")[0] for name in contents.cameras if not name.startswith(_FOLDERS))
+    if others:
+        yield f"leave_out = [{', '.join(map(quoted, others))}]  # has cameras that are not imported"
+        yield ""
+
+
+def _first_row(contents: _Contents, array: StoredArray) -> str:
+    """Its numbers; why they cannot be read, where that is so."""
+    try:
+        return first_numbers(np.ravel(array.read(0, 1)))
+    except Hdf5Error as error:
+        return without_path(error, contents.file.path)
+
+
+def _robot(contents: _Contents, is_aloha: bool) -> str:
+    found = (found_attribute(contents.file, contents.place, name) for name in _ROBOTS)
+    return next((name for name in found if isinstance(name, str) and name.strip()), "aloha" if is_aloha else "robot")
+
+
+def _model(contents: _Contents) -> list[str]:
+    text = found_attribute(contents.file, contents.place, "model_file")
+    is_urdf = isinstance(text, str) and "<robot" in text[:1000]  # robosuite's models are MuJoCo's
+    return ['urdf_attribute = "model_file"'] if is_urdf else ['# urdf = "robot.urdf"']
+
+
+def _task(contents: _Contents, path: Path) -> list[str]:
+    for name in _TASKS:
+        found = found_attribute(contents.file, contents.place, name)
+        if isinstance(found, str) and found.strip():
+            return [f"attribute = {quoted(name)}  # {quoted(found[:60])}"]
+    named = found_attribute(contents.file, contents.place, "env_args.env_name")
+    text = named if isinstance(named, str) and named.strip() else task_in_name(path.stem)
+    if text in ("", "episode"):  # episode_0.hdf5, in a folder that is called after the task
+        text = task_in_name(path.absolute().parent.name) or path.stem
+    return [f"text = {quoted(text)}  # what the robot was asked to do", "# file_name = true"]
+
+
+def _clock(contents: _Contents, is_aloha: bool) -> list[str]:
+    rate = told_rate(contents.file, contents.place)
+    if rate is not None:
+        return [f"# fps = {rate:g}  # as the file says"]
+    if is_aloha:
+        return [f"fps = {_ALOHA_FPS}  # of ALOHA's recorders (DT = 0.02); the file does not say it"]
+    return ["# fps = 20  # rows a second, which the file does not say: look it up"]
+
+
+def _episodes(contents: _Contents, is_aloha: bool) -> Iterator[str]:
+    if is_aloha:
+        yield "# The file is one episode."
+        return
+    yield f"group = {quoted(_ROBOMIMIC)}"
+    masks = list(contents.file.children("mask")) if contents.file.is_group("mask") else []
+    if masks:
+        yield f"# mask = {quoted(masks[0])}  # only those that one of these lists: {', '.join(map(quoted, masks))}"
+    if contents.file.attribute(contents.place, "success") is not None:
+        yield 'success = "success"'
+    elif "rewards" in contents.arrays:
+        yield '# success = "rewards"  # where the last one above 0 means a success'
+
+
+def _features(contents: _Contents, is_aloha: bool) -> Iterator[str]:
+    actions = ["action", "base_action"] if is_aloha else ["actions"]
+    folder = "observations/" if is_aloha else f"{_OBSERVATIONS}/"
+    vectors = [name for name in contents.arrays if contents.is_vector(name)]
+    observed: dict[str, list[str]] = {}
+    for name in (name for name in vectors if name.startswith(folder)):
+        observed.setdefault(_feature_of(name.removeprefix(folder)), []).append(name)
+    if STATE not in observed and EE_POSE in observed:
+        observed[STATE] = observed.pop(EE_POSE)
+    if STATE not in observed:
+        yield from ("", "# Nothing says that it is the robot's state: take one of those above.")
+    for feature in sorted(observed, key=lambda name: name != STATE):
+        yield from _parts(feature, sorted(observed[feature], key=_order), contents)
+    yield from _parts("action", [name for name in actions if name in vectors], contents)
+    if "states" in vectors:
+        yield from (f"# {line}" if line else "" for line in _parts("observation.simulator", ["states"], contents))
+
+
+def _feature_of(name: str) -> str:
+    """The feature that an observation is a part of."""
+    known = next((feature for end, feature in _PARTS.items() if name == end or name.endswith(f"_{end}")), "")
+    return known or f"observation.{_word(name)}"
+
+
+def _order(name: str) -> tuple[str, int]:
+    """Of the parts of a feature: robot after robot, the arm in front of its gripper, positions before orientations."""
+    last = name.rpartition("/")[2]
+    ends = [index for index, end in enumerate(_PARTS) if last == end or last.endswith(f"_{end}")]
+    robot = last.removesuffix(list(_PARTS)[ends[0]]) if ends else last
+    return robot, ends[0] if ends else 0
+
+
+def _word(name: str) -> str:
+    """A name of a feature or camera: letters, digits and _, a letter in front."""
+    word = "".join(letter if letter.isascii() and letter.isalnum() else "_" for letter in name).strip("_")
+    return word if word[:1].isalpha() else f"x_{word}"
+
+
+def _parts(feature: str, names: Sequence[str], contents: _Contents) -> Iterator[str]:
+    key = feature if "." not in feature else quoted(feature)
+    for name in names:
+        yield from ("", f"[[features.{key}]]", f"dataset = {quoted(name)}")
+        if name in ("observations/qpos", "action") and contents.arrays[name].shape[1:] == (2 * len(_ALOHA_JOINTS),):
+            joints = [f"{side}_{joint}" for side in ("left", "right") for joint in _ALOHA_JOINTS]
+            yield f"# names = [{', '.join(map(quoted, joints))}]  # of ALOHA's two arms"
+
+
+def _cameras(contents: _Contents) -> Iterator[str]:
+    taken: list[str] = []
+    for name in contents.cameras:
+        if not name.startswith(_FOLDERS):
+            continue
+        camera = unique_name(_word(name.rpartition("/")[2].removesuffix("_image")), taken)
+        taken.append(camera)
+        yield from ("", f"[cameras.{camera}]", f"dataset = {quoted(name)}")
+        if len(contents.arrays[name].shape) <= 2:
+            yield '# colors = "bgr"  # where red and blue are exchanged in the pictures, as recorders with OpenCV do'

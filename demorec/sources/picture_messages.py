@@ -1,0 +1,288 @@
+"""Messages that hold a picture, as ROS and Foxglove define them: what is in them, and whether they are whole."""
+
+from __future__ import annotations
+
+import io
+from array import array
+from collections.abc import Iterable, Iterator
+from typing import Any, NamedTuple, cast
+
+import av
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, UnidentifiedImageError
+
+from demorec.core.config import MAX_PIXELS
+from demorec.core.errors import in_words
+from demorec.mcap.depth import decode_millimetres
+from demorec.mcap.video import is_keyframe
+from demorec.sources.fields import FieldError, picture_bytes, whole
+from demorec.sources.raw_pictures import RAW_ENCODINGS, check_raw, raw_picture
+from demorec.sources.ros_types import Values
+
+VIDEO_FORMATS = ("h264", "h265", "av1")
+KEPT_FORMATS = ("jpeg", *VIDEO_FORMATS)
+"""What stays as it is, byte for byte."""
+_JPEG, _PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
+_DECODERS = {"h264": "h264", "h265": "hevc", "av1": "libdav1d"}
+_MAX_UNITS = 256
+"""Of a coded picture before its first slice, that are looked at."""
+_SEQUENCE_BYTES = 24
+"""Of an AV1 keyframe, within which its sequence header ends."""
+_ALIASES = {"hevc": "h265", "avc": "h264", "jpg": "jpeg"}
+
+
+_FREE_SETS, _FRAMES_OF_A_SET = 40, 20
+"""Decoding a picture takes up to a tenth of a second: cameras have one set of parameters, or a few."""
+_HEAD_BYTES = 12
+"""ConfigHeader: a format and two parameters, which mean something for 32FC1 alone."""
+_PNG = b"\x89PNG\r\n\x1a\n"
+
+
+class PictureHead(NamedTuple):
+    """What is known of a picture before it is decoded.
+
+    Attributes:
+        format: raw, jpeg, png, compressedDepth or a codec of `VIDEO_FORMATS`.
+        encoding: Of raw pixels and of distances: "rgb8", "bayer_rggb8", "16UC1"; else "".
+        width, height: Pixels; 0 in video between keyframes.
+        is_keyframe: Whether it can be decoded without those before it: in video a keyframe with its parameter sets.
+    """
+
+    format: str
+    encoding: str
+    width: int
+    height: int
+    is_keyframe: bool
+
+
+class PictureHeads:
+    """The heads of a camera's pictures in order: a bag has a million of them, which are of a few kinds."""
+
+    def __init__(self) -> None:
+        self._kinds: list[PictureHead] = []
+        self._places: dict[PictureHead, int] = {}
+        self._of = array("I")
+
+    def append(self, head: PictureHead) -> None:
+        """Add the next one."""
+        place = self._places.get(head)
+        if place is None:
+            place = self._places[head] = len(self._kinds)
+            self._kinds.append(head)
+        self._of.append(place)
+
+    def __len__(self) -> int:
+        return len(self._of)
+
+    def __getitem__(self, index: int) -> PictureHead:
+        return self._kinds[self._of[index]]
+
+    def kinds(self, among: NDArray[np.int64] | None = None) -> list[PictureHead]:
+        """The different ones, of all or of the pictures of these numbers."""
+        if among is None:
+            return list(self._kinds)
+        return [self._kinds[place] for place in np.unique(np.array(self._of)[among]).tolist()]
+
+    @property
+    def are_keyframes(self) -> NDArray[np.bool_]:
+        """(N,) of each whether it can be decoded without those before it."""
+        return np.array([head.is_keyframe for head in self._kinds], bool)[np.array(self._of, np.intp)]
+
+
+def picture_head(values: Values) -> PictureHead:
+    """Of a message; FieldError when it holds no picture, a damaged one, or one in a format that is not read."""
+    if "data" not in values:
+        raise FieldError("it holds no picture")
+    if "encoding" in values and "width" in values and "height" in values:
+        size = whole(values, "width"), whole(values, "height")
+        head = _checked(PictureHead("raw", str(values["encoding"]), *size, True))
+        check_raw(values)
+        return head
+    if "format" not in values:
+        raise FieldError("it holds no picture")
+    data = picture_bytes(values)
+    name = str(values["format"]).lower()
+    if "compresseddepth" in name:
+        head = _checked(PictureHead("compressedDepth", *compressed_depth_head(str(values["format"]), data), True))
+        decode_compressed_depth(data)
+        return head
+    if data.startswith((_JPEG, _PNG)):
+        return file_head(data)
+    codec = _ALIASES.get(name, name)
+    if codec not in VIDEO_FORMATS:
+        raise FieldError(f"its format {name[:40]!r} is not read; jpeg, png, {', '.join(VIDEO_FORMATS)} are")
+    if not _starts_by_itself(codec, data):
+        return PictureHead(codec, "", 0, 0, False)
+    return _checked(PictureHead(codec, "", *_sizes.of(codec, data), True))
+
+
+def _checked(head: PictureHead) -> PictureHead:
+    if head.width < 1 or head.height < 1 or head.width * head.height > MAX_PIXELS:
+        raise FieldError(f"its picture has {head.width}x{head.height} pixels, at most {MAX_PIXELS} are read")
+    if head.format == "raw" and head.encoding not in RAW_ENCODINGS:
+        raise FieldError(f"its encoding {head.encoding[:40]!r} is not read; {', '.join(RAW_ENCODINGS)} are")
+    return head
+
+
+def file_head(data: bytes) -> PictureHead:
+    """Of a JPEG or PNG file; FieldError when it is none, damaged, or too large."""
+    kind = "jpeg" if data.startswith(_JPEG) else "png"
+    try:
+        with Image.open(io.BytesIO(data), formats=(kind.upper(),)) as image:
+            width, height = image.size
+            if kind == "png":  # what stays as it is, is not looked into; what will be decoded must be whole
+                _check_mode(image)
+                image.verify()
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise FieldError(f"its picture is damaged ({in_words(error)})") from error
+    end = b"\xff\xd9" if kind == "jpeg" else b"IEND\xaeB`\x82"
+    if end not in data[-64:]:  # some cameras pad their pictures
+        raise FieldError("its picture is cut off")
+    return _checked(PictureHead(kind, "", width, height, True))
+
+
+def _check_mode(image: Image.Image) -> None:
+    if image.mode not in ("RGB", "RGBA", "L", "P", "1"):
+        raise FieldError(f"its pixels are {image.mode!r}, which is no colour of 8 bits")
+
+
+def decode_picture(values: Values) -> NDArray[Any]:
+    """(H, W, 3) RGB of a picture that is no video, or its distances (H, W); FieldError when it cannot be decoded."""
+    if "encoding" in values:
+        return raw_picture(values)
+    if "compresseddepth" in str(values["format"]).lower():
+        return decode_compressed_depth(picture_bytes(values))
+    return decode_file(picture_bytes(values))
+
+
+def decode_file(data: bytes) -> NDArray[np.uint8]:
+    """(H, W, 3) RGB of a JPEG or PNG file; FieldError when it cannot be decoded."""
+    try:
+        with Image.open(io.BytesIO(data), formats=("JPEG", "PNG")) as image:
+            _check_mode(image)
+            return np.asarray(image.convert("RGB"))
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise FieldError(f"its picture cannot be decoded ({in_words(error)})") from error
+
+
+def _starts_by_itself(codec: str, data: bytes) -> bool:
+    if codec == "av1":
+        return is_keyframe(codec, data)
+    kinds = [kind for kind, _ in _nal_units(codec, data)]
+    if codec == "h264":  # ITU-T H.264, table 7-1
+        return 5 in kinds and 7 in kinds
+    return 33 in kinds and any(16 <= kind <= 23 for kind in kinds)  # ITU-T H.265, table 7-1
+
+
+def _nal_units(codec: str, data: bytes) -> Iterator[tuple[int, int]]:
+    """Type and place of those of an access unit, up to its first slice."""
+    position, count = data.find(b"\x00\x00\x01"), 0
+    while 0 <= position < len(data) - 3:
+        head = data[position + 3]
+        kind = head & 31 if codec == "h264" else (head >> 1) & 63
+        yield kind, position
+        count += 1
+        if (kind in (1, 5) if codec == "h264" else kind < 32) or count == _MAX_UNITS:
+            return
+        position = data.find(b"\x00\x00\x01", position + 3)
+
+
+class _VideoSizes:
+    """Sizes of keyframes: their parameter sets say them, in bits, and one picture of each kind is decoded for it."""
+
+    def __init__(self) -> None:
+        self._known: dict[tuple[str, bytes], tuple[int, int]] = {}
+        self._num_seen = self._num_decoded = 0
+
+    def of(self, codec: str, data: bytes) -> tuple[int, int]:
+        """Width and height of a keyframe; FieldError when it gives no picture."""
+        self._num_seen += 1
+        key = (codec, data[:_SEQUENCE_BYTES] if codec == "av1" else _parameter_sets(codec, data))
+        size = self._known.get(key)
+        if size is None:
+            if self._num_decoded > _FREE_SETS + self._num_seen // _FRAMES_OF_A_SET:
+                raise FieldError(f"its {codec} video has other parameters at every keyframe")
+            self._num_decoded += 1
+            frame = next(_frames(codec, [data]), None)
+            if frame is None:
+                raise FieldError(f"its {codec} keyframe gives no picture")
+            if len(self._known) > 1000:
+                self._known.clear()
+            size = self._known[key] = (frame.width, frame.height)
+        return size
+
+
+_sizes = _VideoSizes()
+
+
+def _parameter_sets(codec: str, data: bytes) -> bytes:
+    """Those in front of a keyframe's picture, without what may differ from picture to picture beside them."""
+    units = list(_nal_units(codec, data))
+    kinds = (7, 8) if codec == "h264" else (32, 33, 34)
+    places = [place for _, place in units[1:]] + [units[-1][1]]
+    return b"".join(data[at:end] for (kind, at), end in zip(units, places, strict=True) if kind in kinds)
+
+
+def decode_video(codec: str, packets: Iterable[bytes]) -> Iterator[NDArray[np.uint8]]:
+    """The pictures of packets, from a keyframe on; FieldError when they cannot be decoded."""
+    for frame in _frames(codec, packets):
+        try:
+            yield cast(NDArray[np.uint8], frame.to_ndarray(format="rgb24"))
+        except (av.FFmpegError, ValueError) as error:
+            raise FieldError(f"its {codec} video cannot be decoded") from error
+
+
+def _frames(codec: str, packets: Iterable[bytes]) -> Iterator[av.VideoFrame]:
+    try:
+        context = cast(av.VideoCodecContext, av.CodecContext.create(_DECODERS[codec], "r"))
+        context.thread_count = 1
+        context.options = {"max_pixels": str(MAX_PIXELS)}
+        for data in packets:
+            yield from context.decode(av.Packet(data))
+        yield from context.decode(None)
+    except (av.FFmpegError, ValueError) as error:
+        raise FieldError(f"its {codec} video cannot be decoded") from error
+
+
+def compressed_depth_head(form: str, data: bytes) -> tuple[str, int, int]:
+    """Encoding, width and height of a picture; FieldError when it is none, or does not hold whole millimetres."""
+    encoding = form.split(";")[0].strip()
+    if encoding != "16UC1":
+        raise FieldError(
+            f"its compressedDepth is of {encoding[:20]!r}, which does not keep what was measured; 16UC1, and 32FC1 "
+            "that is not compressed, are read"
+        )
+    width, height = _size(data)
+    return encoding, width, height
+
+
+def decode_compressed_depth(data: bytes) -> NDArray[np.uint16]:
+    """(H, W) millimetres; FieldError when they cannot be decoded."""
+    width, height = _size(data)
+    try:
+        if data.startswith(_PNG, _HEAD_BYTES):
+            with Image.open(io.BytesIO(data[_HEAD_BYTES:]), formats=("PNG",)) as image:
+                if image.mode not in ("I;16", "I"):
+                    raise ValueError(f"its pixels are {image.mode}, not of 16 bits")
+                return np.asarray(image).astype(np.uint16)
+        return decode_millimetres(data, (height, width))
+    except UnidentifiedImageError as error:
+        raise FieldError("its distances cannot be decoded (they are no whole PNG file)") from error
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise FieldError(f"its distances cannot be decoded ({in_words(error)})") from error
+
+
+def _size(data: bytes) -> tuple[int, int]:
+    """Width and height, within bounds."""
+    if data.startswith(_PNG, _HEAD_BYTES):
+        size = data[_HEAD_BYTES + 16 : _HEAD_BYTES + 24]  # of the first chunk, IHDR
+        order = "big"
+    else:
+        size, order = data[_HEAD_BYTES : _HEAD_BYTES + 8], "little"
+    if len(size) < 8:
+        raise FieldError("its distances are cut off")
+    width, height = (int.from_bytes(size[at : at + 4], order) for at in (0, 4))  # type: ignore[arg-type]
+    if not 1 <= width * height <= MAX_PIXELS:
+        raise FieldError(f"its picture has {width}x{height} pixels, at most {MAX_PIXELS} are read")
+    return width, height

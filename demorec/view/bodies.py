@@ -1,0 +1,140 @@
+"""The things of the scene: what they look like, how they move, where they shall end."""
+
+from __future__ import annotations
+
+import functools
+import logging
+from dataclasses import replace
+
+import numpy as np
+import rerun as rr
+import trimesh
+from numpy.typing import NDArray
+
+from demorec.core.errors import DemorecError, as_reason
+from demorec.core.geometry import Array, Pose
+from demorec.episode.scene import Body, Rgba, Shape, Texture
+from demorec.render.procedural import texture_pixels
+from demorec.robots.assets import asset_path
+from demorec.robots.urdf import Urdf
+from demorec.view.episode import PlayedEpisode
+from demorec.view.meshes import SurfaceMesh, joined, mesh_file, of_trimesh, sphere_mesh, urdf_meshes
+from demorec.view.paths import Paths
+from demorec.view.robot import as_mesh3d
+from demorec.view.style import GOAL
+from demorec.view.times import log_pose, send_poses
+
+log = logging.getLogger(__name__)
+
+_OWN_COLOR: Rgba = (1.0, 1.0, 1.0, 1.0)
+_SAME_SIZE = 0.1
+"""How far a model's extents may be from those of the recorded scene, as a part of the largest."""
+
+
+def log_bodies(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisode, tint: Rgba | None = None) -> None:
+    """Every body at its place or along its way, and as wire frames the goals and the known ends of objects.
+
+    A body whose model is not installed here, or is another one, is drawn as the recording describes it.
+    """
+    scene = episode.info.scene
+    for body in scene.bodies:
+        entity = paths.body(body.name)
+        if tint is not None and body.role in ("support", "fixture"):
+            continue  # the other episode's table, which would lie in the same place
+        recording.log(entity, _visible(body, episode, tint), static=True)
+        poses = episode.object_poses.get(body.name)
+        if poses is not None:
+            send_poses(recording, entity, episode.time_ns, poses)
+        else:
+            log_pose(recording, entity, body.world_from_body.vector())
+    for name, pose in episode.end_poses.items():
+        wire = rr.Boxes3D(sizes=[scene.body(name).shape.extents], colors=[(200, 200, 200)], radii=[-1.0])
+        log_pose(recording, paths.end(name), pose)
+        recording.log(paths.end(name), wire, static=True)
+    for goal in scene.goals:
+        wire = rr.Boxes3D(sizes=[scene.body(goal.object).shape.extents], colors=[GOAL], radii=[-1.5])
+        log_pose(recording, paths.goal(goal.object), scene.world_from_goal(goal).vector())
+        recording.log(paths.goal(goal.object), wire, static=True)
+
+
+def _visible(body: Body, episode: PlayedEpisode, tint: Rgba | None) -> rr.Mesh3D:
+    if body.shape.kind == "box" and body.texture is not None:
+        return _textured_box(np.array(body.shape.size), body.texture)
+    color = body.rgba
+    if body.texture is not None:
+        first, second = body.texture.colors
+        color = (*((a + b) / 2 for a, b in zip(first, second, strict=True)), 1.0)  # type: ignore[assignment]
+    if body.shape.kind not in ("mesh", "urdf"):
+        return as_mesh3d(_primitive_mesh(body.shape).placed(Pose(), np.ones(3), color), tint)
+    mesh = _installed_mesh(body.shape)
+    if mesh is not None:
+        if color != _OWN_COLOR:  # instead of the model's own colours, as in the simulator
+            mesh = replace(mesh, colors=np.full_like(mesh.colors, 255))
+        return as_mesh3d(mesh.placed(Pose(), np.ones(3), color), tint)
+    description = episode.body_description(body.name)
+    if description is not None:  # in the body's colours already
+        return as_mesh3d(joined(list(urdf_meshes(description, None).values())), tint)
+    return as_mesh3d(_unit_mesh("box").placed(Pose(), np.array(body.shape.extents), color), tint)
+
+
+def _primitive_mesh(shape: Shape) -> SurfaceMesh:
+    if shape.kind == "capsule":
+        capsule = trimesh.creation.capsule(radius=shape.size[0], height=shape.size[1], count=[32, 32])
+        capsule.apply_translation((0.0, 0.0, -capsule.bounds.mean(axis=0)[2]))
+        return of_trimesh(capsule)
+    return _unit_mesh(shape.kind).placed(Pose(), np.array(shape.extents), _OWN_COLOR)
+
+
+@functools.lru_cache(maxsize=64)
+def _installed_mesh(shape: Shape) -> SurfaceMesh | None:
+    """The model file of a mesh or urdf in the body's frame; None, and a word about it, when it cannot be used."""
+    try:
+        mesh = _model_mesh(shape)
+    except (DemorecError, OSError, ValueError) as error:
+        log.warning("An object is drawn as the recording describes it, since %s.", as_reason(error))
+        return None
+    extents = mesh.vertices.max(axis=0) - mesh.vertices.min(axis=0)
+    if np.abs(extents - shape.extents).max() > _SAME_SIZE * max(shape.extents):
+        log.warning("An object is drawn as the recording describes it, since %s has another size.", shape.file)
+        return None
+    return mesh
+
+
+def _model_mesh(shape: Shape) -> SurfaceMesh:
+    path = asset_path(shape.file)
+    if shape.kind == "mesh":
+        return mesh_file(path).placed(shape.body_from_mesh, np.full(3, shape.scale), _OWN_COLOR)
+    text = path.read_text()
+    poses = Urdf.parse(text, scale=shape.scale).link_poses({})
+    links = urdf_meshes(text, path.parent, shape.scale)
+    return joined([mesh.placed(poses[link], np.ones(3), _OWN_COLOR) for link, mesh in links.items()])
+
+
+@functools.cache
+def _unit_mesh(kind: str) -> SurfaceMesh:
+    """A box, ball or cylinder with extents of 1: scaled for each body, since shading a mesh anew takes longer."""
+    if kind == "box":
+        return of_trimesh(trimesh.creation.box(extents=(1.0, 1.0, 1.0)))
+    if kind == "sphere":
+        return sphere_mesh(0.5)
+    return of_trimesh(trimesh.creation.cylinder(radius=0.5, height=1.0, sections=48))
+
+
+def _textured_box(size: Array, texture: Texture) -> rr.Mesh3D:
+    """A box each face of which shows the texture once."""
+    corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
+    vertices, normals = np.zeros((24, 3)), np.zeros((24, 3))
+    for face in range(6):
+        axis, sign = divmod(face, 2)
+        rows = slice(4 * face, 4 * face + 4)
+        normals[rows, axis] = vertices[rows, axis] = 2 * sign - 1
+        vertices[rows, (axis + 1) % 3], vertices[rows, (axis + 2) % 3] = corners.T
+    quads = np.arange(0, 24, 4)[:, None]
+    triangles: NDArray[np.int64] = np.concatenate([quads + np.array([0, 1, 2]), quads + np.array([0, 2, 3])])
+    return rr.Mesh3D(
+        vertex_positions=vertices * size / 2,
+        vertex_normals=normals,
+        vertex_texcoords=np.tile((corners + 1) / 2, (6, 1)),
+        triangle_indices=triangles,
+        albedo_texture=texture_pixels(texture, 512),
+    )

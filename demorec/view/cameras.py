@@ -1,0 +1,112 @@
+"""Cameras: poses, pinholes (frusta in the 3D view) and pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from functools import partial
+from itertools import batched
+from typing import Any
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from demorec.view.episode import Depth, Distances, PlayedCollected, PlayedEpisode, Video, timed
+from demorec.view.paths import Paths
+from demorec.view.style import FRUSTUM, segment_colors
+from demorec.view.times import indexes, log_pose, send_poses
+
+_CODECS = {"h264": rr.VideoCodec.H264, "h265": rr.VideoCodec.H265, "av1": rr.VideoCodec.AV1}
+_PACKETS_AT_ONCE, _PICTURES_AT_ONCE = 256, 64
+_FRUSTUM_METRES = {"world": 0.22}
+_FRUSTUM_ON_ROBOT = 0.04
+
+
+def log_cameras(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisode | PlayedCollected) -> None:
+    """Every camera with what it saw; the coded pictures are passed on as they are."""
+    if isinstance(episode, PlayedCollected):
+        names, depth = list({**episode.videos, **episode.depth}), episode.depth
+    else:
+        names = [camera.name for camera in episode.info.scene.cameras]
+        depth = {name: partial(_millimetres, read) for name, read in episode.depth.items()}
+        _log_calibrations(recording, paths, episode)
+        _log_segmentations(recording, paths, episode)
+    for name in names:
+        if name in episode.videos:
+            _send_video(recording, paths.camera(name), episode.time_ns, episode.videos[name])
+        if name in depth:
+            _send_images(recording, paths.camera(name, "/depth"), episode.time_ns, depth[name]())
+
+
+def _log_calibrations(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisode) -> None:
+    for camera in episode.info.scene.cameras:
+        entity = paths.camera(camera.name)
+        pinhole = rr.Pinhole(
+            image_from_camera=camera.intrinsics,
+            resolution=(camera.width, camera.height),
+            camera_xyz=rr.ViewCoordinates.RDF,
+            image_plane_distance=_FRUSTUM_METRES.get(camera.mount, _FRUSTUM_ON_ROBOT),
+            color=FRUSTUM,
+            line_width=-1.0,
+        )
+        recording.log(entity, pinhole, static=True)
+        poses = episode.world_from_camera.get(camera.name)
+        if camera.mount == "world":
+            log_pose(recording, entity, camera.mount_from_camera.vector())
+        elif poses is not None:
+            send_poses(recording, entity, episode.time_ns, poses)
+
+
+def _send_video(recording: rr.RecordingStream, entity: str, frame_times: NDArray[np.int64], video: Video) -> None:
+    """Coded pictures as they are, each at its time."""
+    if video.codec in _CODECS:
+        recording.log(entity, rr.VideoStream(codec=_CODECS[video.codec]), static=True)
+    for batch in batched(video.packets(), _PACKETS_AT_ONCE):
+        times, samples, are_keyframes = zip(*batch, strict=True)
+        if video.codec in _CODECS:
+            columns = rr.VideoStream.columns(sample=samples, is_keyframe=np.array(are_keyframes))
+        else:
+            columns = rr.EncodedImage.columns(blob=samples, media_type=["image/jpeg"] * len(samples))
+        recording.send_columns(entity, indexes(np.array(times), frame_times), columns)
+
+
+def _millimetres(read: Depth) -> Iterator[tuple[int, Distances]]:
+    for time_ns, metres in read():
+        yield time_ns, np.rint(metres * 1000).clip(0, 65535).astype(np.uint16)
+
+
+def _send_images(
+    recording: rr.RecordingStream,
+    entity: str,
+    frame_times: NDArray[np.int64],
+    images: Iterable[tuple[int, Distances]],
+    kind: type[rr.DepthImage] | type[rr.SegmentationImage] = rr.DepthImage,
+) -> None:
+    """Distances (H, W), uint16 millimetres or float32 metres, or numbers of segments, uint16; each at its time."""
+    for batch in batched(images, _PICTURES_AT_ONCE):
+        height, width = batch[0][1].shape
+        is_float = batch[0][1].dtype == np.float32
+        datatype = rr.ChannelDatatype.F32 if is_float else rr.ChannelDatatype.U16
+        image_format = rr.components.ImageFormat(width=width, height=height, channel_datatype=datatype)
+        unit: dict[str, Any] = {"meter": [1.0 if is_float else 1000.0] * len(batch)} if kind is rr.DepthImage else {}
+        columns = kind.columns(
+            buffer=[image.tobytes() for _, image in batch], format=[image_format] * len(batch), **unit
+        )
+        recording.send_columns(entity, indexes(np.array([time_ns for time_ns, _ in batch]), frame_times), columns)
+
+
+def _log_segmentations(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisode) -> None:
+    """Segments by small numbers, the smallest of theirs (the background) 0, and what the numbers mean."""
+    known = np.array(sorted(episode.segment_names))
+    for camera in episode.info.scene.cameras:
+        if camera.name not in episode.segmentation:
+            continue
+        pictures = timed(episode.time_ns, episode.segmentation[camera.name])
+        numbers = ((time_ns, np.searchsorted(known, values).astype(np.uint16)) for time_ns, values in pictures)
+        entity = paths.camera(camera.name, "/segmentation")
+        _send_images(recording, entity, episode.time_ns, numbers, rr.SegmentationImage)
+    if episode.segmentation:
+        names = {number: episode.segment_names[value] for number, value in enumerate(known.tolist()) if number > 0}
+        colors = segment_colors(names.values())
+        labels = [rr.AnnotationInfo(number, name, colors[name]) for number, name in names.items()]
+        recording.log(paths.world, rr.AnnotationContext(labels), static=True)

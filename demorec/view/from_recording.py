@@ -1,0 +1,160 @@
+"""Episodes out of recordings, of simulated and of collected ones."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.episode.collected import NO_PICTURE, CollectedColumns
+from demorec.episode.episode import EpisodeColumns
+from demorec.mcap import AnyRecording, CollectedRecording, Recording, open_recording
+from demorec.mcap.channels import description_topic
+from demorec.mcap.external.transforms import JointPositions
+from demorec.runs.run_file import EPISODES, FAILED
+from demorec.view.episode import Curves, PlayedCollected, PlayedEpisode, Video, timed
+
+
+@contextmanager
+def open_recorded(path: Path) -> Iterator[PlayedEpisode | PlayedCollected]:
+    """The episode of a recording; its pictures can be read until the context is left.
+
+    Raises:
+        RecordingError: It cannot be read.
+    """
+    folder = path.resolve().parent
+    known = {
+        "name": path.name.removesuffix(".mcap"),
+        "group": folder.parent.name if folder.name in (EPISODES, FAILED) else folder.name,
+        "identity": hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:16],
+        "source": path.name,
+    }
+    with open_recording(path) as recording:
+        if isinstance(recording, CollectedRecording):
+            yield _collected(recording, known)
+        else:
+            yield _simulated(recording, known)
+
+
+def _simulated(recording: Recording, known: dict[str, Any]) -> PlayedEpisode:
+    info, columns = recording.info, recording.columns()
+    return PlayedEpisode(
+        **known,
+        info=info,
+        outcome=recording.outcome,
+        robot_description=recording.description(),
+        body_description=lambda body: (
+            recording.description(body) if description_topic(body) in recording.topics else None
+        ),
+        time_ns=columns.time_ns,
+        joint_position=columns.joint_position,
+        base_from_tcp=columns.base_from_tcp,
+        object_poses=columns.object_poses,
+        world_from_camera=columns.world_from_camera,
+        phase=columns.phase,
+        events=tuple(recording.events()),
+        curves=_curves(recording, columns),
+        videos={name: _video(recording, name, columns.time_ns) for name in recording.cameras},
+        depth={
+            name: partial(timed, columns.time_ns, partial(recording.depth, name))
+            for name in recording.cameras
+            if recording.has_depth(name)
+        },
+        segmentation={
+            name: partial(recording.segmentation, name)
+            for name in recording.cameras
+            if recording.has_segmentation(name)
+        },
+        segment_names=recording.segment_names(),
+    )
+
+
+def _collected(recording: CollectedRecording, known: dict[str, Any]) -> PlayedCollected:
+    info, columns = recording.info, recording.columns()
+    time_ns = columns.time_ns - (columns.time_ns[0] if columns.num_frames else 0)
+    positions = JointPositions(info.features)
+    values = positions.of(columns.features) if positions.joints else np.zeros((len(time_ns), 0))
+    return PlayedCollected(
+        **known,
+        info=info,
+        outcome=recording.outcome,
+        time_ns=time_ns,
+        joint_position=dict(zip(positions.joints, values.T, strict=True)),
+        curves={
+            feature.name: Curves(
+                time_ns=time_ns, values=columns.features[feature.name].astype(np.float64), names=feature.names
+            )
+            for feature in info.features
+        },
+        videos={
+            camera: _video(recording, camera, _shown_at(columns, camera, time_ns))
+            for camera in recording.cameras
+            if len(columns.picture_stamps[camera])
+        },
+        depth={
+            camera: partial(timed, _shown_at(columns, camera, time_ns), partial(recording.distances, camera))
+            for camera in recording.depth_cameras
+            if len(columns.picture_stamps[camera])
+        },
+        statements=tuple((int(time_ns[frame]), "subtask", text) for frame, text in recording.subtasks),
+    )
+
+
+def _shown_at(columns: CollectedColumns, camera: str, time_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(P,) when each picture of a camera is shown: with the first frame that holds it, or the next one after it.
+
+    Not at its own stamp, which may be of another clock.
+    """
+    frames = np.flatnonzero(columns.pictures[camera] != NO_PICTURE)
+    numbers = np.maximum.accumulate(columns.pictures[camera][frames])
+    count = len(columns.picture_stamps[camera])
+    places = np.minimum(np.searchsorted(numbers, np.arange(count)), max(len(frames) - 1, 0))
+    return time_ns[frames[places]] if len(frames) else np.zeros(count, dtype=np.int64)
+
+
+def _video(recording: AnyRecording, camera: str, shown_at: NDArray[np.int64]) -> Video:
+    """The coded pictures of a camera, each at its time (P,)."""
+
+    def packets() -> Iterator[tuple[int, bytes, bool]]:
+        for packet in recording.packets(camera):
+            yield int(shown_at[packet.frame_index]), packet.data, packet.is_keyframe
+
+    return Video(codec=recording.video_settings(camera).codec, packets=packets)
+
+
+def _curves(recording: Recording, columns: EpisodeColumns) -> dict[str, Curves]:
+    """All plots; joints at the rate at which they were recorded, which may be that of the physics."""
+    robot = recording.info.robot
+    time_ns = columns.time_ns
+    position, velocity, effort = columns.joint_position, columns.joint_velocity, columns.joint_effort
+    if recording.topics["/joint_states"][1] > recording.num_frames:
+        samples = list(recording.joint_samples())
+        time_ns = np.array([sample.time_ns for sample in samples], dtype=np.int64)
+        position = np.array([sample.joint_position for sample in samples])
+        velocity = np.array([sample.joint_velocity for sample in samples])
+        effort = np.array([sample.joint_effort for sample in samples])
+    num_arm = len(robot.arm_joints)
+    frames = columns.time_ns
+    wrench = {}
+    if columns.wrench is not None:
+        wrench = {
+            "hand force": Curves(time_ns=frames, values=columns.wrench[:, :3], names=("x", "y", "z")),
+            "hand torque": Curves(time_ns=frames, values=columns.wrench[:, 3:], names=("x", "y", "z")),
+        }
+    return {
+        "position": Curves(time_ns=time_ns, values=position[:, :num_arm], names=robot.arm_joints),
+        "velocity": Curves(time_ns=time_ns, values=velocity[:, :num_arm], names=robot.arm_joints),
+        "effort": Curves(time_ns=time_ns, values=effort[:, :num_arm], names=robot.arm_joints),
+        "target": Curves(time_ns=frames, values=columns.action_joint_target, names=robot.arm_joints),
+        "gripper": Curves(time_ns=frames, values=columns.gripper_width[:, None], names=("opening",)),
+        "gripper target": Curves(time_ns=frames, values=columns.action_gripper[:, None], names=("target",)),
+        "force": Curves(time_ns=frames, values=columns.contact_force[:, None], names=("contact force",)),
+        "ee": Curves(time_ns=frames, values=columns.base_from_tcp[:, :3], names=("x", "y", "z")),
+        **wrench,
+    }

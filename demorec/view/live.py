@@ -1,0 +1,125 @@
+"""Episodes shown while a run goes on: finished recordings are handed to a process of low priority, which sends them.
+
+Generating waits for nothing here: handing over a file is one line into a pipe. `python -m demorec.view.live URL`
+is that process; it reads paths from its standard input.
+"""
+
+from __future__ import annotations
+
+import os
+import queue
+import subprocess
+import sys
+import threading
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any
+
+from demorec.core.errors import ConfigError, DemorecError
+from demorec.core.text import printable
+from demorec.view.programs import free_port, has_display, viewer_environment, viewer_program
+
+_NICENESS = 15
+_END_SECONDS = 60.0
+
+
+class LiveViewer(AbstractContextManager["LiveViewer"]):
+    """Context manager over a window to which finished episodes can be added; the window stays open afterwards.
+
+    Args:
+        url: Of a viewer that runs already ("rerun+http://127.0.0.1:9876/proxy"); None opens a window.
+
+    Raises:
+        ConfigError: There is no screen to open a window on.
+    """
+
+    def __init__(self, url: str | None = None) -> None:
+        if url is None:
+            if not has_display():
+                raise ConfigError(
+                    "--view opens a window, but there is no screen: leave it out, then demorec view --web."
+                )
+            port = free_port()
+            url = f"rerun+http://127.0.0.1:{port}/proxy"
+            command = [viewer_program(), "--port", str(port), "--bind", "127.0.0.1", "--expect-data-soon"]
+            subprocess.Popen(
+                command,
+                env=viewer_environment(),
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+                start_new_session=True,  # Ctrl-C is for the run, not for the window
+            )
+        self._sender = subprocess.Popen(
+            [sys.executable, "-m", "demorec.view.live", url],
+            stdin=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+        self._paths: queue.SimpleQueue[Path | None] = queue.SimpleQueue()
+        self._feeder = threading.Thread(target=self._feed, daemon=True)
+        self._feeder.start()
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def add(self, recording: Path) -> None:
+        """Show a finished recording as soon as there is time; returns at once."""
+        self._paths.put(recording)
+
+    def close(self) -> None:
+        """Wait until all that was added is in the viewer, within a minute; harmless when called twice."""
+        self._paths.put(None)
+        self._feeder.join(_END_SECONDS)
+        try:
+            self._sender.wait(_END_SECONDS)
+        except subprocess.TimeoutExpired:
+            self._sender.kill()
+            self._sender.wait()
+
+    def _feed(self) -> None:
+        pipe: Any = self._sender.stdin
+        try:
+            while (path := self._paths.get()) is not None:
+                pipe.write(f"{path.resolve()}\n")
+                pipe.flush()
+            pipe.close()
+        except OSError:  # the sender has ended; the run goes on without it
+            return
+
+
+def send(recording: Path, url: str, laid_out: set[str]) -> None:
+    """One recording to a running viewer; with the layout unless its application is in `laid_out`, where it is put.
+
+    Raises:
+        DemorecError: It cannot be read.
+    """
+    from demorec.view.layout import episode_layout
+    from demorec.view.scene import application_id, log_episode, new_recording
+    from demorec.view.sources import find_episodes
+
+    (source,) = find_episodes([recording])
+    with source.open() as episode:
+        stream = new_recording(episode)
+        application = application_id(episode)
+        layout = None if application in laid_out else episode_layout(episode)
+        laid_out.add(application)
+        stream.connect_grpc(url, default_blueprint=layout)
+        log_episode(stream, episode)
+        stream.flush(timeout_sec=_END_SECONDS)
+        stream.disconnect()
+
+
+def _main() -> None:
+    if hasattr(os, "nice"):
+        os.nice(_NICENESS)
+    url, laid_out = sys.argv[1], set[str]()
+    for line in sys.stdin:
+        try:
+            send(Path(line.rstrip("\n")), url, laid_out)
+        except DemorecError as error:
+            sys.stderr.write(printable(f"--view: {error}") + "\n")
+
+
+if __name__ == "__main__":
+    _main()

@@ -1,0 +1,218 @@
+"""What the robot and the objects look like: triangles with normals and colours, from URDF and mesh files.
+
+Mesh files are simplified once and kept in the user's cache folder: the original robot has 100,000 triangles, of which
+a viewer on a laptop, or in a browser, shows no more than a tenth as something different.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import fast_simplification
+import numpy as np
+import platformdirs
+import trimesh
+from numpy.typing import NDArray
+
+from demorec.core.errors import DemorecError, RecordingError, in_words
+from demorec.core.geometry import Pose
+from demorec.episode.scene import Rgba
+from demorec.robots.assets import mesh_path
+from demorec.robots.urdf import Urdf
+from demorec.robots.urdf_shapes import UrdfShape, read_links
+
+MAX_TRIANGLES = 2500
+"""Of one mesh file."""
+_CREASE = np.radians(35.0)
+"""Edges sharper than this stay sharp when a surface is shaded."""
+_ROD_RADIUS, _SHORTEST_ROD = 0.015, 1e-3
+"""Metres."""
+_CACHE_VERSION = b"2"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SurfaceMesh:
+    """Triangles in a link's or body's frame, metres.
+
+    Attributes:
+        vertices, normals: (N, 3) float32.
+        triangles: (M, 3) uint32.
+        colors: (N, 4) uint8 RGBA.
+    """
+
+    vertices: NDArray[np.float32]
+    normals: NDArray[np.float32]
+    triangles: NDArray[np.uint32]
+    colors: NDArray[np.uint8]
+
+    def placed(self, pose: Pose, scale: NDArray[np.float64], rgba: Rgba) -> SurfaceMesh:
+        """Scaled, then moved by `pose`, its colours multiplied by `rgba`."""
+        rotation = pose.rotation
+        normals = (self.normals / scale) @ rotation.T  # only drawn: rounding may differ between CPUs
+        lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+        return SurfaceMesh(
+            vertices=pose.apply(self.vertices * scale).astype(np.float32),
+            normals=(normals / np.maximum(lengths, 1e-12)).astype(np.float32),
+            triangles=self.triangles,
+            colors=np.rint(self.colors * np.array(rgba)).astype(np.uint8),
+        )
+
+
+def joined(meshes: list[SurfaceMesh]) -> SurfaceMesh:
+    """Several meshes as one."""
+    offsets = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
+    return SurfaceMesh(
+        vertices=np.concatenate([mesh.vertices for mesh in meshes]),
+        normals=np.concatenate([mesh.normals for mesh in meshes]),
+        triangles=np.concatenate(
+            [mesh.triangles + np.uint32(offset) for mesh, offset in zip(meshes, offsets, strict=True)]
+        ),
+        colors=np.concatenate([mesh.colors for mesh in meshes]),
+    )
+
+
+def urdf_meshes(text: str, folder: Path | None, scale: float = 1.0) -> dict[str, SurfaceMesh]:
+    """Link -> what it looks like, of all links that can be seen.
+
+    Args:
+        text: The URDF.
+        folder: Where it lay, to find its mesh files; None for one without mesh files.
+        scale: Uniform scale.
+
+    Raises:
+        RecordingError: A mesh file cannot be read.
+        ValueError: The text is no URDF.
+    """
+    links = {}
+    for link in read_links(text, scale=scale):
+        meshes = [mesh for shape in link.visuals if (mesh := _shape_mesh(shape, folder)) is not None]
+        if meshes:
+            links[link.name] = joined(meshes)
+    return links
+
+
+def skeleton_meshes(urdf: Urdf) -> dict[str, SurfaceMesh]:
+    """Link -> rods from its origin to those of the joints that hang on it, of an arm whose looks are not known."""
+    links: dict[str, list[SurfaceMesh]] = {}
+    for joint in urdf.joints:
+        end = joint.parent_from_joint.position
+        if np.abs(end).max() > _SHORTEST_ROD:
+            rod = trimesh.creation.cylinder(radius=_ROD_RADIUS, segment=[np.zeros(3), end], sections=16)
+            links.setdefault(joint.parent, []).append(of_trimesh(rod))
+    return {link: joined(rods) for link, rods in links.items()}
+
+
+def _shape_mesh(shape: UrdfShape, folder: Path | None) -> SurfaceMesh | None:
+    scale: NDArray[np.float64] = np.ones(3)
+    match shape.kind:
+        case "mesh":
+            if folder is None:
+                raise RecordingError(f"The robot's mesh {shape.file!r} is named by its URDF, but is not kept with it")
+            try:
+                path = mesh_path(folder, shape.file)
+            except DemorecError as error:
+                raise RecordingError(str(error)) from error
+            mesh, scale = mesh_file(path), np.array(shape.size)
+        case "box":
+            mesh = of_trimesh(trimesh.creation.box(extents=shape.size))
+        case "sphere":
+            mesh = sphere_mesh(shape.size[0])
+        case "cylinder" | "capsule":
+            mesh = of_trimesh(trimesh.creation.cylinder(radius=shape.size[0], height=shape.size[1], sections=32))
+        case "plane":
+            return None
+    return mesh.placed(shape.link_from_shape, scale, shape.rgba or (1.0, 1.0, 1.0, 1.0))
+
+
+def sphere_mesh(radius: float) -> SurfaceMesh:
+    """A ball."""
+    return of_trimesh(trimesh.creation.icosphere(subdivisions=3, radius=radius))
+
+
+@functools.lru_cache(maxsize=64)
+def mesh_file(path: Path) -> SurfaceMesh:
+    """A mesh file with the colours of its materials, simplified; from the cache when it was read before.
+
+    Raises:
+        RecordingError: It cannot be read.
+    """
+    try:
+        digest = hashlib.sha256(_CACHE_VERSION + path.read_bytes())
+        materials = path.with_suffix(".mtl")
+        digest.update(materials.read_bytes() if materials.is_file() else b"")
+        cached = platformdirs.user_cache_path("demorec") / "playback" / f"{digest.hexdigest()[:32]}.npz"
+        if cached.is_file():
+            with np.load(cached) as arrays:
+                return SurfaceMesh(**{name: arrays[name] for name in ("vertices", "normals", "triangles", "colors")})
+        mesh = _read_mesh_file(path)
+    except (OSError, ValueError, KeyError) as error:
+        raise RecordingError(f"The mesh cannot be read ({in_words(error)}): {path}") from error
+    _keep(cached, mesh)
+    return mesh
+
+
+def _keep(cached: Path, mesh: SurfaceMesh) -> None:
+    """Write the cache file as a whole or not at all; a folder that cannot be written only costs time."""
+    try:
+        cached.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=cached.parent, suffix=".npz", delete=False) as file:
+            np.savez(file, vertices=mesh.vertices, normals=mesh.normals, triangles=mesh.triangles, colors=mesh.colors)
+        Path(file.name).replace(cached)
+    except OSError:
+        return
+
+
+def _read_mesh_file(path: Path) -> SurfaceMesh:
+    loaded = trimesh.load(path, process=False)
+    parts: list[Any] = list(loaded.geometry.values()) if isinstance(loaded, trimesh.Scene) else [loaded]
+    total = sum(len(part.faces) for part in parts)
+    is_obj = path.suffix.lower() == ".obj"
+    # As in PyBullet: a texture, or several materials, colour an OBJ file; a single material does not.
+    colored = not is_obj or len(parts) > 1 or _texture(parts[0]) is not None
+    keep = min(1.0, MAX_TRIANGLES / total)
+    return joined([_simplified(part, keep, _color(part) if colored else None) for part in parts if len(part.faces)])
+
+
+def _simplified(part: Any, keep: float, rgba: NDArray[np.uint8] | None) -> SurfaceMesh:
+    bare = trimesh.Trimesh(vertices=part.vertices, faces=part.faces, process=False)
+    bare.merge_vertices()
+    if keep < 1.0 and len(bare.faces) > 100:
+        vertices, faces = fast_simplification.simplify(
+            bare.vertices.astype(np.float32), bare.faces.astype(np.int32), target_reduction=1.0 - keep
+        )
+        bare = trimesh.Trimesh(vertices=vertices, faces=faces, process=False)
+    return of_trimesh(bare, rgba)
+
+
+def _texture(part: Any) -> Any:
+    return getattr(getattr(part.visual, "material", None), "image", None)
+
+
+def _color(part: Any) -> NDArray[np.uint8] | None:
+    """The part's colour, RGBA; of a texture its mean over the middles of the part's triangles."""
+    if _texture(part) is not None:
+        middles = part.visual.uv[part.faces].mean(axis=1)
+        colors = trimesh.visual.uv_to_color(middles, _texture(part)).astype(np.float64)
+        mean: NDArray[np.float64] = np.average(colors, axis=0, weights=part.area_faces)
+        return np.rint(mean).astype(np.uint8)
+    color = getattr(getattr(part.visual, "material", None), "diffuse", None)
+    if color is None:
+        color = getattr(part.visual, "main_color", None)
+    return None if color is None else np.array(color, dtype=np.uint8)
+
+
+def of_trimesh(mesh: Any, rgba: NDArray[np.uint8] | None = None) -> SurfaceMesh:
+    """A trimesh mesh, smooth but for its creases, in one colour (white when None)."""
+    shaded = trimesh.graph.smooth_shade(mesh, angle=_CREASE)
+    color = np.full(4, 255, dtype=np.uint8) if rgba is None else rgba
+    return SurfaceMesh(
+        vertices=np.asarray(shaded.vertices, dtype=np.float32),
+        normals=np.asarray(shaded.vertex_normals, dtype=np.float32),
+        triangles=np.asarray(shaded.faces, dtype=np.uint32),
+        colors=np.tile(color, (len(shaded.vertices), 1)),
+    )

@@ -1,0 +1,68 @@
+"""The programs that playback starts: Rerun's viewer, and the ffmpeg that it needs to play H.264."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import socket
+import sys
+from pathlib import Path
+
+import platformdirs
+
+from demorec.core.errors import MissingDependencyError
+
+
+def viewer_program() -> str:
+    """The viewer that came with rerun-sdk, so that its version fits the recordings."""
+    import rerun_cli
+
+    folder = Path(rerun_cli.__file__).parent
+    for name in ("Rerun.app/Contents/MacOS/Rerun", "rerun.exe", "rerun"):
+        if (folder / name).is_file():
+            return str(folder / name)
+    raise MissingDependencyError("Showing recordings", "rerun-sdk", "pip install 'rerun-sdk>=0.41,<0.42'")
+
+
+def viewer_environment() -> dict[str, str]:
+    """The environment for the viewer: with an `ffmpeg` on PATH, that of imageio-ffmpeg when there is no other."""
+    environment = dict(os.environ)
+    environment.setdefault("RUST_LOG", "warn")
+    if shutil.which("ffmpeg") is None:
+        environment["PATH"] = os.pathsep.join([environment.get("PATH", ""), str(_ffmpeg_folder())])
+    return environment
+
+
+def _ffmpeg_folder() -> Path:
+    """A folder that holds imageio-ffmpeg's program (ffmpeg-linux-x86_64-v7.0.2 or so) under the name ffmpeg."""
+    import imageio_ffmpeg
+
+    try:
+        program = Path(imageio_ffmpeg.get_ffmpeg_exe())
+    except RuntimeError as error:
+        raise MissingDependencyError("Playing H.264", "ffmpeg", "pip install imageio-ffmpeg, or ffmpeg") from error
+    folder = platformdirs.user_cache_path("demorec") / "bin" / program.name
+    link = folder / ("ffmpeg.exe" if sys.platform == "win32" else "ffmpeg")
+    if not link.is_file():
+        folder.mkdir(parents=True, exist_ok=True)
+        fresh = folder / f"{link.name}.{os.getpid()}"
+        try:
+            fresh.symlink_to(program)
+        except OSError:
+            shutil.copy2(program, fresh)
+        fresh.replace(link)
+    return folder
+
+
+def free_port() -> int:
+    """A TCP port of this machine that nobody listens on."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def has_display() -> bool:
+    """Whether a window can be opened."""
+    if not sys.platform.startswith("linux"):
+        return True
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

@@ -1,0 +1,107 @@
+"""Episodes to .rrd files, with the layout inside."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import rerun as rr
+
+from demorec.core.errors import ConfigError, RecordingError
+from demorec.core.replacing import RERUN_FILE, written_whole
+from demorec.view.compare import log_comparison, new_comparison
+from demorec.view.episode import PlayedCollected
+from demorec.view.layout import comparison_layout, episode_layout
+from demorec.view.scene import log_episode, new_recording
+from demorec.view.sources import PlaybackSource
+
+
+def save(source: PlaybackSource, target: Path) -> None:
+    """An episode into an .rrd file, which appears when it is complete.
+
+    Raises:
+        DemorecError: The episode cannot be read, or the file cannot be written.
+    """
+    with _partial(target) as part:
+        _save_episode(source, part, is_alone=True)
+
+
+def numbered(target: Path, count: int) -> list[Path]:
+    """The names of `count` files: the target itself for one, NAME-0000.rrd and so on for several.
+
+    Rerun's viewer shows one recording of a file (it takes the last), so several episodes are several files.
+    """
+    if count == 1:
+        return [target]
+    return [target.with_name(f"{target.stem}-{index:04d}{target.suffix}") for index in range(count)]
+
+
+def save_each(sources: Sequence[PlaybackSource], folder: Path) -> list[Path]:
+    """Each episode into an .rrd file of its own.
+
+    Raises:
+        DemorecError: An episode cannot be read, or a file cannot be written.
+    """
+    files = [folder / f"{index:06d}.rrd" for index in range(len(sources))]
+    for source, file in zip(sources, files, strict=True):
+        with _refusals_told(file):
+            _save_episode(source, file, is_alone=len(sources) == 1)
+    return files
+
+
+def save_comparison(a: PlaybackSource, b: PlaybackSource, target: Path) -> None:
+    """Two episodes over each other into one .rrd file.
+
+    Raises:
+        DemorecError: As `save`; ConfigError when they cannot be compared.
+    """
+    with _partial(target) as part, a.open() as first, b.open() as second:
+        if isinstance(first, PlayedCollected) or isinstance(second, PlayedCollected):
+            raise ConfigError(
+                "Collected episodes cannot be laid over each other: nobody knows that their robots stand alike. View "
+                "them without --compare."
+            )
+        recording = new_comparison(first, second)
+        with _saving(recording, part, comparison_layout(first, second)):
+            log_comparison(recording, first, second)
+
+
+def _save_episode(source: PlaybackSource, target: Path, *, is_alone: bool) -> None:
+    with source.open() as episode:
+        recording = new_recording(episode)
+        with _saving(recording, target, episode_layout(episode, is_alone=is_alone)):
+            log_episode(recording, episode)
+
+
+@contextmanager
+def _saving(recording: rr.RecordingStream, target: Path, layout: rr.blueprint.Blueprint) -> Iterator[None]:
+    """Write what is logged in the block, with its layout; OSError when that is not possible.
+
+    An episode is gathered in memory and written from here: Rerun's own thread for files keeps it to its log when the
+    disk is full, or has the program wait for ever.
+    """
+    stream = recording.binary_stream()
+    recording.send_blueprint(layout, make_active=False, make_default=True)
+    try:
+        yield
+    finally:
+        data = stream.read()  # in any case: Rerun warns on the terminal of what nobody has read
+        recording.disconnect()
+    assert data is not None  # there is a layout, at least
+    target.write_bytes(data)
+
+
+@contextmanager
+def _partial(target: Path) -> Iterator[Path]:
+    """A name beside the target, renamed when the block ends well and removed when not."""
+    with _refusals_told(target), written_whole(target, RERUN_FILE) as part:
+        yield part
+
+
+@contextmanager
+def _refusals_told(target: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise RecordingError(f"The file cannot be written ({error.strerror or error}): {target}") from error

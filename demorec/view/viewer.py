@@ -1,0 +1,291 @@
+"""Rerun's viewer: in a window, without a screen (for pictures), or in the browser."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+from urllib.parse import quote
+from urllib.request import urlopen
+
+from rerun.experimental import ViewerClient
+
+from demorec.core.errors import ConfigError, DemorecError, RecordingError
+from demorec.core.processes import start_program
+from demorec.core.replacing import PICTURE, written_whole
+from demorec.view.programs import free_port, has_display, viewer_environment, viewer_program
+from demorec.view.times import SECONDS
+
+_START_SECONDS = 60.0
+_SETTLE_SECONDS = 30.0
+_END_SECONDS = 5.0
+_PANIC = re.compile(r"panicked at '(?P<message>.*)'$", re.MULTILINE)
+_NO_DRIVER = ("Failed to create render state", "Failed to get render context")
+"""How the viewer's panic begins where there is no Vulkan driver, or where OpenGL alone is not enough for it."""
+_NO_GLYPH = re.compile(r'No glyph for "(?P<character>.+?)" \((?P<code>U\+[0-9A-F]+)\)')
+
+
+def _start_viewer(*arguments: str, **options: Any) -> subprocess.Popen[Any]:
+    """The viewer, which nobody but this machine reaches; `options` are those of `start_program`."""
+    command = [viewer_program(), "--bind", "127.0.0.1", *arguments]
+    return start_program(command, env=viewer_environment(), **options)
+
+
+def need_screen() -> None:
+    """Raise ConfigError unless a window can be opened."""
+    if not has_display():
+        raise ConfigError(
+            "There is no screen to open a window on: use --screenshot x.png, --web for a browser, or, unless it is an "
+            ".rrd file already, --save x.rrd."
+        )
+
+
+def show(recordings: Sequence[Path]) -> None:
+    """Open a window with .rrd files and wait until it is closed.
+
+    Raises:
+        ConfigError: There is no screen.
+        RecordingError: The viewer failed.
+    """
+    need_screen()
+    code = _start_viewer("--port", "auto", "--hide-welcome-screen", *map(str, recordings)).wait()
+    if code:
+        raise RecordingError(f"Rerun's viewer ended with exit code {code}.")
+
+
+def why_it_ended(said: str) -> DemorecError:
+    """The error for a viewer that ended by itself, from what it wrote to its standard error."""
+    panic = _PANIC.search(said)
+    message = panic["message"] if panic else ""
+    if message.startswith(_NO_DRIVER):
+        return RecordingError(
+            f"Rerun's viewer found no Vulkan driver to draw a picture with ({message.rstrip('.')}): "
+            "apt-get install mesa-vulkan-drivers brings one that needs no graphics card."
+        )
+    glyph = _NO_GLYPH.match(message)
+    if glyph:
+        return RecordingError(
+            f"Rerun's viewer without a screen cannot draw {glyph['character']!r} ({glyph['code']}), which the file "
+            "contains: look at it in the window, or with --web."
+        )
+    return RecordingError(f"Rerun's viewer ended by itself: {message or said.strip()[-300:]}")
+
+
+class HeadlessViewer(AbstractContextManager["HeadlessViewer"]):
+    """Context manager over a viewer without a screen that shows .rrd or .mcap files in order, the first one in front.
+
+    Raises:
+        RecordingError: There is no graphics driver, the viewer does not come up or ends by itself, or it cannot load
+            the file.
+    """
+
+    def __init__(self, *recordings: Path, width: int = 1600, height: int = 950) -> None:
+        self._port = free_port()
+        self._recordings = recordings
+        # Not a pipe, which would fill up when nobody reads it.
+        self._said = tempfile.TemporaryFile(mode="w+", errors="replace")  # noqa: SIM115 (closed by close)
+        self._process = _start_viewer(
+            "--headless", "--port", str(self._port), "--window-size", f"{width}x{height}", "--hide-welcome-screen",
+            str(recordings[0]), stdout=subprocess.DEVNULL, stderr=self._said,
+        )  # fmt: skip
+        try:
+            self.client = self._connect()
+            self._add(recordings[1:])
+        except BaseException:
+            self.close()
+            raise
+
+    def __exit__(
+        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        try:
+            if isinstance(exc, (OSError, RuntimeError, ValueError)):
+                with suppress(subprocess.TimeoutExpired):  # one that panics has left us before it has said why
+                    self._process.wait(_END_SECONDS)
+                    raise self._reason() from exc
+        finally:
+            self.close()
+
+    def close(self) -> None:
+        """End the viewer; harmless when called twice."""
+        end_process(self._process)
+        self._said.close()
+
+    def _reason(self) -> DemorecError:
+        """Why the viewer has ended, by what it said."""
+        self._said.seek(0)
+        return why_it_ended(self._said.read())
+
+    def _connect(self) -> ViewerClient:
+        deadline = time.monotonic() + _START_SECONDS
+        while time.monotonic() < deadline:
+            if self._process.poll() is not None:
+                raise self._reason()
+            try:
+                client = ViewerClient.connect(f"rerun+http://127.0.0.1:{self._port}/proxy")
+                if _loaded(client, 1):
+                    return client
+            except (OSError, RuntimeError, ValueError):  # TimeoutError is an OSError
+                pass
+            time.sleep(0.2)
+        raise _not_loaded(self._recordings[0])
+
+    def _add(self, recordings: Sequence[Path]) -> None:
+        """Load more files; the viewer lists them as they come, but names and reads only what it has shown."""
+        for count, recording in enumerate(recordings, start=2):
+            self.client.open(str(recording), navigate=False)
+            deadline = time.monotonic() + _START_SECONDS
+            while not _loaded(self.client, count):
+                if time.monotonic() > deadline:
+                    raise _not_loaded(recording)
+                time.sleep(0.1)
+        listed = self.client.get_state().recordings
+        if len(listed) > 1:
+            for shown in (*listed[1:], listed[0]):
+                self.client.set_location(shown.location)
+                self._picture()
+
+    @property
+    def end(self) -> float:
+        """Seconds of the last row of the recording in front; 0 when it has no such time line."""
+        first = self.client.get_state().recordings[0]
+        return max((line.end / 1e9 for line in first.timelines if line.name == SECONDS), default=0.0)
+
+    def seek(self, seconds: float) -> None:
+        """Pause at a time of the episode, and wait until the picture has settled (videos are decoded)."""
+        for recording in self.client.get_state().recordings:
+            self.client.set_time(timeline=SECONDS, duration=seconds, play_state="paused", recording=recording.store_id)
+        self._settle()
+
+    def _settle(self) -> None:
+        before, same = b"", 0
+        deadline = time.monotonic() + _SETTLE_SECONDS
+        while same < 3 and time.monotonic() < deadline:
+            time.sleep(0.4)
+            now = self._picture()
+            before, same = now, same + 1 if now == before else 0
+
+    def _picture(self, *view: Any) -> bytes:
+        """PNG of the window or of one view; the client waits for some seconds only, too short for a busy machine."""
+        deadline = time.monotonic() + _START_SECONDS
+        while True:
+            try:
+                return bytes(self.client.take_screenshot(*view))
+            except TimeoutError as error:
+                if self._process.poll() is not None:
+                    raise
+                if time.monotonic() > deadline:
+                    raise RecordingError(
+                        f"Rerun's viewer has not drawn a picture within {_START_SECONDS:.0f} s: is the machine busy?"
+                    ) from error
+
+    def save_picture(self, target: Path) -> None:
+        """The whole window as PNG, whole or not at all; OSError when it cannot be written."""
+        picture = self._picture()
+        with written_whole(target, PICTURE) as part:
+            part.write_bytes(picture)
+
+    def view_picture(self, name: str) -> bytes:
+        """One view as PNG; KeyError when no view has that name."""
+        for view in self.client.get_state().views:
+            if view.name == name:
+                return self._picture(view.view_id)
+        raise KeyError(name)
+
+    def reports(self) -> list[tuple[str, Any]]:
+        """Every warning and error of a view: (its name, what Rerun tells)."""
+        return [(view.name, report) for view in self.client.get_state().views for report in view.reports]
+
+
+def _loaded(client: ViewerClient, count: int) -> bool:
+    state = client.get_state()
+    return not state.loading and sum(bool(recording.timelines) for recording in state.recordings) >= count
+
+
+def _not_loaded(recording: Path) -> RecordingError:
+    return RecordingError(f"Rerun's viewer has not loaded the file within {_START_SECONDS:.0f} s: {recording}")
+
+
+def moment(seconds: float | None, end: float) -> float:
+    """A time of an episode that lasts until `end`, seconds; by default its middle.
+
+    Raises:
+        ConfigError: It is outside of the episode.
+    """
+    if seconds is None:
+        return end / 2
+    if not 0.0 <= seconds <= end + 1e-9:
+        raise ConfigError(f"--at is {seconds:g}, allowed are 0 to {end:.3f} s, the episode's last frame.")
+    return seconds
+
+
+def screenshot(recordings: Sequence[Path], target: Path, *, seconds: float | None, width: int, height: int) -> None:
+    """A picture of the viewer with .rrd files at a time of the first of them, by default its middle.
+
+    Raises:
+        ConfigError: The time is outside of it.
+        DemorecError: The viewer cannot work here, or a view reports an error.
+    """
+    with HeadlessViewer(*recordings, width=width, height=height) as viewer:
+        viewer.seek(moment(seconds, viewer.end))
+        for view, report in viewer.reports():
+            if report.severity == "error":
+                raise RecordingError(f"The view {view!r} cannot be drawn: {report.summary}.")
+        try:
+            viewer.save_picture(target)
+        except OSError as error:
+            raise RecordingError(f"The picture cannot be written ({error.strerror}): {target}") from error
+
+
+@contextmanager
+def serve_web(recordings: Sequence[Path], *, web_port: int = 0) -> Iterator[tuple[str, Callable[[], int]]]:
+    """Serve Rerun's web viewer and .rrd files to this machine alone.
+
+    Yields:
+        The address for the browser, and a function that waits until the server ends and returns its exit code.
+
+    Raises:
+        RecordingError: The port is taken, or the server does not come up.
+    """
+    data_port, web_port = free_port(), web_port or free_port()
+    memory = max(1024, 3 * sum(recording.stat().st_size for recording in recordings) // 2**20)
+    process = _start_viewer(
+        "--serve-web", "--port", str(data_port), "--web-viewer-port", str(web_port), "--server-memory-limit",
+        f"{memory}MiB", *map(str, recordings), stdout=subprocess.DEVNULL,
+    )  # fmt: skip
+    try:
+        page = f"http://127.0.0.1:{web_port}"
+        _wait_for_page(page, process)
+        yield f"{page}/?url={quote(f'rerun+http://127.0.0.1:{data_port}/proxy', safe='')}", process.wait
+    finally:
+        end_process(process)
+
+
+def _wait_for_page(page: str, process: subprocess.Popen[Any]) -> None:
+    deadline = time.monotonic() + _START_SECONDS
+    while time.monotonic() < deadline and process.poll() is None:
+        try:
+            with urlopen(page, timeout=5):
+                return
+        except OSError:
+            time.sleep(0.1)
+    raise RecordingError(f"Rerun's web server did not come up at {page}: is the port taken?")
+
+
+def end_process(process: subprocess.Popen[Any]) -> None:
+    """Ask a process to end, and make it when it does not within some seconds."""
+    if process.stdin is not None:
+        process.stdin.close()
+    if process.poll() is None:
+        process.terminate()
+        try:
+            process.wait(timeout=5)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
